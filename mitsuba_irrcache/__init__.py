@@ -1,0 +1,25 @@
+"""Irradiance caching for participating media in Mitsuba 3.
+
+Importing this package, before or after ``mitsuba.set_variant``, makes ``<integrator type="irrcache"/>`` available in
+every variant set from then on.
+"""
+
+from __future__ import annotations
+
+from . import runtime
+
+runtime.prepare_llvm()  # before Dr.Jit is imported for the first time
+
+from . import _register  # noqa: E402,F401
+from .cache import IrradianceCache  # noqa: E402
+from .errors import CacheFileError, IrrcacheError, UnsupportedSceneError  # noqa: E402
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CacheFileError",
+    "IrradianceCache",
+    "IrrcacheError",
+    "UnsupportedSceneError",
+    "__version__",
+]

@@ -1,0 +1,117 @@
+"""The convex bounding shape of a medium, intersected in closed form.
+
+No ray ever starts on the boundary by way of an epsilon, so nothing here depends on the scene's scale or
+position. Boxes may be placed by any affine map; they are recognised from their mesh, whatever plugin made it.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .errors import UnsupportedSceneError
+from .grid import Affine
+
+
+class Boundary:
+    """The image of the cube [-1, 1]^3 (``kind="box"``) or of the unit sphere (``"sphere"``) under ``to_world``."""
+
+    def __init__(self, kind: str, to_world: np.ndarray) -> None:
+        self.kind = kind
+        self.to_world = np.asarray(to_world, dtype=np.float64)
+        self._to_local = Affine(np.linalg.inv(self.to_world))
+
+    @property
+    def frame(self) -> np.ndarray:
+        """``to_world`` of the unit cube [0, 1]^3 that encloses the boundary."""
+        unit = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]])
+        return self.to_world @ unit
+
+    def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+        """Whether the ray's line meets the inside, and the distances of entry and exit (entry < 0: from within)."""
+        origin = self._to_local.point(ray.o)
+        direction = self._to_local.vector(ray.d)
+        return _slabs(origin, direction) if self.kind == "box" else _sphere(origin, direction)
+
+
+def _slabs(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    """The cube [-1, 1]^3. Directions in a face are handled by a reciprocal that is never infinite."""
+    rcp = safe_rcp(d)
+    lower, upper = (-1.0 - o) * rcp, (1.0 - o) * rcp
+    near = dr.max(dr.minimum(lower, upper))
+    far = dr.min(dr.maximum(lower, upper))
+    return near < far, near, far
+
+
+def _sphere(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    """The unit sphere; the closest approach is found first, which keeps far away cameras accurate."""
+    rcp_length = dr.rsqrt(dr.squared_norm(d))
+    direction = d * rcp_length
+    middle = -dr.dot(o, direction)
+    closest = o + middle * direction
+    half_squared = 1.0 - dr.squared_norm(closest)
+    half = dr.sqrt(dr.maximum(half_squared, 0.0))
+    return half_squared > 0, (middle - half) * rcp_length, (middle + half) * rcp_length
+
+
+def safe_rcp(d: mi.Vector3f) -> mi.Vector3f:
+    """1 / d, finite also for components that are 0 or denormal."""
+    return dr.rcp(dr.select(dr.abs(d) > 1e-20, d, dr.mulsign(mi.Vector3f(1e-20), d)))
+
+
+def boundary_of(shape: mi.Shape) -> Boundary:
+    """The boundary that ``shape`` describes: a sphere or any box (cube plugin or mesh, whatever its placement).
+
+    Raises UnsupportedSceneError for every other shape.
+    """
+    if shape.class_name() == "Sphere":
+        return Boundary("sphere", np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4))
+    if shape.is_mesh():
+        vertices = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+        frame = _box_frame(vertices)
+        if frame is not None:
+            return Boundary("box", frame)
+    raise UnsupportedSceneError(
+        f'irrcache: the medium is bounded by shape "{shape.id()}" ({shape.class_name()}), but only boxes '
+        "(a cube with any to_world, or a mesh of that form) and spheres are supported so far; "
+        'bound the medium by a cube, or render this scene with "volpath".'
+    )
+
+
+def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
+    """The affine map of [-1, 1]^3 onto the box with these vertices, or None if they do not form one."""
+    size = np.ptp(vertices, axis=0).max()
+    tolerance = 1e-5 * size + 4 * np.finfo(np.float32).eps * np.abs(vertices).max()
+    corners: list[np.ndarray] = []
+    for v in vertices:
+        if all(np.abs(v - c).max() > tolerance for c in corners):
+            corners.append(v)
+        if len(corners) > 8:
+            return None
+    if len(corners) != 8:
+        return None
+    origin, *others = corners
+    for edges in itertools.combinations([c - origin for c in others], 3):
+        linear = np.stack(edges, axis=1)
+        if abs(np.linalg.det(linear)) < 1e-12 * size**3:
+            continue
+        built = [origin + linear @ bits for bits in itertools.product((0.0, 1.0), repeat=3)]
+        if all(min(np.abs(b - c).max() for c in corners) <= tolerance for b in built):
+            frame = np.eye(4)
+            frame[:3, :3] = 0.5 * _conventional(linear)
+            frame[:3, 3] = np.mean(corners, axis=0)
+            return frame
+    return None
+
+
+def _conventional(edges: np.ndarray) -> np.ndarray:
+    """The same edges (columns) ordered and signed so that each points along its world axis where it can."""
+    best = max(
+        itertools.permutations(range(3)),
+        key=lambda p: np.prod([abs(edges[i, p[i]]) / np.linalg.norm(edges[:, p[i]]) for i in range(3)]),
+    )
+    ordered = edges[:, list(best)]
+    return ordered * np.where(np.diag(ordered) < 0, -1.0, 1.0)

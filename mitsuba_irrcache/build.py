@@ -1,0 +1,165 @@
+"""From a scene to a filled cache, and when an old one still holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .cache import BATCH, IrradianceCache, active_voxels
+from .errors import CacheFileError, IrrcacheError
+from .fingerprint import Snapshot, digests
+from .grid import Grid
+from .medium import MediumGrid
+from .memory import available_memory
+from .scene import bake_scene
+from .solvers import path
+
+#: called with (stage, done, total)
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """What a cache is asked to be; see the plugin's documentation."""
+
+    max_depth: int = -1
+    rr_depth: int = 5
+    solver: str = "auto"
+    resolution: int = 0
+    samples: int = 64
+    seed: int = 0
+    file: str = ""
+
+
+class CacheBuilder:
+    """Keeps the medium and the cache of one scene up to date, and does no work twice.
+
+    ``medium`` is None for a scene without one; ``cache`` is None where no light needs caching (no medium, or
+    ``max_depth`` below 2).
+    """
+
+    def __init__(self, settings: CacheSettings) -> None:
+        self.settings = settings
+        self.medium: MediumGrid | None = None
+        self.cache: IrradianceCache | None = None
+        self.seconds = 0.0
+        self._scene: mi.Scene | None = None
+        self._snapshot: Snapshot | None = None
+
+    def update(self, scene: mi.Scene, progress: Progress | None = None) -> bool:
+        """Makes ``medium`` and ``cache`` fit ``scene``; True if anything changed."""
+        snapshot = Snapshot(scene)
+        edited = snapshot.changes(self._snapshot) if scene is self._scene else []
+        stale = scene is not self._scene or bool(edited)
+        if stale:
+            if edited:
+                names = ", ".join(edited[:4])
+                mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
+            self.medium = self.cache = None
+            self.medium = bake_scene(scene)
+            if self.medium is not None and self.settings.max_depth not in (0, 1):
+                self.cache = self._start_cache(scene, self.medium, bool(edited))
+            self._scene, self._snapshot = scene, snapshot
+        if self.cache is not None and self.cache.samples < self._target:
+            self._fill(scene, progress)
+            return True
+        return stale
+
+    @property
+    def _target(self) -> int:
+        return -(-self.settings.samples // BATCH) * BATCH
+
+    def _start_cache(self, scene: mi.Scene, medium: MediumGrid, edited: bool) -> IrradianceCache:
+        settings = self.settings
+        grid = Grid.near_cubic(medium.frame, settings.resolution or choose_resolution(medium))
+        _check_memory(grid)
+        active = active_voxels(medium, grid)
+        if medium.albedo.maximum == 0:
+            active = mi.UInt32()
+        mi.Log(
+            mi.LogLevel.Info,
+            f"irrcache: cache of {' x '.join(map(str, grid.shape[::-1]))} voxels, {dr.width(active)} of "
+            f"{grid.voxel_count} see the medium; solver path",
+        )
+        channels = 1 if mi.is_monochromatic else 3
+        cache = IrradianceCache(grid, active, channels, settings.max_depth)
+        if not settings.file:
+            return cache
+        cache.fingerprint = digests(scene, medium) | {
+            "settings": f"solver path, max_depth {settings.max_depth}, grid {grid.shape[::-1]}"
+        }
+        return self._resume(cache, edited)
+
+    def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache:
+        """The cache on disk where it is of the same light; a foreign file is refused, never overwritten."""
+        file = Path(self.settings.file)
+        if not file.exists():
+            if not file.parent.is_dir():
+                raise IrrcacheError(
+                    f'irrcache: cache_file "{file}": the folder "{file.parent}" does not exist.'
+                )
+            return cache
+        stored = IrradianceCache.load(file)
+        differing = [k for k in cache.fingerprint if stored.fingerprint.get(k) != cache.fingerprint[k]]
+        if not differing:
+            mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
+            return stored
+        if edited:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'irrcache: the scene was edited ({", ".join(differing)}): "{file}" keeps the light of before.',
+            )
+            cache.fingerprint = {}
+            return cache
+        detail = (
+            f' ({stored.fingerprint.get("settings")} in the file, {cache.fingerprint["settings"]} here)'
+            if differing == ["settings"]
+            else ""
+        )
+        raise CacheFileError(
+            f'irrcache: cache_file "{file}" belongs to another scene: {", ".join(differing)} differ{detail}. '
+            "Delete the file, or give this scene a cache_file of its own."
+        )
+
+    def _fill(self, scene: mi.Scene, progress: Progress | None) -> None:
+        started = perf_counter()
+        settings, cache = self.settings, self.cache
+        path.refine(
+            scene,
+            self.medium,
+            cache,
+            self._target - cache.samples,
+            settings.seed,
+            settings.rr_depth,
+            progress=None if progress is None else lambda *n: progress("cache", *n),
+        )
+        dr.sync_thread()
+        self.seconds = perf_counter() - started
+        if settings.file and cache.fingerprint:
+            cache.save(settings.file)
+
+
+def choose_resolution(medium: MediumGrid) -> int:
+    """Cache voxels along the longest side: half the medium's own (the light is smoother than the data), 32 to 96."""
+    if medium.sigma_t.grid is None:
+        return 32
+    return int(np.clip(max(medium.sigma_t.grid.shape) // 2, 32, 96))
+
+
+def _check_memory(grid: Grid) -> None:
+    """Refuses a cache that cannot be held: float64 sums and squares of two layers, and the float32 field."""
+    channels = 1 if mi.is_monochromatic else 3
+    needed = grid.voxel_count * (channels * (2 * 2 * 8 + 4) + 4)
+    available = available_memory()
+    if needed > available or grid.voxel_count >= 2**32:
+        sides = " x ".join(map(str, grid.shape[::-1]))
+        raise IrrcacheError(
+            f"irrcache: a cache of {sides} voxels needs {needed / 2**30:.1f} GiB, and {available / 2**30:.1f} GiB are "
+            "free; lower resolution."
+        )

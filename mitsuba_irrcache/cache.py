@@ -1,0 +1,288 @@
+"""The irradiance cache: a camera-independent field with its statistics, kept, merged, saved and loaded."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .errors import CacheFileError, IrrcacheError
+from .files import atomic_write
+from .grid import Grid, GridField
+
+#: Samples of a voxel come in batches of this many, spread evenly over directions. They are not independent of each
+#: other, the batches are: means and errors are statistics of batch means.
+BATCH = 8
+
+LAYERS = ("uncollided", "scattered")
+FORMAT = "mitsuba_irrcache 1"
+
+
+class IrradianceCache:
+    """Irradiance (fluence rate) Phi = int_S2 L dw [W m^-2, or the scene's unit of radiance times sr] on a grid.
+
+    It has two layers: ``uncollided`` (light straight from the emitters) and ``scattered`` (all later orders, up to
+    what ``max_depth`` admits: orders 0 .. max_depth - 2). Only ``active`` voxels, those that a lookup inside the
+    medium can read, have values; the others are zero. ``fingerprint`` maps each ingredient of the light
+    (medium, boundary, emitters, settings) to a digest.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        active: mi.UInt32,
+        channels: int,
+        max_depth: int,
+        fingerprint: dict[str, str] | None = None,
+    ) -> None:
+        self.grid = grid
+        self.active = active
+        self.active_count = dr.width(active)
+        self.channels = channels
+        self.max_depth = max_depth
+        self.fingerprint = fingerprint or {}
+        #: samples taken per voxel from each random stream
+        self.streams: dict[int, int] = {}
+        zeros = dr.zeros(dr.float64_array_t(mi.Float), max(self.active_count, 1))
+        # For each layer and channel: the sum of batch means and the sum of their squares.
+        self._sums = [[zeros, zeros] for _ in range(len(LAYERS) * channels)]
+
+    # ------------------------------------------------------------------ statistics
+
+    @property
+    def samples(self) -> int:
+        """Samples per active voxel."""
+        return sum(self.streams.values())
+
+    @property
+    def irradiance(self) -> mi.TensorXf:
+        """Phi, both layers, (z, y, x, channel)."""
+        return self._tensor([a + b for a, b in zip(self._means(0), self._means(1), strict=True)])
+
+    @property
+    def uncollided(self) -> mi.TensorXf:
+        """Phi of scattering order 0, (z, y, x, channel)."""
+        return self._tensor(self._means(0))
+
+    @property
+    def scattered(self) -> mi.TensorXf:
+        """Phi of the scattering orders 1 and above, (z, y, x, channel)."""
+        return self._tensor(self._means(1))
+
+    @property
+    def standard_error(self) -> mi.TensorXf:
+        """Standard error of ``irradiance``, (z, y, x, channel); NaN before there are two batches of samples."""
+        n = self.samples // BATCH
+        if n < 2:
+            return self._tensor([dr.full(mi.Float, dr.nan, self.active_count)] * self.channels)
+        errors = []
+        for c in range(self.channels):
+            # The layers are drawn independently of each other: their variances add.
+            variance = 0
+            for layer in range(len(LAYERS)):
+                total, squares = self._sums[layer * self.channels + c]
+                variance = variance + dr.maximum(squares / n - dr.square(total / n), 0) / (n - 1)
+            errors.append(mi.Float(dr.sqrt(variance)))
+        return self._tensor(errors)
+
+    def field(self) -> GridField:
+        """Phi for lookups: one channel where all channels agree to the last bit."""
+        means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        if all(dr.all(m == means[0])[0] for m in means[1:]):
+            means = means[:1]
+        return GridField(self.grid, self._tensor(means).array, len(means))
+
+    def _means(self, layer: int) -> list[mi.Float]:
+        n = max(self.samples // BATCH, 1)
+        first = layer * self.channels
+        return [mi.Float(total / n) for total, _ in self._sums[first : first + self.channels]]
+
+    def _tensor(self, values: list[mi.Float]) -> mi.TensorXf:
+        count = len(values)
+        flat = dr.zeros(mi.Float, self.grid.voxel_count * count)
+        if self.active_count:
+            for c, value in enumerate(values):
+                dr.scatter(flat, value, self.active * count + c)
+        return mi.TensorXf(flat, (*self.grid.shape, count))
+
+    # ------------------------------------------------------------------ growing
+
+    def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
+        """Adds ``samples`` per voxel of the stream ``seed``: for each block of voxels and then each layer and channel,
+        the sum of batch means and of their squares. Merged in float64."""
+        double = dr.float64_array_t(mi.Float)
+        for i, pair in enumerate(self._sums):
+            for j in range(2):
+                pieces = [block[i][j] for block in blocks]
+                total = dr.concat(pieces) if len(pieces) > 1 else pieces[0]
+                pair[j] = pair[j] + double(total)
+        dr.eval(self._sums)
+        self.note_samples(seed, samples)
+
+    def note_samples(self, seed: int, samples: int) -> None:
+        """Counts samples whose contribution is already in (or exactly zero)."""
+        self.streams[seed] = self.streams.get(seed, 0) + samples
+
+    def merge(self, other: IrradianceCache) -> None:
+        """Adds the samples of ``other``, made with other seeds, perhaps elsewhere.
+
+        Raises IrrcacheError if the two do not describe the same light, or share a seed.
+        """
+        for name in sorted(self.fingerprint.keys() | other.fingerprint.keys()):
+            if self.fingerprint.get(name) != other.fingerprint.get(name):
+                raise IrrcacheError(
+                    f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
+                )
+        if self.grid.shape != other.grid.shape or self.max_depth != other.max_depth:
+            raise IrrcacheError(
+                f"IrradianceCache.merge: shape {self.grid.shape} with max_depth {self.max_depth} does not fit "
+                f"shape {other.grid.shape} with max_depth {other.max_depth}."
+            )
+        common = sorted(self.streams.keys() & other.streams.keys())
+        if common:
+            raise IrrcacheError(
+                f"IrradianceCache.merge: both caches were made with cache_seed {common[0]}, so their samples are the "
+                "same, not independent; make one of them with another cache_seed."
+            )
+        for mine, theirs in zip(self._sums, other._sums, strict=True):
+            mine[:] = [a + b for a, b in zip(mine, theirs, strict=True)]
+        self.streams |= other.streams
+
+    # ------------------------------------------------------------------ files
+
+    def save(self, path: str | Path) -> None:
+        """Writes the cache with all its statistics; the file appears whole or not at all."""
+        description = {
+            "format": FORMAT,
+            "shape": self.grid.shape,
+            "to_world": self.grid.to_world.tolist(),
+            "channels": self.channels,
+            "max_depth": self.max_depth,
+            "streams": {str(seed): n for seed, n in self.streams.items()},
+            "fingerprint": self.fingerprint,
+        }
+        with atomic_write(path) as file:
+            np.savez(
+                file,
+                description=np.frombuffer(json.dumps(description).encode(), dtype=np.uint8),
+                active=np.array(self.active),
+                sums=np.array([[np.array(s) for s in pair] for pair in self._sums]),
+            )
+
+    @classmethod
+    def load(cls, path: str | Path) -> IrradianceCache:
+        """Reads a cache that ``save`` wrote. Raises CacheFileError, naming the file, for anything else."""
+        path = Path(path)
+        try:
+            arrays = _read_arrays(path)
+            description = json.loads(arrays["description"].tobytes())
+            if description["format"] != FORMAT:
+                raise CacheFileError(
+                    f'"{path}" has the format {description["format"]!r}, this version reads {FORMAT!r}.'
+                )
+            return cls._restore(description, arrays)
+        except CacheFileError:
+            raise
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
+            raise CacheFileError(
+                f'"{path}" is not a readable irradiance cache ({error}); delete it or name another cache_file.'
+            ) from error
+
+    @classmethod
+    def _restore(cls, description: dict, arrays: dict[str, np.ndarray]) -> IrradianceCache:
+        grid = Grid(tuple(int(n) for n in description["shape"]), np.array(description["to_world"]))
+        active, sums = arrays["active"], arrays["sums"]
+        channels = int(description["channels"])
+        if active.dtype != np.uint32 or active.ndim != 1 or active.size > grid.voxel_count:
+            raise ValueError("its list of voxels does not fit its grid")
+        if active.size and (int(active[-1]) >= grid.voxel_count or (np.diff(active.astype(np.int64)) <= 0).any()):
+            raise ValueError("its list of voxels is out of order")
+        expected = (len(LAYERS) * channels, 2, max(active.size, 1))
+        if channels not in (1, 3) or sums.dtype != np.float64 or sums.shape != expected:
+            raise ValueError(f"sums of shape {sums.shape} where {expected} is expected")
+        if not np.isfinite(sums).all():
+            raise ValueError("it holds values that are not finite")
+        cache = cls(
+            grid, mi.UInt32(active), channels, int(description["max_depth"]), dict(description["fingerprint"])
+        )
+        cache.streams = {int(seed): int(n) for seed, n in description["streams"].items()}
+        double = dr.float64_array_t(mi.Float)
+        cache._sums = [[double(total), double(squares)] for total, squares in sums]
+        return cache
+
+    def export_vol(self, path: str | Path) -> None:
+        """Writes ``irradiance`` as a Mitsuba ``.vol`` file (float32, bounding box of the grid; a rotation is lost)."""
+        from .volumes.mitsuba_vol import write_vol
+
+        corners = self.grid.to_world @ np.array(
+            [[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64
+        ).T
+        write_vol(path, np.array(self.irradiance), (corners[:3].min(axis=1), corners[:3].max(axis=1)))
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an uncompressed npz: a file cannot claim more memory than it has bytes."""
+    with zipfile.ZipFile(path) as archive:
+        if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+            raise ValueError("it is compressed")
+    with np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name] for name in ("description", "active", "sums")}
+
+
+def active_voxels(medium, grid: Grid) -> mi.UInt32:
+    """Flat indices, ascending, of the voxels of ``grid`` that a lookup where ``sigma_t > 0`` can read.
+
+    Every macrocell that is not empty marks the voxels whose trilinear support its box may overlap.
+    """
+    cells = medium.macrocells
+    occupied = dr.compress(cells.majorant > 0)
+    if dr.width(occupied) == 0:
+        return mi.UInt32()
+    if cells.count == 1:
+        return dr.arange(mi.UInt32, grid.voxel_count)
+    return _mark(cells, occupied, grid)
+
+
+@dr.syntax
+def _mark(cells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
+    nz, ny, nx = cells.shape
+    lower = mi.Point3f(mi.Vector3u(occupied % nx, (occupied // nx) % ny, occupied // (nx * ny)))
+    to_voxels = grid.coordinates.matrix @ np.linalg.inv(cells.coordinates.matrix)
+    linear = np.abs(to_voxels[:3, :3]) / 2
+    half = [dr.opaque(mi.Float, float(v)) for v in linear.sum(axis=1)]
+    center = [
+        dr.opaque(mi.Float, float(row[3]))
+        + dr.opaque(mi.Float, float(row[0])) * (lower.x + 0.5)
+        + dr.opaque(mi.Float, float(row[1])) * (lower.y + 0.5)
+        + dr.opaque(mi.Float, float(row[2])) * (lower.z + 0.5)
+        for row in to_voxels[:3]
+    ]
+    # Voxel i is read from u in (i - 1/2, i + 3/2); border cells and border voxels reach beyond the grid.
+    index = [occupied % nx, (occupied // nx) % ny, occupied // (nx * ny)]
+    first, last = [], []
+    for axis, n in enumerate((nx, ny, nz)):
+        side = grid.sides[axis]
+        low = dr.floor(center[axis] - half[axis] - 0.5 - 1e-3)
+        high = dr.floor(center[axis] + half[axis] + 0.5 + 1e-3)
+        first.append(mi.Int32(dr.clip(low, 0, mi.Float(side - 1))))
+        last.append(mi.Int32(dr.clip(high, 0, mi.Float(side - 1))))
+    marks = dr.zeros(mi.UInt32, grid.voxel_count)
+    x, y, z = mi.Int32(first[0]), mi.Int32(first[1]), mi.Int32(first[2])
+    x0, y0, x1, y1, z1 = first[0], first[1], last[0], last[1], last[2]
+    sx, sy, _ = grid.sides
+    active = mi.Bool(True)
+    while dr.hint(active, label="active voxels"):
+        dr.scatter(marks, mi.UInt32(1), mi.UInt32((z * sy + y) * sx + x), active)
+        x += 1
+        wrap_x = x > x1
+        x = dr.select(wrap_x, x0, x)
+        y = dr.select(wrap_x, y + 1, y)
+        wrap_y = y > y1
+        y = dr.select(wrap_y, y0, y)
+        z = dr.select(wrap_y, z + 1, z)
+        active &= z <= z1
+    return dr.compress(marks > 0)

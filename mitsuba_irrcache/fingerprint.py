@@ -1,0 +1,92 @@
+"""What a cache depends on: quick identities within a process, digests of the contents for files."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .grid import Field
+from .medium import MediumGrid
+
+
+class Snapshot:
+    """The light-carrying parameters of a scene, by identity: comparing two costs no kernel.
+
+    It holds on to the arrays, so an array's identity cannot be given to another one. Sensors, films, samplers and
+    integrators are no part of it. A parameter set to equal contents counts as changed.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        camera_side = (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.ReconstructionFilter)
+        params = mi.traverse(scene)
+        self._values = {
+            key: params[key]
+            for key, entry in params.properties.items()
+            if not isinstance(entry[2], camera_side)
+        }
+        self._identities = {key: _identity(value) for key, value in self._values.items()}
+
+    def changes(self, other: Snapshot) -> list[str]:
+        """Names of the parameters that differ."""
+        mine, theirs = self._identities, other._identities
+        return sorted(k for k in mine.keys() | theirs.keys() if mine.get(k) != theirs.get(k))
+
+
+def _identity(value: Any) -> Any:
+    if dr.is_tensor_v(value):
+        return (value.shape, _identity(value.array))
+    if dr.is_jit_v(value):
+        if dr.depth_v(value) == 1:
+            return value.index
+        return tuple(_identity(component) for component in value)
+    if dr.is_array_v(value):
+        return tuple(np.array(value).ravel().tolist())
+    matrix = getattr(value, "matrix", None)
+    return _identity(matrix) if matrix is not None else value
+
+
+def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
+    """SHA-256 of the contents of each ingredient of the light in ``medium``."""
+    boundary = medium.boundary
+    return {
+        "medium": _digest(*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()),
+        "boundary": _digest(boundary.kind, boundary.to_world),
+        "emitters": _digest(*sorted(_emitter_digest(e) for e in scene.emitters())),
+        "variant": "grey" if mi.is_monochromatic else "rgb",
+    }
+
+
+def _field_parts(field: Field) -> tuple:
+    if field.grid is None:
+        return (np.array(field.value),)
+    return (
+        field.grid.shape,
+        np.float32(field.grid.to_world),
+        np.array(field.scale),
+        field.channels,
+        np.array(field.data),
+    )
+
+
+def _emitter_digest(emitter: mi.Emitter) -> str:
+    params = mi.traverse(emitter)
+    values = [(key, np.array(_plain(params[key]))) for key in sorted(params.keys())]
+    return _digest(emitter.class_name(), *(part for pair in values for part in pair))
+
+
+def _plain(value: Any) -> Any:
+    matrix = getattr(value, "matrix", None)
+    return value if matrix is None else matrix
+
+
+def _digest(*parts: Any) -> str:
+    sha = hashlib.sha256()
+    for part in parts:
+        data = part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
+        sha.update(len(data).to_bytes(8, "little"))
+        sha.update(data)
+    return sha.hexdigest()[:32]

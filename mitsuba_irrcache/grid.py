@@ -1,0 +1,161 @@
+"""Regular voxel grids in the world: placement, coordinates and trilinear lookups.
+
+One convention everywhere, the one of Mitsuba's ``gridvolume``: arrays are ``(z, y, x, channel)``, values sit
+at voxel *centres*, are clamped at the border, and the grid fills the unit cube carried by ``to_world``.
+*Voxel coordinates* ``u`` run from 0 to n along each axis, so voxel ``i`` is centred at ``u = i + 0.5``.
+
+The classes here and those built on them are plain ones: Dr.Jit would carry every array of a dataclass through
+its loops as a loop variable.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .errors import IrrcacheError
+
+
+class Grid:
+    """A voxel grid: ``shape`` is ``(z, y, x)``, ``to_world`` a 4x4 affine map of the unit cube (float64)."""
+
+    def __init__(self, shape: tuple[int, int, int], to_world: np.ndarray) -> None:
+        matrix = np.array(to_world, dtype=np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.linalg.det(matrix):
+            raise IrrcacheError(
+                f"Grid: to_world must be an invertible affine 4x4 matrix, got {to_world}"
+            )
+        if any(n < 1 for n in shape):
+            raise IrrcacheError(f"Grid: every side needs at least one voxel, got shape {shape}")
+        self.shape = tuple(int(n) for n in shape)
+        self.to_world = matrix
+        # Opaque values cannot be made inside a recorded loop, so all are made here.
+        forward = matrix @ np.diag([*(1.0 / self.resolution), 1.0])
+        self.world = Affine(forward)  #: voxel coordinates -> world position
+        self.coordinates = Affine(np.linalg.inv(forward))  #: world position -> voxel coordinates
+        self.sides = tuple(dr.opaque(mi.Int32, n) for n in self.shape[::-1])  #: nx, ny, nz
+
+    @property
+    def voxel_count(self) -> int:
+        return int(np.prod(self.shape))
+
+    @property
+    def resolution(self) -> np.ndarray:
+        """Voxels along x, y, z."""
+        return np.array(self.shape[::-1])
+
+    @cached_property
+    def side_lengths(self) -> np.ndarray:
+        """World lengths of the three edges of the grid."""
+        return np.linalg.norm(self.to_world[:3, :3], axis=0)
+
+    @cached_property
+    def voxel_size(self) -> np.ndarray:
+        """World lengths of the edges of one voxel."""
+        return self.side_lengths / self.resolution
+
+    def centers(self, index: mi.UInt32) -> mi.Point3f:
+        """World positions of the voxels with the flat indices ``index`` (x fastest)."""
+        nz, ny, nx = self.shape
+        x, y, z = index % nx, (index // nx) % ny, index // (nx * ny)
+        return self.world.point(mi.Point3f(x, y, z) + 0.5)
+
+    @staticmethod
+    def near_cubic(to_world: np.ndarray, resolution: int) -> Grid:
+        """A grid over the unit cube ``to_world`` with ``resolution`` near-cubic voxels along its longest side."""
+        sides = np.linalg.norm(np.asarray(to_world, dtype=np.float64)[:3, :3], axis=0)
+        counts = np.maximum(1, np.rint(resolution * sides / sides.max())).astype(int)
+        return Grid(tuple(int(n) for n in counts[::-1]), to_world)
+
+
+class Affine:
+    """An affine map of points and vectors, its entries opaque to the kernels (a new placement recompiles nothing).
+
+    Points are taken relative to the centre of the unit cube first, so that a grid far from the
+    world's origin loses no more bits than its float32 positions already have.
+    """
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        self.matrix = np.asarray(matrix, dtype=np.float64)
+        linear = self.matrix[:3, :3]
+        pivot = -np.linalg.solve(linear, self.matrix[:3, 3])
+        self._linear = [[dr.opaque(mi.Float, float(v)) for v in row] for row in linear]
+        self._pivot = mi.Point3f([dr.opaque(mi.Float, float(v)) for v in pivot])
+
+    def point(self, p: mi.Point3f) -> mi.Point3f:
+        return mi.Point3f(self.vector(mi.Vector3f(p - self._pivot)))
+
+    def vector(self, v: mi.Vector3f) -> mi.Vector3f:
+        return mi.Vector3f([dr.fma(a, v.x, dr.fma(b, v.y, c * v.z)) for a, b, c in self._linear])
+
+
+class ConstantField:
+    """A value that is the same everywhere: a Float (grey) or a Color3f."""
+
+    grid = None
+
+    def __init__(self, values: np.ndarray, scale: float = 1.0) -> None:
+        self.channels = len(values)
+        opaque = [dr.opaque(mi.Float, float(v) * scale) for v in values]
+        self.value = opaque[0] if self.channels == 1 else mi.Color3f(opaque)
+        self.minimum = float(np.min(values)) * scale
+        self.maximum = float(np.max(values)) * scale
+
+    def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        return self.value
+
+
+class GridField:
+    """Values at the voxel centres of a grid, trilinear between them, clamped at the border.
+
+    ``data`` is flat with ``channels`` (1 or 3) interleaved values per voxel and is not copied; ``scale``
+    multiplies every lookup, so that a scaled medium needs no array of its own.
+    """
+
+    def __init__(self, grid: Grid, data: mi.Float, channels: int, scale: float = 1.0) -> None:
+        if dr.width(data) != grid.voxel_count * channels:
+            raise IrrcacheError(
+                f"GridField: {dr.width(data)} values do not fill {grid.shape} x {channels} channels"
+            )
+        self.grid, self.data, self.channels = grid, data, channels
+        self.scale = dr.opaque(mi.Float, scale)
+        self.maximum = float(dr.max(data)[0]) * scale
+
+    def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """Trilinear value at the voxel coordinates ``u``: a Float for one channel, else a Color3f."""
+        values = [v * self.scale for v in self._interpolate(u, active)]
+        return values[0] if self.channels == 1 else mi.Color3f(values)
+
+    def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """Trilinear value at the world position ``p``."""
+        return self.at(self.grid.coordinates.point(p), active)
+
+    def _interpolate(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
+        nx, ny, _ = self.grid.sides
+        stencils = [_stencil(c, n) for c, n in zip(u, self.grid.sides, strict=True)]
+        (xs, wx), (ys, wy), (zs, wz) = stencils
+        rows = [(z * ny + y) * nx for z in zs for y in ys]
+
+        def value(row: mi.Int32, x: mi.Int32, channel: int) -> mi.Float:
+            index = mi.UInt32((row + x) * self.channels + channel)
+            return dr.gather(mi.Float, self.data, index, active)
+
+        result = []
+        for c in range(self.channels):
+            edges = [dr.lerp(value(row, xs[0], c), value(row, xs[1], c), wx) for row in rows]
+            faces = [dr.lerp(edges[i], edges[i + 1], wy) for i in (0, 2)]
+            result.append(dr.lerp(*faces, wz))
+        return result
+
+
+Field = ConstantField | GridField
+
+
+def _stencil(u: mi.Float, n: mi.Int32) -> tuple[tuple[mi.Int32, mi.Int32], mi.Float]:
+    """The two clamped voxels around the coordinate ``u`` and the weight of the second."""
+    s = dr.clip(u - 0.5, 0.0, mi.Float(n - 1))
+    lower = mi.Int32(s)
+    return (lower, dr.minimum(lower + 1, n - 1)), s - mi.Float(lower)

@@ -1,0 +1,123 @@
+"""Coarse cells over the extinction grid: local majorants, empty-space skipping, and a walk through them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .boundary import Boundary, safe_rcp
+from .grid import Affine, ConstantField, Field, GridField
+
+
+class Macrocells:
+    """Bounds of sigma_t [1/scene unit], over all channels, over blocks of voxels.
+
+    Conservative under trilinear interpolation and clamping: the outermost cells reach to infinity.
+    """
+
+    def __init__(
+        self,
+        majorant: mi.Float,
+        minorant: mi.Float,
+        shape: tuple[int, int, int],
+        coordinates: Affine,
+    ) -> None:
+        self.majorant = majorant
+        self.minorant = minorant
+        self.shape = shape
+        self.coordinates = coordinates  #: world -> macrocell coordinates, 0 to n along each axis
+        self.sides = tuple(dr.opaque(mi.Int32, n) for n in shape[::-1])
+
+    @staticmethod
+    def build(sigma_t: Field, boundary: Boundary) -> Macrocells:
+        if isinstance(sigma_t, ConstantField):
+            majorant = dr.opaque(mi.Float, sigma_t.maximum)
+            minorant = dr.opaque(mi.Float, sigma_t.minimum)
+            return Macrocells(majorant, minorant, (1, 1, 1), Affine(np.linalg.inv(boundary.frame)))
+        grid = sigma_t.grid
+        size = max(4, -(-max(grid.shape) // 64))
+        shape = tuple(-(-n // size) for n in grid.shape)
+        minorant, majorant = _block_bounds(sigma_t, size, shape)
+        shrink = np.diag([1 / size] * 3 + [1.0])
+        return Macrocells(majorant, minorant, shape, Affine(shrink @ grid.coordinates.matrix))
+
+    @property
+    def count(self) -> int:
+        return int(np.prod(self.shape))
+
+    def walk(self, ray: mi.Ray3f) -> Walk:
+        """The constants of a walk along ``ray``."""
+        return Walk(self, ray)
+
+
+class Walk:
+    """A ray in macrocell coordinates. The cell is kept as integers by the caller; nothing accumulates."""
+
+    def __init__(self, cells: Macrocells, ray: mi.Ray3f) -> None:
+        self.cells = cells
+        self.origin = cells.coordinates.point(ray.o)
+        self.direction = cells.coordinates.vector(ray.d)
+        self.rcp = safe_rcp(self.direction)
+
+    def cell(self, t: mi.Float) -> mi.Vector3i:
+        """The cell that contains the point at distance ``t``."""
+        u = dr.fma(self.direction, t, self.origin)
+        limits = mi.Vector3i(*self.cells.sides) - 1
+        # Clipped as floats first: a float beyond 2^31 has no integer.
+        return mi.Vector3i(dr.clip(dr.floor(u), 0.0, mi.Vector3f(limits)))
+
+    def index(self, cell: mi.Vector3i) -> mi.UInt32:
+        nx, ny, _ = self.cells.sides
+        return mi.UInt32((cell.z * ny + cell.y) * nx + cell.x)
+
+    def majorant(self, cell: mi.Vector3i, active: mi.Bool) -> mi.Float:
+        return dr.gather(mi.Float, self.cells.majorant, self.index(cell), active)
+
+    def minorant(self, cell: mi.Vector3i, active: mi.Bool) -> mi.Float:
+        return dr.gather(mi.Float, self.cells.minorant, self.index(cell), active)
+
+    def exit(self, cell: mi.Vector3i) -> tuple[mi.Float, mi.Vector3i]:
+        """Distance at which the ray leaves ``cell``, and the cell behind; infinite for a border cell."""
+        forward = self.direction >= 0
+        wall = mi.Vector3f(cell + dr.select(forward, 1, 0))
+        limits = mi.Vector3i(*self.cells.sides) - 1
+        last = dr.select(forward, cell >= limits, cell <= 0)
+        t = dr.select(last, dr.inf, (wall - self.origin) * self.rcp)
+        nearest = dr.min(t)
+        step = dr.select(forward, mi.Vector3i(1), mi.Vector3i(-1))
+        # Ties step along one axis only; the next call leaves through the other at the same distance.
+        on_x = t.x == nearest
+        on_y = ~on_x & (t.y == nearest)
+        on_z = ~on_x & ~on_y
+        axis = mi.Vector3i(*(dr.select(on, 1, 0) for on in (on_x, on_y, on_z)))
+        following = cell + dr.select(nearest < dr.inf, axis * step, 0)
+        return nearest, following
+
+
+@dr.syntax
+def _block_bounds(
+    sigma_t: GridField, size: int, shape: tuple[int, int, int]
+) -> tuple[mi.Float, mi.Float]:
+    """Least and largest value in each block grown by the one voxel that trilinear stencils reach beyond it."""
+    nz, ny, nx = shape
+    index = dr.arange(mi.UInt32, nx * ny * nz)
+    first = mi.Vector3i(mi.Vector3u(index % nx, (index // nx) % ny, index // (nx * ny)) * size) - 1
+    fx, fy, fz = sigma_t.grid.sides
+    width = dr.opaque(mi.UInt32, size + 2)
+    count = width * width * width
+    k, least, largest = mi.UInt32(0), mi.Float(dr.inf), mi.Float(0)
+    while dr.hint(k < count, label="macrocell bounds"):
+        x = dr.clip(first.x + mi.Int32(k % width), 0, fx - 1)
+        y = dr.clip(first.y + mi.Int32((k // width) % width), 0, fy - 1)
+        z = dr.clip(first.z + mi.Int32(k // (width * width)), 0, fz - 1)
+        voxel = mi.UInt32((z * fy + y) * fx + x) * sigma_t.channels
+        for c in range(sigma_t.channels):
+            value = dr.gather(mi.Float, sigma_t.data, voxel + c)
+            least = dr.minimum(least, value)
+            largest = dr.maximum(largest, value)
+        k += 1
+    # A little slack, since interpolation may round beyond its eight values.
+    least, largest = least * sigma_t.scale * (1 - 1e-6), largest * sigma_t.scale * (1 + 1e-6)
+    dr.eval(least, largest)
+    return least, largest

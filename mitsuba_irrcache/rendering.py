@@ -1,0 +1,100 @@
+"""From camera samples to the film, for integrators written in Python.
+
+Mitsuba's own loop for this knows only opaque or empty samples; a medium needs fractional alpha.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+#: Camera samples in one kernel launch: bounds the memory of the sampler's state (16 bytes each).
+LANES = 1 << 24
+
+#: (sampler, ray, active) -> radiance, alpha
+RadianceFunction = Callable[[mi.Sampler, mi.RayDifferential3f, mi.Bool], tuple]
+
+
+def render_film(
+    sensor: mi.Sensor,
+    radiance: RadianceFunction,
+    seed: int,
+    spp: int,
+    should_stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[int, int], None] | None = None,
+) -> mi.Film:
+    """Renders ``radiance`` to the sensor's film, ``spp`` samples per pixel (0: the sampler's own count)."""
+    film, sampler = sensor.film(), sensor.sampler().clone()
+    if spp:
+        sampler.set_sample_count(spp)
+    spp = sampler.sample_count()
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    size = mi.ScalarVector2u(film.crop_size()) + 2 * border
+    pixels = int(size.x) * int(size.y)
+    film.prepare([])
+    if not pixels:
+        return film
+    per_pass = _divisor(spp, max(1, LANES // pixels))
+    sampler.set_samples_per_wavefront(per_pass)
+    sampler.seed(seed, pixels * per_pass)
+    block = film.create_block()
+    block.set_offset(film.crop_offset())
+    block.set_coalesce(block.coalesce() and per_pass >= 4)
+    for done in range(0, spp, per_pass):
+        _splat(sensor, sampler, block, size, border, per_pass, spp, radiance)
+        if per_pass < spp:
+            sampler.advance()
+            sampler.schedule_state()
+            dr.eval(block.tensor())
+        if progress is not None:
+            progress(done + per_pass, spp)
+        if should_stop():
+            break
+    film.put_block(block)
+    return film
+
+
+def _divisor(n: int, limit: int) -> int:
+    """The largest divisor of ``n`` that is at most ``limit``."""
+    return next(d for d in range(min(n, limit), 0, -1) if n % d == 0)
+
+
+def _splat(
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    block: mi.ImageBlock,
+    size: mi.ScalarVector2u,
+    border: int,
+    per_pass: int,
+    spp: int,
+    radiance: RadianceFunction,
+) -> None:
+    film = sensor.film()
+    index = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass) // dr.opaque(mi.UInt32, per_pass)
+    width = dr.opaque(mi.UInt32, int(size.x))
+    row = index // width
+    pixel = mi.Vector2f(mi.Vector2i(mi.Int32(index - row * width), mi.Int32(row)) - border)
+    pixel += mi.Vector2f(film.crop_offset())
+    position = pixel + sampler.next_2d()
+    scale = 1 / mi.ScalarVector2f(film.crop_size())
+    on_film = (position - mi.Vector2f(film.crop_offset())) * scale
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(time, 0, on_film, aperture)
+    ray.scale_differential(dr.rsqrt(float(spp)))
+    value, alpha = radiance(sampler, ray, mi.Bool(True))
+    value = value * weight
+    flags = film.flags()
+    if mi.has_flag(flags, mi.FilmFlags.Special):
+        channels = film.prepare_sample(
+            value, ray.wavelengths, block.channel_count(), 1.0, alpha, mi.Bool(True)
+        )
+    else:
+        rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
+        channels = [*rgb, alpha, mi.Float(1)] if mi.has_flag(flags, mi.FilmFlags.Alpha) else [*rgb, mi.Float(1)]
+    # With a box filter the sample's place in the pixel does not matter; its rounding would.
+    block.put(pixel if film.rfilter().is_box_filter() else position, channels)

@@ -1,0 +1,115 @@
+"""Null-collision tracking through a medium: free flights and transmittance, both unbiased.
+
+Tentative collisions are drawn with the majorant of the macrocell at hand. Functions return the random generator
+they advanced, since a recorded loop does not update its caller's copy.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .medium import MediumGrid
+
+#: Ratio tracking continues below this transmittance by Russian roulette only.
+ROULETTE_BELOW = 0.1
+
+
+def brightest(value: mi.Float | mi.Color3f) -> mi.Float:
+    """The largest channel."""
+    return value if isinstance(value, mi.Float) else dr.max(value)
+
+
+@dr.syntax
+def free_flight(
+    medium: MediumGrid,
+    ray: mi.Ray3f,
+    near: mi.Float,
+    far: mi.Float,
+    weight: mi.Spectrum,
+    rng: mi.PCG32,
+    active: mi.Bool,
+):
+    """Delta tracking from ``near`` to ``far``: whether the ray collides, where, and the weight carried on.
+
+    With grey extinction the weight is unchanged. With coloured extinction a collision is accepted with the
+    probability that the current weights give it, and the weights make up for each channel's difference
+    (spectral tracking, Kutz et al. 2017), so that they stay bounded.
+    """
+    walk = medium.macrocells.walk(ray)
+    t = mi.Float(near)
+    cell = walk.cell(t)
+    active = mi.Bool(active) & (near < far)
+    collided = mi.Bool(False)
+    grey = medium.sigma_t.channels == 1
+    weight = mi.Spectrum(weight)
+    while dr.hint(active, label="free flight"):
+        majorant = walk.majorant(cell, active)
+        wall, following = walk.exit(cell)
+        candidate = t - dr.log(1 - rng.next_float32(active)) / majorant
+        leaves = ~(candidate < dr.minimum(wall, far))
+        tentative = active & ~leaves
+        sigma_t = medium.sigma_t.at_world(ray(candidate), tentative)
+        choice = rng.next_float32(active)
+        if dr.hint(grey, mode="scalar"):
+            collides = tentative & (choice * majorant < sigma_t)
+        else:
+            real = sigma_t / majorant
+            total = dr.sum(weight)
+            probability = dr.select(total > 0, dr.dot(weight, real) / total, 0)
+            collides = tentative & (choice < probability)
+            accepted = dr.select(collides, real / probability, (1 - real) / (1 - probability))
+            weight = dr.select(tentative, weight * accepted, weight)
+        collided |= collides
+        t = dr.select(leaves, wall, candidate)
+        cell = dr.select(leaves, following, cell)
+        active &= ~collides & (t < far)
+    return collided, t, weight, rng
+
+
+@dr.syntax
+def transmittance(
+    medium: MediumGrid, ray: mi.Ray3f, near: mi.Float, far: mi.Float, rng: mi.PCG32, active: mi.Bool
+):
+    """An unbiased estimate of T = exp(-int sigma_t dt) from ``near`` to ``far``.
+
+    Analytic for a homogeneous medium; otherwise residual ratio tracking (Novak et al. 2014) with each macrocell's
+    smallest extinction as control, so every factor lies in [0, 1].
+    """
+    if dr.hint(medium.homogeneous, mode="scalar"):
+        length = dr.maximum(far - near, 0)
+        optical_depth = medium.sigma_t.value * length
+        # 0 * infinity: an emitter infinitely far away, seen through nothing.
+        result = dr.exp(-dr.select(medium.sigma_t.value > 0, optical_depth, 0))
+    else:
+        walk = medium.macrocells.walk(ray)
+        t = mi.Float(near)
+        cell = walk.cell(t)
+        active = mi.Bool(active) & (near < far)
+        result = mi.Float(1) if medium.sigma_t.channels == 1 else mi.Color3f(1)
+        while dr.hint(active, label="ratio tracking"):
+            control = walk.minorant(cell, active)
+            residual = walk.majorant(cell, active) - control
+            wall, following = walk.exit(cell)
+            end = dr.minimum(wall, far)
+            candidate = t - dr.log(1 - rng.next_float32(active)) / residual
+            leaves = ~(candidate < end)
+            tentative = active & ~leaves
+            sigma_t = medium.sigma_t.at_world(ray(candidate), tentative)
+            stop = dr.select(leaves, end, candidate)
+            factor = dr.exp(-control * (stop - t))
+            kept = dr.clip(1 - (sigma_t - control) / residual, 0, 1)
+            result = dr.select(active, result * factor, result)
+            result = dr.select(tentative, result * kept, result)
+            t = dr.select(leaves, wall, candidate)
+            cell = dr.select(leaves, following, cell)
+            active &= t < far
+            # Russian roulette: what is nearly dark is not worth many lookups.
+            largest = brightest(result)
+            faint = active & (largest < ROULETTE_BELOW)
+            survives = rng.next_float32(active) * ROULETTE_BELOW < largest
+            result = dr.select(
+                faint, dr.select(survives, result * (ROULETTE_BELOW / largest), 0), result
+            )
+            active &= ~faint | survives
+    return result, rng

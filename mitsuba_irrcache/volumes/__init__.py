@@ -1,0 +1,1 @@
+"""Getting volumes in: readers, transfer functions, presets, scene folders and phantoms."""

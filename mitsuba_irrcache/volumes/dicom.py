@@ -1,0 +1,137 @@
+"""A folder with one CT or MR series as DICOM files, one per slice, through SimpleITK."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk
+from tqdm import tqdm
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.volumes.data import VolumeData
+
+_POSITION = "0020|0032"
+_ORIENTATION = "0020|0037"
+_MODALITY = "0008|0060"
+# Scanners round positions to about 0.01 mm; anything beyond this share of a slice is no rounding.
+_UNEVEN = 0.05
+
+
+def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> VolumeData:
+    """Read the series in ``folder``, sorted by position, rescaled (Hounsfield units for CT).
+
+    Placement is LPS (x to the patient's left, y to the back, z to the head), in mm. The third
+    direction is that from the first slice to the last, so a tilted gantry is placed as it was.
+
+    Args:
+        folder: the files of one series; of several where ``series`` names one.
+        series: SeriesInstanceUID.
+
+    Raises:
+        IrrcacheError: no DICOM files, several series and none named, a single slice, or slices
+            missing, doubled or unevenly spaced.
+    """
+    folder = Path(folder)
+    uid = _choose_series(folder, series)
+    files = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), uid)
+    if len(files) < 2:
+        raise IrrcacheError(
+            f"series {uid} in {folder} has {len(files)} slice; a volume needs at least 2"
+        )
+    positions, orientation, modality = _slice_placement(files)
+    row, column = orientation.reshape(2, 3)
+    order = np.argsort(positions @ np.cross(row, column), kind="stable")
+    positions = positions[order]
+    _check_gaps(folder, positions, np.cross(row, column))
+    stack = positions[-1] - positions[0]
+    image = _read_slices([files[i] for i in order], folder)
+    return VolumeData(
+        values=sitk.GetArrayFromImage(image),
+        spacing=(*image.GetSpacing()[:2], np.linalg.norm(stack) / (len(files) - 1)),
+        origin=tuple(positions[0]),
+        direction=np.stack([row, column, stack / np.linalg.norm(stack)], axis=1),
+        unit="HU" if modality == "CT" else "",
+        source=f"{folder} ({len(files)} DICOM slices)",
+    )
+
+
+def _choose_series(folder: Path, series: str | None) -> str:
+    """The UID of the one series there is, or of the one asked for."""
+    found = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
+    if not found:
+        raise IrrcacheError(
+            f"folder {folder} has no DICOM series; give the folder that holds the slices itself"
+        )
+    if series in found:
+        return series
+    if series is None and len(found) == 1:
+        return found[0]
+    counts = (len(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), f)) for f in found)
+    listing = "; ".join(f"{f} ({n} slices)" for f, n in zip(found, counts, strict=True))
+    wanted = "several series" if series is None else f"no series {series}"
+    raise IrrcacheError(f"folder {folder} has {wanted}: choose one with --series UID: {listing}")
+
+
+def _slice_placement(files: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, str]:
+    """Positions ``(slice, 3)``, the orientation common to all (6,), and the modality."""
+    reader = sitk.ImageFileReader()
+    positions, orientations, modality = [], [], ""
+    for file in tqdm(files, "reading DICOM headers", delay=1, disable=None):
+        reader.SetFileName(file)
+        reader.ReadImageInformation()
+        if not (reader.HasMetaDataKey(_POSITION) and reader.HasMetaDataKey(_ORIENTATION)):
+            raise IrrcacheError(f"{file} has no ImagePositionPatient; it is no slice of a volume")
+        positions.append(_numbers(reader.GetMetaData(_POSITION)))
+        orientations.append(_numbers(reader.GetMetaData(_ORIENTATION)))
+        modality = reader.GetMetaData(_MODALITY).strip() if reader.HasMetaDataKey(_MODALITY) else ""
+    turned = np.abs(np.array(orientations) - orientations[0]).max(axis=1) > 1e-3
+    if turned.any():
+        raise IrrcacheError(
+            f"{files[int(turned.argmax())]} lies in another plane than {files[0]}; "
+            "keep scout views and reformats out of the folder"
+        )
+    return np.array(positions), np.array(orientations[0]), modality
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(number) for number in text.split("\\")]
+
+
+def _check_gaps(folder: Path, positions: np.ndarray, normal: np.ndarray) -> None:
+    """Refuse doubled, missing or uneven slices: the volume's one z spacing would be a lie."""
+    depth = positions @ normal
+    steps = np.diff(depth)
+    usual = float(np.median(steps))
+    worst = int(np.argmax(np.abs(steps - usual)))
+    step = float(steps[worst])
+    where = f"between positions {depth[worst]:.2f} and {depth[worst + 1]:.2f} mm in {folder}"
+    if usual <= 0 or step < 0.01 * usual:
+        raise IrrcacheError(
+            f"two slices at the same position {where}; keep one of them, or choose --series UID"
+        )
+    if abs(step - usual) <= _UNEVEN * usual:
+        return
+    missing = round(step / usual) - 1
+    if missing > 0:
+        raise IrrcacheError(
+            f"about {missing} slice(s) missing {where}: the step is {step:.2f} mm, usually "
+            f"{usual:.2f} mm; complete the series"
+        )
+    raise IrrcacheError(
+        f"uneven slices {where}: the step is {step:.2f} mm, usually {usual:.2f} mm; "
+        "resample the series to even slices first"
+    )
+
+
+def _read_slices(files: list[str], folder: Path) -> sitk.Image:
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames(files)
+    try:
+        image = reader.Execute()
+    except RuntimeError as error:
+        raise IrrcacheError(f"cannot read the DICOM series in {folder}: {error}") from error
+    if image.GetNumberOfComponentsPerPixel() != 1:
+        raise IrrcacheError(f"the DICOM series in {folder} is in colour; give one of grey values")
+    return image

@@ -1,0 +1,151 @@
+"""Image files with a header - NRRD, NIfTI, MetaImage, single DICOM - through SimpleITK."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.volumes.data import VolumeData
+
+EXTENSIONS = (".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".dcm")
+# Deflate cannot shrink anything further than this (zlib.net/zlib_tech.html).
+_BEST_DEFLATE_RATIO = 1032
+_COMPRESSED = re.compile(
+    rb"^(?:encoding:\s*(?:gz|gzip|bz2|bzip2)|CompressedData\s*=\s*True)\s*$", re.I | re.M
+)
+_DETACHED = re.compile(rb"^(?:data ?file:\s*|ElementDataFile\s*=\s*)(.+?)\s*$", re.I | re.M)
+_COMPONENT_BYTES = {
+    sitk.sitkUInt8: 1,
+    sitk.sitkInt8: 1,
+    sitk.sitkUInt16: 2,
+    sitk.sitkInt16: 2,
+    sitk.sitkUInt32: 4,
+    sitk.sitkInt32: 4,
+    sitk.sitkUInt64: 8,
+    sitk.sitkInt64: 8,
+    sitk.sitkFloat32: 4,
+    sitk.sitkFloat64: 8,
+}
+
+
+def read_image(path: str | os.PathLike) -> VolumeData:
+    """Read one image file; spacing, origin and direction are kept (LPS, mm).
+
+    Raises:
+        IrrcacheError: missing or truncated file, a header that promises more than the file can
+            hold (found before anything is allocated), or an image that is no scalar volume.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise IrrcacheError(f"volume file {path} does not exist")
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(path))
+    try:
+        reader.ReadImageInformation()
+        _check_scalar_volume(path, reader)
+        _check_file_holds(path, _image_bytes(path, reader))
+        image = reader.Execute()
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise IrrcacheError(
+            f"cannot read {path}: {reason} (is it truncated, or of another format?)"
+        ) from error
+    if image.GetDimension() == 4:
+        image = image[..., 0]
+    return VolumeData(
+        values=sitk.GetArrayFromImage(image),
+        spacing=image.GetSpacing(),
+        origin=image.GetOrigin(),
+        direction=np.array(image.GetDirection()).reshape(3, 3),
+        source=str(path),
+    )
+
+
+def _check_scalar_volume(path: Path, reader: sitk.ImageFileReader) -> None:
+    size = reader.GetSize()
+    if len(size) < 3 or (len(size) == 3 and size[2] == 1):
+        raise IrrcacheError(
+            f"{path} is one slice of size {size}; give the folder of the series, or a 3-D file"
+        )
+    if len(size) > 3 and any(n != 1 for n in size[3:]):
+        raise IrrcacheError(f"{path} has size {size}; extract one 3-D frame of it first")
+    if reader.GetNumberOfComponents() != 1:
+        raise IrrcacheError(
+            f"{path} has {reader.GetNumberOfComponents()} values per voxel; extract one of them"
+        )
+
+
+def _image_bytes(path: Path, reader: sitk.ImageFileReader) -> int:
+    """Bytes of the voxels as stored; SimpleITK reports the type after rescaling, so ask NIfTI."""
+    count = int(np.prod(reader.GetSize(), dtype=object))
+    if reader.HasMetaDataKey("bitpix"):
+        return count * int(reader.GetMetaData("bitpix")) // 8
+    return count * _COMPONENT_BYTES.get(reader.GetPixelID(), 1)
+
+
+def _check_file_holds(path: Path, image_bytes: int) -> None:
+    """Compare what the header promises with the file, and unpack a ``.gz`` once to its end."""
+    if path.suffix == ".dcm":
+        return  # the pixel data may be compressed by any codec; GDCM checks it
+    if path.suffix == ".gz":
+        _check_ratio(path, path.stat().st_size, image_bytes)
+        _check_gzip(path, image_bytes)
+        return
+    with path.open("rb") as stream:
+        header = stream.read(64 * 1024)
+    data = path if path.suffix == ".nii" else _data_file(path, header)
+    if data is None:
+        return
+    stored = data.stat().st_size
+    if _COMPRESSED.search(header):
+        _check_ratio(data, stored, image_bytes)
+    elif stored < image_bytes:
+        _raise_truncated(data, stored, image_bytes)
+
+
+def _data_file(path: Path, header: bytes) -> Path | None:
+    """Where an NRRD or MetaImage header says its voxels are; None for a list of files."""
+    detached = _DETACHED.search(header)
+    if detached is None or detached[1].upper() == b"LOCAL":
+        return path
+    if detached[1].upper().startswith(b"LIST") or b"%" in detached[1]:
+        return None
+    data = path.parent / os.fsdecode(detached[1])
+    if not data.is_file():
+        raise IrrcacheError(f"{path} names a data file {data} that does not exist; put it there")
+    return data
+
+
+def _check_ratio(path: Path, stored: int, image_bytes: int) -> None:
+    if image_bytes > stored * _BEST_DEFLATE_RATIO:
+        raise IrrcacheError(
+            f"{path} promises {image_bytes} bytes of voxels, but its {stored} compressed bytes "
+            "cannot hold them; the header is wrong or the file truncated"
+        )
+
+
+def _check_gzip(path: Path, image_bytes: int) -> None:
+    """Unpack to the end: the NIfTI reader fills what is missing with zeros and says nothing."""
+    unpacked = 0
+    try:
+        with gzip.open(path) as stream:
+            while block := stream.read(1 << 22):
+                unpacked += len(block)
+    except (EOFError, zlib.error, OSError) as error:
+        raise IrrcacheError(f"{path} is truncated or damaged ({error}); copy it again") from error
+    if unpacked < image_bytes:
+        _raise_truncated(path, unpacked, image_bytes)
+
+
+def _raise_truncated(path: Path, actual: int, image_bytes: int) -> None:
+    raise IrrcacheError(
+        f"{path} is truncated: {actual} bytes, but its header promises {image_bytes} bytes of "
+        "voxels; copy or export it again"
+    )

@@ -1,0 +1,285 @@
+"""The subcommand ``irrcache import``: from a volume file to a Mitsuba scene."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.volumes import processing
+from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.raw import RawLayout
+from mitsuba_irrcache.volumes.readers import read_volume
+from mitsuba_irrcache.volumes.scene import SceneSettings, write_scene
+from mitsuba_irrcache.volumes.transfer import (
+    DensityMapping,
+    TransferFunction,
+    load_preset,
+    load_transfer_function,
+    preset_names,
+)
+
+_PHANTOM = "phantom:thorax"
+# Air is -1000 HU; data in Hounsfield units without any would be rare.
+_AIR_LIKE = -200
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``irrcache import`` on ``parser``."""
+    parser.add_argument(
+        "input",
+        nargs="+",
+        metavar="INPUT",
+        help="NRRD, NIfTI, MetaImage or .vol file, DICOM folder, raw file(s) in one or in slices, "
+        f"or {_PHANTOM} (a chest made here; {_PHANTOM}:X,Y,Z for another size)",
+    )
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="a new folder, or FOLDER/scene.xml"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an earlier import")
+    _add_appearance(parser.add_argument_group("appearance (one is needed)"))
+    _add_processing(parser.add_argument_group("processing, in this order"))
+    _add_raw(parser.add_argument_group("raw files"))
+    parser.add_argument("--series", metavar="UID", help="which series of a DICOM folder")
+    parser.add_argument(
+        "--replace-nan", type=float, metavar="VALUE", help="put VALUE for NaN and infinite values"
+    )
+    parser.add_argument(
+        "--max-depth", type=int, default=2, help="default of the scene (2: single scattering)"
+    )
+    parser.add_argument(
+        "--up", choices=("z", "y"), help="axis up in the picture (default: z; y for .vol)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import as ``args`` say and print a summary; returns the exit status 0.
+
+    Raises:
+        IrrcacheError: input that cannot be used; nothing is left behind.
+    """
+    mapping = _mapping(args)
+    volume = _process(_read(args), args)
+    _warn_about_unit(volume, mapping)
+    resampled, sigma_t, albedo = processing.bake(
+        volume, mapping, _target_size(volume, args), args.supersample
+    )
+    settings = SceneSettings(max_depth=args.max_depth, up=_up(args))
+    written = write_scene(
+        args.output, resampled, mapping, sigma_t, albedo, settings, overwrite=args.overwrite
+    )
+    print(_summary(resampled, sigma_t, albedo, written, args.output))
+    return 0
+
+
+def _add_appearance(group: argparse._ArgumentGroup) -> None:
+    choice = group.add_mutually_exclusive_group(required=True)
+    choice.add_argument("--preset", metavar="NAME", help=", ".join(preset_names()))
+    choice.add_argument("--transfer-function", metavar="FILE", help="a JSON file")
+    choice.add_argument(
+        "--density",
+        type=float,
+        nargs="?",
+        const=1.0,
+        metavar="SCALE",
+        help="the values are densities: sigma_t = SCALE * value (default: 1)",
+    )
+    group.add_argument(
+        "--albedo",
+        type=_numbers,
+        metavar="A | R,G,B",
+        help="with --density: the albedo (default: 1)",
+    )
+
+
+def _add_processing(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--flip", metavar="AXES", type=_axes, default="", help="mirror, e.g. z, xz")
+    group.add_argument(
+        "--crop", type=_ranges, metavar="X0:X1,Y0:Y1,Z0:Z1", help="keep these voxels"
+    )
+    group.add_argument(
+        "--rescale", type=_numbers, metavar="SLOPE,INTERCEPT", help="to Hounsfield units, say"
+    )
+    group.add_argument("--clip", type=_interval, metavar="A:B", help="limit the values to A..B; write --clip=-100:500 where A is negative")
+    group.add_argument(
+        "--isolate",
+        type=_finite,
+        metavar="VALUE",
+        help="keep the largest object above VALUE; -300 frees a patient of the table",
+    )
+    size = group.add_mutually_exclusive_group()
+    size.add_argument("--voxel-size", type=float, metavar="MM", help="resample to cubic voxels")
+    size.add_argument(
+        "--longest", type=int, metavar="N", help="resample to N voxels along the longest side"
+    )
+    group.add_argument(
+        "--supersample",
+        type=int,
+        default=1,
+        metavar="K",
+        help="apply the transfer function at K times the resolution; keeps thin bone thin",
+    )
+
+
+def _add_raw(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--raw-shape", type=_counts, metavar="X,Y,Z", help="voxels; marks raw input")
+    group.add_argument("--raw-type", default="uint8", help="e.g. uint16, float32 (default: uint8)")
+    group.add_argument("--raw-endian", choices=("little", "big"), default="little")
+    group.add_argument("--raw-spacing", type=_numbers, default=(1.0, 1.0, 1.0), metavar="X,Y,Z")
+    group.add_argument("--raw-offset", type=int, default=0, metavar="BYTES")
+
+
+def _mapping(args: argparse.Namespace) -> TransferFunction | DensityMapping:
+    if args.density is None and args.albedo is not None:
+        raise IrrcacheError("--albedo needs --density; a transfer function has its own colours")
+    if args.preset is not None:
+        return load_preset(args.preset)
+    if args.transfer_function is not None:
+        return load_transfer_function(args.transfer_function)
+    albedo = args.albedo or (1.0,)
+    return DensityMapping(args.density, albedo * 3 if len(albedo) == 1 else albedo)
+
+
+def _read(args: argparse.Namespace) -> VolumeData:
+    source = args.input[0]
+    if source.partition(":")[0] == "phantom" and len(args.input) == 1:
+        return _phantom(source)
+    raw = None
+    if args.raw_shape is not None:
+        raw = RawLayout(
+            args.raw_shape, args.raw_type, args.raw_endian, args.raw_spacing, args.raw_offset
+        )
+    return read_volume(
+        source if len(args.input) == 1 else args.input,
+        raw=raw,
+        series=args.series,
+        replace_nan=args.replace_nan,
+    )
+
+
+def _phantom(source: str) -> VolumeData:
+    """``phantom:thorax``, or ``phantom:thorax:X,Y,Z`` with the number of voxels."""
+    # The phantom is needed for this one input only.
+    from mitsuba_irrcache.volumes.phantom import thorax
+
+    name, _, size = source.removeprefix("phantom:").partition(":")
+    if name != "thorax":
+        raise IrrcacheError(f"no phantom {name!r}; there is {_PHANTOM}")
+    if not size:
+        return thorax()
+    try:
+        x, y, z = _counts(size)
+    except (argparse.ArgumentTypeError, ValueError) as error:
+        raise IrrcacheError(f"phantom size {size!r}: give X,Y,Z, e.g. 128,96,128") from error
+    return thorax((z, y, x))
+
+
+def _process(volume: VolumeData, args: argparse.Namespace) -> VolumeData:
+    if args.flip:
+        volume = processing.flip(volume, args.flip)
+    if args.crop is not None:
+        volume = processing.crop(volume, args.crop)
+    if args.rescale is not None:
+        if len(args.rescale) != 2:
+            raise IrrcacheError(f"--rescale {args.rescale}: give SLOPE,INTERCEPT")
+        volume = processing.rescale(volume, *args.rescale)
+    if args.clip is not None:
+        volume = processing.clip(volume, *args.clip)
+    if args.isolate is not None:
+        volume = processing.isolate(volume, args.isolate)
+    return volume
+
+
+def _target_size(volume: VolumeData, args: argparse.Namespace) -> processing.Size:
+    if args.voxel_size is not None:
+        return processing.size_for_voxel(volume, args.voxel_size)
+    if args.longest is not None:
+        return processing.size_for_longest(volume, args.longest)
+    return volume.size
+
+
+def _up(args: argparse.Namespace) -> str:
+    """Graphics volumes have y up, medical ones the patient's head at +z."""
+    if args.up is not None:
+        return args.up
+    return "y" if Path(args.input[0]).suffix == ".vol" else "z"
+
+
+def _warn_about_unit(volume: VolumeData, mapping: TransferFunction | DensityMapping) -> None:
+    if isinstance(mapping, DensityMapping) or mapping.unit != "HU" or volume.unit == "HU":
+        return
+    low = float(volume.values.min())
+    if low > _AIR_LIKE:
+        print(
+            f"warning: the transfer function is in HU, but the least value of {volume.source} is "
+            f"{low:g}, not about -1000; if air is 0 there, give --rescale 1,-1000",
+            file=sys.stderr,
+        )
+
+
+def _summary(
+    volume: VolumeData, sigma_t: np.ndarray, albedo: np.ndarray, written: int, output: str
+) -> str:
+    """What was imported, in a few lines that show a wrong unit or spacing at a glance."""
+    depths = [
+        float((sigma_t.sum(axis=2 - axis, dtype=np.float64) * spacing).max())
+        for axis, spacing in enumerate(volume.spacing)
+    ]
+    size = " x ".join(str(n) for n in volume.size)
+    spacing = " x ".join(f"{s:.4g}" for s in volume.spacing)
+    extent = " x ".join(f"{e:.4g}" for e in volume.physical_size)
+    empty = 1.0 - np.count_nonzero(sigma_t) / sigma_t.size
+    values = np.asarray(volume.values)
+    unit = f" {volume.unit}" if volume.unit else ""
+    lines = [
+        f"source         {volume.source}",
+        f"size           {size} voxels of {spacing}, {extent} in all",
+        f"values         {values.min():.6g} .. {values.max():.6g}{unit}",
+        f"sigma_t        0 .. {sigma_t.max():.4g} per unit length, {empty:.1%} of voxels empty",
+        f"albedo         {albedo.min():.3g} .. {albedo.max():.3g}",
+        "optical depth  at most " + ", ".join(f"{d:.3g}" for d in depths) + " along x, y, z",
+        f"written        {written / 1e6:.1f} MB to {output}",
+    ]
+    return "\n".join(lines)
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(_finite(part) for part in text.split(","))
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+    return value
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    counts = tuple(int(part) for part in text.split(","))
+    if len(counts) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r}: give three counts X,Y,Z")
+    return counts
+
+
+def _axes(text: str) -> str:
+    if set(text) - set("xyz"):
+        raise argparse.ArgumentTypeError(f"{text!r}: give some of x, y, z")
+    return text
+
+
+def _interval(text: str) -> tuple[float, float]:
+    low, separator, high = text.partition(":")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text!r}: give A:B")
+    return (float(low) if low else -math.inf, float(high) if high else math.inf)
+
+
+def _ranges(text: str) -> list[tuple[int | None, int | None]]:
+    parts = text.split(",")
+    if len(parts) != 3 or any(part.count(":") != 1 for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r}: give X0:X1,Y0:Y1,Z0:Z1; a bare : keeps all")
+    return [tuple(int(n) if n else None for n in part.split(":")) for part in parts]

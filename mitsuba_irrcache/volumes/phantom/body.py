@@ -1,0 +1,50 @@
+"""The outside of the body: skin, subcutaneous fat and the muscles over the rib cage."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mitsuba_irrcache.volumes.phantom import anatomy
+from mitsuba_irrcache.volumes.phantom.canvas import Canvas, Region
+from mitsuba_irrcache.volumes.phantom.distance import Ellipsoid
+
+SKIN_THICKNESS = 2.0
+
+# Subcutaneous fat: z, thickness in mm.
+FAT_THICKNESS = ((0, 15), (100, 11), (200, 8), (280, 7), (330, 5))
+
+# The sheet of fat between the rib cage and the muscles over it: height above the ribs' centre
+# lines and thickness in mm.
+FASCIA_HEIGHT, FASCIA_THICKNESS = 9.0, 2.4
+
+# The furrow over the spine: half width and depth in mm.
+FURROW_WIDTH, FURROW_DEPTH = 14.0, 5.0
+
+
+def paint_body(canvas: Canvas) -> None:
+    """Paint skin, subcutaneous fat, muscle, and the fat between the muscles and in the armpits."""
+    region = canvas.region(anatomy.WHOLE)
+    distance = skin_distance(region)
+    canvas.paint(region, distance, anatomy.SKIN)
+    distance += np.float32(SKIN_THICKNESS)
+    canvas.paint(region, distance, anatomy.FAT)
+    heights, thickness = np.transpose(FAT_THICKNESS)
+    distance += np.interp(region.z, heights, thickness).astype(np.float32)
+    canvas.paint(region, distance, anatomy.MUSCLE)
+    _paint_fascia(canvas)
+    armpits = [Ellipsoid((s * 128, 2, 228), (12, 30, 34)) for s in (anatomy.RIGHT, anatomy.LEFT)]
+    canvas.paint_solids(armpits, anatomy.FAT)
+
+
+def _paint_fascia(canvas: Canvas) -> None:
+    region = canvas.region(anatomy.CAGE.bounds(), FASCIA_HEIGHT + FASCIA_THICKNESS + canvas.edge)
+    height = anatomy.CAGE.distance(region.x, region.y, region.z)
+    sheet = np.abs(height - np.float32(FASCIA_HEIGHT)) - np.float32(FASCIA_THICKNESS / 2)
+    canvas.paint(region, sheet, anatomy.FAT)
+
+
+def skin_distance(region: Region) -> np.ndarray:
+    """Signed distance (z, y, x) in mm to the skin, with the furrow over the spine."""
+    distance = anatomy.TORSO.distance(region.x, region.y, region.z)
+    distance += FURROW_DEPTH * np.exp(-((region.x / FURROW_WIDTH) ** 2)) * (region.y > 0)
+    return distance

@@ -1,0 +1,226 @@
+"""Operations on volumes before they become a medium: crop, clip, rescale, resample, bake."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+from tqdm import tqdm
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
+
+Size = tuple[int, int, int]
+# Voxels eroded before objects are told apart: a mattress is thicker than that, noise is not.
+_BRIDGE = 2
+
+
+def crop(volume: VolumeData, ranges: Sequence[tuple[int | None, int | None]]) -> VolumeData:
+    """Keep the voxels with ``start <= index < stop`` along x, y, z; what is kept does not move.
+
+    Args:
+        volume: what to crop; the result shares its memory.
+        ranges: three pairs ``(start, stop)``; None means from the first, or to the last voxel.
+
+    Raises:
+        IrrcacheError: a range that is empty or reaches outside.
+    """
+    bounds = []
+    for axis, (start, stop), count in zip("xyz", ranges, volume.size, strict=True):
+        first, last = 0 if start is None else start, count if stop is None else stop
+        if not 0 <= first < last <= count:
+            raise IrrcacheError(
+                f"crop {first}:{last} along {axis}: give start < stop within 0:{count}"
+            )
+        bounds.append((first, last))
+    (x0, x1), (y0, y1), (z0, z1) = bounds
+    origin = volume.index_to_world @ (x0, y0, z0, 1.0)
+    return replace(volume, values=volume.values[z0:z1, y0:y1, x0:x1], origin=tuple(origin[:3]))
+
+
+def clip(volume: VolumeData, low: float, high: float) -> VolumeData:
+    """Limit the values to ``[low, high]``.
+
+    Raises:
+        IrrcacheError: ``low`` is not below ``high``.
+    """
+    if not low < high:
+        raise IrrcacheError(f"clip {low:g}:{high:g}: give the lower value first")
+    values = np.asarray(volume.values)
+    if values.dtype.kind in "iu":
+        limits = np.iinfo(values.dtype)
+        low, high = max(np.ceil(low), limits.min), min(np.floor(high), limits.max)
+    return replace(volume, values=np.clip(values, low, high).astype(values.dtype, copy=False))
+
+
+def rescale(volume: VolumeData, slope: float, intercept: float) -> VolumeData:
+    """``slope * value + intercept``, float32; brings stored values to Hounsfield units, say.
+
+    Raises:
+        IrrcacheError: a slope of 0, or either not finite.
+    """
+    if slope == 0 or not np.isfinite([slope, intercept]).all():
+        raise IrrcacheError(f"rescale by {slope}, {intercept}: give finite values, slope not 0")
+    values = np.asarray(volume.values, dtype=np.float32) * np.float32(slope)
+    return replace(volume, values=values + np.float32(intercept))
+
+
+def flip(volume: VolumeData, axes: str) -> VolumeData:
+    """Mirror the values along the axes named, e.g. ``"xz"``, inside the same box.
+
+    Raw slices do not say which way they run; a head may come in upside down.
+    """
+    order = tuple(slice(None, None, -1 if axis in axes else 1) for axis in "zyx")
+    return replace(volume, values=volume.values[order])
+
+
+def isolate(volume: VolumeData, threshold: float) -> VolumeData:
+    """Keep the largest connected object above ``threshold``, all else becomes the least value.
+
+    Takes the table and the tubes away from a patient. Bridges up to four voxels thick are cut;
+    cavities of the object that are closed within a slice, such as lungs, stay, and so does a rim
+    of one voxel, in which the surface fades.
+
+    Raises:
+        IrrcacheError: nothing thicker than four voxels lies above ``threshold``.
+    """
+    values = np.asarray(volume.values)
+    above = values > threshold
+    cores = ndimage.binary_erosion(above, iterations=_BRIDGE)
+    labels, count = ndimage.label(cores)
+    if count == 0:
+        raise IrrcacheError(
+            f"isolate {threshold:g}: nothing of {volume.source!r} lies above it (values are "
+            f"{values.min():g} .. {values.max():g}); give a lower threshold"
+        )
+    core = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
+    kept = ndimage.binary_dilation(core, iterations=_BRIDGE) & above
+    for part in tqdm(kept, "isolating", delay=1, disable=None):
+        ndimage.binary_dilation(ndimage.binary_fill_holes(part), output=part)
+    return replace(volume, values=np.where(kept, values, values.min()))
+
+
+def size_for_voxel(volume: VolumeData, voxel_size: float) -> Size:
+    """Counts along x, y, z for near-cubic voxels of ``voxel_size`` (world units).
+
+    Raises:
+        IrrcacheError: a voxel size that is not positive.
+    """
+    if not (np.isfinite(voxel_size) and voxel_size > 0):
+        raise IrrcacheError(f"voxel size {voxel_size}: give a positive length")
+    x, y, z = (max(1, round(length / voxel_size)) for length in volume.physical_size)
+    return x, y, z
+
+
+def size_for_longest(volume: VolumeData, longest: int) -> Size:
+    """Counts along x, y, z with ``longest`` near-cubic voxels along the longest physical side.
+
+    Raises:
+        IrrcacheError: ``longest`` below 1.
+    """
+    if longest < 1:
+        raise IrrcacheError(f"longest side of {longest} voxels: give at least 1")
+    return size_for_voxel(volume, max(volume.physical_size) / longest)
+
+
+def resample(volume: VolumeData, size: Size) -> VolumeData:
+    """Linear interpolation to ``size`` voxels (x, y, z) in the same box, float32.
+
+    Axes that lose resolution are smoothed first, so that thin structures fade instead of breaking
+    up. (Cubic interpolation would ring below zero next to bone.)
+
+    Raises:
+        IrrcacheError: a size with a side below 1.
+    """
+    if min(size) < 1:
+        raise IrrcacheError(f"size {size}: give at least 1 voxel along x, y and z")
+    smooth = _antialiased(volume.values, size)
+    return replace(
+        volume,
+        values=_sample_slices(smooth, size, 0, size[2]),
+        spacing=_spacing(volume, size),
+    )
+
+
+def bake(
+    volume: VolumeData,
+    mapping: TransferFunction | DensityMapping,
+    size: Size,
+    supersample: int = 1,
+) -> tuple[VolumeData, np.ndarray, np.ndarray]:
+    """Turn a volume into the grids of a medium, of ``size`` voxels (x, y, z).
+
+    A medium's grids hold extinction, so a transfer function acts *before* the renderer
+    interpolates. Where it is steep, between soft tissue and bone, the interpolated extinction is not
+    that of the interpolated value: thin bone gets blurred and thicker. ``supersample`` = k applies
+    it at k times the resolution and averages the results, in blocks of k^3: extinction by volume,
+    albedo weighted by extinction.
+
+    Returns:
+        the volume resampled to ``size`` (``volume`` itself where nothing changes), extinction
+        float32 ``(z, y, x)`` in 1/world unit, and albedo float32 ``(z, y, x, 3)``.
+
+    Raises:
+        IrrcacheError: ``supersample`` below 1.
+    """
+    if supersample < 1:
+        raise IrrcacheError(f"supersample {supersample}: give at least 1")
+    resampled = volume if size == volume.size else resample(volume, size)
+    if supersample == 1:
+        return resampled, *mapping.apply(resampled.values)
+    fitted = mapping.fitted_to(resampled.values)
+    fine = tuple(n * supersample for n in size)
+    smooth = _antialiased(volume.values, fine)
+    x, y, z = size
+    sigma_t = np.empty((z, y, x), dtype=np.float32)
+    albedo = np.empty((z, y, x, 3), dtype=np.float32)
+    for k in tqdm(range(z), "supersampling", delay=1, disable=None):
+        part = _sample_slices(smooth, fine, k * supersample, (k + 1) * supersample)
+        sigma_t[k], albedo[k] = _average_blocks(*fitted.map(part), supersample)
+    return resampled, sigma_t, albedo
+
+
+def _spacing(volume: VolumeData, size: Size) -> tuple[float, ...]:
+    return tuple(length / n for length, n in zip(volume.physical_size, size, strict=True))
+
+
+def _antialiased(values: np.ndarray, size: Size) -> np.ndarray:
+    """Values smoothed along the axes that lose resolution; a half-width of half the new voxel."""
+    factors = np.array(values.shape) / np.array(size[::-1])
+    sigma = np.maximum(0.0, (factors - 1.0) / 2.0)
+    if not sigma.any():
+        return values
+    return ndimage.gaussian_filter(values, sigma, output=np.float32, mode="nearest", truncate=3.0)
+
+
+def _sample_slices(values: np.ndarray, size: Size, first: int, last: int) -> np.ndarray:
+    """Slices ``first .. last - 1`` of ``values`` seen as ``size`` voxels in the same box.
+
+    Only the source slices that they touch are read; float32 ``(last - first, y, x)``.
+    """
+    x, y, z = size
+    step = np.array(values.shape) / (z, y, x)
+    start = step * (first + 0.5, 0.5, 0.5) - 0.5
+    bottom = int(np.clip(np.floor(start[0]), 0, len(values) - 1))
+    top = int(np.clip(np.ceil(start[0] + step[0] * (last - first - 1)), 0, len(values) - 1))
+    start[0] -= bottom
+    source = np.asarray(values[bottom : top + 1], dtype=np.float32)
+    return ndimage.affine_transform(
+        source, step, start, (last - first, y, x), order=1, mode="nearest"
+    )
+
+
+def _average_blocks(sigma_t: np.ndarray, albedo: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
+    """Means over blocks of a slab ``k`` thick: extinction ``(y, x)``, albedo ``(y, x, 3)``."""
+    y, x = sigma_t.shape[1] // k, sigma_t.shape[2] // k
+    blocks = (k, y, k, x, k)
+    axes = (0, 2, 4)
+    extinction = sigma_t.reshape(blocks).mean(axis=axes)
+    scattering = (sigma_t[..., None] * albedo).reshape(*blocks, 3).mean(axis=axes)
+    plain = albedo.reshape(*blocks, 3).mean(axis=axes)
+    divisor = np.where(extinction > 0, extinction, 1.0)[..., None]
+    mean_albedo = np.where(extinction[..., None] > 0, scattering / divisor, plain)
+    return extinction, np.minimum(mean_albedo, 1.0)  # rounding may exceed 1 in the last place

@@ -1,0 +1,242 @@
+"""A folder with a Mitsuba scene around a volume: any Mitsuba 3 renders it as it is."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.mitsuba_vol import write_vol
+from mitsuba_irrcache.volumes.staging import staged_files, staged_folder
+from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
+
+SIGMA_T_FILE, ALBEDO_FILE, MAPPING_FILE = "sigma_t.vol", "albedo.vol", "transfer_function.json"
+_FIELD_OF_VIEW = 30.0
+_MARGIN = 1.04
+# Views as (direction in which the camera lies, up). Medical volumes are LPS: the patient faces -y
+# with the head at +z, so the camera stands in front, a little to the patient's right and above.
+VIEWS = {
+    "z": (np.array([-0.45, -1.0, 0.25]), np.array([0.0, 0.0, 1.0])),
+    "y": (np.array([-0.45, 0.25, 1.0]), np.array([0.0, 1.0, 0.0])),
+}
+_CUBE_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """Defaults that ``scene.xml`` exposes as parameters (``-D name=value``), and its view.
+
+    Attributes:
+        up: the world axis that points up in the picture, ``"z"`` (medical) or ``"y"``.
+    """
+
+    integrator: str = "volpath"
+    max_depth: int = 2
+    spp: int = 64
+    width: int = 512
+    height: int = 512
+    scale: float = 1.0
+    radiance: float = 1.0
+    hide_emitters: bool = False
+    up: str = "z"
+
+
+def write_scene(
+    target: str | os.PathLike,
+    volume: VolumeData,
+    mapping: TransferFunction | DensityMapping,
+    sigma_t: np.ndarray,
+    albedo: np.ndarray,
+    settings: SceneSettings | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Write ``scene.xml``, ``sigma_t.vol``, ``albedo.vol`` and ``transfer_function.json``.
+
+    Args:
+        target: a folder, which appears as a whole and replaces an earlier import on success only;
+            or a file ending in ``.xml``, beside which the other files go, in a folder that exists
+            and keeps what else it holds.
+        volume: gives the placement; scene units are its world units.
+        mapping: how the grids were made, kept as a record.
+        sigma_t: shape ``(z, y, x)``, extinction in 1/world unit.
+        albedo: shape ``(z, y, x, 3)``; stored as one channel where it is grey.
+        settings: defaults of the scene's parameters.
+        overwrite: replace an earlier import.
+
+    Returns:
+        the number of bytes written.
+
+    Raises:
+        IrrcacheError: shapes that disagree, values outside their range, an empty medium, or a
+            target that may not be replaced. Nothing is left behind then.
+    """
+    settings = settings or SceneSettings()
+    _check_medium(volume, sigma_t, albedo)
+    target = Path(target)
+    as_file = target.suffix.lower() == ".xml"
+    scene_name = target.name if as_file else "scene.xml"
+    names = {SIGMA_T_FILE, ALBEDO_FILE, MAPPING_FILE, scene_name}
+    staged = (
+        staged_files(target.parent, names, overwrite)
+        if as_file
+        else staged_folder(target, names, overwrite)
+    )
+    with staged as folder:
+        write_vol(folder / SIGMA_T_FILE, sigma_t)
+        write_vol(folder / ALBEDO_FILE, albedo[..., :1] if _is_grey(albedo) else albedo)
+        (folder / MAPPING_FILE).write_text(mapping.to_json(), encoding="utf-8")
+        xml = scene_xml(volume.to_world, camera(volume, sigma_t, settings.up), settings)
+        (folder / scene_name).write_text(xml, encoding="utf-8")
+        return sum(path.stat().st_size for path in folder.iterdir())
+
+
+def camera(volume: VolumeData, sigma_t: np.ndarray, up: str = "z") -> tuple[np.ndarray, ...]:
+    """Origin, target and up vector of a camera that frames the occupied part of the volume.
+
+    Raises:
+        IrrcacheError: ``up`` is neither "z" nor "y".
+    """
+    if up not in VIEWS:
+        raise IrrcacheError(f"up axis {up!r}: give z or y")
+    towards, up_vector = VIEWS[up]
+    towards = towards / np.linalg.norm(towards)
+    corners = _occupied_corners(volume, sigma_t)
+    target = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    right = np.cross(up_vector, towards)
+    right /= np.linalg.norm(right)
+    relative = corners - target
+    along = relative @ towards
+    aside = np.maximum(np.abs(relative @ right), np.abs(relative @ np.cross(towards, right)))
+    distance = (along + _MARGIN * aside / np.tan(np.radians(_FIELD_OF_VIEW / 2))).max()
+    return target + distance * towards, target, up_vector
+
+
+def scene_xml(
+    to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: SceneSettings
+) -> str:
+    """The scene; ``to_world`` places the unit cube of the grids, ``view`` is as from ``camera``."""
+    # Mitsuba's cube is [-1, 1]^3, a grid's [0, 1]^3.
+    cube_to_unit = np.diag([0.5, 0.5, 0.5, 1.0])
+    cube_to_unit[:3, 3] = 0.5
+    origin, target, up = (_text(vector) for vector in view)
+    far = 10 * float(np.linalg.norm(np.subtract(view[0], view[1])))
+    defaults = {
+        "integrator": settings.integrator,
+        "max_depth": settings.max_depth,
+        "hide_emitters": str(settings.hide_emitters).lower(),
+        "spp": settings.spp,
+        "width": settings.width,
+        "height": settings.height,
+        "scale": f"{settings.scale:.9g}",
+        "radiance": f"{settings.radiance:.9g}",
+    }
+    return f"""<scene version="3.0.0">
+{_default_lines(defaults)}
+
+    <integrator type="$integrator">
+        <integer name="max_depth" value="$max_depth"/>
+        <boolean name="hide_emitters" value="$hide_emitters"/>
+    </integrator>
+
+    <sensor type="perspective">
+        <float name="fov" value="{_FIELD_OF_VIEW:g}"/>
+        <string name="fov_axis" value="smaller"/>
+        <float name="near_clip" value="{far * 1e-5:.9g}"/>
+        <float name="far_clip" value="{far:.9g}"/>
+        <transform name="to_world">
+            <lookat origin="{origin}" target="{target}" up="{up}"/>
+        </transform>
+        <sampler type="independent">
+            <integer name="sample_count" value="$spp"/>
+        </sampler>
+        <film type="hdrfilm">
+            <integer name="width" value="$width"/>
+            <integer name="height" value="$height"/>
+            <string name="pixel_format" value="rgb"/>
+            <string name="component_format" value="float32"/>
+            <rfilter type="gaussian"/>
+        </film>
+    </sensor>
+
+    <emitter type="constant">
+        <rgb name="radiance" value="$radiance, $radiance, $radiance"/>
+    </emitter>
+
+    <!-- Lengths are in the units of the data (mm for medical volumes), extinction is per length. -->
+    <medium type="heterogeneous" id="volume">
+        <volume name="sigma_t" type="gridvolume">
+            <string name="filename" value={quoteattr(SIGMA_T_FILE)}/>
+            <transform name="to_world"><matrix value="{_text(to_world)}"/></transform>
+        </volume>
+        <volume name="albedo" type="gridvolume">
+            <string name="filename" value={quoteattr(ALBEDO_FILE)}/>
+            <transform name="to_world"><matrix value="{_text(to_world)}"/></transform>
+        </volume>
+        <float name="scale" value="$scale"/>
+        <phase type="isotropic"/>
+    </medium>
+
+    <shape type="cube">
+        <transform name="to_world"><matrix value="{_text(to_world @ cube_to_unit)}"/></transform>
+        <bsdf type="null"/>
+        <ref name="interior" id="volume"/>
+    </shape>
+</scene>
+"""
+
+
+def _default_lines(defaults: dict[str, object]) -> str:
+    return "\n".join(
+        f"    <default name={quoteattr(name)} value={quoteattr(str(value))}/>"
+        for name, value in defaults.items()
+    )
+
+
+def _text(numbers: np.ndarray) -> str:
+    return " ".join(f"{number:.9g}" for number in np.ravel(numbers))
+
+
+def _occupied_corners(volume: VolumeData, sigma_t: np.ndarray) -> np.ndarray:
+    """World positions ``(8, 3)`` of the corners of the smallest index box with extinction."""
+    occupied = sigma_t > 0
+    ranges = []
+    for axis in (2, 1, 0):
+        others = tuple(a for a in range(3) if a != axis)
+        hit = np.flatnonzero(occupied.any(axis=others))
+        ranges.append((hit[0] - 0.5, hit[-1] + 0.5))
+    low, high = np.array(ranges).T
+    corners = low + _CUBE_CORNERS * (high - low)
+    matrix = volume.index_to_world
+    return corners @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _is_grey(albedo: np.ndarray) -> bool:
+    return all(
+        np.array_equal(part[..., 0], part[..., 1]) and np.array_equal(part[..., 0], part[..., 2])
+        for part in albedo
+    )
+
+
+def _check_medium(volume: VolumeData, sigma_t: np.ndarray, albedo: np.ndarray) -> None:
+    shape = volume.values.shape
+    if sigma_t.shape != shape or albedo.shape != (*shape, 3):
+        raise IrrcacheError(
+            f"extinction {sigma_t.shape} and albedo {albedo.shape} do not fit the volume {shape}; "
+            "bake them from it"
+        )
+    low, high = float(sigma_t.min()), float(sigma_t.max())
+    if not (low >= 0 and np.isfinite(high)):
+        raise IrrcacheError(f"extinction from {low:g} to {high:g}; it must be finite and >= 0")
+    if high == 0:
+        raise IrrcacheError(
+            f"the whole medium is empty: the values of {volume.source!r} lie where the transfer "
+            "function is transparent; check its unit, or rescale the values"
+        )
+    low, high = float(albedo.min()), float(albedo.max())
+    if not (low >= 0 and high <= 1):
+        raise IrrcacheError(f"albedo from {low:g} to {high:g}; it must lie within 0..1")

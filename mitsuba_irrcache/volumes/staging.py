@@ -1,0 +1,143 @@
+"""Results appear whole or not at all: they are built under a temporary name and then renamed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from mitsuba_irrcache.errors import IrrcacheError
+
+
+@contextmanager
+def staged_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
+    """A binary stream whose content replaces ``path`` when the block ends without an exception.
+
+    Raises:
+        IrrcacheError: the folder of ``path`` does not exist.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise IrrcacheError(f"cannot write {path}: folder {path.parent} does not exist; create it")
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            yield stream
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+@contextmanager
+def staged_folder(folder: str | os.PathLike, names: set[str], overwrite: bool) -> Iterator[Path]:
+    """A temporary folder that becomes ``folder`` when the block ends without an exception.
+
+    Args:
+        folder: where the result goes; an empty folder may exist there.
+        names: the files that the result consists of. Only a folder with no others is replaced, so
+            that ``overwrite`` can never delete what somebody else put there.
+        overwrite: replace an earlier result, and only on success.
+
+    Raises:
+        IrrcacheError: ``folder`` is a file, or is not empty and may not be replaced.
+    """
+    folder = Path(folder).absolute()
+    _check_replaceable(folder, names, overwrite)
+    with _temporary_beside(folder) as temporary:
+        built = temporary / "new"
+        built.mkdir()
+        yield built
+        replaced = temporary / "old"
+        if folder.exists():
+            os.rename(folder, replaced)
+        try:
+            os.rename(built, folder)
+        except OSError:
+            if replaced.exists():
+                os.rename(replaced, folder)
+            raise
+
+
+@contextmanager
+def staged_files(folder: str | os.PathLike, names: set[str], overwrite: bool) -> Iterator[Path]:
+    """A temporary folder whose files move into the existing ``folder`` when the block succeeds.
+
+    Args:
+        folder: an existing folder, whose other files stay as they are.
+        names: the files that the result consists of.
+        overwrite: replace files of these names; on a failure the old ones are put back.
+
+    Raises:
+        IrrcacheError: ``folder`` does not exist, or holds one of ``names`` already.
+    """
+    folder = Path(folder).absolute()
+    if not folder.is_dir():
+        raise IrrcacheError(f"folder {folder} does not exist; create it")
+    taken = sorted(name for name in names if (folder / name).exists())
+    if taken and not overwrite:
+        raise IrrcacheError(
+            f"{folder} has {', '.join(taken)} already; choose another folder, or overwrite"
+        )
+    with _temporary_beside(folder / "scene") as temporary:
+        built = temporary / "new"
+        built.mkdir()
+        yield built
+        _move_into(folder, built, temporary)
+
+
+def _move_into(folder: Path, built: Path, backup: Path) -> None:
+    """Move every file of ``built`` into ``folder``; undo all of it if one cannot be moved."""
+    moved: list[str] = []
+    names = sorted(path.name for path in built.iterdir())
+    try:
+        for name in names:
+            if (folder / name).exists():
+                os.rename(folder / name, backup / name)
+            os.rename(built / name, folder / name)
+            moved.append(name)
+    except OSError:
+        for name in moved:
+            os.unlink(folder / name)
+        for name in names:
+            if (backup / name).exists():
+                os.rename(backup / name, folder / name)
+        raise
+
+
+def _check_replaceable(folder: Path, names: set[str], overwrite: bool) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise IrrcacheError(f"{folder} is a file; name a folder, or a scene ending in .xml")
+    if not folder.parent.is_dir():
+        raise IrrcacheError(f"folder {folder.parent} does not exist; create it")
+    present = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    foreign = sorted(present - names)
+    if foreign:
+        raise IrrcacheError(
+            f"folder {folder} holds other files ({', '.join(foreign[:3])}"
+            f"{', ...' if len(foreign) > 3 else ''}) and is not replaced; choose another folder"
+        )
+    if present and not overwrite:
+        raise IrrcacheError(f"folder {folder} is not empty; choose another, or overwrite")
+
+
+@contextmanager
+def _temporary_beside(path: Path) -> Iterator[Path]:
+    """A folder on the same file system as ``path`` (renames stay atomic), removed in any case."""
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        yield temporary
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _umask() -> int:
+    """The process's file mode mask, which ``mkstemp`` does not apply."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,217 @@
+"""Finding an LLVM that Dr.Jit can use, and refusing the others before they abort the process."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mitsuba_irrcache import install_llvm, runtime
+
+ELF = b"\x7fELF" + bytes(60)
+
+linux_only = pytest.mark.skipif(platform.system() != "Linux", reason="names of Linux libraries")
+
+
+@pytest.fixture
+def minimum_17(monkeypatch):
+    monkeypatch.setattr(runtime, "minimum_llvm", lambda: 17)
+
+
+@pytest.fixture
+def folder_of_libraries(tmp_path, monkeypatch, minimum_17):
+    """A machine whose only LLVM libraries are those that a test puts into this folder."""
+    monkeypatch.setattr(runtime, "_llvm_patterns", lambda: [f"{tmp_path}/libLLVM*.so*"])
+    monkeypatch.setenv(runtime.LLVM_VARIABLE, "")
+    return tmp_path
+
+
+def put(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).write_bytes(ELF)
+
+
+@linux_only
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM-15.so.1", (15,)),
+        ("libLLVM-17.so", (17,)),
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM.so.22.1.8", (22, 1, 8)),
+    ],
+)
+def test_version_is_read_from_the_names_that_distributions_use(tmp_path, minimum_17, name, version):
+    put(tmp_path, name)
+    library = runtime.inspect_llvm(tmp_path / name)
+    assert library.version == version
+    assert bool(library.problem) == (version[0] < 17)
+
+
+@linux_only
+def test_version_is_read_from_a_link_and_from_neighbours(tmp_path, minimum_17):
+    put(tmp_path, "libLLVM.so.19.1")
+    (tmp_path / "libLLVM-unversioned.so").symlink_to("libLLVM.so.19.1")
+    assert runtime.inspect_llvm(tmp_path / "libLLVM-unversioned.so").version == (19, 1)
+
+    (tmp_path / "llvm/lib/clang/18").mkdir(parents=True)
+    put(tmp_path / "llvm/lib", "libLLVM.so")
+    assert runtime.inspect_llvm(tmp_path / "llvm/lib/libLLVM.so").version == (18,)
+
+    (tmp_path / "Cellar/llvm/20.1.7_1/lib").mkdir(parents=True)
+    put(tmp_path / "Cellar/llvm/20.1.7_1/lib", "libLLVM.so")
+    found = runtime.inspect_llvm(tmp_path / "Cellar/llvm/20.1.7_1/lib/libLLVM.so")
+    assert found.version == (20, 1, 7)
+
+
+@linux_only
+def test_newest_usable_library_is_chosen(folder_of_libraries):
+    put(folder_of_libraries, "libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM-17.so.1")
+    put(folder_of_libraries, "libLLVM.so.19.1", "libLLVMSPIRVLib.so.99")
+    (folder_of_libraries / "libLLVM.so.99.1").write_text("not a library")
+
+    found = [library.path.name for library in runtime.find_llvm()]
+    assert found == ["libLLVM.so.19.1", "libLLVM-17.so.1", "libLLVM-15.so.1", "libLLVM-9.so.1"]
+
+    runtime.prepare_llvm()
+    assert os.environ[runtime.LLVM_VARIABLE] == str(folder_of_libraries / "libLLVM.so.19.1")
+
+
+@linux_only
+def test_nothing_is_chosen_where_nothing_is_usable(folder_of_libraries):
+    put(folder_of_libraries, "libLLVM-14.so.1", "libLLVM-15.so.1")
+    runtime.prepare_llvm()
+    assert os.environ[runtime.LLVM_VARIABLE] == ""
+    assert runtime.usable_llvm() is None
+
+
+def test_the_choice_of_the_user_stands(monkeypatch):
+    monkeypatch.setenv(runtime.LLVM_VARIABLE, "/my/own/libLLVM.so")
+    runtime.prepare_llvm()
+    assert os.environ[runtime.LLVM_VARIABLE] == "/my/own/libLLVM.so"
+
+
+def test_preparing_is_fast_and_starts_no_process(monkeypatch):
+    monkeypatch.setenv(runtime.LLVM_VARIABLE, "")
+    monkeypatch.setattr(subprocess, "run", None)
+    runtime.find_llvm()  # the first look at a cold disk is not what is measured
+    start = time.perf_counter()
+    runtime.prepare_llvm()
+    assert time.perf_counter() - start < 0.1
+
+
+def test_files_that_are_no_library_are_named_as_such(tmp_path):
+    text = tmp_path / "libLLVM.so.19.1"
+    text.write_text("LLVM")
+    assert "not a shared library" in runtime.inspect_llvm(text).problem
+    assert "no such file" in runtime.inspect_llvm(tmp_path / "missing.so").problem
+    assert "not a file" in runtime.inspect_llvm(tmp_path).problem
+
+
+@linux_only
+def test_another_library_is_not_mistaken_for_llvm():
+    name = ctypes.util.find_library("c")
+    library = runtime.inspect_llvm(name)
+    assert library.version == ()
+    assert "not libLLVM" in library.problem
+
+
+@pytest.mark.skipif(not runtime.find_llvm(), reason="needs an LLVM library")
+def test_a_library_states_the_version_that_its_name_has():
+    for library in runtime.find_llvm():
+        assert runtime._version_by_loading(library.path)[:1] == library.version[:1]
+
+
+def run_with_llvm(path: str, code: str) -> subprocess.CompletedProcess:
+    environment = {**os.environ, runtime.LLVM_VARIABLE: path}
+    return subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120
+    )
+
+
+REQUIRE = """
+from mitsuba_irrcache import runtime
+try:
+    runtime.require_llvm()
+except runtime.LLVMUnusableError as error:
+    print(error)
+    raise SystemExit(3)
+"""
+
+
+def bad_libraries() -> list:
+    old = [library.path for library in runtime.find_llvm() if library.problem]
+    if not old:
+        reason = "needs a libLLVM that is too old, such as that of Debian's libllvm15"
+        return [pytest.param("", marks=pytest.mark.skip(reason=reason), id="old")]
+    return [pytest.param(str(path), id=path.name) for path in old]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *bad_libraries(),
+        pytest.param("/missing/libLLVM.so", id="missing"),
+        pytest.param(__file__, id="text"),
+    ],
+)
+def test_bad_llvm_ends_in_an_error_that_names_it_and_the_remedy(path):
+    done = run_with_llvm(path, REQUIRE)
+    assert done.returncode == 3, done.stderr
+    assert path in done.stdout
+    assert "Remedy: " in done.stdout
+
+
+@pytest.mark.skipif(runtime.usable_llvm() is None, reason="needs a usable LLVM")
+def test_usable_llvm_is_accepted_and_is_the_one_that_dr_jit_loads():
+    library = runtime.usable_llvm()
+    done = run_with_llvm(str(library.path), REQUIRE + "print(*runtime.loaded_llvm())")
+    assert done.returncode == 0, done.stderr
+    loaded = tuple(map(int, done.stdout.split()))
+    assert loaded[: len(library.version)] == library.version
+
+
+@linux_only
+def test_a_library_loaded_before_ours_was_chosen_is_explained(folder_of_libraries, monkeypatch):
+    put(folder_of_libraries, "libLLVM.so.19.1")
+    runtime.prepare_llvm()
+    monkeypatch.setattr(runtime, "loaded_llvm", lambda: (15, 0, 6))
+    with pytest.raises(runtime.LLVMUnusableError, match=r"15\.0\.6(?s:.)*import mitsuba_irrcache"):
+        runtime.require_llvm()
+
+
+@pytest.mark.parametrize(
+    ("system", "words"),
+    [
+        ("Linux", ["libllvm19", "conda-forge", "DRJIT_LIBLLVM_PATH"]),
+        ("Darwin", ["brew install llvm", "conda-forge"]),
+        ("Windows", ["installer", "LLVM-C.dll", "DRJIT_LIBLLVM_PATH"]),
+    ],
+)
+def test_remedy_fits_the_platform(monkeypatch, system, words):
+    monkeypatch.setattr(runtime, "usable_llvm", lambda: None)
+    monkeypatch.setattr(platform, "system", lambda: system)
+    remedy = runtime.llvm_remedy()
+    assert [word for word in words if word not in remedy] == []
+
+
+@pytest.mark.parametrize(
+    ("packages", "chosen"),
+    [
+        (["libllvm14", "libllvm15", "libllvm16", "libllvm19", "libllvm22"], "libllvm19"),
+        (["libllvm15", "libllvm17t64", "libllvm18"], "libllvm18"),
+        (["libllvm15", "libllvm17t64"], "libllvm17t64"),
+        (["libllvm14", "libllvm15"], None),
+        ([], None),
+    ],
+)
+def test_installer_takes_llvm_19_or_the_newest(minimum_17, packages, chosen):
+    listing = "".join(f"{name} - Modular compiler, runtime library\n" for name in packages)
+    assert install_llvm.choose_package(listing) == chosen
