@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from mitsuba_irrcache import runtime, versions
+from mitsuba_irrcache.memory import available_memory
 
 DEFAULT_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
@@ -94,16 +95,15 @@ def examine(variants: list[str]) -> dict[str, Any]:
 
 
 def examine_system() -> dict[str, Any]:
-    """Python, operating system, processor, cores and memory (MiB, None where unknown)."""
-    total, free = _memory()
+    """Python, operating system, processor, cores and memory (bytes)."""
     return {
         "python": f"{platform.python_version()} ({sys.executable})",
         "platform": platform.platform(),
         "processor": _processor(),
         "vector_extensions": _vector_extensions(),
         "cores": _cores(),
-        "memory_mib": total,
-        "free_memory_mib": free,
+        "memory": _total_memory(),
+        "free_memory": available_memory(),
     }
 
 
@@ -261,18 +261,11 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-def _memory() -> tuple[int | None, int | None]:
-    """Total and available memory in MiB; None where the system does not say."""
-    text = _read("/proc/meminfo")
-    total, free = (
-        re.search(rf"^{name}:\s*(\d+) kB", text, re.MULTILINE)
-        for name in ("MemTotal", "MemAvailable")
-    )
-    if total and free:
-        return int(total[1]) // 1024, int(free[1]) // 1024
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2**20, None
-    return None, None
+def _total_memory() -> int | None:
+    """The memory of the machine in bytes; None where the system does not say."""
+    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
+        return None
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _optix_library() -> str | None:
@@ -309,14 +302,14 @@ def _system_lines(report: dict[str, Any]) -> list[str]:
         f"  Python         {system['python']}",
         f"  platform       {system['platform']}",
         f"  processor      {system['processor']}, {system['cores']} cores ({extensions})",
-        f"  memory         {_gib(system['free_memory_mib'])} free of {_gib(system['memory_mib'])}",
+        f"  memory         {_gib(system['free_memory'])} free of {_gib(system['memory'])}",
         f"  GPU            {gpu}; OptiX: {cuda['optix'] or 'not found'}",
         f"  kernel cache   {cache['folder']}, {cache['bytes'] / 2**20:.1f} MiB{writable}",
     ]
 
 
-def _gib(mebibytes: int | None) -> str:
-    return "unknown" if mebibytes is None else f"{mebibytes / 1024:.1f} GiB"
+def _gib(size: int | None) -> str:
+    return "unknown" if size is None else f"{size / 2**30:.1f} GiB"
 
 
 def _package_lines(packages: list[dict[str, Any]]) -> list[str]:

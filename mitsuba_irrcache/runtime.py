@@ -1,8 +1,8 @@
 """An LLVM that Dr.Jit can use: finding one, and a clear error where there is none.
 
 Dr.Jit 1.5 emits ``llvm.minimum``, which LLVM cannot select on x86-64 before version 17: the process
-aborts at the first such kernel (measured with 15 and 16). Dr.Jit loads
-LLVM when it is imported, so a better one must be named in ``DRJIT_LIBLLVM_PATH`` before that.
+aborts at the first such kernel (seen with 15 and 16; 19 and 22 work). Dr.Jit loads LLVM when it is
+imported, so a better one must be named in ``DRJIT_LIBLLVM_PATH`` before that.
 """
 
 from __future__ import annotations

@@ -80,16 +80,17 @@ def flip(volume: VolumeData, axes: str) -> VolumeData:
 def isolate(volume: VolumeData, threshold: float) -> VolumeData:
     """Keep the largest connected object above ``threshold``, all else becomes the least value.
 
-    Takes the table and the tubes away from a patient. Bridges up to four voxels thick are cut;
-    cavities of the object that are closed within a slice, such as lungs, stay, and so does a rim
-    of one voxel, in which the surface fades.
+    Takes the table and the tubes away from a patient. Bridges up to four voxels thick are cut, but
+    for short stubs; cavities of the object that are closed within a slice, such as lungs, stay, and
+    so does a rim of one voxel, in which the surface fades.
 
     Raises:
         IrrcacheError: nothing thicker than four voxels lies above ``threshold``.
     """
     values = np.asarray(volume.values)
     above = values > threshold
-    cores = ndimage.binary_erosion(above, iterations=_BRIDGE)
+    # What goes on beyond the border of the volume is not thin there.
+    cores = ndimage.binary_erosion(above, iterations=_BRIDGE, border_value=1)
     labels, count = ndimage.label(cores)
     if count == 0:
         raise IrrcacheError(
@@ -97,7 +98,8 @@ def isolate(volume: VolumeData, threshold: float) -> VolumeData:
             f"{values.min():g} .. {values.max():g}); give a lower threshold"
         )
     core = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
-    kept = ndimage.binary_dilation(core, iterations=_BRIDGE) & above
+    # Twice as far as was eroded: ears and other edges that the erosion rounded off come back.
+    kept = ndimage.binary_dilation(core, iterations=2 * _BRIDGE, mask=above)
     for part in tqdm(kept, "isolating", delay=1, disable=None):
         ndimage.binary_dilation(ndimage.binary_fill_holes(part), output=part)
     return replace(volume, values=np.where(kept, values, values.min()))
@@ -138,10 +140,14 @@ def resample(volume: VolumeData, size: Size) -> VolumeData:
     if min(size) < 1:
         raise IrrcacheError(f"size {size}: give at least 1 voxel along x, y and z")
     smooth = _antialiased(volume.values, size)
+    spacing = np.array(volume.physical_size) / size
+    # The box stays; the centre of its first voxel is half a new voxel from the corner.
+    first_centre = volume.to_world @ (*(0.5 / np.array(size)), 1.0)
     return replace(
         volume,
         values=_sample_slices(smooth, size, 0, size[2]),
-        spacing=_spacing(volume, size),
+        spacing=tuple(spacing),
+        origin=tuple(first_centre[:3]),
     )
 
 
@@ -181,10 +187,6 @@ def bake(
         part = _sample_slices(smooth, fine, k * supersample, (k + 1) * supersample)
         sigma_t[k], albedo[k] = _average_blocks(*fitted.map(part), supersample)
     return resampled, sigma_t, albedo
-
-
-def _spacing(volume: VolumeData, size: Size) -> tuple[float, ...]:
-    return tuple(length / n for length, n in zip(volume.physical_size, size, strict=True))
 
 
 def _antialiased(values: np.ndarray, size: Size) -> np.ndarray:

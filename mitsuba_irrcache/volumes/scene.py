@@ -17,14 +17,13 @@ from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 
 SIGMA_T_FILE, ALBEDO_FILE, MAPPING_FILE = "sigma_t.vol", "albedo.vol", "transfer_function.json"
 _FIELD_OF_VIEW = 30.0
-_MARGIN = 1.04
+_MARGIN = 1.08
 # Views as (direction in which the camera lies, up). Medical volumes are LPS: the patient faces -y
 # with the head at +z, so the camera stands in front, a little to the patient's right and above.
 VIEWS = {
     "z": (np.array([-0.45, -1.0, 0.25]), np.array([0.0, 0.0, 1.0])),
     "y": (np.array([-0.45, 0.25, 1.0]), np.array([0.0, 1.0, 0.0])),
 }
-_CUBE_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 
 
 @dataclass(frozen=True)
@@ -105,11 +104,11 @@ def camera(volume: VolumeData, sigma_t: np.ndarray, up: str = "z") -> tuple[np.n
         raise IrrcacheError(f"up axis {up!r}: give z or y")
     towards, up_vector = VIEWS[up]
     towards = towards / np.linalg.norm(towards)
-    corners = _occupied_corners(volume, sigma_t)
-    target = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    occupied = _occupied_ends(volume, sigma_t)
+    target = 0.5 * (occupied.min(axis=0) + occupied.max(axis=0))
     right = np.cross(up_vector, towards)
     right /= np.linalg.norm(right)
-    relative = corners - target
+    relative = occupied - target
     along = relative @ towards
     aside = np.maximum(np.abs(relative @ right), np.abs(relative @ np.cross(towards, right)))
     distance = (along + _MARGIN * aside / np.tan(np.radians(_FIELD_OF_VIEW / 2))).max()
@@ -201,18 +200,16 @@ def _text(numbers: np.ndarray) -> str:
     return " ".join(f"{number:.9g}" for number in np.ravel(numbers))
 
 
-def _occupied_corners(volume: VolumeData, sigma_t: np.ndarray) -> np.ndarray:
-    """World positions ``(8, 3)`` of the corners of the smallest index box with extinction."""
+def _occupied_ends(volume: VolumeData, sigma_t: np.ndarray) -> np.ndarray:
+    """World positions ``(n, 3)`` of the first and last voxel with extinction in every row."""
     occupied = sigma_t > 0
-    ranges = []
-    for axis in (2, 1, 0):
-        others = tuple(a for a in range(3) if a != axis)
-        hit = np.flatnonzero(occupied.any(axis=others))
-        ranges.append((hit[0] - 0.5, hit[-1] + 0.5))
-    low, high = np.array(ranges).T
-    corners = low + _CUBE_CORNERS * (high - low)
+    z, y = np.nonzero(occupied.any(axis=2))
+    rows = occupied[z, y]
+    first = rows.argmax(axis=1)
+    last = rows.shape[1] - 1 - rows[:, ::-1].argmax(axis=1)
+    x, y, z = np.concatenate([first, last]), np.tile(y, 2), np.tile(z, 2)
     matrix = volume.index_to_world
-    return corners @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.stack([x, y, z], axis=1) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _is_grey(albedo: np.ndarray) -> bool:

@@ -8,7 +8,14 @@ import numpy as np
 
 from mitsuba_irrcache.volumes.phantom import anatomy
 from mitsuba_irrcache.volumes.phantom.canvas import Canvas, Tissue
-from mitsuba_irrcache.volumes.phantom.distance import Ellipsoid, Segment, Trunk, chain, smooth_curve
+from mitsuba_irrcache.volumes.phantom.distance import (
+    Ellipsoid,
+    Segment,
+    Solid,
+    Trunk,
+    chain,
+    smooth_curve,
+)
 from mitsuba_irrcache.volumes.phantom.vessels import vessel_tree
 
 PLEURA = Trunk(
@@ -91,7 +98,7 @@ HILA = {anatomy.RIGHT: (-54.0, 4.0, 180.0), anatomy.LEFT: (58.0, 15.0, 182.0)}
 
 LIVER = (
     Ellipsoid((-72, -2, 40), (72, 88, 76)),
-    Ellipsoid((8, -42, 66), (66, 40, 32), (1, -0.1, 0.15)),
+    Ellipsoid((-4, -42, 66), (54, 38, 28), (1, -0.1, 0.15)),
 )
 STOMACH = (Ellipsoid((62, -30, 58), (40, 46, 42)), Ellipsoid((40, -52, 20), (44, 30, 34)))
 STOMACH_BUBBLE = (Ellipsoid((64, -46, 72), (30, 24, 22)),)
@@ -108,13 +115,15 @@ ABDOMINAL_ORGANS = (
 
 
 def paint_cavities(canvas: Canvas) -> None:
-    """Paint the lungs above the diaphragm and the organs of the upper abdomen below it."""
+    """Paint the lungs, what parts them, and the organs of the upper abdomen."""
     region = canvas.region(PLEURA.bounds(), canvas.edge)
     walls = PLEURA.distance(region.x, region.y, region.z)
     domes = dome_distance(region.x, region.y, region.z)
     canvas.paint(region, lung_distance(walls, domes, region.y, region.z), anatomy.LUNG)
     for side in (anatomy.RIGHT, anatomy.LEFT):
         canvas.paint_solids(vessel_tree(HILA[side], _lung_points(side)), anatomy.VESSEL)
+    # The abdomen comes after the fat that rests on the diaphragm, and the heart after both.
+    canvas.paint_solids(_mediastinal_fat(), anatomy.FAT)
     abdomen = np.maximum(walls, domes, out=domes)
     abdomen += np.float32(DIAPHRAGM_THICKNESS)
     canvas.paint(region, abdomen, anatomy.FAT)
@@ -154,8 +163,7 @@ def _lung_points(side: int, count: int = 700) -> np.ndarray:
 
 
 def paint_mediastinum(canvas: Canvas) -> None:
-    """Fat between the lungs, muscle beside the spine, heart, great vessels, airways."""
-    canvas.paint_solids(_mediastinal_fat(), anatomy.FAT)
+    """Paint the muscle beside the spine, the heart, the great vessels and the airways."""
     canvas.paint_solids(_paravertebral_muscle(), anatomy.MUSCLE)
     paint_heart(canvas)
     _paint_tubes(canvas, VENAE_CAVAE, anatomy.VENOUS_BLOOD)
@@ -168,16 +176,17 @@ def paint_mediastinum(canvas: Canvas) -> None:
     _paint_tubes(canvas, airways, anatomy.AIR)
 
 
-def _mediastinal_fat() -> list[Segment]:
-    """Sheets in the median plane: thin behind the sternum, wide about the great vessels."""
-    front = chain([(0, -74, 262), (2, -84, 200), (4, -80, 120)], 6.0, 8.0, (0, 1, 0))
+def _mediastinal_fat() -> list[Solid]:
+    """Sheets in the median plane, thin behind the sternum, and a pad under the heart."""
+    front = chain([(0, -62, 268), (2, -72, 200), (4, -72, 110), (4, -68, 74)], 6.0, 20.0, (0, 1, 0))
     middle = chain(
-        [(0, -8, 298), (0, -12, 280), (0, -16, 250), (2, -16, 200), (4, -10, 150), (4, -2, 118)],
+        [(0, -8, 298), (0, -12, 280), (0, -16, 250), (2, -16, 200), (4, -10, 150), (4, -4, 80)],
         [24, 25, 27, 26, 22, 18],
         24.0,
         (0, 1, 0),
     )
-    return [*front, *middle]
+    under_heart = Ellipsoid((22, -38, 98), (58, 40, 22))
+    return [*front, *middle, under_heart]
 
 
 def _paravertebral_muscle() -> list[Segment]:

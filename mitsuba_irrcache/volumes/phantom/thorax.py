@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
 
@@ -22,7 +23,7 @@ SMALLEST_SIDE = 8
 COARSEST_SPACING = 3.0
 
 # Peak use while painting, in bytes per painted voxel.
-BYTES_PER_VOXEL = 48
+BYTES_PER_VOXEL = 40
 
 
 def thorax(shape: Sequence[int] = (350, 150, 512), memory_limit: int = 8 * 2**30) -> VolumeData:
@@ -77,8 +78,8 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, int, int]:
     return sides
 
 
-def _check_memory(shape: tuple, painted: tuple, memory_limit: int) -> None:
-    needed = BYTES_PER_VOXEL * int(np.prod(painted, dtype=object))
+def _check_memory(shape: Sequence[int], painted: Sequence[int], memory_limit: int) -> None:
+    needed = BYTES_PER_VOXEL * math.prod(painted)
     if needed > memory_limit:
         raise IrrcacheError(
             f"a phantom of shape {shape} (z, y, x) needs {needed} bytes, more than the limit of "

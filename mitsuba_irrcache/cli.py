@@ -1,0 +1,51 @@
+"""The command ``irrcache``: render, import, doctor."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+
+from .errors import IrrcacheError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit status (1: an error was printed, 130: interrupted)."""
+    args = _parser().parse_args(arguments)
+    try:
+        return args.run(args)
+    except KeyboardInterrupt:
+        print("irrcache: interrupted; no output was written", file=sys.stderr)
+        return 130
+    except IrrcacheError as error:
+        message = str(error)
+    except RuntimeError as error:  # how Mitsuba reports a scene it cannot load
+        message = _essence(str(error))
+    print(f"irrcache: error: {message.removeprefix('irrcache: ')}", file=sys.stderr)
+    return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    from . import doctor, render
+    from .volumes import importer
+
+    parser = argparse.ArgumentParser(
+        prog="irrcache", description="Irradiance caching for participating media in Mitsuba 3."
+    )
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for name, module, text in (
+        ("render", render, "render a scene with irrcache"),
+        ("import", importer, "make a scene of a CT, MR or other volume"),
+        ("doctor", doctor, "check this machine and say what to install"),
+    ):
+        command = commands.add_parser(name, help=text, description=module.__doc__)
+        module.add_arguments(command)
+        command.set_defaults(run=module.run)
+    return parser
+
+
+def _essence(text: str) -> str:
+    """Mitsuba wraps what a Python plugin raises in a traceback; the reader wants its last line."""
+    raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", text, re.MULTILINE)
+    return raised[-1] if raised else text.strip()

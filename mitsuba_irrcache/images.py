@@ -1,0 +1,49 @@
+"""Writing images: EXR with metadata and a PNG beside it, whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from .errors import IrrcacheError
+
+
+def check_output(path: str | Path) -> Path:
+    """The path of an EXR that can be written; raises IrrcacheError before any work is done for it."""
+    path = Path(path)
+    if path.suffix.lower() != ".exr":
+        raise IrrcacheError(f'the output "{path}" must end in .exr (a PNG is written beside it).')
+    if not path.parent.is_dir():
+        raise IrrcacheError(f'cannot write "{path}": the folder "{path.parent}" does not exist.')
+    if not os.access(path.parent, os.W_OK):
+        raise IrrcacheError(f'cannot write "{path}": no permission to write to "{path.parent}".')
+    return path
+
+
+def write_image(path: str | Path, image: np.ndarray, metadata: dict[str, object]) -> Path:
+    """Writes ``image`` (height, width, 1 | 3 | 4), linear radiance, to ``path`` (.exr) and as sRGB to a PNG.
+
+    ``metadata`` goes into the EXR's header under ``irrcache:``. Returns the PNG's path.
+    """
+    path = check_output(path)
+    image = np.ascontiguousarray(image, dtype=np.float32)
+    buffer = oiio.ImageBuf(image)
+    for key, value in metadata.items():
+        buffer.specmod().attribute(f"irrcache:{key}", value if isinstance(value, float | int) else str(value))
+    _write(buffer, path, oiio.FLOAT)
+    png = path.with_suffix(".png")
+    _write(oiio.ImageBufAlgo.colorconvert(buffer, "linear", "sRGB"), png, oiio.UINT8)
+    return png
+
+
+def _write(buffer: oiio.ImageBuf, path: Path, kind: oiio.BASETYPE) -> None:
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        if buffer.has_error or not buffer.write(str(temporary), kind):
+            raise IrrcacheError(f'cannot write "{path}": {buffer.geterror()}')
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,112 @@
+"""Scene files, with parameters, and with another integrator where one is asked for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import mitsuba as mi
+
+from .errors import IrrcacheError
+
+#: Properties that every volumetric path integrator shares, and that keep their meaning here.
+SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+
+
+def load_scene(
+    path: str | Path,
+    parameters: dict[str, str] | None = None,
+    integrator: str | None = None,
+) -> mi.Scene:
+    """Loads a scene XML with ``$parameters`` and gives it the ``integrator``, for example ``irrcache{step=0.5}``.
+
+    Depth, Russian roulette and visibility of emitters are taken over from the scene's own integrator, unless
+    the specification sets them. With None the scene's integrator stays as it is.
+    Raises IrrcacheError if the file is missing or has no integrator to replace.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise IrrcacheError(f'there is no scene file "{path}".')
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_file(config, str(path), **(parameters or {}))
+    with _search_path(path.parent):
+        mi.parser.transform_all(config, state)
+        if integrator is not None:
+            _replace_integrator(state, integrator, path)
+        scene = mi.parser.instantiate(config, state)
+    return scene[0] if isinstance(scene, list) else scene
+
+
+def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) -> str:
+    """Name of the integrator plugin in a scene file; "path" where it names none, as in Mitsuba."""
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_file(config, str(path), **(parameters or {}))
+    node = _integrator_node(state)
+    return "path" if node is None else node.props.plugin_name()
+
+
+def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
+    """Splits ``name`` or ``name{key=value,...}`` into the plugin's name and its properties.
+
+    Values become booleans (true, false), integers, floats or strings, whichever they look like.
+    """
+    match = re.fullmatch(r"\s*([A-Za-z_]\w*)\s*(?:\{(.*)\})?\s*", specification, re.DOTALL)
+    if match is None:
+        raise IrrcacheError(
+            f'cannot read the integrator "{specification}"; write a name, or name{{key=value,key=value}}.'
+        )
+    name, body = match.groups()
+    properties: dict[str, object] = {}
+    for item in filter(None, (part.strip() for part in (body or "").split(","))):
+        key, equals, value = item.partition("=")
+        if not equals or not key.strip():
+            raise IrrcacheError(f'cannot read "{item}" in the integrator "{specification}"; write key=value.')
+        properties[key.strip()] = _literal(value.strip())
+    return name, properties
+
+
+def _literal(text: str) -> object:
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text.strip("'\"")
+
+
+def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
+    """The scene's integrator: nodes are in the file's order, so one nested in a wrapper comes after it."""
+    return next((n for n in state.nodes if n.type == mi.ObjectType.Integrator), None)
+
+
+def _replace_integrator(state: mi.parser.ParserState, specification: str, path: Path) -> None:
+    name, properties = parse_integrator(specification)
+    node = _integrator_node(state)
+    if node is None:
+        raise IrrcacheError(
+            f'"{path}" names no integrator; add <integrator type="{name}"/> to it.'
+        )
+    inherited = {k: node.props[k] for k in SHARED_PROPERTIES if k in node.props}
+    for key in list(node.props.keys()):
+        node.props.remove_property(key)
+    node.props.set_plugin_name(name)
+    for key, value in (inherited | properties).items():
+        node.props[key] = value
+
+
+class _search_path:  # noqa: N801 (a context manager)
+    """Mitsuba looks for files of a scene beside it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = str(folder.resolve())
+
+    def __enter__(self) -> None:
+        self.saved = mi.file_resolver()
+        resolver = mi.FileResolver(self.saved)
+        resolver.prepend(self.folder)
+        mi.set_file_resolver(resolver)
+
+    def __exit__(self, *_: object) -> None:
+        mi.set_file_resolver(self.saved)

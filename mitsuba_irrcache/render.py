@@ -1,0 +1,139 @@
+"""``irrcache render``: a scene file to an EXR and a PNG."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from . import __version__
+from .errors import IrrcacheError
+from .images import check_output, write_image
+from .loading import integrator_of, load_scene
+from .runtime import require_llvm
+from .variants import SUPPORTED
+
+#: Stock integrators that ``irrcache`` stands in for when a scene names one of them.
+REPLACED = ("path", "volpath", "volpathmis", "prbvolpath")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``irrcache render``: those of the ``mitsuba`` command where it has them."""
+    parser.add_argument("scene", help="scene XML")
+    parser.add_argument("-o", "--output", help="EXR to write (default: beside the scene)")
+    parser.add_argument(
+        "-m", "--mode", default="llvm_ad_rgb", choices=SUPPORTED, help="variant (default: %(default)s)"
+    )
+    parser.add_argument(
+        "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
+        help="value of a $parameter of the scene; repeatable",
+    )  # fmt: skip
+    parser.add_argument(
+        "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
+        help="integrator to use, with properties (default: the scene's if it is irrcache, else irrcache)",
+    )  # fmt: skip
+    parser.add_argument("--spp", type=int, default=0, help="samples per pixel (default: the scene's)")
+    parser.add_argument("-s", "--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the camera samples (default: 0)")
+    parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Renders, and prints where the time went."""
+    source = Path(args.scene)
+    output = check_output(args.output or source.with_suffix(".exr"))
+    if args.spp < 0:
+        raise IrrcacheError(f"--spp is {args.spp}; it must be at least 1 (or 0 for the scene's own).")
+    if args.mode.startswith("llvm"):
+        require_llvm()
+    mi.set_variant(args.mode)
+    mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
+    seconds: dict[str, float] = {}
+    with _stopwatch(seconds, "load"):
+        parameters = _definitions(args.define)
+        if not source.is_file():
+            raise IrrcacheError(f'there is no scene file "{source}".')
+        integrator = args.integrator
+        if integrator is None and integrator_of(source, parameters) in REPLACED:
+            integrator = "irrcache"
+        scene = load_scene(source, parameters, integrator)
+    if not 0 <= args.sensor < len(scene.sensors()):
+        raise IrrcacheError(
+            f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), counted from 0."
+        )
+    image = _render(scene, args, seconds)
+    png = write_image(output, image, _describe(scene, args, seconds))
+    print(f"wrote {output} and {png}")
+    print("  ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
+    return 0
+
+
+def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]) -> np.ndarray:
+    integrator = scene.integrator()
+    if hasattr(integrator, "prepare"):
+        with _stopwatch(seconds, "cache"), progress_bar(integrator):
+            integrator.prepare(scene)
+    with _stopwatch(seconds, "projection" if "cache" in seconds else "render"):
+        image = mi.render(scene, sensor=args.sensor, seed=args.seed, spp=args.spp)
+        dr.sync_thread()
+    return np.array(image)
+
+
+@contextmanager
+def progress_bar(integrator: mi.Integrator):
+    """Shows the growth of the cache on a terminal, once it takes longer than a second."""
+    with tqdm(unit="sample", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
+
+        def advance(stage: str, done: int, total: int) -> None:
+            bar.total = total
+            bar.set_description(stage, refresh=False)
+            bar.update(done - bar.n)
+
+        integrator.progress = advance
+        try:
+            yield
+        finally:
+            integrator.progress = None
+
+
+@contextmanager
+def _stopwatch(seconds: dict[str, float], name: str):
+    started = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - started
+
+
+def _definitions(items: list[str]) -> dict[str, str]:
+    result = {}
+    for item in items:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise IrrcacheError(f'cannot read -D "{item}"; write -D name=value.')
+        result[key] = value
+    return result
+
+
+def _describe(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]) -> dict[str, object]:
+    """What made the image, for the header of the EXR."""
+    described = {
+        "version": __version__,
+        "mitsuba": metadata.version("mitsuba"),
+        "drjit": metadata.version("drjit"),
+        "variant": args.mode,
+        "scene": Path(args.scene).name,
+        "integrator": " ".join(str(scene.integrator()).split()),
+        "sensor": args.sensor,
+        "seed": args.seed,
+        "spp": args.spp or scene.sensors()[args.sensor].sampler().sample_count(),
+    }
+    cache = getattr(scene.integrator(), "cache", None)
+    if cache is not None:
+        described["cache"] = f"{'x'.join(map(str, cache.grid.shape[::-1]))} voxels, {cache.samples} samples"
+    return described | {f"seconds_{name}": value for name, value in seconds.items()}
