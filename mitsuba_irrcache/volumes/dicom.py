@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
+import SimpleITK
 from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError
@@ -35,7 +35,7 @@ def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> V
     """
     folder = Path(folder)
     uid = _choose_series(folder, series)
-    files = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), uid)
+    files = _series_files(folder, uid)
     if len(files) < 2:
         raise IrrcacheError(
             f"series {uid} in {folder} has {len(files)} slice; a volume needs at least 2"
@@ -48,7 +48,7 @@ def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> V
     stack = positions[-1] - positions[0]
     image = _read_slices([files[i] for i in order], folder)
     return VolumeData(
-        values=sitk.GetArrayFromImage(image),
+        values=SimpleITK.GetArrayFromImage(image),
         spacing=(*image.GetSpacing()[:2], np.linalg.norm(stack) / (len(files) - 1)),
         origin=tuple(positions[0]),
         direction=np.stack([row, column, stack / np.linalg.norm(stack)], axis=1),
@@ -59,7 +59,7 @@ def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> V
 
 def _choose_series(folder: Path, series: str | None) -> str:
     """The UID of the one series there is, or of the one asked for."""
-    found = sitk.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
+    found = SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     if not found:
         raise IrrcacheError(
             f"folder {folder} has no DICOM series; give the folder that holds the slices itself"
@@ -68,15 +68,18 @@ def _choose_series(folder: Path, series: str | None) -> str:
         return series
     if series is None and len(found) == 1:
         return found[0]
-    counts = (len(sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), f)) for f in found)
-    listing = "; ".join(f"{f} ({n} slices)" for f, n in zip(found, counts, strict=True))
+    listing = "; ".join(f"{f} ({len(_series_files(folder, f))} slices)" for f in found)
     wanted = "several series" if series is None else f"no series {series}"
     raise IrrcacheError(f"folder {folder} has {wanted}: choose one with --series UID: {listing}")
 
 
+def _series_files(folder: Path, uid: str) -> tuple[str, ...]:
+    return SimpleITK.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), uid)
+
+
 def _slice_placement(files: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, str]:
     """Positions ``(slice, 3)``, the orientation common to all (6,), and the modality."""
-    reader = sitk.ImageFileReader()
+    reader = SimpleITK.ImageFileReader()
     positions, orientations, modality = [], [], ""
     for file in tqdm(files, "reading DICOM headers", delay=1, disable=None):
         reader.SetFileName(file)
@@ -125,8 +128,8 @@ def _check_gaps(folder: Path, positions: np.ndarray, normal: np.ndarray) -> None
     )
 
 
-def _read_slices(files: list[str], folder: Path) -> sitk.Image:
-    reader = sitk.ImageSeriesReader()
+def _read_slices(files: list[str], folder: Path) -> SimpleITK.Image:
+    reader = SimpleITK.ImageSeriesReader()
     reader.SetFileNames(files)
     try:
         image = reader.Execute()

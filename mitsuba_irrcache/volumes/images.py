@@ -9,7 +9,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
+import SimpleITK
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
@@ -22,16 +22,16 @@ _COMPRESSED = re.compile(
 )
 _DETACHED = re.compile(rb"^(?:data ?file:\s*|ElementDataFile\s*=\s*)(.+?)\s*$", re.I | re.M)
 _COMPONENT_BYTES = {
-    sitk.sitkUInt8: 1,
-    sitk.sitkInt8: 1,
-    sitk.sitkUInt16: 2,
-    sitk.sitkInt16: 2,
-    sitk.sitkUInt32: 4,
-    sitk.sitkInt32: 4,
-    sitk.sitkUInt64: 8,
-    sitk.sitkInt64: 8,
-    sitk.sitkFloat32: 4,
-    sitk.sitkFloat64: 8,
+    SimpleITK.sitkUInt8: 1,
+    SimpleITK.sitkInt8: 1,
+    SimpleITK.sitkUInt16: 2,
+    SimpleITK.sitkInt16: 2,
+    SimpleITK.sitkUInt32: 4,
+    SimpleITK.sitkInt32: 4,
+    SimpleITK.sitkUInt64: 8,
+    SimpleITK.sitkInt64: 8,
+    SimpleITK.sitkFloat32: 4,
+    SimpleITK.sitkFloat64: 8,
 }
 
 
@@ -45,7 +45,7 @@ def read_image(path: str | os.PathLike) -> VolumeData:
     path = Path(path)
     if not path.is_file():
         raise IrrcacheError(f"volume file {path} does not exist")
-    reader = sitk.ImageFileReader()
+    reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
     try:
         reader.ReadImageInformation()
@@ -60,7 +60,7 @@ def read_image(path: str | os.PathLike) -> VolumeData:
     if image.GetDimension() == 4:
         image = image[..., 0]
     return VolumeData(
-        values=sitk.GetArrayFromImage(image),
+        values=SimpleITK.GetArrayFromImage(image),
         spacing=image.GetSpacing(),
         origin=image.GetOrigin(),
         direction=np.array(image.GetDirection()).reshape(3, 3),
@@ -68,7 +68,7 @@ def read_image(path: str | os.PathLike) -> VolumeData:
     )
 
 
-def _check_scalar_volume(path: Path, reader: sitk.ImageFileReader) -> None:
+def _check_scalar_volume(path: Path, reader: SimpleITK.ImageFileReader) -> None:
     size = reader.GetSize()
     if len(size) < 3 or (len(size) == 3 and size[2] == 1):
         raise IrrcacheError(
@@ -82,7 +82,7 @@ def _check_scalar_volume(path: Path, reader: sitk.ImageFileReader) -> None:
         )
 
 
-def _image_bytes(path: Path, reader: sitk.ImageFileReader) -> int:
+def _image_bytes(path: Path, reader: SimpleITK.ImageFileReader) -> int:
     """Bytes of the voxels as stored; SimpleITK reports the type after rescaling, so ask NIfTI."""
     count = int(np.prod(reader.GetSize(), dtype=object))
     if reader.HasMetaDataKey("bitpix"):

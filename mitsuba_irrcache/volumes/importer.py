@@ -104,7 +104,12 @@ def _add_processing(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--rescale", type=_numbers, metavar="SLOPE,INTERCEPT", help="to Hounsfield units, say"
     )
-    group.add_argument("--clip", type=_interval, metavar="A:B", help="limit the values to A..B; write --clip=-100:500 where A is negative")
+    group.add_argument(
+        "--clip",
+        type=_interval,
+        metavar="A:B",
+        help="limit the values to A..B; write --clip=-100:500 where A is negative",
+    )
     group.add_argument(
         "--isolate",
         type=_finite,
@@ -242,7 +247,7 @@ def _summary(
         f"sigma_t        0 .. {sigma_t.max():.4g} per unit length, {empty:.1%} of voxels empty",
         f"albedo         {albedo.min():.3g} .. {albedo.max():.3g}",
         "optical depth  at most " + ", ".join(f"{d:.3g}" for d in depths) + " along x, y, z",
-        f"written        {written / 1e6:.1f} MB to {output}",
+        f"written        {written / 1e6:,.2f} MB to {output}",
     ]
     return "\n".join(lines)
 

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.volumes.staging import staged_file
+from mitsuba_irrcache.files import atomic_write
 
 _HEADER = struct.Struct("<3sB5i6f")
 _VERSION = 3
@@ -70,7 +70,7 @@ def write_vol(
     z, y, x, channels = array.shape
     corners = np.asarray(bbox, dtype=np.float32).reshape(6)
     header = _HEADER.pack(b"VOL", _VERSION, _FLOAT32, x, y, z, channels, *corners)
-    with staged_file(path) as stream:
+    with atomic_write(path) as stream:
         stream.write(header)
         for index in tqdm(range(z), f"writing {Path(path).name}", delay=1, disable=None):
             part = np.ascontiguousarray(array[index], dtype="<f4")

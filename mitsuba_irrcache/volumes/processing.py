@@ -81,8 +81,8 @@ def isolate(volume: VolumeData, threshold: float) -> VolumeData:
     """Keep the largest connected object above ``threshold``, all else becomes the least value.
 
     Takes the table and the tubes away from a patient. Bridges up to four voxels thick are cut, but
-    for short stubs; cavities of the object that are closed within a slice, such as lungs, stay, and
-    so does a rim of one voxel, in which the surface fades.
+    for stubs of four; cavities of the object that are closed within a slice, such as lungs, stay,
+    and so does a rim of one voxel, in which the surface fades.
 
     Raises:
         IrrcacheError: nothing thicker than four voxels lies above ``threshold``.
@@ -160,10 +160,10 @@ def bake(
     """Turn a volume into the grids of a medium, of ``size`` voxels (x, y, z).
 
     A medium's grids hold extinction, so a transfer function acts *before* the renderer
-    interpolates. Where it is steep, between soft tissue and bone, the interpolated extinction is not
-    that of the interpolated value: thin bone gets blurred and thicker. ``supersample`` = k applies
-    it at k times the resolution and averages the results, in blocks of k^3: extinction by volume,
-    albedo weighted by extinction.
+    interpolates. Where it is steep, between soft tissue and bone, the interpolated extinction is
+    not that of the interpolated value: thin bone gets blurred and thicker. ``supersample`` = k
+    applies it at k times the resolution and averages the results, in blocks of k^3: extinction by
+    volume, albedo weighted by extinction.
 
     Returns:
         the volume resampled to ``size`` (``volume`` itself where nothing changes), extinction

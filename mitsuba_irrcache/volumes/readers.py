@@ -43,7 +43,9 @@ def read_volume(
     return replace(volume, values=_finite(volume, replace_nan))
 
 
-def _read(path: PathLike | Sequence[PathLike], raw: RawLayout | None, series: str | None):
+def _read(
+    path: PathLike | Sequence[PathLike], raw: RawLayout | None, series: str | None
+) -> VolumeData:
     paths = _expand(path)
     if raw is not None:
         return read_raw(paths[0], raw) if len(paths) == 1 else read_raw_slices(paths, raw)
@@ -97,9 +99,7 @@ def _read_mitsuba(path: Path) -> VolumeData:
             "use it in a scene as it is"
         )
     spacing = (high - low) / values.shape[2::-1]
-    return VolumeData(
-        values[..., 0], tuple(spacing), tuple(low + 0.5 * spacing), source=str(path)
-    )
+    return VolumeData(values[..., 0], tuple(spacing), tuple(low + 0.5 * spacing), source=str(path))
 
 
 def _finite(volume: VolumeData, replacement: float | None) -> np.ndarray:

@@ -115,13 +115,9 @@ def camera(volume: VolumeData, sigma_t: np.ndarray, up: str = "z") -> tuple[np.n
     return target + distance * towards, target, up_vector
 
 
-def scene_xml(
-    to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: SceneSettings
-) -> str:
+def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: SceneSettings) -> str:
     """The scene; ``to_world`` places the unit cube of the grids, ``view`` is as from ``camera``."""
-    # Mitsuba's cube is [-1, 1]^3, a grid's [0, 1]^3.
-    cube_to_unit = np.diag([0.5, 0.5, 0.5, 1.0])
-    cube_to_unit[:3, 3] = 0.5
+    grid, boundary = _text(to_world), _text(_boundary_to_world(to_world))
     origin, target, up = (_text(vector) for vector in view)
     far = 10 * float(np.linalg.norm(np.subtract(view[0], view[1])))
     defaults = {
@@ -166,27 +162,39 @@ def scene_xml(
         <rgb name="radiance" value="$radiance, $radiance, $radiance"/>
     </emitter>
 
-    <!-- Lengths are in the units of the data (mm for medical volumes), extinction is per length. -->
+    <!-- Lengths are in the units of the data (mm for medical volumes), extinction in 1/length. -->
     <medium type="heterogeneous" id="volume">
         <volume name="sigma_t" type="gridvolume">
             <string name="filename" value={quoteattr(SIGMA_T_FILE)}/>
-            <transform name="to_world"><matrix value="{_text(to_world)}"/></transform>
+            <transform name="to_world"><matrix value="{grid}"/></transform>
         </volume>
         <volume name="albedo" type="gridvolume">
             <string name="filename" value={quoteattr(ALBEDO_FILE)}/>
-            <transform name="to_world"><matrix value="{_text(to_world)}"/></transform>
+            <transform name="to_world"><matrix value="{grid}"/></transform>
         </volume>
         <float name="scale" value="$scale"/>
         <phase type="isotropic"/>
     </medium>
 
     <shape type="cube">
-        <transform name="to_world"><matrix value="{_text(to_world @ cube_to_unit)}"/></transform>
+        <transform name="to_world"><matrix value="{boundary}"/></transform>
         <bsdf type="null"/>
         <ref name="interior" id="volume"/>
     </shape>
 </scene>
 """
+
+
+def _boundary_to_world(to_world: np.ndarray) -> np.ndarray:
+    """Placement of Mitsuba's ``cube``, which is ``[-1, 1]^3``, around a grid in ``[0, 1]^3``.
+
+    A mirrored cube has its normals inside, and Mitsuba then takes the outside for the medium. The
+    cube is symmetric, so a mirrored grid gets a boundary mirrored once more.
+    """
+    handedness = np.sign(np.linalg.det(to_world[:3, :3]))
+    cube_to_unit = np.diag([0.5 * handedness, 0.5, 0.5, 1.0])
+    cube_to_unit[:3, 3] = 0.5
+    return to_world @ cube_to_unit
 
 
 def _default_lines(defaults: dict[str, object]) -> str:

@@ -1,4 +1,4 @@
-"""Results appear whole or not at all: they are built under a temporary name and then renamed."""
+"""Folders appear whole or not at all: they are built under a temporary name and then renamed."""
 
 from __future__ import annotations
 
@@ -8,30 +8,8 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
 
 from mitsuba_irrcache.errors import IrrcacheError
-
-
-@contextmanager
-def staged_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
-    """A binary stream whose content replaces ``path`` when the block ends without an exception.
-
-    Raises:
-        IrrcacheError: the folder of ``path`` does not exist.
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise IrrcacheError(f"cannot write {path}: folder {path.parent} does not exist; create it")
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            yield stream
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
 
 
 @contextmanager
@@ -129,15 +107,11 @@ def _check_replaceable(folder: Path, names: set[str], overwrite: bool) -> None:
 @contextmanager
 def _temporary_beside(path: Path) -> Iterator[Path]:
     """A folder on the same file system as ``path`` (renames stay atomic), removed in any case."""
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    except OSError as error:
+        raise IrrcacheError(f"cannot write to {path.parent}: {error.strerror}") from error
     try:
         yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _umask() -> int:
-    """The process's file mode mask, which ``mkstemp`` does not apply."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -25,19 +25,19 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, replace
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.volumes.staging import staged_file
+from mitsuba_irrcache.files import atomic_write
 
 FORMAT = "irrcache transfer function"
 VERSION = 1
 _REQUIRED = {"format", "version", "opacity", "colour"}
 _KEYS = _REQUIRED | {"description", "unit", "value_range", "percentiles", "length"}
+_PRESETS = Path(__file__).parent / "presets"
 _MAX_TABLE = 1 << 16
 _MAX_PERCENTILE_SAMPLES = 10_000_000
 
@@ -158,7 +158,7 @@ class TransferFunction:
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the JSON file, atomically."""
-        with staged_file(path) as stream:
+        with atomic_write(path) as stream:
             stream.write(self.to_json().encode())
 
 
@@ -282,7 +282,7 @@ def parse_transfer_function(text: str) -> TransferFunction:
 
 def preset_names() -> list[str]:
     """Names of the presets that come with the package, sorted."""
-    return sorted(p.name[:-5] for p in _presets().iterdir() if p.name.endswith(".json"))
+    return sorted(p.stem for p in _PRESETS.glob("*.json"))
 
 
 def load_preset(name: str) -> TransferFunction:
@@ -293,11 +293,7 @@ def load_preset(name: str) -> TransferFunction:
     """
     if name not in preset_names():
         raise IrrcacheError(f"no preset {name!r}; choose one of {', '.join(preset_names())}")
-    return parse_transfer_function((_presets() / f"{name}.json").read_text(encoding="utf-8"))
-
-
-def _presets() -> resources.abc.Traversable:
-    return resources.files("mitsuba_irrcache.volumes") / "presets"
+    return parse_transfer_function((_PRESETS / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def _check_keys(document: object) -> None:
@@ -311,7 +307,7 @@ def _check_keys(document: object) -> None:
         raise IrrcacheError(f'the key "{missing[0]}" is missing; add it')
     if document["format"] != FORMAT or document["version"] != VERSION:
         raise IrrcacheError(
-            f'format {document["format"]!r} version {document["version"]!r}; '
+            f"format {document['format']!r} version {document['version']!r}; "
             f"this is read: {FORMAT!r} version {VERSION}"
         )
 
@@ -366,8 +362,8 @@ def _check_values(key: str, values: np.ndarray) -> None:
     if unsorted.size:
         index = int(unsorted[0]) + 1
         raise IrrcacheError(
-            f'"{key}" point {index} has value {values[index]:g}, not above the {values[index - 1]:g}'
-            " before it; sort the points by value, each value once"
+            f'"{key}" point {index} has value {values[index]:g}, not above '
+            f"{values[index - 1]:g} before it; sort the points by value, each value once"
         )
 
 

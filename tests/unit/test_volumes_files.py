@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import SimpleITK as sitk
+import SimpleITK
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -40,11 +40,11 @@ def ramp(dtype="int16") -> np.ndarray:
 
 
 def write_image(path: Path, values: np.ndarray, compress: bool = False) -> Path:
-    image = sitk.GetImageFromArray(values)
+    image = SimpleITK.GetImageFromArray(values)
     image.SetSpacing(SPACING)
     image.SetOrigin(ORIGIN)
     image.SetDirection(DIRECTION.ravel())
-    sitk.WriteImage(image, str(path), useCompression=compress)
+    SimpleITK.WriteImage(image, str(path), useCompression=compress)
     return path
 
 
@@ -54,10 +54,10 @@ def write_dicom(folder: Path, positions, uid="1.2.826.0.1.9", tag="a", shear=0.0
     File names do not follow the positions.
     """
     folder.mkdir(exist_ok=True)
-    writer = sitk.ImageFileWriter()
+    writer = SimpleITK.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
     for index, position in enumerate(positions):
-        image = sitk.GetImageFromArray(np.full((6, 5), 20 * position, dtype=np.int16))
+        image = SimpleITK.GetImageFromArray(np.full((6, 5), 20 * position, dtype=np.int16))
         image.SetSpacing(SPACING[:2])
         tags = {
             "0008|0060": "CT",
@@ -94,7 +94,7 @@ def test_unit_cube_and_voxel_centres_agree():
     [{"spacing": (1, 0, 1)}, {"spacing": (1, np.nan, 1)}, {"direction": np.ones((3, 3))}],
 )
 def test_impossible_placement_is_refused(changes):
-    with pytest.raises(IrrcacheError, match="spacing|direction"):
+    with pytest.raises(IrrcacheError, match=r"spacing|direction"):
         VolumeData(ramp(), **changes)
 
 
@@ -152,7 +152,7 @@ def test_two_series_are_named_and_can_be_chosen(tmp_path):
     for part in ("1.2.3.10 (3 slices)", "1.2.3.20 (4 slices)", "--series"):
         assert part in str(error.value)
     assert read_volume(tmp_path / "ct", series="1.2.3.20").size == (5, 6, 4)
-    with pytest.raises(IrrcacheError, match="no series 9.9"):
+    with pytest.raises(IrrcacheError, match=r"no series 9.9"):
         read_volume(tmp_path / "ct", series="9.9")
 
 
@@ -197,13 +197,13 @@ def test_raw_slices_are_in_natural_order(tmp_path):
 
 def test_missing_raw_slice_is_named(tmp_path):
     write_slices(tmp_path, [1, 2, 3, 5, 6])
-    with pytest.raises(IrrcacheError, match="between head.3 and head.5"):
+    with pytest.raises(IrrcacheError, match=r"between head.3 and head.5"):
         read_volume(tmp_path / "head.*", raw=RawLayout((5, 4, 5), "uint16", "big"))
 
 
 def test_wrong_number_of_raw_slices(tmp_path):
     write_slices(tmp_path, range(4))
-    with pytest.raises(IrrcacheError, match="4 slice files.*asks for 5"):
+    with pytest.raises(IrrcacheError, match=r"4 slice files.*asks for 5"):
         read_volume(tmp_path / "head.*", raw=RawLayout((5, 4, 5), "uint16", "big"))
 
 
@@ -346,8 +346,8 @@ def test_nan_is_counted_and_located_or_replaced(tmp_path):
     ],
 )
 def test_what_is_no_volume_is_refused(tmp_path, values, message):
-    image = sitk.GetImageFromArray(values, isVector=False)
-    sitk.WriteImage(image, str(tmp_path / "a.nrrd"))
+    image = SimpleITK.GetImageFromArray(values, isVector=False)
+    SimpleITK.WriteImage(image, str(tmp_path / "a.nrrd"))
     with pytest.raises(IrrcacheError, match=message):
         read_volume(tmp_path / "a.nrrd")
 
@@ -361,6 +361,7 @@ def test_unsupported_extension_is_named(tmp_path):
 # Data of others
 
 
+@pytest.mark.data
 def test_oblique_head_is_placed_as_its_affine_says():
     """The NIfTI affine (RAS) with x and y negated (LPS) is ``index_to_world``."""
     path = data_folder() / "niivue_ct" / "CT_pitch.nii.gz"
@@ -371,6 +372,7 @@ def test_oblique_head_is_placed_as_its_affine_says():
     np.testing.assert_allclose(read_volume(path).index_to_world[:3], affine, atol=1e-3)
 
 
+@pytest.mark.data
 def test_unc_head_is_read_in_order():
     volume = read_volume(
         data_folder() / "unc_cthead" / "CThead.*",

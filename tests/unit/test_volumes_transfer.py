@@ -61,9 +61,7 @@ def test_values_too_far_apart_for_a_table():
     np.testing.assert_array_equal(parse().apply(values)[0], parse().sigma_t(values))
 
 
-@given(
-    scale=st.floats(1e-3, 1e3), shift=st.floats(-1e3, 1e3), seed=st.integers(0, 2**16)
-)
+@given(scale=st.floats(1e-3, 1e3), shift=st.floats(-1e3, 1e3), seed=st.integers(0, 2**16))
 @settings(max_examples=25, deadline=None)
 def test_percentile_functions_do_not_care_about_units(scale, shift, seed):
     function = parse(
@@ -126,15 +124,15 @@ def test_missing_key_is_named():
 
 @pytest.mark.parametrize("text", ["", "[]", "{not json", "3"])
 def test_no_json_object(text):
-    with pytest.raises(IrrcacheError, match="JSON|object"):
+    with pytest.raises(IrrcacheError, match=r"JSON|object"):
         parse_transfer_function(text)
 
 
 def test_file_is_named_in_errors(tmp_path):
-    with pytest.raises(IrrcacheError, match="bone.json does not exist"):
+    with pytest.raises(IrrcacheError, match=r"bone.json does not exist"):
         load_transfer_function(tmp_path / "bone.json")
     (tmp_path / "bone.json").write_bytes(b"\xff\xfe")
-    with pytest.raises(IrrcacheError, match="bone.json"):
+    with pytest.raises(IrrcacheError, match=r"bone.json"):
         load_transfer_function(tmp_path / "bone.json")
 
 
@@ -174,11 +172,11 @@ def test_density_is_scaled():
 
 def test_negative_density_is_refused():
     values = np.array([[[1.0, -0.5], [-2.0, 3.0]]])
-    with pytest.raises(IrrcacheError, match="2 densities are negative, the least -2.*--clip"):
+    with pytest.raises(IrrcacheError, match=r"2 densities are negative, the least -2.*--clip"):
         DensityMapping().apply(values)
 
 
 @pytest.mark.parametrize("arguments", [(-1.0,), (math.inf,), (1.0, (0.5, 0.5, 1.2))])
 def test_impossible_density_mapping(arguments):
-    with pytest.raises(IrrcacheError, match="scale|albedo"):
+    with pytest.raises(IrrcacheError, match=r"scale|albedo"):
         DensityMapping(*arguments)
