@@ -13,7 +13,7 @@ help: ## show this list
 setup: $(READY) ## install the package, what it needs, and an LLVM that Dr.Jit can use, into .venv
 
 demo: setup ## render a chest with irrcache and compare it with volpath
-	$(BIN)/python experiments/demo/run.py
+	$(BIN)/python -m experiments.demo.run
 
 test: setup ## run the tests
 	$(BIN)/python -m pytest

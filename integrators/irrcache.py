@@ -1,4 +1,6 @@
-"""The integrator plugin ``irrcache``. Executed anew for every variant, since its base class belongs to one."""
+"""The integrator plugin ``irrcache``. Executed anew for every variant, since its base class belongs
+to one.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,7 @@ FILTERS = ("none",)
 
 
 class IrradianceCachingIntegrator(mi.SamplingIntegrator):
-    r"""
-    .. _integrator-irrcache:
+    r""".. _integrator-irrcache:
 
     Irradiance caching for participating media (:monosp:`irrcache`)
     ---------------------------------------------------------------
@@ -40,17 +41,19 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - Hide directly visible emitters. (Default: no, i.e. |false|)
 
      * - solver
-       - |string|
-       - How the cache is computed: ``path`` (Monte Carlo at every voxel) or ``auto``. (Default: ``auto``)
+       - |string| - How the cache is computed: ``path`` (Monte Carlo at every voxel) or ``auto``.
+       (Default: ``auto``)
 
      * - resolution
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
-         0: half the data's resolution, within 32 to 96. (Default: 0)
+         0: that of the data, at most 128; two per mean free path, 32 to 96, in a
+         homogeneous medium. (Default: 0)
 
      * - cache_spp
        - |int|
-       - Samples per cache voxel, rounded up to a multiple of 8. (Default: 64)
+       - Samples per cache voxel, rounded up to a multiple of 8;
+         0: 16 to 256, about 2^24 for all voxels together. (Default: 0)
 
      * - cache_seed
        - |int|
@@ -74,14 +77,15 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - Load the cache from this file if it is there, write it when it was computed. A file
          of another scene is refused. (Default: none)
 
-    Computes the irradiance (fluence rate) that reaches every point of an isotropically scattering medium once,
-    independently of the camera, and integrates the radiative transfer equation along camera rays from it. A moved
-    camera, another film or another seed reuse the cache; an edited medium or emitter renews it. The image is
-    consistent, not unbiased: it converges to ``volpath``'s as ``resolution`` and ``cache_spp`` grow and ``step`` falls.
+    Computes the irradiance (fluence rate) that reaches every point of an isotropically scattering
+    medium once, independently of the camera, and integrates the radiative transfer equation along
+    camera rays from it. A moved camera, another film or another seed reuse the cache; an edited
+    medium or emitter renews it. The image is consistent, not unbiased: it converges to
+    ``volpath``'s as ``resolution`` and ``cache_spp`` grow and ``step`` falls.
 
-    One medium (``heterogeneous`` or ``homogeneous``, isotropic phase function) in a box or sphere with a null BSDF,
-    and emitters that are not surfaces, are supported; whatever else is refused by name. A scene without media is
-    rendered by ``volpath``.
+    One medium (``heterogeneous`` or ``homogeneous``, isotropic phase function) in a box or sphere
+    with a null BSDF, and emitters that are not surfaces, are supported; whatever else is refused by
+    name. A scene without media is rendered by ``volpath``.
 
     .. tabs::
         .. code-tab:: xml
@@ -106,7 +110,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             rr_depth=_integer(props, "rr_depth", 5, 1, "at least 1"),
             solver=_choice(props, "solver", "auto", SOLVERS),
             resolution=_integer(props, "resolution", 0, 0, "0 (chosen) or a number of voxels"),
-            samples=_integer(props, "cache_spp", 64, 1, "at least 1"),
+            samples=_integer(props, "cache_spp", 0, 0, "0 (chosen) or a number of samples"),
             seed=_integer(props, "cache_seed", 0, 0, "at least 0"),
             file=str(props.get("cache_file", "")),
         )
@@ -125,7 +129,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     @property
     def cache(self) -> IrradianceCache | None:
-        """The irradiance cache of the last scene rendered; None before, and where none is needed."""
+        """The irradiance cache of the last scene rendered; None before, and where none is
+        needed.
+        """
         return self._builder.cache
 
     def prepare(self, scene: mi.Scene) -> None:
@@ -146,7 +152,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-        """Radiance along ``ray``, for wrappers such as ``aov``; alpha is rounded at random to be a mask."""
+        """Radiance along ``ray``, for wrappers such as ``aov``; alpha is rounded at random to be a
+        mask.
+        """
         self.prepare(scene)
         if self._projection is None:
             return self._fallback().sample(scene, sampler, ray, medium, active)
@@ -195,7 +203,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         ray = mi.Ray3f(ray)
         background = mi.Spectrum(0)
         environment = scene.environment()
-        visible = environment is not None and not self._hide_emitters and self._settings.max_depth != 0
+        visible = (
+            environment is not None and not self._hide_emitters and self._settings.max_depth != 0
+        )
         if visible:
             escaped = dr.zeros(mi.SurfaceInteraction3f)
             escaped.wi = -ray.d
@@ -227,10 +237,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def to_string(self) -> str:
         s = self._settings
         return (
-            f"IrradianceCachingIntegrator[\n  max_depth = {s.max_depth},\n  rr_depth = {s.rr_depth},\n"
+            f"IrradianceCachingIntegrator[\n  max_depth = {s.max_depth},\n  rr_depth = "
+            f"{s.rr_depth},\n"
             f"  hide_emitters = {str(self._hide_emitters).lower()},\n  solver = {s.solver},\n"
-            f"  resolution = {s.resolution},\n  cache_spp = {s.samples},\n  cache_seed = {s.seed},\n"
-            f"  quadrature = {self._quadrature},\n  step = {self._step:g},\n  filter = {self._filter},\n"
+            f"  resolution = {s.resolution},\n  cache_spp = {s.samples},\n  cache_seed = "
+            f"{s.seed},\n"
+            f"  quadrature = {self._quadrature},\n  step = {self._step:g},\n  filter = "
+            f"{self._filter},\n"
             f'  cache_file = "{s.file}"\n]'
         )
 
@@ -245,7 +258,9 @@ def _integer(props: mi.Properties, name: str, default: int, least: int, wanted: 
 def _choice(props: mi.Properties, name: str, default: str, choices: tuple[str, ...]) -> str:
     value = props.get(name, default)
     if value not in choices:
-        raise IrrcacheError(f"irrcache: {name} is {value!r}; it must be one of: {', '.join(choices)}.")
+        raise IrrcacheError(
+            f"irrcache: {name} is {value!r}; it must be one of: {', '.join(choices)}."
+        )
     return value
 
 

@@ -1,7 +1,8 @@
 """Registers the plugins for every variant that is set, before or after this package is imported.
 
-A plugin's class derives from a base class of one variant, so its file is executed anew for each. Mitsuba 3.10
-finds this module by the entry point group ``mitsuba`` and reloads it; on 3.9 a callback does the same.
+A plugin's class derives from a base class of one variant, so its file is executed anew for each.
+Mitsuba 3.10 finds this module by the entry point group ``mitsuba`` and reloads it; on 3.9 a
+callback does the same.
 """
 
 from __future__ import annotations

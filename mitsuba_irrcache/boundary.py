@@ -1,7 +1,8 @@
 """The convex bounding shape of a medium, intersected in closed form.
 
-No ray ever starts on the boundary by way of an epsilon, so nothing here depends on the scene's scale or
-position. Boxes may be placed by any affine map; they are recognised from their mesh, whatever plugin made it.
+No ray ever starts on the boundary by way of an epsilon, so nothing here depends on the scene's
+scale or position. Boxes may be placed by any affine map; they are recognised from their mesh,
+whatever plugin made it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from .grid import Affine
 
 
 class Boundary:
-    """The image of the cube [-1, 1]^3 (``kind="box"``) or of the unit sphere (``"sphere"``) under ``to_world``."""
+    """The image of the cube [-1, 1]^3 (``kind="box"``) or of the unit sphere (``"sphere"``) under
+    ``to_world``.
+    """
 
     def __init__(self, kind: str, to_world: np.ndarray) -> None:
         self.kind = kind
@@ -31,14 +34,18 @@ class Boundary:
         return self.to_world @ unit
 
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Whether the ray's line meets the inside, and the distances of entry and exit (entry < 0: from within)."""
+        """Whether the ray's line meets the inside, and the distances of entry and exit (entry < 0:
+        from within).
+        """
         origin = self._to_local.point(ray.o)
         direction = self._to_local.vector(ray.d)
         return _slabs(origin, direction) if self.kind == "box" else _sphere(origin, direction)
 
 
 def _slabs(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-    """The cube [-1, 1]^3. Directions in a face are handled by a reciprocal that is never infinite."""
+    """The cube [-1, 1]^3. Directions in a face are handled by a reciprocal that is never
+    infinite.
+    """
     rcp = safe_rcp(d)
     lower, upper = (-1.0 - o) * rcp, (1.0 - o) * rcp
     near = dr.max(dr.minimum(lower, upper))
@@ -47,7 +54,9 @@ def _slabs(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
 
 
 def _sphere(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-    """The unit sphere; the closest approach is found first, which keeps far away cameras accurate."""
+    """The unit sphere; the closest approach is found first, which keeps far away cameras
+    accurate.
+    """
     rcp_length = dr.rsqrt(dr.squared_norm(d))
     direction = d * rcp_length
     middle = -dr.dot(o, direction)
@@ -62,27 +71,49 @@ def safe_rcp(d: mi.Vector3f) -> mi.Vector3f:
     return dr.rcp(dr.select(dr.abs(d) > 1e-20, d, dr.mulsign(mi.Vector3f(1e-20), d)))
 
 
-def boundary_of(shape: mi.Shape) -> Boundary:
-    """The boundary that ``shape`` describes: a sphere or any box (cube plugin or mesh, whatever its placement).
+def boundary_of(scene: mi.Scene, shape: mi.Shape) -> Boundary:
+    """The boundary that ``shape`` describes: a sphere or any box (cube plugin or mesh, whatever its
+    placement).
 
-    Raises UnsupportedSceneError for every other shape.
+    Raises UnsupportedSceneError for every other shape, and for one whose normals point inwards:
+    there Mitsuba takes the whole outside for the interior medium (a cube mirrored by its
+    ``to_world`` is such a case).
     """
+    boundary = None
     if shape.class_name() == "Sphere":
-        return Boundary("sphere", np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4))
-    if shape.is_mesh():
-        vertices = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-        frame = _box_frame(vertices)
-        if frame is not None:
-            return Boundary("box", frame)
-    raise UnsupportedSceneError(
-        f'irrcache: the medium is bounded by shape "{shape.id()}" ({shape.class_name()}), but only boxes '
-        "(a cube with any to_world, or a mesh of that form) and spheres are supported so far; "
-        'bound the medium by a cube, or render this scene with "volpath".'
-    )
+        matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64)
+        boundary = Boundary("sphere", matrix.reshape(4, 4))
+    elif shape.is_mesh():
+        vertices = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64)
+        frame = _box_frame(vertices.reshape(-1, 3))
+        boundary = None if frame is None else Boundary("box", frame)
+    name = f'shape "{shape.id()}" ({shape.class_name()})'
+    if boundary is None:
+        raise UnsupportedSceneError(
+            f"irrcache: the medium is bounded by {name}, but only boxes (a cube with any to_world, "
+            "or a mesh of that "
+            'form) and spheres are supported so far; bound the medium by a cube, or use "volpath".'
+        )
+    if _normal_points_inwards(scene, boundary):
+        raise UnsupportedSceneError(
+            f"irrcache: the normals of {name} point inwards, so Mitsuba puts its interior medium "
+            "outside of it; "
+            "mirror its to_world once more (or drop flip_normals)."
+        )
+    return boundary
+
+
+def _normal_points_inwards(scene: mi.Scene, boundary: Boundary) -> bool:
+    center = mi.Point3f(*(float(v) for v in boundary.to_world[:3, 3]))
+    direction = dr.normalize(mi.Vector3f(*(float(v) for v in boundary.to_world[:3, 0])))
+    hit = scene.ray_intersect(mi.Ray3f(center, direction))
+    return bool((hit.is_valid() & (dr.dot(hit.n, direction) < 0))[0])
 
 
 def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
-    """The affine map of [-1, 1]^3 onto the box with these vertices, or None if they do not form one."""
+    """The affine map of [-1, 1]^3 onto the box with these vertices, or None if they do not form
+    one.
+    """
     size = np.ptp(vertices, axis=0).max()
     tolerance = 1e-5 * size + 4 * np.finfo(np.float32).eps * np.abs(vertices).max()
     corners: list[np.ndarray] = []
@@ -108,10 +139,14 @@ def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
 
 
 def _conventional(edges: np.ndarray) -> np.ndarray:
-    """The same edges (columns) ordered and signed so that each points along its world axis where it can."""
+    """The same edges (columns) ordered and signed so that each points along its world axis where it
+    can.
+    """
     best = max(
         itertools.permutations(range(3)),
-        key=lambda p: np.prod([abs(edges[i, p[i]]) / np.linalg.norm(edges[:, p[i]]) for i in range(3)]),
+        key=lambda p: np.prod(
+            [abs(edges[i, p[i]]) / np.linalg.norm(edges[:, p[i]]) for i in range(3)]
+        ),
     )
     ordered = edges[:, list(best)]
     return ordered * np.where(np.diag(ordered) < 0, -1.0, 1.0)

@@ -32,7 +32,7 @@ class CacheSettings:
     rr_depth: int = 5
     solver: str = "auto"
     resolution: int = 0
-    samples: int = 64
+    samples: int = 0
     seed: int = 0
     file: str = ""
 
@@ -40,8 +40,8 @@ class CacheSettings:
 class CacheBuilder:
     """Keeps the medium and the cache of one scene up to date, and does no work twice.
 
-    ``medium`` is None for a scene without one; ``cache`` is None where no light needs caching (no medium, or
-    ``max_depth`` below 2).
+    ``medium`` is None for a scene without one; ``cache`` is None where no light needs caching (no
+    medium, or ``max_depth`` below 2).
     """
 
     def __init__(self, settings: CacheSettings) -> None:
@@ -73,7 +73,7 @@ class CacheBuilder:
 
     @property
     def _target(self) -> int:
-        return -(-self.settings.samples // BATCH) * BATCH
+        return -(-(self.settings.samples or choose_samples(self.cache)) // BATCH) * BATCH
 
     def _start_cache(self, scene: mi.Scene, medium: MediumGrid, edited: bool) -> IrradianceCache:
         settings = self.settings
@@ -84,7 +84,8 @@ class CacheBuilder:
             active = mi.UInt32()
         mi.Log(
             mi.LogLevel.Info,
-            f"irrcache: cache of {' x '.join(map(str, grid.shape[::-1]))} voxels, {dr.width(active)} of "
+            f"irrcache: cache of {' x '.join(map(str, grid.shape[::-1]))} voxels, "
+            f"{dr.width(active)} of "
             f"{grid.voxel_count} see the medium; solver path",
         )
         channels = 1 if mi.is_monochromatic else 3
@@ -97,7 +98,9 @@ class CacheBuilder:
         return self._resume(cache, edited)
 
     def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache:
-        """The cache on disk where it is of the same light; a foreign file is refused, never overwritten."""
+        """The cache on disk where it is of the same light; a foreign file is refused, never
+        overwritten.
+        """
         file = Path(self.settings.file)
         if not file.exists():
             if not file.parent.is_dir():
@@ -106,24 +109,29 @@ class CacheBuilder:
                 )
             return cache
         stored = IrradianceCache.load(file)
-        differing = [k for k in cache.fingerprint if stored.fingerprint.get(k) != cache.fingerprint[k]]
+        differing = [
+            k for k in cache.fingerprint if stored.fingerprint.get(k) != cache.fingerprint[k]
+        ]
         if not differing:
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             return stored
         if edited:
             mi.Log(
                 mi.LogLevel.Warn,
-                f'irrcache: the scene was edited ({", ".join(differing)}): "{file}" keeps the light of before.',
+                f'irrcache: the scene was edited ({", ".join(differing)}): "{file}" keeps the '
+                "light of before.",
             )
             cache.fingerprint = {}
             return cache
         detail = (
-            f' ({stored.fingerprint.get("settings")} in the file, {cache.fingerprint["settings"]} here)'
+            f" ({stored.fingerprint.get('settings')} in the file, {cache.fingerprint['settings']} "
+            "here)"
             if differing == ["settings"]
             else ""
         )
         raise CacheFileError(
-            f'irrcache: cache_file "{file}" belongs to another scene: {", ".join(differing)} differ{detail}. '
+            f'irrcache: cache_file "{file}" belongs to another scene: {", ".join(differing)} '
+            f"differ{detail}. "
             "Delete the file, or give this scene a cache_file of its own."
         )
 
@@ -146,20 +154,34 @@ class CacheBuilder:
 
 
 def choose_resolution(medium: MediumGrid) -> int:
-    """Cache voxels along the longest side: half the medium's own (the light is smoother than the data), 32 to 96."""
-    if medium.sigma_t.grid is None:
-        return 32
-    return int(np.clip(max(medium.sigma_t.grid.shape) // 2, 32, 96))
+    """Cache voxels along the longest side: as many as the medium has, at most 128.
+
+    For the same number of samples, more voxels with fewer samples each give the smaller error: a
+    camera ray averages the noise of many voxels, but not their discretisation. A homogeneous medium
+    gets half a mean free path per voxel.
+    """
+    if medium.sigma_t.grid is not None:
+        return min(max(medium.sigma_t.grid.shape), 128)
+    longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
+    return int(np.clip(np.ceil(2 * longest * medium.sigma_t.maximum), 32, 96))
+
+
+def choose_samples(cache: IrradianceCache) -> int:
+    """Samples per voxel: about 2^24 in all, 16 to 256 each."""
+    return int(np.clip(2**24 // max(cache.active_count, 1), 16, 256))
 
 
 def _check_memory(grid: Grid) -> None:
-    """Refuses a cache that cannot be held: float64 sums and squares of two layers, and the float32 field."""
+    """Refuses a cache that cannot be held: float64 sums and squares of two layers, and the float32
+    field.
+    """
     channels = 1 if mi.is_monochromatic else 3
     needed = grid.voxel_count * (channels * (2 * 2 * 8 + 4) + 4)
     available = available_memory()
     if needed > available or grid.voxel_count >= 2**32:
         sides = " x ".join(map(str, grid.shape[::-1]))
         raise IrrcacheError(
-            f"irrcache: a cache of {sides} voxels needs {needed / 2**30:.1f} GiB, and {available / 2**30:.1f} GiB are "
+            f"irrcache: a cache of {sides} voxels needs {needed / 2**30:.1f} GiB, and "
+            f"{available / 2**30:.1f} GiB are "
             "free; lower resolution."
         )

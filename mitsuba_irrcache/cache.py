@@ -1,4 +1,6 @@
-"""The irradiance cache: a camera-independent field with its statistics, kept, merged, saved and loaded."""
+"""The irradiance cache: a camera-independent field with its statistics, kept, merged, saved and
+loaded.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,10 @@ import numpy as np
 
 from .errors import CacheFileError, IrrcacheError
 from .files import atomic_write
-from .grid import Grid, GridField
+from .grid import Affine, Grid, RootField
 
-#: Samples of a voxel come in batches of this many, spread evenly over directions. They are not independent of each
-#: other, the batches are: means and errors are statistics of batch means.
+#: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
+#: independent of each other, the batches are: means and errors are statistics of batch means.
 BATCH = 8
 
 LAYERS = ("uncollided", "scattered")
@@ -23,12 +25,14 @@ FORMAT = "mitsuba_irrcache 1"
 
 
 class IrradianceCache:
-    """Irradiance (fluence rate) Phi = int_S2 L dw [W m^-2, or the scene's unit of radiance times sr] on a grid.
+    """Irradiance (fluence rate) Phi = int_S2 L dw [W m^-2, or the scene's unit of radiance times
+    sr] on a grid.
 
-    It has two layers: ``uncollided`` (light straight from the emitters) and ``scattered`` (all later orders, up to
-    what ``max_depth`` admits: orders 0 .. max_depth - 2). Only ``active`` voxels, those that a lookup inside the
-    medium can read, have values; the others are zero. ``fingerprint`` maps each ingredient of the light
-    (medium, boundary, emitters, settings) to a digest.
+    It has two layers: ``uncollided`` (light straight from the emitters) and ``scattered`` (all
+    later orders, up to what ``max_depth`` admits: orders 0 .. max_depth - 2). Only ``active``
+    voxels, those that a lookup inside the medium can read, have values; the others are zero.
+    ``fingerprint`` maps each ingredient of the light (medium, boundary, emitters, settings) to a
+    digest.
     """
 
     def __init__(
@@ -75,26 +79,49 @@ class IrradianceCache:
 
     @property
     def standard_error(self) -> mi.TensorXf:
-        """Standard error of ``irradiance``, (z, y, x, channel); NaN before there are two batches of samples."""
+        """Standard error of ``irradiance``, (z, y, x, channel); NaN before there are two batches of
+        samples.
+        """
+        variances = [self._variance(c) for c in range(self.channels)]
+        return self._tensor(
+            [
+                dr.full(mi.Float, dr.nan, self.active_count) if v is None else mi.Float(dr.sqrt(v))
+                for v in variances
+            ]
+        )
+
+    def _variance(self, channel: int):
+        """Squared standard error of the irradiance (float64), None before there are two batches."""
         n = self.samples // BATCH
         if n < 2:
-            return self._tensor([dr.full(mi.Float, dr.nan, self.active_count)] * self.channels)
-        errors = []
-        for c in range(self.channels):
+            return None
+        variance = 0
+        for layer in range(len(LAYERS)):
+            total, squares = self._sums[layer * self.channels + channel]
             # The layers are drawn independently of each other: their variances add.
-            variance = 0
-            for layer in range(len(LAYERS)):
-                total, squares = self._sums[layer * self.channels + c]
-                variance = variance + dr.maximum(squares / n - dr.square(total / n), 0) / (n - 1)
-            errors.append(mi.Float(dr.sqrt(variance)))
-        return self._tensor(errors)
+            variance = variance + dr.maximum(squares / n - dr.square(total / n), 0) / (n - 1)
+        return variance
 
-    def field(self) -> GridField:
+    def field(self) -> RootField:
         """Phi for lookups: one channel where all channels agree to the last bit."""
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
-        if all(dr.all(m == means[0])[0] for m in means[1:]):
-            means = means[:1]
-        return GridField(self.grid, self._tensor(means).array, len(means))
+        roots = [dr.sqrt(m) * self._root_correction(m, c) for c, m in enumerate(means)]
+        if all(dr.all(r == roots[0])[0] for r in roots[1:]):
+            roots = roots[:1]
+        return RootField(self.grid, self._tensor(roots).array, len(roots))
+
+    def _root_correction(self, mean: mi.Float, channel: int) -> mi.Float:
+        """Makes interpolated roots of noisy values right on average.
+
+        With relative variance v of the voxels, E[(sum w_i sqrt(x_i))^2] = mu (1 - (1 - sum w_i^2) v
+        / 4) to first order, and sum w_i^2 is (2/3)^3 on average over a cell. Without it 16 samples
+        read some 1 % too little light.
+        """
+        variance = self._variance(channel)
+        if variance is None:
+            return mi.Float(1)
+        relative = dr.select(mean > 0, mi.Float(variance) / dr.square(mean), 0)
+        return dr.rsqrt(1 - (1 - 8 / 27) / 4 * dr.minimum(relative, 1))
 
     def _means(self, layer: int) -> list[mi.Float]:
         n = max(self.samples // BATCH, 1)
@@ -112,8 +139,9 @@ class IrradianceCache:
     # ------------------------------------------------------------------ growing
 
     def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
-        """Adds ``samples`` per voxel of the stream ``seed``: for each block of voxels and then each layer and channel,
-        the sum of batch means and of their squares. Merged in float64."""
+        """Adds ``samples`` per voxel of the stream ``seed``: for each block of voxels and then each
+        layer and channel, the sum of batch means and of their squares. Merged in float64.
+        """
         double = dr.float64_array_t(mi.Float)
         for i, pair in enumerate(self._sums):
             for j in range(2):
@@ -139,13 +167,15 @@ class IrradianceCache:
                 )
         if self.grid.shape != other.grid.shape or self.max_depth != other.max_depth:
             raise IrrcacheError(
-                f"IrradianceCache.merge: shape {self.grid.shape} with max_depth {self.max_depth} does not fit "
+                f"IrradianceCache.merge: shape {self.grid.shape} with max_depth {self.max_depth} "
+                "does not fit "
                 f"shape {other.grid.shape} with max_depth {other.max_depth}."
             )
         common = sorted(self.streams.keys() & other.streams.keys())
         if common:
             raise IrrcacheError(
-                f"IrradianceCache.merge: both caches were made with cache_seed {common[0]}, so their samples are the "
+                f"IrradianceCache.merge: both caches were made with cache_seed {common[0]}, so "
+                "their samples are the "
                 "same, not independent; make one of them with another cache_seed."
             )
         for mine, theirs in zip(self._sums, other._sums, strict=True):
@@ -175,21 +205,33 @@ class IrradianceCache:
 
     @classmethod
     def load(cls, path: str | Path) -> IrradianceCache:
-        """Reads a cache that ``save`` wrote. Raises CacheFileError, naming the file, for anything else."""
+        """Reads a cache that ``save`` wrote. Raises CacheFileError, naming the file, for anything
+        else.
+        """
         path = Path(path)
         try:
             arrays = _read_arrays(path)
             description = json.loads(arrays["description"].tobytes())
             if description["format"] != FORMAT:
                 raise CacheFileError(
-                    f'"{path}" has the format {description["format"]!r}, this version reads {FORMAT!r}.'
+                    f'"{path}" has the format {description["format"]!r}, this version reads '
+                    f"{FORMAT!r}."
                 )
             return cls._restore(description, arrays)
         except CacheFileError:
             raise
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            zipfile.BadZipFile,
+            EOFError,
+            MemoryError,
+        ) as error:
             raise CacheFileError(
-                f'"{path}" is not a readable irradiance cache ({error}); delete it or name another cache_file.'
+                f'"{path}" is not a readable irradiance cache ({error}); delete it or name another '
+                "cache_file."
             ) from error
 
     @classmethod
@@ -199,7 +241,9 @@ class IrradianceCache:
         channels = int(description["channels"])
         if active.dtype != np.uint32 or active.ndim != 1 or active.size > grid.voxel_count:
             raise ValueError("its list of voxels does not fit its grid")
-        if active.size and (int(active[-1]) >= grid.voxel_count or (np.diff(active.astype(np.int64)) <= 0).any()):
+        if active.size and (
+            int(active[-1]) >= grid.voxel_count or (np.diff(active.astype(np.int64)) <= 0).any()
+        ):
             raise ValueError("its list of voxels is out of order")
         expected = (len(LAYERS) * channels, 2, max(active.size, 1))
         if channels not in (1, 3) or sums.dtype != np.float64 or sums.shape != expected:
@@ -207,7 +251,11 @@ class IrradianceCache:
         if not np.isfinite(sums).all():
             raise ValueError("it holds values that are not finite")
         cache = cls(
-            grid, mi.UInt32(active), channels, int(description["max_depth"]), dict(description["fingerprint"])
+            grid,
+            mi.UInt32(active),
+            channels,
+            int(description["max_depth"]),
+            dict(description["fingerprint"]),
         )
         cache.streams = {int(seed): int(n) for seed, n in description["streams"].items()}
         double = dr.float64_array_t(mi.Float)
@@ -215,13 +263,20 @@ class IrradianceCache:
         return cache
 
     def export_vol(self, path: str | Path) -> None:
-        """Writes ``irradiance`` as a Mitsuba ``.vol`` file (float32, bounding box of the grid; a rotation is lost)."""
+        """Writes ``irradiance`` as a Mitsuba ``.vol`` file (float32, bounding box of the grid; a
+        rotation is lost).
+        """
         from .volumes.mitsuba_vol import write_vol
 
-        corners = self.grid.to_world @ np.array(
-            [[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64
-        ).T
-        write_vol(path, np.array(self.irradiance), (corners[:3].min(axis=1), corners[:3].max(axis=1)))
+        corners = (
+            self.grid.to_world
+            @ np.array(
+                [[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64
+            ).T
+        )
+        write_vol(
+            path, np.array(self.irradiance), (corners[:3].min(axis=1), corners[:3].max(axis=1))
+        )
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -234,7 +289,8 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def active_voxels(medium, grid: Grid) -> mi.UInt32:
-    """Flat indices, ascending, of the voxels of ``grid`` that a lookup where ``sigma_t > 0`` can read.
+    """Flat indices, ascending, of the voxels of ``grid`` that a lookup where ``sigma_t > 0`` can
+    read.
 
     Every macrocell that is not empty marks the voxels whose trilinear support its box may overlap.
     """
@@ -247,32 +303,40 @@ def active_voxels(medium, grid: Grid) -> mi.UInt32:
     return _mark(cells, occupied, grid)
 
 
+def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], list[mi.Int32]]:
+    """First and last voxel along x, y, z whose trilinear support the box of each macrocell
+    meets.
+    """
+    nz, ny, nx = cells.shape
+    index = [occupied % nx, (occupied // nx) % ny, occupied // (nx * ny)]
+    to_voxels = grid.coordinates.matrix @ np.linalg.inv(cells.coordinates.matrix)
+    # Border cells reach beyond their own grid, whose values are clamped: here as far as the cache.
+    corners = np.array(list(np.ndindex(2, 2, 2))) * grid.resolution
+    to_cells = np.linalg.inv(to_voxels)
+    reach = corners @ to_cells[:3, :3].T + to_cells[:3, 3]
+    start, end = np.minimum(0.0, reach.min(axis=0)), np.maximum((nx, ny, nz), reach.max(axis=0))
+    middle, half = [], []
+    for i, n, least, most in zip(index, (nx, ny, nz), start, end, strict=True):
+        low = dr.select(i == 0, dr.opaque(mi.Float, float(least)), mi.Float(i))
+        high = dr.select(i == n - 1, dr.opaque(mi.Float, float(most)), mi.Float(i) + 1)
+        middle.append(0.5 * (low + high))
+        half.append(0.5 * (high - low))
+    center = Affine(to_voxels).point(mi.Point3f(middle))
+    first, last = [], []
+    for side, c, row in zip(grid.sides, center, np.abs(to_voxels[:3, :3]), strict=True):
+        extent = sum(dr.opaque(mi.Float, float(m)) * h for m, h in zip(row, half, strict=True))
+        limit = mi.Float(side - 1)
+        # Voxel i is read from u in (i - 1/2, i + 3/2); border voxels also from beyond the grid.
+        first.append(mi.Int32(dr.clip(dr.floor(c - extent - 0.5 - 1e-3), 0, limit)))
+        last.append(mi.Int32(dr.clip(dr.floor(c + extent + 0.5 + 1e-3), 0, limit)))
+    return first, last
+
+
 @dr.syntax
 def _mark(cells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
-    nz, ny, nx = cells.shape
-    lower = mi.Point3f(mi.Vector3u(occupied % nx, (occupied // nx) % ny, occupied // (nx * ny)))
-    to_voxels = grid.coordinates.matrix @ np.linalg.inv(cells.coordinates.matrix)
-    linear = np.abs(to_voxels[:3, :3]) / 2
-    half = [dr.opaque(mi.Float, float(v)) for v in linear.sum(axis=1)]
-    center = [
-        dr.opaque(mi.Float, float(row[3]))
-        + dr.opaque(mi.Float, float(row[0])) * (lower.x + 0.5)
-        + dr.opaque(mi.Float, float(row[1])) * (lower.y + 0.5)
-        + dr.opaque(mi.Float, float(row[2])) * (lower.z + 0.5)
-        for row in to_voxels[:3]
-    ]
-    # Voxel i is read from u in (i - 1/2, i + 3/2); border cells and border voxels reach beyond the grid.
-    index = [occupied % nx, (occupied // nx) % ny, occupied // (nx * ny)]
-    first, last = [], []
-    for axis, n in enumerate((nx, ny, nz)):
-        side = grid.sides[axis]
-        low = dr.floor(center[axis] - half[axis] - 0.5 - 1e-3)
-        high = dr.floor(center[axis] + half[axis] + 0.5 + 1e-3)
-        first.append(mi.Int32(dr.clip(low, 0, mi.Float(side - 1))))
-        last.append(mi.Int32(dr.clip(high, 0, mi.Float(side - 1))))
+    (x0, y0, z0), (x1, y1, z1) = _supports(cells, occupied, grid)
     marks = dr.zeros(mi.UInt32, grid.voxel_count)
-    x, y, z = mi.Int32(first[0]), mi.Int32(first[1]), mi.Int32(first[2])
-    x0, y0, x1, y1, z1 = first[0], first[1], last[0], last[1], last[2]
+    x, y, z = mi.Int32(x0), mi.Int32(y0), mi.Int32(z0)
     sx, sy, _ = grid.sides
     active = mi.Bool(True)
     while dr.hint(active, label="active voxels"):

@@ -11,17 +11,19 @@ from .errors import IrrcacheError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit status (1: an error was printed, 130: interrupted)."""
+    """Runs the command line; returns the exit status (1: an error was printed, 130:
+    interrupted).
+    """
     args = _parser().parse_args(arguments)
     try:
         return args.run(args)
     except KeyboardInterrupt:
         print("irrcache: interrupted; no output was written", file=sys.stderr)
         return 130
-    except IrrcacheError as error:
+    except (IrrcacheError, OSError) as error:
         message = str(error)
     except RuntimeError as error:  # how Mitsuba reports a scene it cannot load
-        message = _essence(str(error))
+        message = _essence(error)
     print(f"irrcache: error: {message.removeprefix('irrcache: ')}", file=sys.stderr)
     return 1
 
@@ -45,7 +47,11 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _essence(text: str) -> str:
-    """Mitsuba wraps what a Python plugin raises in a traceback; the reader wants its last line."""
-    raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", text, re.MULTILINE)
-    return raised[-1] if raised else text.strip()
+def _essence(error: BaseException) -> str:
+    """Mitsuba wraps what a Python plugin raises, as text or as a cause; the reader wants the
+    origin.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", str(error), re.MULTILINE)
+    return raised[-1] if raised else str(error).strip()

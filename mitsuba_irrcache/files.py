@@ -22,7 +22,9 @@ def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
     if not path.parent.is_dir():
         raise IrrcacheError(f'cannot write "{path}": the folder "{path.parent}" does not exist.')
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+        handle, temporary = tempfile.mkstemp(
+            dir=path.parent, prefix=f".{path.name}.", suffix=".tmp"
+        )
     except OSError as error:
         raise IrrcacheError(f'cannot write "{path}": {error.strerror}.') from error
     try:

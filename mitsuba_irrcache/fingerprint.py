@@ -16,8 +16,9 @@ from .medium import MediumGrid
 class Snapshot:
     """The light-carrying parameters of a scene, by identity: comparing two costs no kernel.
 
-    It holds on to the arrays, so an array's identity cannot be given to another one. Sensors, films, samplers and
-    integrators are no part of it. A parameter set to equal contents counts as changed.
+    It holds on to the arrays, so an array's identity cannot be given to another one. Sensors,
+    films, samplers and integrators are no part of it. A parameter set to equal contents counts as
+    changed.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -53,7 +54,9 @@ def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
     """SHA-256 of the contents of each ingredient of the light in ``medium``."""
     boundary = medium.boundary
     return {
-        "medium": _digest(*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()),
+        "medium": _digest(
+            *_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()
+        ),
         "boundary": _digest(boundary.kind, boundary.to_world),
         "emitters": _digest(*sorted(_emitter_digest(e) for e in scene.emitters())),
         "variant": "grey" if mi.is_monochromatic else "rgb",

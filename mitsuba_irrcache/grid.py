@@ -1,11 +1,12 @@
 """Regular voxel grids in the world: placement, coordinates and trilinear lookups.
 
-One convention everywhere, the one of Mitsuba's ``gridvolume``: arrays are ``(z, y, x, channel)``, values sit
-at voxel *centres*, are clamped at the border, and the grid fills the unit cube carried by ``to_world``.
-*Voxel coordinates* ``u`` run from 0 to n along each axis, so voxel ``i`` is centred at ``u = i + 0.5``.
+One convention everywhere, the one of Mitsuba's ``gridvolume``: arrays are ``(z, y, x, channel)``,
+values sit at voxel *centres*, are clamped at the border, and the grid fills the unit cube carried
+by ``to_world``. *Voxel coordinates* ``u`` run from 0 to n along each axis, so voxel ``i`` is
+centred at ``u = i + 0.5``.
 
-The classes here and those built on them are plain ones: Dr.Jit would carry every array of a dataclass through
-its loops as a loop variable.
+The classes here and those built on them are plain ones: Dr.Jit would carry every array of a
+dataclass through its loops as a loop variable.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from .errors import IrrcacheError
 
 
 class Grid:
-    """A voxel grid: ``shape`` is ``(z, y, x)``, ``to_world`` a 4x4 affine map of the unit cube (float64)."""
+    """A voxel grid: ``shape`` is ``(z, y, x)``, ``to_world`` a 4x4 affine map of the unit cube
+    (float64).
+    """
 
     def __init__(self, shape: tuple[int, int, int], to_world: np.ndarray) -> None:
         matrix = np.array(to_world, dtype=np.float64)
@@ -59,20 +62,23 @@ class Grid:
 
     def centers(self, index: mi.UInt32) -> mi.Point3f:
         """World positions of the voxels with the flat indices ``index`` (x fastest)."""
-        nz, ny, nx = self.shape
+        _, ny, nx = self.shape
         x, y, z = index % nx, (index // nx) % ny, index // (nx * ny)
         return self.world.point(mi.Point3f(x, y, z) + 0.5)
 
     @staticmethod
     def near_cubic(to_world: np.ndarray, resolution: int) -> Grid:
-        """A grid over the unit cube ``to_world`` with ``resolution`` near-cubic voxels along its longest side."""
+        """A grid over the unit cube ``to_world`` with ``resolution`` near-cubic voxels along its
+        longest side.
+        """
         sides = np.linalg.norm(np.asarray(to_world, dtype=np.float64)[:3, :3], axis=0)
         counts = np.maximum(1, np.rint(resolution * sides / sides.max())).astype(int)
         return Grid(tuple(int(n) for n in counts[::-1]), to_world)
 
 
 class Affine:
-    """An affine map of points and vectors, its entries opaque to the kernels (a new placement recompiles nothing).
+    """An affine map of points and vectors, its entries opaque to the kernels (a new placement
+    recompiles nothing).
 
     Points are taken relative to the centre of the unit cube first, so that a grid far from the
     world's origin loses no more bits than its float32 positions already have.
@@ -111,8 +117,8 @@ class ConstantField:
 class GridField:
     """Values at the voxel centres of a grid, trilinear between them, clamped at the border.
 
-    ``data`` is flat with ``channels`` (1 or 3) interleaved values per voxel and is not copied; ``scale``
-    multiplies every lookup, so that a scaled medium needs no array of its own.
+    ``data`` is flat with ``channels`` (1 or 3) interleaved values per voxel and is not copied;
+    ``scale`` multiplies every lookup, so that a scaled medium needs no array of its own.
     """
 
     def __init__(self, grid: Grid, data: mi.Float, channels: int, scale: float = 1.0) -> None:
@@ -125,7 +131,9 @@ class GridField:
         self.maximum = float(dr.max(data)[0]) * scale
 
     def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """Trilinear value at the voxel coordinates ``u``: a Float for one channel, else a Color3f."""
+        """Trilinear value at the voxel coordinates ``u``: a Float for one channel, else a
+        Color3f.
+        """
         values = [v * self.scale for v in self._interpolate(u, active)]
         return values[0] if self.channels == 1 else mi.Color3f(values)
 
@@ -149,6 +157,22 @@ class GridField:
             faces = [dr.lerp(edges[i], edges[i + 1], wy) for i in (0, 2)]
             result.append(dr.lerp(*faces, wz))
         return result
+
+
+class RootField(GridField):
+    """Non-negative values whose square *roots* are trilinear; made of those roots.
+
+    Irradiance falls off like an exponential inside dense matter, where it is convex and plain
+    interpolation reads too much light: +1.3 % of the mean radiance on a CT head, against +0.4 % for
+    roots (experiments/accuracy). Roots are still exact for constants and of second order.
+    """
+
+    def __init__(self, grid: Grid, roots: mi.Float, channels: int) -> None:
+        super().__init__(grid, roots, channels)
+        self.maximum = self.maximum**2
+
+    def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        return dr.square(super().at(u, active))
 
 
 Field = ConstantField | GridField

@@ -6,13 +6,15 @@ import os
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
+import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
 
 from .errors import IrrcacheError
 
 
 def check_output(path: str | Path) -> Path:
-    """The path of an EXR that can be written; raises IrrcacheError before any work is done for it."""
+    """The path of an EXR that can be written; raises IrrcacheError before any work is done for
+    it.
+    """
     path = Path(path)
     if path.suffix.lower() != ".exr":
         raise IrrcacheError(f'the output "{path}" must end in .exr (a PNG is written beside it).')
@@ -24,7 +26,8 @@ def check_output(path: str | Path) -> Path:
 
 
 def write_image(path: str | Path, image: np.ndarray, metadata: dict[str, object]) -> Path:
-    """Writes ``image`` (height, width, 1 | 3 | 4), linear radiance, to ``path`` (.exr) and as sRGB to a PNG.
+    """Writes ``image`` (height, width, 1 | 3 | 4), linear radiance, to ``path`` (.exr) and as sRGB
+    to a PNG.
 
     ``metadata`` goes into the EXR's header under ``irrcache:``. Returns the PNG's path.
     """
@@ -32,7 +35,9 @@ def write_image(path: str | Path, image: np.ndarray, metadata: dict[str, object]
     image = np.ascontiguousarray(image, dtype=np.float32)
     buffer = oiio.ImageBuf(image)
     for key, value in metadata.items():
-        buffer.specmod().attribute(f"irrcache:{key}", value if isinstance(value, float | int) else str(value))
+        buffer.specmod().attribute(
+            f"irrcache:{key}", value if isinstance(value, float | int) else str(value)
+        )
     _write(buffer, path, oiio.FLOAT)
     png = path.with_suffix(".png")
     _write(oiio.ImageBufAlgo.colorconvert(buffer, "linear", "sRGB"), png, oiio.UINT8)

@@ -18,10 +18,11 @@ def load_scene(
     parameters: dict[str, str] | None = None,
     integrator: str | None = None,
 ) -> mi.Scene:
-    """Loads a scene XML with ``$parameters`` and gives it the ``integrator``, for example ``irrcache{step=0.5}``.
+    """Loads a scene XML with ``$parameters`` and gives it the ``integrator``, for example
+    ``irrcache{step=0.5}``.
 
-    Depth, Russian roulette and visibility of emitters are taken over from the scene's own integrator, unless
-    the specification sets them. With None the scene's integrator stays as it is.
+    Depth, Russian roulette and visibility of emitters are taken over from the scene's own
+    integrator, unless the specification sets them. With None the scene's integrator stays as it is.
     Raises IrrcacheError if the file is missing or has no integrator to replace.
     """
     path = Path(path)
@@ -53,14 +54,17 @@ def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
     match = re.fullmatch(r"\s*([A-Za-z_]\w*)\s*(?:\{(.*)\})?\s*", specification, re.DOTALL)
     if match is None:
         raise IrrcacheError(
-            f'cannot read the integrator "{specification}"; write a name, or name{{key=value,key=value}}.'
+            f'cannot read the integrator "{specification}"; write a name, or '
+            f"name{{key=value,key=value}}."
         )
     name, body = match.groups()
     properties: dict[str, object] = {}
     for item in filter(None, (part.strip() for part in (body or "").split(","))):
         key, equals, value = item.partition("=")
         if not equals or not key.strip():
-            raise IrrcacheError(f'cannot read "{item}" in the integrator "{specification}"; write key=value.')
+            raise IrrcacheError(
+                f'cannot read "{item}" in the integrator "{specification}"; write key=value.'
+            )
         properties[key.strip()] = _literal(value.strip())
     return name, properties
 
@@ -77,7 +81,9 @@ def _literal(text: str) -> object:
 
 
 def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
-    """The scene's integrator: nodes are in the file's order, so one nested in a wrapper comes after it."""
+    """The scene's integrator: nodes are in the file's order, so one nested in a wrapper comes after
+    it.
+    """
     return next((n for n in state.nodes if n.type == mi.ObjectType.Integrator), None)
 
 
@@ -85,9 +91,7 @@ def _replace_integrator(state: mi.parser.ParserState, specification: str, path: 
     name, properties = parse_integrator(specification)
     node = _integrator_node(state)
     if node is None:
-        raise IrrcacheError(
-            f'"{path}" names no integrator; add <integrator type="{name}"/> to it.'
-        )
+        raise IrrcacheError(f'"{path}" names no integrator; add <integrator type="{name}"/> to it.')
     inherited = {k: node.props[k] for k in SHARED_PROPERTIES if k in node.props}
     for key in list(node.props.keys()):
         node.props.remove_property(key)

@@ -1,4 +1,6 @@
-"""Coarse cells over the extinction grid: local majorants, empty-space skipping, and a walk through them."""
+"""Coarse cells over the extinction grid: local majorants, empty-space skipping, and a walk through
+them.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,9 @@ class Macrocells:
 
 
 class Walk:
-    """A ray in macrocell coordinates. The cell is kept as integers by the caller; nothing accumulates."""
+    """A ray in macrocell coordinates. The cell is kept as integers by the caller; nothing
+    accumulates.
+    """
 
     def __init__(self, cells: Macrocells, ray: mi.Ray3f) -> None:
         self.cells = cells
@@ -78,7 +82,9 @@ class Walk:
         return dr.gather(mi.Float, self.cells.minorant, self.index(cell), active)
 
     def exit(self, cell: mi.Vector3i) -> tuple[mi.Float, mi.Vector3i]:
-        """Distance at which the ray leaves ``cell``, and the cell behind; infinite for a border cell."""
+        """Distance at which the ray leaves ``cell``, and the cell behind; infinite for a border
+        cell.
+        """
         forward = self.direction >= 0
         wall = mi.Vector3f(cell + dr.select(forward, 1, 0))
         limits = mi.Vector3i(*self.cells.sides) - 1
@@ -86,7 +92,8 @@ class Walk:
         t = dr.select(last, dr.inf, (wall - self.origin) * self.rcp)
         nearest = dr.min(t)
         step = dr.select(forward, mi.Vector3i(1), mi.Vector3i(-1))
-        # Ties step along one axis only; the next call leaves through the other at the same distance.
+        # Ties step along one axis only; the next call leaves through the other at the same
+        # distance.
         on_x = t.x == nearest
         on_y = ~on_x & (t.y == nearest)
         on_z = ~on_x & ~on_y
@@ -99,7 +106,9 @@ class Walk:
 def _block_bounds(
     sigma_t: GridField, size: int, shape: tuple[int, int, int]
 ) -> tuple[mi.Float, mi.Float]:
-    """Least and largest value in each block grown by the one voxel that trilinear stencils reach beyond it."""
+    """Least and largest value in each block grown by the one voxel that trilinear stencils reach
+    beyond it.
+    """
     nz, ny, nx = shape
     index = dr.arange(mi.UInt32, nx * ny * nz)
     first = mi.Vector3i(mi.Vector3u(index % nx, (index // nx) % ny, index // (nx * ny)) * size) - 1

@@ -17,7 +17,9 @@ MEDIA = ("HeterogeneousMedium", "HomogeneousMedium")
 
 
 class MediumGrid:
-    """``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and the world box ``bbox`` (None: unbounded)."""
+    """``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and the world box ``bbox``
+    (None: unbounded).
+    """
 
     def __init__(
         self,
@@ -37,7 +39,9 @@ class MediumGrid:
 
     @property
     def frame(self) -> np.ndarray:
-        """``to_world`` of the smallest known unit cube that encloses the medium: where a cache goes."""
+        """``to_world`` of the smallest known unit cube that encloses the medium: where a cache
+        goes.
+        """
         frames = [self.boundary.frame]
         if self.bbox is not None:
             frames.append(_axis_aligned(*self.bbox))
@@ -62,31 +66,37 @@ class MediumGrid:
 
 
 def bake(medium: mi.Medium, boundary: Boundary) -> MediumGrid:
-    """The fields of a ``heterogeneous`` or ``homogeneous`` Mitsuba medium, on the medium's own grids.
+    """The fields of a ``heterogeneous`` or ``homogeneous`` Mitsuba medium, on the medium's own
+    grids.
 
-    Raises UnsupportedSceneError for other media, volume plugins and phase functions, and IrrcacheError for
-    values no medium can have (NaN, negative extinction, albedo outside [0, 1]).
+    Raises UnsupportedSceneError for other media, volume plugins and phase functions, and
+    IrrcacheError for values no medium can have (NaN, negative extinction, albedo outside [0, 1]).
     """
     name = f'medium "{medium.id()}" ({medium.class_name()})'
     if medium.class_name() not in MEDIA:
         raise UnsupportedSceneError(
-            f'irrcache: {name} is not supported, only "heterogeneous" and "homogeneous" are; use "volpath".'
+            f'irrcache: {name} is not supported, only "heterogeneous" and "homogeneous" are; use '
+            '"volpath".'
         )
     phase = medium.phase_function()
     if phase.class_name() != "IsotropicPhaseFunction":
         raise UnsupportedSceneError(
-            f"irrcache: {name} has the phase function {phase.class_name()}, but an irradiance cache is exact for "
+            f"irrcache: {name} has the phase function {phase.class_name()}, but an irradiance "
+            "cache is exact for "
             'isotropic scattering only; make it <phase type="isotropic"/> or use "volpath".'
         )
     volumes = children(medium)
     scale = float(mi.traverse(medium)["scale"])
     if not np.isfinite(scale) or scale < 0:
-        raise IrrcacheError(f"irrcache: {name} has scale {scale}; it must be finite and not negative.")
+        raise IrrcacheError(
+            f"irrcache: {name} has scale {scale}; it must be finite and not negative."
+        )
     sigma_t = _field(volumes["sigma_t"], f"sigma_t of {name}", scale)
     albedo = _field(volumes["albedo"], f"albedo of {name}", 1.0)
     if albedo.maximum > 1.0 + 1e-6:
         raise IrrcacheError(
-            f"irrcache: the albedo of {name} reaches {albedo.maximum:g}; above 1 a medium creates light. "
+            f"irrcache: the albedo of {name} reaches {albedo.maximum:g}; above 1 a medium creates "
+            "light. "
             "Clip it to [0, 1]."
         )
     bounded = medium.class_name() == "HeterogeneousMedium"
@@ -118,7 +128,8 @@ def _field(volume: mi.Volume, name: str, scale: float) -> Field:
         return _constant(volume, name, scale)
     if volume.class_name() != "GridVolume":
         raise UnsupportedSceneError(
-            f'irrcache: the {name} is a {volume.class_name()}; only "gridvolume" and "constvolume" are '
+            f'irrcache: the {name} is a {volume.class_name()}; only "gridvolume" and "constvolume" '
+            "are "
             'supported. Resample it to a gridvolume or use "volpath".'
         )
     tensor = dr.detach(mi.traverse(volume)["data"])
@@ -139,7 +150,9 @@ def _field(volume: mi.Volume, name: str, scale: float) -> Field:
 def _constant(volume: mi.Volume, name: str, scale: float) -> ConstantField:
     values = np.array(volume.eval(dr.zeros(mi.Interaction3f, 1)), dtype=np.float64).reshape(-1)
     if not np.isfinite(values).all() or values.min() < 0:
-        raise IrrcacheError(f"irrcache: the {name} is {values}; it must be finite and not negative.")
+        raise IrrcacheError(
+            f"irrcache: the {name} is {values}; it must be finite and not negative."
+        )
     return ConstantField(values[:1] if np.ptp(values) == 0 else values, scale)
 
 
@@ -152,8 +165,10 @@ def _check_values(data: mi.Float, shape: tuple[int, ...], name: str) -> None:
     z, y, x, _ = (int(i) for i in np.unravel_index(where, shape))
     value = float(dr.slice(data, where))
     raise IrrcacheError(
-        f"irrcache: the {name} has {count} values that are negative or not finite, the first at voxel "
-        f"(z, y, x) = ({z}, {y}, {x}): {value:g}. Clean the data first (numpy.nan_to_num, numpy.clip, or "
+        f"irrcache: the {name} has {count} values that are negative or not finite, the first at "
+        "voxel "
+        f"(z, y, x) = ({z}, {y}, {x}): {value:g}. Clean the data first (numpy.nan_to_num, "
+        "numpy.clip, or "
         '"irrcache import --clip ... --replace-nan ...").'
     )
 
@@ -161,15 +176,17 @@ def _check_values(data: mi.Float, shape: tuple[int, ...], name: str) -> None:
 def _placement(volume: mi.Volume) -> np.ndarray:
     """``to_world`` of a volume's unit cube.
 
-    Mitsuba exposes it only as text of six digits; the exact bounding box then corrects position and size,
-    which leaves axis-aligned placements exact and rotated ones good to about 1e-6 of the grid's size.
+    Mitsuba exposes it only as text of six digits; the exact bounding box then corrects position and
+    size, which leaves axis-aligned placements exact and rotated ones good to about 1e-6 of the
+    grid's size.
     """
     number = r"[-+0-9.einfa]+"
     row = rf"\[({number}), ({number}), ({number}), ({number})\]"
     match = re.search(r"matrix=\[" + r",\s*".join([row] * 4) + r"\]", str(volume))
     if match is None:
         raise UnsupportedSceneError(
-            f"irrcache: cannot read the placement of {volume.class_name()} from its description; this version "
+            f"irrcache: cannot read the placement of {volume.class_name()} from its description; "
+            "this version "
             'of Mitsuba is not supported. Use "volpath" and report this.'
         )
     to_world = np.linalg.inv(np.array([float(v) for v in match.groups()]).reshape(4, 4))
@@ -188,7 +205,9 @@ def _axis_aligned(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
 
 
 def _clipping_box(volume: mi.Volume, boundary: Boundary) -> tuple[np.ndarray, np.ndarray] | None:
-    """The world box outside which Mitsuba's heterogeneous medium ends, or None if the boundary is inside it."""
+    """The world box outside which Mitsuba's heterogeneous medium ends, or None if the boundary is
+    inside it.
+    """
     lower, upper = (np.array(p, dtype=np.float64) for p in (volume.bbox().min, volume.bbox().max))
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
     world = boundary.frame[:3, :3] @ corners + boundary.frame[:3, 3:]
@@ -199,24 +218,28 @@ def _clipping_box(volume: mi.Volume, boundary: Boundary) -> tuple[np.ndarray, np
 
 
 def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
-    """Compares the baked fields with Mitsuba's own at scattered points: nearest filtering, repeated grids and
-    whatever else cannot be seen from outside would show here instead of in a wrong picture."""
+    """Compares the baked fields with Mitsuba's own at scattered points: nearest filtering, repeated
+    grids and whatever else cannot be seen from outside would show here instead of in a wrong
+    picture.
+    """
     rng = mi.PCG32(512)
     frame = Grid((1, 1, 1), grid.frame)
     p = frame.world.point(mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32()))
     interaction = dr.zeros(mi.MediumInteraction3f, 512)
     interaction.p = p
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(interaction, True)
-    mine_t = mi.Color3f(grid.sigma_t.at_world(p))
+    mine_t = mi.Spectrum(grid.sigma_t.at_world(p))
     mine_s = mine_t * grid.albedo.at_world(p)
     scale = max(grid.sigma_t.maximum, 1e-30)
     error = dr.maximum(
-        dr.max(dr.abs(mi.Color3f(sigma_t) - mine_t)), dr.max(dr.abs(mi.Color3f(sigma_s) - mine_s))
+        dr.max(dr.abs(mi.Spectrum(sigma_t) - mine_t)), dr.max(dr.abs(mi.Spectrum(sigma_s) - mine_s))
     )
     worst = float(dr.max(error)[0]) / scale
     if worst > 0.02:
         raise UnsupportedSceneError(
-            f"irrcache: {name} does not interpolate as expected (difference of {worst:.1%} of its maximum). "
-            'Only trilinear, clamped volumes are supported: use filter_type "trilinear" and wrap_mode "clamp", '
+            f"irrcache: {name} does not interpolate as expected (difference of {worst:.1%} of its "
+            "maximum). "
+            'Only trilinear, clamped volumes are supported: use filter_type "trilinear" and '
+            'wrap_mode "clamp", '
             'or render with "volpath".'
         )

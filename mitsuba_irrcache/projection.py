@@ -1,10 +1,12 @@
-"""Projection of the cache to the screen: ray marching of the radiative transfer equation (paper, eq. 1).
+"""Projection of the cache to the screen: ray marching of the radiative transfer equation (paper,
+eq. 1).
 
     L = int T sigma_s Phi / (4 pi) dt + T L_background
 
-One step is as long as the shortest voxel edge of the medium's grid times ``step``; steps end on the medium's bounds, never
-beyond. The lattice of steps is shifted by a random offset per ray, so that what is left of the discretisation is noise,
-not bands. Macrocells without extinction are crossed in one go.
+One step is as long as the shortest voxel edge of the medium's grid times ``step``; steps end on the
+medium's bounds, never beyond. The lattice of steps is shifted by a random offset per ray, so that
+what is left of the discretisation is noise, not bands. Macrocells without extinction are crossed in
+one go.
 """
 
 from __future__ import annotations
@@ -17,8 +19,8 @@ from .medium import MediumGrid
 
 QUADRATURES = ("riemann", "trapezoid", "exponential")
 
-#: A ray ends early once nothing ahead, not even the brightest cache voxel or the background seen through the
-#: transmittance left, can change its radiance by more than this fraction.
+#: A ray ends early once nothing ahead, not even the brightest cache voxel or the background seen
+#: through the transmittance left, can change its radiance by more than this fraction.
 EARLY_STOP = 1e-4
 
 
@@ -33,17 +35,23 @@ class Projection:
         self.quadrature = quadrature
         grids = [f.grid for f in (medium.sigma_t, medium.albedo, irradiance) if f and f.grid]
         # A constant medium varies only as its light does; without either one step is exact.
-        reference = medium.sigma_t.grid or (min(grids, key=lambda g: g.voxel_size.min()) if grids else None)
+        reference = medium.sigma_t.grid or (
+            min(grids, key=lambda g: g.voxel_size.min()) if grids else None
+        )
         length = reference.voxel_size.min() * step if reference else dr.inf
         self.step = dr.opaque(mi.Float, float(length))
         brightest = irradiance.maximum * medium.albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         self.brightest = dr.opaque(mi.Float, brightest)
 
     def source(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
-        """albedo Phi / (4 pi): in-scattered radiance per unit of optical depth."""
+        """Albedo Phi / (4 pi): in-scattered radiance per unit of optical depth."""
         if self.irradiance is None:
             return mi.Float(0)
-        return self.medium.albedo.at_world(p, active) * self.irradiance.at_world(p, active) * dr.inv_four_pi
+        return (
+            self.medium.albedo.at_world(p, active)
+            * self.irradiance.at_world(p, active)
+            * dr.inv_four_pi
+        )
 
     @dr.syntax
     def march(
@@ -55,10 +63,11 @@ class Projection:
         offset: mi.Float,
         active: mi.Bool,
     ):
-        """Scattered radiance and transmittance between ``near`` and ``far``, as two ``mi.Spectrum``.
+        """Scattered radiance and transmittance between ``near`` and ``far``, as two
+        ``mi.Spectrum``.
 
-        ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is the radiance behind the medium,
-        which early termination has to know.
+        ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is the
+        radiance behind the medium, which early termination has to know.
         """
         sigma_t, walk = self.medium.sigma_t, self.medium.macrocells.walk(ray)
         active = mi.Bool(active) & (near < far)
@@ -100,10 +109,11 @@ class Projection:
 def segment(quadrature: str, sigma_a, sigma_b, source_a, source_b, length: mi.Float):
     """Radiance that a segment adds at its start, and its transmittance.
 
-    ``sigma_*`` is the extinction and ``source_*`` = albedo Phi / (4 pi) at both ends. ``riemann`` (the paper's rule, order 1)
-    takes all from the start; ``trapezoid`` (order 2) takes extinction and sigma_s Phi / (4 pi) as linear in distance;
-    ``exponential`` (order 2) takes extinction and source as linear in distance and the transmittance as exact, so that
-    opaque and long segments stay right.
+    ``sigma_*`` is the extinction and ``source_*`` = albedo Phi / (4 pi) at both ends. ``riemann``
+    (the paper's rule, order 1) takes all from the start; ``trapezoid`` (order 2) takes extinction
+    and sigma_s Phi / (4 pi) as linear in distance; ``exponential`` (order 2) takes extinction and
+    source as linear in distance and the transmittance as exact, so that opaque and long segments
+    stay right.
     """
     if quadrature == "riemann":
         absorbed = absorptance(sigma_a * length)
@@ -118,10 +128,11 @@ def segment(quadrature: str, sigma_a, sigma_b, source_a, source_b, length: mi.Fl
 def exponential_weights(tau_a, tau_b) -> tuple:
     """Weights of the sources at both ends: int_0^1 (1 - u | u) sigma(u) e^-tau(u) du.
 
-    ``tau_a``, ``tau_b`` are the extinctions at the ends times the segment's length, sigma(u) is linear between them and
-    tau(u) = tau_a u + (tau_b - tau_a) u^2 / 2. By parts near = int 1 - e^-tau(u) du, here with three Gauss-Legendre
-    points: right to 1e-3 up to optical depths of 5, and within [0, 1] for all. A source linear in *optical depth* would be simpler, but
-    weights the empty end of a segment that enters a surface far too much.
+    ``tau_a``, ``tau_b`` are the extinctions at the ends times the segment's length, sigma(u) is
+    linear between them and tau(u) = tau_a u + (tau_b - tau_a) u^2 / 2. By parts near = int 1 -
+    e^-tau(u) du, here with three Gauss-Legendre points: right to 1e-3 up to optical depths of 5,
+    and within [0, 1] for all. A source linear in *optical depth* would be simpler, but weights the
+    empty end of a segment that enters a surface far too much.
     """
     near = 0.0
     for u, weight in ((0.5 - 0.3872983346, 5 / 18), (0.5, 8 / 18), (0.5 + 0.3872983346, 5 / 18)):

@@ -29,7 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="scene XML")
     parser.add_argument("-o", "--output", help="EXR to write (default: beside the scene)")
     parser.add_argument(
-        "-m", "--mode", default="llvm_ad_rgb", choices=SUPPORTED, help="variant (default: %(default)s)"
+        "-m",
+        "--mode",
+        default="llvm_ad_rgb",
+        choices=SUPPORTED,
+        help="variant (default: %(default)s)",
     )
     parser.add_argument(
         "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
@@ -39,9 +43,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
         help="integrator to use, with properties (default: the scene's if it is irrcache, else irrcache)",
     )  # fmt: skip
-    parser.add_argument("--spp", type=int, default=0, help="samples per pixel (default: the scene's)")
-    parser.add_argument("-s", "--sensor", type=int, default=0, help="index of the sensor (default: 0)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the camera samples (default: 0)")
+    parser.add_argument(
+        "--spp", type=int, default=0, help="samples per pixel (default: the scene's)"
+    )
+    parser.add_argument(
+        "-s", "--sensor", type=int, default=0, help="index of the sensor (default: 0)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the camera samples (default: 0)"
+    )
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
 
 
@@ -50,7 +60,9 @@ def run(args: argparse.Namespace) -> int:
     source = Path(args.scene)
     output = check_output(args.output or source.with_suffix(".exr"))
     if args.spp < 0:
-        raise IrrcacheError(f"--spp is {args.spp}; it must be at least 1 (or 0 for the scene's own).")
+        raise IrrcacheError(
+            f"--spp is {args.spp}; it must be at least 1 (or 0 for the scene's own)."
+        )
     if args.mode.startswith("llvm"):
         require_llvm()
     mi.set_variant(args.mode)
@@ -66,7 +78,8 @@ def run(args: argparse.Namespace) -> int:
         scene = load_scene(source, parameters, integrator)
     if not 0 <= args.sensor < len(scene.sensors()):
         raise IrrcacheError(
-            f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), counted from 0."
+            f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), "
+            "counted from 0."
         )
     image = _render(scene, args, seconds)
     png = write_image(output, image, _describe(scene, args, seconds))
@@ -120,7 +133,9 @@ def _definitions(items: list[str]) -> dict[str, str]:
     return result
 
 
-def _describe(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]) -> dict[str, object]:
+def _describe(
+    scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]
+) -> dict[str, object]:
     """What made the image, for the header of the EXR."""
     described = {
         "version": __version__,
@@ -135,5 +150,7 @@ def _describe(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, floa
     }
     cache = getattr(scene.integrator(), "cache", None)
     if cache is not None:
-        described["cache"] = f"{'x'.join(map(str, cache.grid.shape[::-1]))} voxels, {cache.samples} samples"
+        described["cache"] = (
+            f"{'x'.join(map(str, cache.grid.shape[::-1]))} voxels, {cache.samples} samples"
+        )
     return described | {f"seconds_{name}": value for name, value in seconds.items()}

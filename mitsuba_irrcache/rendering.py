@@ -25,7 +25,9 @@ def render_film(
     should_stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int, int], None] | None = None,
 ) -> mi.Film:
-    """Renders ``radiance`` to the sensor's film, ``spp`` samples per pixel (0: the sampler's own count)."""
+    """Renders ``radiance`` to the sensor's film, ``spp`` samples per pixel (0: the sampler's own
+    count).
+    """
     film, sampler = sensor.film(), sensor.sampler().clone()
     if spp:
         sampler.set_sample_count(spp)
@@ -72,7 +74,9 @@ def _splat(
     radiance: RadianceFunction,
 ) -> None:
     film = sensor.film()
-    index = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass) // dr.opaque(mi.UInt32, per_pass)
+    index = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass) // dr.opaque(
+        mi.UInt32, per_pass
+    )
     width = dr.opaque(mi.UInt32, int(size.x))
     row = index // width
     pixel = mi.Vector2f(mi.Vector2i(mi.Int32(index - row * width), mi.Int32(row)) - border)
@@ -95,6 +99,10 @@ def _splat(
         )
     else:
         rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
-        channels = [*rgb, alpha, mi.Float(1)] if mi.has_flag(flags, mi.FilmFlags.Alpha) else [*rgb, mi.Float(1)]
+        channels = (
+            [*rgb, alpha, mi.Float(1)]
+            if mi.has_flag(flags, mi.FilmFlags.Alpha)
+            else [*rgb, mi.Float(1)]
+        )
     # With a box filter the sample's place in the pixel does not matter; its rounding would.
     block.put(pixel if film.rfilter().is_box_filter() else position, channels)

@@ -29,7 +29,9 @@ def find_medium(scene: mi.Scene) -> tuple[mi.Medium, mi.Shape] | None:
     medium = shape.interior_medium()
     for sensor in scene.sensors():
         if sensor.get_medium() not in (None, medium):
-            _refuse(f'sensor "{sensor.id()}" is in another medium than the interior of "{shape.id()}"')
+            _refuse(
+                f'sensor "{sensor.id()}" is in another medium than the interior of "{shape.id()}"'
+            )
     return medium, shape
 
 
@@ -54,11 +56,12 @@ def _check_shape(shape: mi.Shape) -> None:
 
 def _refuse(reason: str, hint: str = "") -> None:
     raise UnsupportedSceneError(
-        f'irrcache: {reason}, which would be rendered wrongly.{hint} Otherwise render this scene with "volpath".'
+        f"irrcache: {reason}, which would be rendered wrongly.{hint} Otherwise render this scene "
+        'with "volpath".'
     )
 
 
 def bake_scene(scene: mi.Scene) -> MediumGrid | None:
     """The scene's medium on its grids, or None where there is none."""
     found = find_medium(scene)
-    return None if found is None else bake(found[0], boundary_of(found[1]))
+    return None if found is None else bake(found[0], boundary_of(scene, found[1]))

@@ -1,7 +1,7 @@
 """Null-collision tracking through a medium: free flights and transmittance, both unbiased.
 
-Tentative collisions are drawn with the majorant of the macrocell at hand. Functions return the random generator
-they advanced, since a recorded loop does not update its caller's copy.
+Tentative collisions are drawn with the majorant of the macrocell at hand. Functions return the
+random generator they advanced, since a recorded loop does not update its caller's copy.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ def free_flight(
     rng: mi.PCG32,
     active: mi.Bool,
 ):
-    """Delta tracking from ``near`` to ``far``: whether the ray collides, where, and the weight carried on.
+    """Delta tracking from ``near`` to ``far``: whether the ray collides, where, and the weight
+    carried on.
 
-    With grey extinction the weight is unchanged. With coloured extinction a collision is accepted with the
-    probability that the current weights give it, and the weights make up for each channel's difference
-    (spectral tracking, Kutz et al. 2017), so that they stay bounded.
+    With grey extinction the weight is unchanged. With coloured extinction a collision is accepted
+    with the probability that the current weights give it, and the weights make up for each
+    channel's difference (spectral tracking, Kutz et al. 2017), so that they stay bounded.
     """
     walk = medium.macrocells.walk(ray)
     t = mi.Float(near)
@@ -73,8 +74,8 @@ def transmittance(
 ):
     """An unbiased estimate of T = exp(-int sigma_t dt) from ``near`` to ``far``.
 
-    Analytic for a homogeneous medium; otherwise residual ratio tracking (Novak et al. 2014) with each macrocell's
-    smallest extinction as control, so every factor lies in [0, 1].
+    Analytic for a homogeneous medium; otherwise residual ratio tracking (Novak et al. 2014) with
+    each macrocell's smallest extinction as control, so every factor lies in [0, 1].
     """
     if dr.hint(medium.homogeneous, mode="scalar"):
         length = dr.maximum(far - near, 0)

@@ -4,8 +4,9 @@ With isotropic scattering the irradiance at x is a sum over scattering orders (p
 
     Phi(x) = sum_k E[beta_k D(x_k)],   x_0 = x,  beta_0 = 1,  beta_k = beta_(k-1) albedo(x_k)
 
-where x_k follows from x_(k-1) by a uniform direction and a free flight, and D(x) = int_S2 L_e T dw is the light that
-reaches x straight from the emitters. Order 0 is the *uncollided* layer of the cache, the others the *scattered* one.
+where x_k follows from x_(k-1) by a uniform direction and a free flight, and D(x) = int_S2 L_e T dw
+is the light that reaches x straight from the emitters. Order 0 is the *uncollided* layer of the
+cache, the others the *scattered* one.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from time import perf_counter
 import drjit as dr
 import mitsuba as mi
 
-from ..cache import BATCH, IrradianceCache
-from ..medium import MediumGrid
-from ..tracking import free_flight, transmittance
+from mitsuba_irrcache.cache import BATCH, IrradianceCache
+from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.tracking import free_flight, transmittance
 
-#: Paths in one kernel launch: enough to fill any machine, few enough to bound memory (about 100 bytes each).
+#: Paths in one kernel launch: enough to fill any machine, few enough to bound memory (about 100
+#: bytes each).
 LANES = 1 << 21
 
 #: called with (samples done, samples in all), both in voxels times samples
@@ -36,10 +38,11 @@ def refine(
     rr_depth: int,
     progress: Progress | None = None,
 ) -> None:
-    """Adds ``samples`` per voxel (a multiple of ``BATCH``) of the random stream ``seed`` to ``cache``.
+    """Adds ``samples`` per voxel (a multiple of ``BATCH``) of the random stream ``seed`` to
+    ``cache``.
 
-    The stream goes on where an earlier call with the same seed stopped. Passes end early without losing
-    anything if ``progress`` raises: what was added stays valid.
+    The stream goes on where an earlier call with the same seed stopped. Passes end early without
+    losing anything if ``progress`` raises: what was added stays valid.
     """
     orders = cache.max_depth - 1 if cache.max_depth >= 0 else 0xFFFFFFFF
     if not cache.active_count or orders < 1 or not scene.emitters():
@@ -80,13 +83,17 @@ def _batches(
     seed: int,
     rr_depth: int,
 ) -> tuple:
-    """Sums and sums of squares of batch means of ``count`` batches, for the voxels ``start`` ... of the active list."""
+    """Sums and sums of squares of batch means of ``count`` batches, for the voxels ``start`` ... of
+    the active list.
+    """
     width = min(block, cache.active_count - start)
     lane = dr.arange(mi.UInt32, width * count * BATCH)
     within = lane % BATCH
     batch = (lane // BATCH) % dr.opaque(mi.UInt32, count)
     voxel = dr.gather(
-        mi.UInt32, cache.active, lane // dr.opaque(mi.UInt32, BATCH * count) + dr.opaque(mi.UInt32, start)
+        mi.UInt32,
+        cache.active,
+        lane // dr.opaque(mi.UInt32, BATCH * count) + dr.opaque(mi.UInt32, start),
     )
     layers = _estimate(
         scene,
@@ -103,7 +110,9 @@ def _batches(
     result = []
     for value in layers:
         for channel in range(cache.channels):
-            mean = dr.block_sum(value[channel], BATCH) / BATCH
+            # A layer that is zero throughout comes as a literal without a width.
+            samples = value[channel] + dr.zeros(mi.Float, dr.width(lane))
+            mean = dr.block_sum(samples, BATCH) / BATCH
             result.append((dr.block_sum(mean, count), dr.block_sum(dr.square(mean), count)))
     dr.eval(result)
     return tuple(result)
@@ -122,14 +131,20 @@ def _estimate(
     rr_depth: mi.UInt32,
     multiple: bool,
 ):
-    """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over directions."""
+    """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over
+    directions.
+    """
     shift_a, shift_b = mi.sample_tea_32(voxel, mi.sample_tea_32(seed, batch)[0])
-    rng = mi.PCG32(initstate=mi.UInt64(shift_a) << 32 | mi.UInt64(shift_b), initseq=mi.UInt64(within) + 1)
+    rng = mi.PCG32(
+        initstate=mi.UInt64(shift_a) << 32 | mi.UInt64(shift_b), initseq=mi.UInt64(within) + 1
+    )
     # A batch shares one random shift of a low-discrepancy set; each point alone is uniform.
     shifts = mi.PCG32(initstate=mi.UInt64(shift_b) << 32 | mi.UInt64(shift_a), initseq=mi.UInt64(0))
     spread = [_fraction(shifts.next_float32() + _kronecker(within, axis)) for axis in range(4)]
     always = mi.Bool(True)
-    uncollided, rng = direct_light(scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always)
+    uncollided, rng = direct_light(
+        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always
+    )
     scattered = mi.Spectrum(0)
     if dr.hint(multiple, mode="scalar"):
         weight = mi.Spectrum(1)
@@ -183,7 +198,9 @@ def direct_light(
 
 
 def _kronecker(index: mi.UInt32, axis: int) -> mi.Float:
-    """Point ``index`` of the four-dimensional Kronecker sequence of the generalised golden ratio."""
+    """Point ``index`` of the four-dimensional Kronecker sequence of the generalised golden
+    ratio.
+    """
     golden = 1.1673039782614187  # root of x^5 = x + 1
     return mi.Float(index) * (golden ** -(axis + 1) % 1.0)
 

@@ -1,0 +1,50 @@
+"""Errors of an image against a reference that was rendered in two independent halves a and b.
+
+The halves' noise is independent of the image and of each other, so it drops out of products such as
+(x - a)(x - b). Images are arrays (height, width, channel) of linear radiance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def net_rmse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Root mean square error without the reference's noise: sqrt(mean((x - a)(x - b)))."""
+    return _root(np.mean((image - a) * (image - b), dtype=np.float64))
+
+
+def mean_error(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Mean signed error: what is left when all noise is averaged out."""
+    return float(np.mean(image - 0.5 * (a + b), dtype=np.float64))
+
+
+def block_error(image: np.ndarray, a: np.ndarray, b: np.ndarray, size: int = 8) -> float:
+    """Net RMSE of the means over blocks of ``size`` x ``size`` pixels: what the eye sees as
+    blotches and bands.
+    """
+    return _root(np.mean(block_means(image - a, size) * block_means(image - b, size)))
+
+
+def discretisation_error(x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """What two independent runs x and y of one method have in common: its error without its
+    noise.
+    """
+    return _root(np.mean((x - a) * (y - b), dtype=np.float64))
+
+
+def noise(x: np.ndarray, y: np.ndarray) -> float:
+    """Standard deviation of one run, from two independent ones."""
+    return _root(0.5 * np.mean((x - y) ** 2, dtype=np.float64))
+
+
+def block_means(image: np.ndarray, size: int) -> np.ndarray:
+    """Means over blocks; what does not fill a block at the right and bottom is left out."""
+    height, width = (n // size for n in image.shape[:2])
+    cropped = np.asarray(image, dtype=np.float64)[: height * size, : width * size]
+    return cropped.reshape(height, size, width, size, -1).mean(axis=(1, 3))
+
+
+def _root(value: float) -> float:
+    """Square root that keeps the sign: an estimate of a vanishing square may be negative."""
+    return float(np.copysign(np.sqrt(abs(value)), value))

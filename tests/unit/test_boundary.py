@@ -1,0 +1,106 @@
+"""Boundaries: recognised whatever plugin made them, and hit where brute force says."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.boundary import Boundary, boundary_of
+from mitsuba_irrcache.errors import UnsupportedSceneError
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+PLACEMENTS = [
+    {},
+    {"turn": 35.0, "edges": (0.3, 2.0, 1.0)},
+    {"mirror": True, "turn": 10.0, "center": (2.0, -1.0, 0.5)},
+]
+
+
+def rays(count: int = 2048) -> tuple[np.ndarray, np.ndarray]:
+    """From a sphere around the origin towards points near it, (3, n) each, float32."""
+    rng = np.random.default_rng(3)
+    origin = rng.normal(size=(3, count))
+    origin *= 5 / np.linalg.norm(origin, axis=0)
+    direction = rng.uniform(-1.5, 1.5, (3, count)) - origin
+    return np.float32(origin), np.float32(direction / np.linalg.norm(direction, axis=0))
+
+
+@pytest.mark.parametrize("kind", ["cube", "sphere"])
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_hits_are_mitsubas(scenes, kind, placement):
+    """Entry and exit, ray by ray, as ray tracing against the shape finds them."""
+    if kind == "sphere":
+        placement = {k: v for k, v in placement.items() if k == "center"}
+    shape = scenes.boundary(scenes.medium(1.0, 0.5), scenes.placement(**placement), kind)
+    scene = scenes.load({"type": "volpath"}, shape)
+    boundary = boundary_of(scene, scene.shapes()[0])
+    origin, direction = rays()
+    ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+    hit, near, far = boundary.intersect(ray)
+    hit, near, far = np.array(hit), np.array(near), np.array(far)
+    front = scene.ray_intersect_preliminary(ray)
+    back = scene.ray_intersect_preliminary(mi.Ray3f(ray(20.0), -ray.d))
+    first, last = np.array(front.t), 20.0 - np.array(back.t)
+    grazing = np.isfinite(first) & (last - first < 1e-3)
+    seen = np.isfinite(first) & ~grazing
+    assert 0.1 < seen.mean() < 0.99
+    assert (hit[seen]).all() and not (hit & ~np.isfinite(first)).mean() > 1e-3
+    np.testing.assert_allclose(near[seen], first[seen], atol=2e-4)
+    np.testing.assert_allclose(far[seen], last[seen], atol=2e-4)
+
+
+@pytest.mark.parametrize("kind", ["box", "sphere"])
+def test_from_within(kind):
+    """From inside, entry is behind and exit ahead."""
+    boundary = Boundary(kind, np.eye(4))
+    ray = mi.Ray3f(mi.Point3f(0.25, 0, 0), mi.Vector3f(1, 0, 0))
+    hit, near, far = boundary.intersect(ray)
+    assert hit[0]
+    assert near[0] == pytest.approx(-1.25) and far[0] == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_any_scale(scale):
+    """The same hits, in units of the size."""
+    boundary = Boundary("box", np.diag([scale, scale, scale, 1.0]))
+    origin, direction = rays(256)
+    ray = mi.Ray3f(mi.Point3f(origin * np.float32(scale)), mi.Vector3f(direction))
+    unit = Boundary("box", np.eye(4)).intersect(
+        mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+    )
+    hit, near, far = boundary.intersect(ray)
+    seen = np.array(unit[0])
+    np.testing.assert_array_equal(np.array(hit), seen)
+    for mine, theirs in ((near, unit[1]), (far, unit[2])):
+        np.testing.assert_allclose(np.array(mine)[seen] / scale, np.array(theirs)[seen], rtol=1e-4)
+
+
+def test_a_box_from_another_plugin(scenes, tmp_path):
+    """A PLY of the turned cube's mesh is the same boundary."""
+    place = scenes.placement((1.0, 2.0, 3.0), turn=50)
+    shape = scenes.boundary(scenes.medium(1.0, 0.5), place)
+    cube = scenes.load({"type": "volpath"}, shape)
+    cube.shapes()[0].write_ply(str(tmp_path / "box.ply"))
+    again = shape | {"type": "ply", "filename": str(tmp_path / "box.ply")}
+    del again["to_world"]
+    mesh = scenes.load({"type": "volpath"}, again)
+    expected, measured = (boundary_of(s, s.shapes()[0]).to_world for s in (cube, mesh))
+    np.testing.assert_allclose(measured, expected, atol=1e-5)
+
+
+def test_other_shapes_are_refused(scenes):
+    shape = scenes.boundary(scenes.medium(1.0, 0.5)) | {"type": "cylinder"}
+    scene = scenes.load({"type": "volpath"}, shape)
+    with pytest.raises(UnsupportedSceneError, match="Cylinder.*boxes"):
+        boundary_of(scene, scene.shapes()[0])
+
+
+def test_inward_normals_are_refused(scenes):
+    """A cube mirrored by its to_world holds the medium outside of it, in Mitsuba."""
+    shape = scenes.boundary(scenes.medium(1.0, 0.5))
+    shape["to_world"] = mi.ScalarTransform4f(np.diag([-1.0, 1, 1, 1]))
+    scene = scenes.load({"type": "volpath"}, shape)
+    with pytest.raises(UnsupportedSceneError, match="normals"):
+        boundary_of(scene, scene.shapes()[0])

@@ -1,0 +1,93 @@
+"""Scene files with parameters and with another integrator."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.loading import integrator_of, load_scene, parse_integrator
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SCENE = """<scene version="3.0.0">
+    <default name="size" value="8"/>
+    <integrator type="volpath"> <integer name="max_depth" value="3"/> <integer name="rr_depth" value="7"/> </integrator>
+    <sensor type="perspective">
+        <film type="hdrfilm"> <integer name="width" value="$size"/> <integer name="height" value="$size"/> </film>
+    </sensor>
+    <shape type="cube">
+        <bsdf type="null"/>
+        <medium name="interior" type="heterogeneous">
+            <volume name="sigma_t" type="gridvolume"> <string name="filename" value="density.vol"/> </volume>
+            <float name="albedo" value="0.5"/>
+        </medium>
+    </shape>
+    <emitter type="constant"/>
+</scene>
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A scene file that finds its volume beside it, not in the working folder."""
+    mi.VolumeGrid(np.ones((2, 2, 2, 1), np.float32)).write(str(tmp_path / "density.vol"))
+    (tmp_path / "scene.xml").write_text(SCENE)
+    return tmp_path / "scene.xml"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("volpath", ("volpath", {})),
+        (" irrcache { step = 0.5 , cache_spp=8 } ", ("irrcache", {"step": 0.5, "cache_spp": 8})),
+        ("irrcache{}", ("irrcache", {})),
+        ("a{hide_emitters=true,b=false}", ("a", {"hide_emitters": True, "b": False})),
+        (
+            "a{quadrature=riemann,cache_file='x=y.npz'}",
+            ("a", {"quadrature": "riemann", "cache_file": "x=y.npz"}),
+        ),
+        ("a{x=1e-3,y=-1}", ("a", {"x": 1e-3, "y": -1})),
+    ],
+)
+def test_specification(text, expected):
+    assert parse_integrator(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["", "irrcache{step", "irrcache{step}", "irrcache{=1}", "two words"]
+)
+def test_unreadable_specification_is_quoted(text):
+    with pytest.raises(IrrcacheError, match="cannot read"):
+        parse_integrator(text)
+
+
+def test_scene_as_it_is(file):
+    scene = load_scene(file, {"size": "5"})
+    assert scene.integrator().class_name() == "VolumetricPathIntegrator"
+    assert tuple(scene.sensors()[0].film().size()) == (5, 5)
+
+
+def test_integrator_takes_over_what_is_shared(file):
+    text = str(load_scene(file, integrator="irrcache{step=0.5}").integrator())
+    assert "max_depth = 3" in text and "rr_depth = 7" in text and "step = 0.5" in text
+    assert "max_depth = 9" in str(load_scene(file, integrator="irrcache{max_depth=9}").integrator())
+
+
+def test_search_path_is_restored(file):
+    before = str(mi.file_resolver())
+    load_scene(file)
+    assert str(mi.file_resolver()) == before
+
+
+def test_integrator_of(file):
+    assert integrator_of(file) == "volpath"
+
+
+def test_missing_file_and_missing_integrator(tmp_path):
+    with pytest.raises(IrrcacheError, match=r"no scene file .*absent\.xml"):
+        load_scene(tmp_path / "absent.xml")
+    (tmp_path / "bare.xml").write_text('<scene version="3.0.0"/>')
+    with pytest.raises(IrrcacheError, match="names no integrator"):
+        load_scene(tmp_path / "bare.xml", integrator="irrcache")

@@ -1,0 +1,50 @@
+"""The plugin is there in every order of imports and variants, each in a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+LOAD = 'i = mi.load_dict({"type": "irrcache"}); assert "IrradianceCaching" in type(i).__name__;'
+ORDERS = {
+    "import first": f'import mitsuba_irrcache, mitsuba as mi; mi.set_variant("llvm_ad_rgb"); {LOAD}',
+    "variant first": f'import mitsuba as mi; mi.set_variant("llvm_ad_rgb"); import mitsuba_irrcache; {LOAD}',
+    "variants in turn": (
+        "import mitsuba as mi, mitsuba_irrcache;"
+        + "".join(f'mi.set_variant("llvm_ad_{v}"); {LOAD}' for v in ("rgb", "mono", "rgb"))
+        + "assert isinstance(i, mi.SamplingIntegrator)"
+    ),
+    "imported without a variant": "import mitsuba_irrcache, mitsuba as mi; assert mi.variant() is None",
+    "reloaded": (
+        "import importlib, mitsuba as mi, mitsuba_irrcache, mitsuba_irrcache._register as r;"
+        'importlib.reload(r); importlib.reload(r); mi.set_variant("llvm_ad_rgb");' + LOAD
+    ),
+}
+
+
+@pytest.mark.parametrize("program", ORDERS.values(), ids=ORDERS)
+def test_order(program):
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+
+
+REFUSED = {"scalar_rgb": "voxel in interpreted Python", "llvm_ad_spectral": "not wavelengths"}
+
+
+@pytest.mark.parametrize(("variant", "reason"), REFUSED.items())
+def test_other_variants_are_refused_when_used(variant, reason):
+    """Importing is fine; loading the integrator says why not, and what works."""
+    program = (
+        f'import mitsuba as mi, mitsuba_irrcache; mi.set_variant("{variant}"); print("imported");'
+        'mi.load_dict({"type": "irrcache"})'
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
+    )
+    assert "imported" in done.stdout
+    assert done.returncode == 1
+    assert variant in done.stderr and reason in done.stderr and "llvm_ad_rgb" in done.stderr
