@@ -17,6 +17,7 @@ from mitsuba_irrcache.variants import require_variant
 
 SOLVERS = ("auto", "path")
 FILTERS = ("none",)
+_NO_GRADIENTS = 'irrcache computes no gradients; use the integrator "prbvolpath" for them.'
 
 
 class IrradianceCachingIntegrator(mi.SamplingIntegrator):
@@ -192,6 +193,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                 dr.sync_thread()
             return image
 
+    def render_forward(self, *args: object, **kwargs: object) -> mi.TensorXf:
+        raise NotImplementedError(_NO_GRADIENTS)
+
+    def render_backward(self, *args: object, **kwargs: object) -> None:
+        raise NotImplementedError(_NO_GRADIENTS)
+
     def _radiance(
         self,
         scene: mi.Scene,
@@ -212,8 +219,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             escaped.wavelengths = ray.wavelengths
             background = environment.eval(escaped, active)
         hit, near, far = self._builder.medium.intersect(ray)
-        # As in volpath, a sensor is in the medium only if the scene says so.
-        entered = near > -1e-5 * (far - near)
+        # As in volpath, a sensor is in the medium only if the scene says so, and the way in leads
+        # through the boundary, wherever inside of it the medium's grid begins.
+        _, entry, leave = self._builder.medium.boundary.intersect(ray)
+        entered = entry > -1e-5 * (leave - entry)
         hit &= (far > 0) if inside else entered
         near = dr.maximum(near, 0)
         scattered, transmittance = self._projection.march(

@@ -49,23 +49,25 @@ class CacheBuilder:
         self.medium: MediumGrid | None = None
         self.cache: IrradianceCache | None = None
         self.seconds = 0.0
-        self._scene: mi.Scene | None = None
+        # Not the scene itself: it owns the integrator, and neither would ever be freed.
+        self._scene_id = 0
         self._snapshot: Snapshot | None = None
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> bool:
         """Makes ``medium`` and ``cache`` fit ``scene``; True if anything changed."""
         snapshot = Snapshot(scene)
-        edited = snapshot.changes(self._snapshot) if scene is self._scene else []
-        stale = scene is not self._scene or bool(edited)
+        changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
+        stale = self._snapshot is None or bool(changes)
         if stale:
+            edited = bool(changes) and id(scene) == self._scene_id
             if edited:
-                names = ", ".join(edited[:4])
+                names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
-            self.medium = self.cache = None
+            self.medium = self.cache = self._snapshot = None
             self.medium = bake_scene(scene)
             if self.medium is not None and self.settings.max_depth not in (0, 1):
-                self.cache = self._start_cache(scene, self.medium, bool(edited))
-            self._scene, self._snapshot = scene, snapshot
+                self.cache = self._start_cache(scene, self.medium, edited)
+            self._scene_id, self._snapshot = id(scene), snapshot
         if self.cache is not None and self.cache.samples < self._target:
             self._fill(scene, progress)
             return True

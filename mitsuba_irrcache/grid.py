@@ -143,18 +143,27 @@ class GridField:
 
     def _interpolate(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         nx, ny, _ = self.grid.sides
-        stencils = [_stencil(c, n) for c, n in zip(u, self.grid.sides, strict=True)]
-        (xs, wx), (ys, wy), (zs, wz) = stencils
-        rows = [(z * ny + y) * nx for z in zs for y in ys]
-
-        def value(row: mi.Int32, x: mi.Int32, channel: int) -> mi.Float:
-            index = mi.UInt32((row + x) * self.channels + channel)
-            return dr.gather(mi.Float, self.data, index, active)
-
+        corners, weights, steps = zip(
+            *(_stencil(c, n) for c, n in zip(u, self.grid.sides, strict=True)), strict=True
+        )
+        # One product per lookup; the other corners are a stride away, or 0 at the border.
+        base = ((corners[2] * ny + corners[1]) * nx + corners[0]) * self.channels
+        dx = dr.select(steps[0], self.channels, 0)
+        dy = dr.select(steps[1], nx * self.channels, 0)
+        dz = dr.select(steps[2], nx * ny * self.channels, 0)
+        wx, wy, wz = weights
         result = []
-        for c in range(self.channels):
-            edges = [dr.lerp(value(row, xs[0], c), value(row, xs[1], c), wx) for row in rows]
-            faces = [dr.lerp(edges[i], edges[i + 1], wy) for i in (0, 2)]
+        for channel in range(self.channels):
+            faces = []
+            for z in (base, base + dz):
+                edges = []
+                for y in (z, z + dy):
+                    low, high = (
+                        dr.gather(mi.Float, self.data, mi.UInt32(i + channel), active)
+                        for i in (y, y + dx)
+                    )
+                    edges.append(dr.lerp(low, high, wx))
+                faces.append(dr.lerp(*edges, wy))
             result.append(dr.lerp(*faces, wz))
         return result
 
@@ -178,8 +187,8 @@ class RootField(GridField):
 Field = ConstantField | GridField
 
 
-def _stencil(u: mi.Float, n: mi.Int32) -> tuple[tuple[mi.Int32, mi.Int32], mi.Float]:
-    """The two clamped voxels around the coordinate ``u`` and the weight of the second."""
+def _stencil(u: mi.Float, n: mi.Int32) -> tuple[mi.Int32, mi.Float, mi.Bool]:
+    """The lower of the two voxels around ``u``, the weight of the upper, and whether there is one."""
     s = dr.clip(u - 0.5, 0.0, mi.Float(n - 1))
     lower = mi.Int32(s)
-    return (lower, dr.minimum(lower + 1, n - 1)), s - mi.Float(lower)
+    return lower, s - mi.Float(lower), lower < n - 1

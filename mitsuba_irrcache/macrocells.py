@@ -81,25 +81,26 @@ class Walk:
     def minorant(self, cell: mi.Vector3i, active: mi.Bool) -> mi.Float:
         return dr.gather(mi.Float, self.cells.minorant, self.index(cell), active)
 
-    def exit(self, cell: mi.Vector3i) -> tuple[mi.Float, mi.Vector3i]:
-        """Distance at which the ray leaves ``cell``, and the cell behind; infinite for a border
-        cell.
+    def exit(self, cell: mi.Vector3i, t: mi.Float) -> tuple[mi.Float, mi.Vector3i]:
+        """Distance, at least ``t``, at which the ray leaves ``cell``, and the cell behind.
+
+        The distance is infinite for a border cell, which reaches that far.
         """
-        forward = self.direction >= 0
+        forward = self.rcp > 0  # also tells 0 from -0, as the reciprocal does
         wall = mi.Vector3f(cell + dr.select(forward, 1, 0))
         limits = mi.Vector3i(*self.cells.sides) - 1
         last = dr.select(forward, cell >= limits, cell <= 0)
-        t = dr.select(last, dr.inf, (wall - self.origin) * self.rcp)
-        nearest = dr.min(t)
+        distance = dr.select(last, dr.inf, (wall - self.origin) * self.rcp)
+        nearest = dr.min(distance)
         step = dr.select(forward, mi.Vector3i(1), mi.Vector3i(-1))
         # Ties step along one axis only; the next call leaves through the other at the same
         # distance.
-        on_x = t.x == nearest
-        on_y = ~on_x & (t.y == nearest)
+        on_x = distance.x == nearest
+        on_y = ~on_x & (distance.y == nearest)
         on_z = ~on_x & ~on_y
         axis = mi.Vector3i(*(dr.select(on, 1, 0) for on in (on_x, on_y, on_z)))
         following = cell + dr.select(nearest < dr.inf, axis * step, 0)
-        return nearest, following
+        return dr.maximum(nearest, t), following
 
 
 @dr.syntax

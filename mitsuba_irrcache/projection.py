@@ -85,7 +85,7 @@ class Projection:
         while dr.hint(active, label="ray march"):
             # In an empty macrocell, go on at the last lattice point inside it.
             cell = walk.cell(t)
-            wall, _ = walk.exit(cell)
+            wall, _ = walk.exit(cell, t)
             beyond = dr.floor((dr.minimum(wall, far) - near) / self.step + 1 - offset)
             empty = walk.majorant(cell, active) == 0
             skip = empty & (beyond > mi.Float(k + 1))

@@ -46,7 +46,7 @@ def free_flight(
     weight = mi.Spectrum(weight)
     while dr.hint(active, label="free flight"):
         majorant = walk.majorant(cell, active)
-        wall, following = walk.exit(cell)
+        wall, following = walk.exit(cell, t)
         candidate = t - dr.log(1 - rng.next_float32(active)) / majorant
         leaves = ~(candidate < dr.minimum(wall, far))
         tentative = active & ~leaves
@@ -91,7 +91,7 @@ def transmittance(
         while dr.hint(active, label="ratio tracking"):
             control = walk.minorant(cell, active)
             residual = walk.majorant(cell, active) - control
-            wall, following = walk.exit(cell)
+            wall, following = walk.exit(cell, t)
             end = dr.minimum(wall, far)
             candidate = t - dr.log(1 - rng.next_float32(active)) / residual
             leaves = ~(candidate < end)

@@ -89,8 +89,9 @@ def kernels():
 def placement(
     edges=(2.0, 2.0, 2.0), turn: float = 0.0, mirror: bool = False, center=(0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """``to_world`` of the unit cube: a box with these edges about ``center``, turned by ``turn`` degrees about an
-    oblique axis, and mirrored in its own x axis if asked."""
+    """``to_world`` of the unit cube: a box with these edges about ``center``, turned by ``turn``
+    degrees about an oblique axis, and mirrored in its own x axis if asked.
+    """
     axis = np.array([0.48, 0.64, 0.6])
     cross = np.cross(np.eye(3), axis)
     angle = np.deg2rad(turn)
@@ -129,7 +130,9 @@ def medium(sigma_t, albedo, to_world: np.ndarray | None = None, **properties) ->
 
 
 def boundary(interior: dict, to_world: np.ndarray | None = None, kind: str = "cube") -> dict:
-    """A shape around the unit cube's image under ``to_world`` that bounds a medium; its normals point outwards."""
+    """A shape around the unit cube's image under ``to_world`` that bounds a medium; its normals
+    point outwards.
+    """
     to_world = placement() if to_world is None else to_world
     outwards = np.sign(np.linalg.det(to_world[:3, :3]))
     local = np.diag([0.5 * outwards, 0.5, 0.5, 1])
@@ -144,7 +147,9 @@ def boundary(interior: dict, to_world: np.ndarray | None = None, kind: str = "cu
 
 
 def description(integrator: dict, shape: dict | None, size: int = 24, **objects) -> dict:
-    """A scene seen from (1, 1.5, -5), under a coloured sky and a sun unless ``objects`` names other emitters."""
+    """A scene seen from (1, 1.5, -5), under a coloured sky and a sun unless ``objects`` names other
+    emitters.
+    """
     look = mi.ScalarTransform4f().look_at([1.0, 1.5, -5.0], [0, 0, 0], [0, 1, 0])
     film = {
         "type": "hdrfilm",

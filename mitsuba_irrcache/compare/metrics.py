@@ -9,9 +9,31 @@ from __future__ import annotations
 import numpy as np
 
 
+def colours(image: np.ndarray) -> np.ndarray:
+    """The colour channels of an image (height, width, channel), without alpha and AOVs."""
+    return image[..., : 3 if image.shape[-1] >= 3 else 1]
+
+
+def net_mse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """Mean square error without the reference's noise, mean((x - a)(x - b)), and the standard error
+    of this estimate if pixels are independent.
+    """
+    products = np.multiply(image - a, image - b, dtype=np.float64)
+    return float(products.mean()), float(products.std() / np.sqrt(products.size))
+
+
 def net_rmse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     """Root mean square error without the reference's noise: sqrt(mean((x - a)(x - b)))."""
-    return _root(np.mean((image - a) * (image - b), dtype=np.float64))
+    return _root(net_mse(image, a, b)[0])
+
+
+def relative_mse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Mean of (x - a)(x - b) / (r^2 + 0.01 mean(r)^2) with the reference r = (a + b) / 2: errors in
+    dark pixels weigh as much as in bright ones.
+    """
+    r = 0.5 * (np.asarray(a, dtype=np.float64) + b)
+    floor = 0.01 * r.mean() ** 2 or 1.0
+    return float(np.mean((image - a) * (image - b) / (r**2 + floor)))
 
 
 def mean_error(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
@@ -19,10 +41,20 @@ def mean_error(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     return float(np.mean(image - 0.5 * (a + b), dtype=np.float64))
 
 
+def mean_error_uncertainty(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Standard error of `mean_error` if the errors of pixels are independent."""
+    difference = np.mean(image - 0.5 * (a + b), axis=-1, dtype=np.float64)
+    return float(difference.std() / np.sqrt(difference.size))
+
+
 def block_error(image: np.ndarray, a: np.ndarray, b: np.ndarray, size: int = 8) -> float:
     """Net RMSE of the means over blocks of ``size`` x ``size`` pixels: what the eye sees as
     blotches and bands.
+
+    NaN for an image smaller than a block.
     """
+    if min(image.shape[:2]) < size:
+        return float("nan")
     return _root(np.mean(block_means(image - a, size) * block_means(image - b, size)))
 
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -12,43 +16,107 @@ from tqdm import tqdm
 from mitsuba_irrcache.files import atomic_write
 from mitsuba_irrcache.loading import load_scene
 
+from .scene_files import scene_digest
+
 #: Samples per pixel of one launch.
 CHUNK = 32
+#: Seconds after which an unfinished reference is put on disk, so that little is lost.
+SAVE_INTERVAL = 20.0
+
+
+@dataclass
+class Reference:
+    """Two independent images a and b (height, width, channel), float64, of ``spp`` samples per
+    pixel each, that took ``seconds`` together.
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+    spp: int
+    seconds: float
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The best estimate of the truth."""
+        return 0.5 * (self.a + self.b)
+
+    @classmethod
+    def load(cls, path: Path) -> Reference:
+        """Reads what `save` wrote."""
+        with np.load(path, allow_pickle=False) as stored:
+            return cls(stored["a"], stored["b"], int(stored["spp"]), float(stored["seconds"]))
+
+    def save(self, path: Path) -> None:
+        """Writes an .npz, whole or not at all."""
+        with atomic_write(path) as file:
+            np.savez(file, a=self.a, b=self.b, spp=self.spp, seconds=self.seconds)
+
+
+def default_folder() -> Path:
+    """Where references are kept: irrcache/references in the user's folder for caches."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return Path(base or Path.home() / ".cache") / "irrcache" / "references"
+
+
+def reference_path(
+    scene_file: Path, parameters: dict[str, str], integrator: str, sensor: int, folder: Path
+) -> Path:
+    """The file of a reference: named by a digest of all files of the scene, the parameters, the
+    integrator, the sensor, the variant and Mitsuba's version.
+    """
+    parts = (scene_digest(scene_file, parameters), integrator, sensor, mi.variant(), mi.__version__)
+    digest = hashlib.sha256(repr(parts).encode()).hexdigest()
+    return folder / f"{scene_file.parent.resolve().name}-{scene_file.stem}-{digest[:16]}.npz"
 
 
 def reference(
     scene_file: Path,
     parameters: dict[str, str],
     integrator: str,
-    spp: int,
     folder: Path,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Two independent images (height, width, channel) of ``spp`` samples per pixel each.
+    spp: int = 0,
+    seconds: float = 0.0,
+    sensor: int = 0,
+    advance: Callable[[int, float], None] | None = None,
+) -> Reference:
+    """A reference of at least ``spp`` samples per pixel in each half and at least ``seconds`` of
+    rendering, one of which is given.
 
-    Kept in ``folder`` under a digest of the scene folder's files, the parameters, the integrator
-    and ``spp``: a changed scene never reuses one, a finished one is never rendered again.
+    One in ``folder`` that suffices is not rendered again, one that does not is continued, and one
+    of a scene that has changed since is never found. ``advance`` is told (samples, seconds).
     """
-    sha = hashlib.sha256(repr((sorted(parameters.items()), integrator, spp, mi.variant())).encode())
-    for file in sorted(Path(scene_file).parent.iterdir()):
-        if file.suffix in (".xml", ".vol", ".exr", ".obj", ".ply"):
-            sha.update(file.name.encode())
-            sha.update(file.read_bytes())
+    scene_file = Path(scene_file)
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{Path(scene_file).parent.name}-{sha.hexdigest()[:16]}.npz"
-    if path.exists():
-        with np.load(path, allow_pickle=False) as stored:
-            return stored["a"], stored["b"]
+    path = reference_path(scene_file, parameters, integrator, sensor, folder)
+    found = Reference.load(path) if path.exists() else None
+    if found is not None and found.spp >= spp and found.seconds >= seconds:
+        return found
     scene = load_scene(scene_file, parameters, integrator)
-    launches = max(1, spp // CHUNK)
-    halves = []
-    with tqdm(total=2 * launches, desc=f"reference {path.stem}", delay=1.0, disable=None) as bar:
-        for half in range(2):
-            total = 0.0
-            for i in range(launches):
-                image = mi.render(scene, spp=min(CHUNK, spp), seed=1_000_000 * (half + 1) + i)
-                total = total + np.array(image, dtype=np.float64)
-                bar.update()
-            halves.append(total / launches)
-    with atomic_write(path) as file:
-        np.savez(file, a=halves[0], b=halves[1])
-    return halves[0], halves[1]
+    saved = time.perf_counter()
+    with tqdm(desc=f"reference {path.stem}", unit="spp", delay=1.0, leave=False, disable=None) as bar:
+        while found is None or found.spp < spp or found.seconds < seconds:
+            found = _extend(scene, found, sensor, min(CHUNK, spp) if spp else CHUNK)
+            bar.update(found.spp - bar.n)
+            if advance is not None:
+                advance(found.spp, found.seconds)
+            if time.perf_counter() - saved > SAVE_INTERVAL:
+                found.save(path)
+                saved = time.perf_counter()
+    found.save(path)
+    return found
+
+
+def _extend(scene: mi.Scene, old: Reference | None, sensor: int, spp: int) -> Reference:
+    """The reference with ``spp`` more samples; seeds go on where the last launch stopped."""
+    started = time.perf_counter()
+    done = 0 if old is None else old.spp
+    new = [
+        np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed + done), dtype=np.float64)
+        for seed in (1_000_000_000, 2_000_000_000)
+    ]
+    seconds = time.perf_counter() - started
+    if old is None:
+        return Reference(new[0], new[1], spp, seconds)
+    share = spp / (done + spp)
+    a, b = (o + (n - o) * share for o, n in zip((old.a, old.b), new, strict=True))
+    return Reference(a, b, done + spp, old.seconds + seconds)

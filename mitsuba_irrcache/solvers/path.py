@@ -38,84 +38,100 @@ def refine(
     rr_depth: int,
     progress: Progress | None = None,
 ) -> None:
-    """Adds ``samples`` per voxel (a multiple of ``BATCH``) of the random stream ``seed`` to
-    ``cache``.
+    """Adds ``samples`` per voxel (a multiple of ``BATCH``) of the random stream ``seed``.
 
-    The stream goes on where an earlier call with the same seed stopped. Passes end early without
-    losing anything if ``progress`` raises: what was added stays valid.
+    The stream goes on where an earlier call with the same seed stopped. If ``progress`` raises,
+    passes that are complete stay in the cache.
     """
     orders = cache.max_depth - 1 if cache.max_depth >= 0 else 0xFFFFFFFF
     if not cache.active_count or orders < 1 or not scene.emitters():
         cache.note_samples(seed, samples)
         return
+    estimator = _Estimator(scene, medium, cache, orders, seed, rr_depth)
+    total, done = cache.active_count * samples, 0
+    if total > LANES:
+        seconds = estimator.seconds(total)
+        mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
     block = min(cache.active_count, LANES // BATCH)
     batches_at_once = max(1, LANES // (BATCH * block))
-    total = cache.active_count * samples
-    done = 0
-    started = perf_counter()
     remaining = samples // BATCH
     while remaining:
         count = min(batches_at_once, remaining)
         first = cache.streams.get(seed, 0) // BATCH
         layers = []
         for start in range(0, cache.active_count, block):
-            layers.append(
-                _batches(scene, medium, cache, start, block, first, count, orders, seed, rr_depth)
-            )
-            done += min(block, cache.active_count - start) * BATCH * count
+            width = min(block, cache.active_count - start)
+            voxels = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, start)
+            layers.append(estimator.batches(voxels, first, count))
+            done += width * BATCH * count
             if progress is not None:
                 progress(done, total)
         cache.add(seed, BATCH * count, layers)
         remaining -= count
-    rate = done / max(perf_counter() - started, 1e-9)
-    mi.Log(mi.LogLevel.Info, f"irrcache: path solver, {done} samples, {rate:.3g} per second")
 
 
-def _batches(
-    scene: mi.Scene,
-    medium: MediumGrid,
-    cache: IrradianceCache,
-    start: int,
-    block: int,
-    first: int,
-    count: int,
-    orders: int,
-    seed: int,
-    rr_depth: int,
-) -> tuple:
-    """Sums and sums of squares of batch means of ``count`` batches, for the voxels ``start`` ... of
-    the active list.
-    """
-    width = min(block, cache.active_count - start)
-    lane = dr.arange(mi.UInt32, width * count * BATCH)
-    within = lane % BATCH
-    batch = (lane // BATCH) % dr.opaque(mi.UInt32, count)
-    voxel = dr.gather(
-        mi.UInt32,
-        cache.active,
-        lane // dr.opaque(mi.UInt32, BATCH * count) + dr.opaque(mi.UInt32, start),
-    )
-    layers = _estimate(
-        scene,
-        medium,
-        cache.grid.centers(voxel),
-        batch + dr.opaque(mi.UInt32, first),
-        within,
-        voxel,
-        dr.opaque(mi.UInt32, seed),
-        dr.opaque(mi.UInt32, orders),
-        dr.opaque(mi.UInt32, rr_depth),
-        orders > 1,
-    )
-    result = []
-    for value in layers:
-        for channel in range(cache.channels):
-            # A layer that is zero throughout comes as a literal without a width.
-            samples = value[channel] + dr.zeros(mi.Float, dr.width(lane))
-            mean = dr.block_sum(samples, BATCH) / BATCH
-            result.append((dr.block_sum(mean, count), dr.block_sum(dr.square(mean), count)))
-    dr.eval(result)
-    return tuple(result)
+class _Estimator:
+    """One kernel for all passes: whatever differs between them is opaque to it."""
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        cache: IrradianceCache,
+        orders: int,
+        seed: int,
+        rr_depth: int,
+    ) -> None:
+        self.scene, self.medium, self.cache = scene, medium, cache
+        self.multiple = orders > 1
+        self.orders, self.seed, self.rr_depth = (
+            dr.opaque(mi.UInt32, n) for n in (orders, seed, rr_depth)
+        )
+
+    def batches(self, voxels: mi.UInt32, first: int, count: int) -> tuple:
+        """Estimates ``count`` batches from the batch ``first`` on.
+
+        ``voxels`` are places in the list of active voxels. Returns, for every layer and channel,
+        the sum of the batch means and the sum of their squares, per voxel.
+        """
+        cache = self.cache
+        lane = dr.arange(mi.UInt32, dr.width(voxels) * count * BATCH)
+        batch = (lane // BATCH) % dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+        place = dr.gather(mi.UInt32, voxels, lane // dr.opaque(mi.UInt32, BATCH * count))
+        voxel = dr.gather(mi.UInt32, cache.active, place)
+        layers = _estimate(
+            self.scene,
+            self.medium,
+            cache.grid.centers(voxel),
+            batch,
+            lane % BATCH,
+            voxel,
+            self.seed,
+            self.orders,
+            self.rr_depth,
+            self.multiple,
+        )
+        result = []
+        for value in layers:
+            for channel in range(cache.channels):
+                # A layer that is zero throughout comes as a literal without a width.
+                samples = value[channel] + dr.zeros(mi.Float, dr.width(lane))
+                mean = dr.block_sum(samples, BATCH) / BATCH
+                result.append((dr.block_sum(mean, count), dr.block_sum(dr.square(mean), count)))
+        dr.eval(result)
+        dr.sync_thread()
+        return tuple(result)
+
+    def seconds(self, samples: int) -> float:
+        """Predicts the time for ``samples`` from one batch at voxels all over the medium."""
+        count = self.cache.active_count
+        voxels = dr.arange(mi.UInt32, min(count, LANES // 256))
+        voxels = voxels * dr.opaque(mi.UInt32, max(1, count // dr.width(voxels)))
+        dr.eval(voxels)
+        self.batches(voxels, 0, 1)  # compiles the kernel
+        started = perf_counter()
+        self.batches(voxels, 0, 1)
+        return (perf_counter() - started) * samples / (dr.width(voxels) * BATCH)
 
 
 @dr.syntax

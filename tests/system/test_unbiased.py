@@ -1,8 +1,8 @@
 """The cache against a delta tracker that shares no code with it.
 
-The reference is written in NumPy: float64, its own trilinear interpolation, one global majorant, analog collisions,
-binary transmittance towards the sun, and each colour channel traced by itself. Only the radiance of an escaping ray is
-asked of Mitsuba.
+The reference is written in NumPy: float64, its own trilinear interpolation, one global majorant,
+analog collisions, binary transmittance towards the sun, and each colour channel traced by itself.
+Only the radiance of an escaping ray is asked of Mitsuba.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ SAMPLES = 2048
 
 
 class DeltaTracker:
-    """Irradiance by analog paths in a grey medium that fills the image of the unit cube, for each channel of the light."""
+    """Irradiance by analog paths in a grey medium that fills the image of the unit cube, for each
+    channel of the light.
+    """
 
     def __init__(self, sigma_t, albedo, to_world, sky, sun: np.ndarray, seed: int) -> None:
         self.sigma_t, self.albedo = np.float64(sigma_t), np.float64(albedo)
@@ -30,7 +32,9 @@ class DeltaTracker:
         self.rng = np.random.default_rng(seed)
 
     def irradiance(self, positions: np.ndarray) -> np.ndarray:
-        """Light of scattering order 0, order 1, and all above, (3, n, channel), one path per position (n, 3)."""
+        """Light of scattering order 0, order 1, and all above, (3, n, channel), one path per
+        position (n, 3).
+        """
         result = np.zeros((3, len(positions), len(self.sun)))
         alive, where = np.arange(len(positions)), positions
         order = 0
@@ -69,7 +73,7 @@ class DeltaTracker:
 
     def _lookup(self, values: np.ndarray, position: np.ndarray) -> np.ndarray:
         local = position @ self.to_local[:3, :3].T + self.to_local[:3, 3]
-        nx, ny, nz = counts = np.array(values.shape)[::-1]
+        nx, ny, _nz = counts = np.array(values.shape)[::-1]
         u = np.clip(local * counts - 0.5, 0, counts - 1)
         low = np.minimum(u.astype(int), counts - 2)
         x, y, z = (u - low).T
@@ -97,7 +101,9 @@ def sky_image() -> np.ndarray:
 
 
 def coloured_medium(scenes, coloured: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Extinction from 0.1 to 3 (optical depth 2 to 5 across) and albedo from 0.4 to 0.98, (z, y, x, channel)."""
+    """Extinction from 0.1 to 3 (optical depth 2 to 5 across) and albedo from 0.4 to 0.98, (z, y, x,
+    channel).
+    """
     channels = 3 if coloured else 1
     sigma_t = scenes.texture((*SHAPE, channels), 0.1, 3.0, 1)
     albedo = scenes.texture((*SHAPE, channels), 0.4, 0.98, 2)
@@ -106,12 +112,16 @@ def coloured_medium(scenes, coloured: bool) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def measured():
-    """Reference samples, kept from one max_depth to the next: coloured -> per-channel mean and error of orders."""
+    """Reference samples, kept from one max_depth to the next: coloured -> per-channel mean and
+    error of orders.
+    """
     return {}
 
 
 def reference(store, coloured, sigma_t, albedo, to_world, positions, environment):
-    """Means and standard errors (3, n, channel) of the light up to scattering order 0, 1, and of all orders."""
+    """Means and standard errors (3, n, channel) of the light up to scattering order 0, 1, and of
+    all orders.
+    """
     if coloured not in store:
         parts = []
         for k, channels in enumerate([[0], [1], [2]] if coloured else [[0, 1, 2]]):
@@ -133,11 +143,12 @@ def reference(store, coloured, sigma_t, albedo, to_world, positions, environment
 @pytest.mark.parametrize("max_depth", [2, 3, -1])
 @pytest.mark.parametrize("coloured", [False, True], ids=["grey", "rgb"])
 def test_voxel_irradiance_is_unbiased(scenes, measured, coloured, max_depth):
-    """Z-tests at every voxel (about 250), for each colour channel (fixed seeds; 6 cases x 3 channels).
+    """Z-tests at every voxel (about 250), for each colour channel (fixed seeds; 6 cases x 3
+    channels).
 
-    Each statistic would fail by chance with probability below 1e-4 per channel: |mean of Z| sqrt(n) < 4, the variance of Z within
-    4 deviations of 1, |Z| < 5.2 everywhere, and the pooled mean within 4 standard errors, which are about 0.2 %:
-    a bias of 1 % of the light fails.
+    Each statistic would fail by chance with probability below 1e-4 per channel: |mean of Z| sqrt(n)
+    < 4, the variance of Z within 4 deviations of 1, |Z| < 5.2 everywhere, and the pooled mean
+    within 4 standard errors, which are about 0.2 %: a bias of 1 % of the light fails.
     """
     sigma_t, albedo = coloured_medium(scenes, coloured)
     to_world = scenes.placement((2.4, 1.4, 1.8), turn=35, mirror=True)

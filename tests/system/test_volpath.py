@@ -1,9 +1,10 @@
 """Whole images against Mitsuba's ``volpath``, for each kind of scene that is supported.
 
-Two images x, y from one cache and two independent volpath images a, b give the error without the noise of camera
-samples, mean((x - a)(y - b)), and the bias, mean(x + y - a - b) / 2, with a standard error from the pixels of the
-differences. What is left is the noise of the cache and the discretisation. Every scene keeps to what volpath itself
-renders right: sizes of about 1, near the origin.
+Two images x, y from one cache and two independent volpath images a, b give the error without the
+noise of camera samples, mean((x - a)(y - b)), and the bias, mean(x + y - a - b) / 2, with a
+standard error from the pixels of the differences. What is left is the noise of the cache and the
+discretisation. Every scene keeps to what volpath itself renders right: sizes of about 1, near the
+origin.
 """
 
 from __future__ import annotations
@@ -15,14 +16,17 @@ import pytest
 pytestmark = pytest.mark.usefixtures("rgb")
 
 SPP = 256
-#: Mean error and root mean square error allowed, relative to the mean radiance: coarse voxels and noise of the cache.
+#: Mean and root mean square error allowed, relative to the mean radiance: what coarse voxels and
+#: the noise of the cache may add.
 BIAS, RMSE = 0.01, 0.02
 DENSITY = (5, 6, 7)
 SHARP = {"resolution": 64, "cache_spp": 8, "step": 0.2}
 
 
 class Comparison:
-    """Two irrcache images x, y and two volpath images a, b of a scene; relative to the mean of all channels."""
+    """Two irrcache images x, y and two volpath images a, b of a scene; relative to the mean of all
+    channels.
+    """
 
     def __init__(self, x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
         self.scale = 0.5 * (a + b).mean()
@@ -32,7 +36,9 @@ class Comparison:
         self.rmse = np.sqrt(max(((x - a) * (y - b)).mean(), 0)) / self.scale
 
     def check(self, bias: float = BIAS, rmse: float = RMSE) -> None:
-        """Fails where a channel's bias exceeds ``bias`` by more than 4 standard errors, or the RMSE ``rmse``."""
+        """Fails where a channel's bias exceeds ``bias`` by more than 4 standard errors, or the RMSE
+        ``rmse``.
+        """
         assert self.scale > 0
         assert self.error.max() < 0.3 * bias, "the reference is too noisy to say"
         assert (np.abs(self.bias) < bias + 4 * self.error).all(), (self.bias, self.error)
@@ -123,7 +129,7 @@ def test_sphere(scenes, compare, kind):
 @pytest.mark.parametrize("turn", [0.0, 30.0])
 @pytest.mark.parametrize("grid", [1.4, 2.8])
 def test_grid_smaller_or_larger_than_its_boundary(scenes, compare, grid, turn):
-    """The medium ends at the world box of its grid, whose values are clamped between grid and box."""
+    """The medium ends at the world box of its grid; its values are clamped between the two."""
     medium = cloud(scenes, scenes.placement((grid, grid, grid), turn=turn))
     compare(scenes.boundary(medium, scenes.placement((2.0, 2.0, 2.0), turn=0.5 * turn))).check()
 
@@ -160,7 +166,9 @@ def _bright_window() -> np.ndarray:
 
 @pytest.mark.parametrize("emitter", EMITTERS.values(), ids=EMITTERS)
 def test_emitters(scenes, compare, emitter):
-    """Light with sharp shadows asks for more voxels than the soft light of a sky does, and for shorter steps."""
+    """Light with sharp shadows asks for more voxels than the soft light of a sky does, and for
+    shorter steps.
+    """
     to_world = scenes.placement()
     density = scenes.texture(DENSITY, 0.6, 1.4, 4)
     shape = scenes.boundary(scenes.medium(density, 0.9, to_world), to_world)
@@ -169,6 +177,7 @@ def test_emitters(scenes, compare, emitter):
 
 @pytest.mark.parametrize("hide", [False, True])
 def test_camera_in_the_medium(scenes, compare, hide):
+    """The few voxels before the lens weigh most, so their noise has to be small."""
     to_world = scenes.placement((4.0, 4.0, 4.0))
     sensor = {
         "type": "perspective",
@@ -179,11 +188,28 @@ def test_camera_in_the_medium(scenes, compare, hide):
     }
     fog = cloud(scenes, to_world, scale=0.3)
     shape = scenes.boundary({"type": "ref", "id": "fog"}, to_world)
-    compare(shape, fog=fog, sensor=sensor, hide=hide).check()
+    settings = {"cache_spp": 256, "step": 0.5}
+    compare(shape, irrcache=settings, fog=fog, sensor=sensor, hide=hide).check()
+
+
+def test_camera_within_the_boundary_but_not_in_the_medium(scenes):
+    """A sensor without a medium sees none from inside the boundary, as in volpath: only the sky."""
+    fog = cloud(scenes, scenes.placement((1.0, 1.0, 1.0)))
+    shape = scenes.boundary(fog, scenes.placement((4.0, 4.0, 4.0)))
+    look = mi.ScalarTransform4f().look_at([0, 0.2, -1.5], [0, 0, 0], [0, 1, 0])
+    sensor = scenes.description({}, None)["sensor"] | {"to_world": look, "fov": 60.0}
+    images = []
+    for name in ("irrcache", "volpath"):
+        scene = scenes.load({"type": name, "max_depth": 2}, shape, sensor=sensor)
+        images.append(scenes.image(scene, spp=4))
+    np.testing.assert_allclose(*images, rtol=1e-5)
+    np.testing.assert_allclose(images[0], np.broadcast_to([0.6, 0.8, 1.0], images[0].shape), 1e-5)
 
 
 def test_hidden_emitters_leave_alpha(scenes):
-    """The film's alpha is the chance that a ray meets the medium; volpath's is the mean of a 0/1 decision."""
+    """The film's alpha is the chance that a ray meets the medium; volpath's is the mean of a 0/1
+    decision.
+    """
     to_world = scenes.placement()
     shape = scenes.boundary(cloud(scenes, to_world), to_world)
     film = scenes.description({}, None)["sensor"]["film"] | {"pixel_format": "rgba"}
@@ -197,7 +223,9 @@ def test_hidden_emitters_leave_alpha(scenes):
 
 
 def test_crop_window(scenes):
-    """A crop shows the same part of the picture as the whole film does, with a filter wider than a pixel."""
+    """A crop shows the same part of the picture as the whole film does, with a filter wider than a
+    pixel.
+    """
     to_world = scenes.placement(turn=10)
     shape = scenes.boundary(cloud(scenes, to_world), to_world)
     whole = scenes.description({}, None, size=24)["sensor"]

@@ -93,7 +93,7 @@ def test_a_box_from_another_plugin(scenes, tmp_path):
 def test_other_shapes_are_refused(scenes):
     shape = scenes.boundary(scenes.medium(1.0, 0.5)) | {"type": "cylinder"}
     scene = scenes.load({"type": "volpath"}, shape)
-    with pytest.raises(UnsupportedSceneError, match="Cylinder.*boxes"):
+    with pytest.raises(UnsupportedSceneError, match=r"Cylinder.*boxes"):
         boundary_of(scene, scene.shapes()[0])
 
 

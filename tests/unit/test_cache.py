@@ -1,4 +1,6 @@
-"""The cache: which voxels it holds, what its statistics mean, and that it survives files and merging."""
+"""The cache: which voxels it holds, what its statistics mean, and that it survives files and
+merging.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.fixture
 def make(scenes):
-    """A function: a cache of a small cloud under a sky and a sun, filled by these calls of the solver (seed, samples)."""
+    """A function: a cache of a small cloud under a sky and a sun, filled by these calls of the
+    solver (seed, samples).
+    """
     to_world = scenes.placement((2.0, 1.0, 1.5), turn=20)
     sigma_t = scenes.texture((4, 3, 5), 0.0, 2.0, 1)
     shape = scenes.boundary(scenes.medium(sigma_t, 0.8, to_world), to_world)
@@ -53,8 +57,10 @@ def values(tensor) -> np.ndarray:
 @pytest.mark.parametrize("turn", [0.0, 45.0])
 @pytest.mark.parametrize("resolution", [7, 16, 40])
 def test_active_voxels_are_those_that_are_needed(scenes, turn, resolution):
-    """Every voxel that a lookup where sigma_t > 0 reads is active (checked at 2e5 points, also beyond a grid that is
-    smaller than its boundary); and no voxel farther than a macrocell from the medium is."""
+    """Every voxel that a lookup where sigma_t > 0 reads is active (checked at 2e5 points, also
+    beyond a grid that is smaller than its boundary); and no voxel farther than a macrocell from the
+    medium is.
+    """
     density = np.zeros((16, 20, 24), np.float32)
     density[2:5, 14:19, 3:9] = 1.0
     density[9:10, 3:4, 22:24] = 1.0  # at the border, so it reaches beyond the grid
@@ -79,9 +85,9 @@ def test_active_voxels_are_those_that_are_needed(scenes, turn, resolution):
     assert needed.any()
     assert not (needed & ~active).any()
 
-    # Surplus within the grid: not farther than a macrocell (0.3 across) and two voxels from what is needed.
+    # Surplus within the grid: within a macrocell (0.3 across) and two voxels of what is needed.
     at = np.stack(np.unravel_index(np.arange(grid.voxel_count), grid.shape)[::-1], axis=1)
-    reach = 0.3 * resolution / 2.6 * (1 if turn == 0 else 1.8) + 3
+    reach = 0.3 * resolution / 2.6 * (1 if turn == 0 else 2.2) + 3
     chosen = at[needed]
     centers = grid.centers(dr.arange(mi.UInt32, grid.voxel_count))
     local = np.array(field.grid.coordinates.point(centers)) / field.grid.resolution[:, None]
@@ -109,15 +115,32 @@ def test_layers_add_up(make):
 
 
 def test_lookup_at_a_centre_is_the_value(make):
-    cache = make((0, 16))
+    """Once noise is small: lookups make up for the bias that noise has on interpolated roots."""
+    cache = make((0, 8192))
     p = cache.grid.centers(dr.arange(mi.UInt32, cache.grid.voxel_count))
     looked_up = np.array(cache.field().at_world(p)).T.reshape(values(cache.irradiance).shape)
-    np.testing.assert_allclose(looked_up, values(cache.irradiance), rtol=2e-4)
+    np.testing.assert_allclose(looked_up, values(cache.irradiance), rtol=2e-3)
+
+
+def test_noise_does_not_shift_lookups(make):
+    """The mean lookup in 64 caches of the default 16 samples is that of a converged one, to 0.3 %
+    (and 3 standard errors, each below 0.15 %: without a correction it is 1 % off).
+    """
+    rng = np.random.default_rng(1)
+    exact = make((999, 1 << 12), resolution=10)
+    u = rng.uniform(0, 1, (3, 4096)) * exact.grid.resolution[:, None]
+    p = exact.grid.world.point(mi.Point3f(np.float32(u)))
+    expected = values(exact.field().at_world(p)).mean()
+    noisy = [values(make((s, 16), resolution=10).field().at_world(p)).mean() for s in range(64)]
+    error = np.std(noisy, ddof=1) / 8
+    assert error < 1.5e-3 * expected
+    assert np.mean(noisy) == pytest.approx(expected, abs=3e-3 * expected + 3 * error)
 
 
 def test_standard_error_is_the_scatter_of_repetitions(make):
-    """48 caches of 64 samples: their scatter at each voxel against the error each claims; pooled over some 100
-    voxels, 10 % is 6 deviations."""
+    """48 caches of 64 samples: their scatter at each voxel against the error each claims; pooled
+    over some 100 voxels, 10 % is 6 deviations.
+    """
     caches = [make((seed, 64)) for seed in range(48)]
     scatter = np.var([values(c.irradiance) for c in caches], axis=0, ddof=1)
     claimed = np.mean([values(c.standard_error) ** 2 for c in caches], axis=0)
@@ -150,7 +173,9 @@ def test_streams_are_independent(make):
 
 
 def test_merging_is_one_longer_run(make):
-    """Seeds 1 and 2 merged are the solver's own run over both streams, and weighted by their samples."""
+    """Seeds 1 and 2 merged are the solver's own run over both streams, and weighted by their
+    samples.
+    """
     merged, other = make((1, 64)), make((2, 32))
     expected = (64 * values(merged.irradiance) + 32 * values(other.irradiance)) / 96
     merged.merge(other)
@@ -236,8 +261,8 @@ def damaged(content: bytes, how: str) -> bytes:
 @pytest.mark.parametrize(
     "how",
     [
-        "truncated", "empty", "garbage", "flipped", "array missing", "pickle", "compressed", "not finite", "short",
-        "voxel outside", "other format", "huge grid",
+        "truncated", "empty", "garbage", "flipped", "array missing", "pickle", "compressed",
+        "not finite", "short", "voxel outside", "other format", "huge grid",
     ],
 )  # fmt: skip
 def test_damaged_files_are_refused_by_name(make, tmp_path, how):

@@ -40,7 +40,7 @@ def test_permissions_are_those_of_a_new_file(tmp_path):
 
 def test_missing_folder_is_named(tmp_path):
     with (
-        pytest.raises(IrrcacheError, match="nowhere.*does not exist"),
+        pytest.raises(IrrcacheError, match=r"nowhere.*does not exist"),
         atomic_write(tmp_path / "nowhere" / "a.bin"),
     ):
         pass

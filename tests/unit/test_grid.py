@@ -74,7 +74,9 @@ def test_lookup_clamps_outside(scenes):
 @given(st.tuples(*[st.floats(0.01, 100)] * 3), st.integers(1, 200))
 @settings(max_examples=50, deadline=None)
 def test_near_cubic(edges, resolution):
-    """The longest side has the voxels asked for; no edge differs from it by more than rounding a count can cause."""
+    """The longest side has the voxels asked for; no edge differs from it by more than rounding a
+    count can cause.
+    """
     mi.set_variant("llvm_ad_rgb")
     grid = Grid.near_cubic(np.diag([*edges, 1.0]), resolution)
     counts = grid.resolution

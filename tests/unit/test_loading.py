@@ -13,14 +13,20 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 SCENE = """<scene version="3.0.0">
     <default name="size" value="8"/>
-    <integrator type="volpath"> <integer name="max_depth" value="3"/> <integer name="rr_depth" value="7"/> </integrator>
+    <integrator type="volpath">
+        <integer name="max_depth" value="3"/> <integer name="rr_depth" value="7"/>
+    </integrator>
     <sensor type="perspective">
-        <film type="hdrfilm"> <integer name="width" value="$size"/> <integer name="height" value="$size"/> </film>
+        <film type="hdrfilm">
+            <integer name="width" value="$size"/> <integer name="height" value="$size"/>
+        </film>
     </sensor>
     <shape type="cube">
         <bsdf type="null"/>
         <medium name="interior" type="heterogeneous">
-            <volume name="sigma_t" type="gridvolume"> <string name="filename" value="density.vol"/> </volume>
+            <volume name="sigma_t" type="gridvolume">
+                <string name="filename" value="density.vol"/>
+            </volume>
             <float name="albedo" value="0.5"/>
         </medium>
     </shape>

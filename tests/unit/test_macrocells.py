@@ -50,7 +50,9 @@ def test_bounds_hold_everywhere(shape, channels, sparse, seed):
 
 
 def test_bounds_are_tight():
-    """The majorant is the largest voxel within reach, no more: 5 x 5 x 5 voxels in one cell and its neighbour."""
+    """The majorant is the largest voxel within reach, no more: 5 x 5 x 5 voxels in one cell and its
+    neighbour.
+    """
     field, cells = cells_of((5, 5, 5), 1, 3)
     values = 2 * np.array(field.data).reshape(5, 5, 5)
     assert cells.shape == (2, 2, 2)
@@ -62,7 +64,9 @@ def test_bounds_are_tight():
 @given(st.integers(0, 2**31))
 @settings(max_examples=20, deadline=None)
 def test_walk_visits_the_cell_of_every_point(seed):
-    """Following exits from cell to cell, the cell at hand holds each point between entry and exit (to rounding)."""
+    """Following exits from cell to cell, the cell at hand holds each point between entry and exit
+    (to rounding).
+    """
     mi.set_variant("llvm_ad_rgb")
     _, cells = cells_of((9, 13, 11), 1, 5)
     rng = np.random.default_rng(seed)
@@ -76,7 +80,7 @@ def test_walk_visits_the_cell_of_every_point(seed):
     cell = walk.cell(t)
     limits = np.array([[3], [4], [3]]) - 1
     for _ in range(3 + 4 + 3):
-        wall, following = walk.exit(cell)
+        wall, following = walk.exit(cell, t)
         end = np.minimum(np.array(wall), 10.0)
         middle = 0.5 * (np.array(t) + end)
         u = np.array(walk.origin) + np.array(walk.direction) * middle

@@ -1,4 +1,6 @@
-"""The quadratures of the ray march: their weights, their orders of convergence, skipping and early stop."""
+"""The quadratures of the ray march: their weights, their orders of convergence, skipping and early
+stop.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ DEPTHS = [0.0, 1e-38, 1e-8, 1e-4, 0.01, 0.0999, 0.1001, 0.5, 1.0, 5.0, 20.0, 80.
 @pytest.mark.parametrize("tau_b", DEPTHS)
 @pytest.mark.parametrize("tau_a", DEPTHS)
 def test_exponential_weights_are_the_integral(tau_a, tau_b):
-    """int_0^1 (1 - u | u) sigma(u) e^-tau(u) du with sigma linear, in float64 by adaptive quadrature.
+    """int_0^1 (1 - u | u) sigma(u) e^-tau(u) du with sigma linear, in float64 by adaptive
+    quadrature.
 
     Their sum is exact; each alone is good to 2e-3 up to an optical depth of 5 and to 0.06 beyond.
     """
@@ -63,7 +66,9 @@ def test_exponential_weights_are_the_integral(tau_a, tau_b):
 
 @pytest.mark.parametrize("quadrature", QUADRATURES)
 def test_constant_segment_far_and_near_opaque(quadrature):
-    """A constant source S in a constant medium adds S (1 - e^-tau); trapezoid only while tau is small."""
+    """A constant source S in a constant medium adds S (1 - e^-tau); trapezoid only while tau is
+    small.
+    """
     sigma, source, length = mi.Float(3.0), mi.Float(0.7), mi.Float([0.0, 1e-4, 0.01, 1.0, 1e30])
     added, passed = segment(quadrature, sigma, sigma, source, source, length)
     tau = 3.0 * np.float64(length)
@@ -162,7 +167,9 @@ def sparse_medium() -> tuple[MediumGrid, Grid]:
 
 
 def test_skipping_empty_macrocells_changes_nothing():
-    """The same lattice without skipping (every macrocell claimed to be occupied) gives the same radiance."""
+    """The same lattice without skipping (every macrocell claimed to be occupied) gives the same
+    radiance.
+    """
     medium, grid = sparse_medium()
     phi = np.random.default_rng(6).uniform(1, 4, grid.voxel_count).astype(np.float32)
     irradiance = GridField(grid, mi.Float(phi), 1)
@@ -216,7 +223,9 @@ def test_early_stop_with_a_bright_light_behind():
 @pytest.mark.parametrize("sigma", [0.0, 1e-38, 1e-12, 1e4, 1e30])
 @pytest.mark.parametrize("quadrature", QUADRATURES)
 def test_extreme_extinction_stays_finite(quadrature, sigma):
-    """Nothing, almost nothing, and a wall; the trapezoid overshoots in a wall, but only by its own step."""
+    """Nothing, almost nothing, and a wall; the trapezoid overshoots in a wall, but only by its own
+    step.
+    """
     boundary = Boundary("box", np.eye(4))
     grid = Grid((1, 1, 8), np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]]))
     medium = MediumGrid(
@@ -236,7 +245,7 @@ def test_extreme_extinction_stays_finite(quadrature, sigma):
 )
 @pytest.mark.parametrize("where", [(0, 0, 0), (0.25, 0.5, 0.75), (0.999, 1, 0)])
 def test_rays_along_axes_faces_and_edges(direction, where):
-    """A constant medium in a grid: the optical depth is the length, whatever walls the ray lies in."""
+    """In a constant medium the optical depth is the length, whatever wall the ray lies in."""
     boundary = Boundary("box", np.diag([2, 2, 2, 1.0]))
     frame = np.array([[4, 0, 0, -2], [0, 4, 0, -2], [0, 0, 4, -2], [0, 0, 0, 1.0]])
     grid = Grid((16, 16, 16), frame)

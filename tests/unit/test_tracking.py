@@ -19,7 +19,9 @@ COUNT = 1 << 18
 
 
 def column_medium(channels: int, density: float = 1.0) -> tuple[MediumGrid, np.ndarray]:
-    """Extinction that varies along x only, in [-1, 1]^3, with an empty part; and its values (24, channel)."""
+    """Extinction that varies along x only, in [-1, 1]^3, with an empty part; and its values (24,
+    channel).
+    """
     values = (
         density
         * np.random.default_rng(8).exponential(1.0, (24, channels))
@@ -48,23 +50,25 @@ def lanes(start: float):
 @pytest.mark.parametrize("density", [0.3, 1.5])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_transmittance_is_unbiased(channels, density):
-    """4 standard errors of 2^18 estimates: below 0.5 % of T where T > 0.05; each estimate lies in [0, 1] but for
-    Russian roulette."""
+    """4 standard errors of 2^18 estimates, each below 0.4 % of T (here 0.08 to 0.8): 2 % wrong
+    fails for all, 1 % for most; and each estimate lies in [0, 1].
+    """
     medium, values = column_medium(channels, density)
     ray, near, rng = lanes(-0.9)
     estimate, _ = transmittance(medium, ray, near, near + 1.7, rng, mi.Bool(True))
     estimate = np.atleast_2d(np.array(estimate, dtype=np.float64))
     expected = np.exp(-optical_depth(values, -0.9, 0.8))
     error = estimate.std(axis=1) / np.sqrt(COUNT)
-    print(error / expected, expected)
-    assert (error < 2e-3 * np.maximum(expected, 0.05)).all()
+    assert (error < 4e-3 * np.maximum(expected, 0.05)).all()
     assert (np.abs(estimate.mean(axis=1) - expected) < 4 * error + 1e-6).all()
     assert estimate.min() >= 0 and estimate.max() <= 1 + 1e-5
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_free_flights_have_the_density_of_the_medium(channels):
-    """Weighted collisions in each of 10 intervals against T sigma_t, and escapes against T, per channel (4.5 errors)."""
+    """Weighted collisions in each of 10 intervals against T sigma_t, and escapes against T, per
+    channel (4.5 errors).
+    """
     medium, values = column_medium(channels)
     ray, near, rng = lanes(-1.0)
     collided, t, weight, _ = free_flight(
@@ -84,7 +88,9 @@ def test_free_flights_have_the_density_of_the_medium(channels):
 
 
 def test_coloured_weights_stay_bounded():
-    """Spectral tracking (Kutz et al.): the weights' sum never exceeds three times the largest initial weight."""
+    """Spectral tracking (Kutz et al.): the weights' sum never exceeds three times the largest
+    initial weight.
+    """
     medium, _ = column_medium(3, 4.0)
     ray, near, rng = lanes(-1.0)
     _, _, weight, _ = free_flight(

@@ -1,0 +1,58 @@
+"""What a scene consists of on disk: its XML files and every file that they name."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import mitsuba as mi
+
+
+def scene_files(path: Path, parameters: dict[str, str]) -> list[Path]:
+    """The scene's XML, the XML files it includes and all files that its objects name, sorted.
+
+    Names are looked up as Mitsuba does it: beside the scene and in its ``<path>`` folders.
+    """
+    saved = mi.file_resolver()
+    resolver = mi.FileResolver(saved)
+    resolver.prepend(str(path.parent.resolve()))
+    mi.set_file_resolver(resolver)
+    try:
+        config = mi.parser.ParserConfig(mi.variant())
+        state = mi.parser.parse_file(config, str(path), **parameters)
+        names = [
+            value
+            for node in state.nodes
+            for key in node.props.keys()
+            if isinstance(value := node.props[key], str) and value
+        ]
+        found = [Path(str(resolver.resolve(name))) for name in names]
+    finally:
+        mi.set_file_resolver(saved)
+    files = {Path(str(file)).resolve() for file in state.files}
+    return sorted(files | {file.resolve() for file in found if _is_file(file)})
+
+
+def scene_digest(path: Path, parameters: dict[str, str]) -> str:
+    """SHA-256 of the contents of `scene_files` and of the parameters; where they lie does not
+    count.
+    """
+    sha = hashlib.sha256(repr(sorted(parameters.items())).encode())
+    for file in scene_files(path, parameters):
+        sha.update(hashlib.sha256(file.name.encode()).digest() + _digest(file))
+    return sha.hexdigest()
+
+
+def _digest(file: Path) -> bytes:
+    sha = hashlib.sha256()
+    with open(file, "rb") as stream:
+        while block := stream.read(1 << 20):
+            sha.update(block)
+    return sha.digest()
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a string that is no name of a file, for instance too long
+        return False

@@ -1,0 +1,104 @@
+"""Who is ahead: errors at equal time and times to equal error, read off curves of error over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: A snapshot counts for a budget that it exceeds by at most this factor.
+TOLERANCE = 1.1
+#: Slopes of log error over log time that pass for Monte Carlo noise, and may be extrapolated.
+NOISE_SLOPES = (-0.65, -0.35)
+#: Beyond this many times the longest measurement nothing is extrapolated.
+FARTHEST = 1e4
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Errors of one integrator over seconds, both rising in time; ``resolved`` is the least error
+    that the reference can tell from none.
+    """
+
+    integrator: str
+    seconds: np.ndarray
+    errors: np.ndarray
+    resolved: np.ndarray
+
+    @property
+    def shown(self) -> np.ndarray:
+        """Errors, not below what is resolved."""
+        return np.maximum(self.errors, self.resolved)
+
+
+@dataclass(frozen=True)
+class Reached:
+    """Seconds to an error; ``how`` is "measured", "at most" (the first snapshot is better already),
+    "extrapolated" (as noise), or "never" where nothing can be said.
+    """
+
+    seconds: float
+    how: str
+
+
+def curves(rows: list[dict]) -> list[Curve]:
+    """The curve of every integrator, in the order of the rows."""
+    result = []
+    for name in dict.fromkeys(row["integrator"] for row in rows):
+        own = sorted((r for r in rows if r["integrator"] == name), key=lambda r: r["seconds"])
+        columns = (np.array([r[key] for r in own]) for key in ("seconds", "rmse", "rmse_resolved"))
+        result.append(Curve(name, *columns))
+    return result
+
+
+def equal_time(curves: list[Curve], budgets: list[float]) -> list[list[float | None]]:
+    """A row for each budget with the error of every curve; None where nothing is ready by then."""
+    return [[_error_at(curve, budget) for curve in curves] for budget in sorted(budgets)]
+
+
+def equal_error(curves: list[Curve], targets: list[float]) -> list[list[Reached]]:
+    """A row for each target error with the time that every curve takes."""
+    return [[time_to(curve, target) for curve in curves] for target in targets]
+
+
+def targets(curves: list[Curve], count: int = 6) -> list[float]:
+    """Round errors (1, 2, 5) within what the curves span, from coarse to fine."""
+    values = np.concatenate([curve.shown for curve in curves]) if curves else np.array([])
+    values = values[values > 0]
+    if not values.size:
+        return []
+    decades = range(int(np.floor(np.log10(values.min()))), int(np.ceil(np.log10(values.max()))) + 1)
+    round_values = [m * 10.0**d for d in decades for m in (1, 2, 5)]
+    inside = [v for v in round_values if values.min() <= v <= values.max()]
+    return inside[::-1][-count:] or [float(values.min())]
+
+
+def time_to(curve: Curve, target: float) -> Reached:
+    """Seconds until the error is at most ``target``: between snapshots log-log interpolated."""
+    t, e = curve.seconds, curve.shown
+    below = np.flatnonzero(e <= target)
+    if not below.size:
+        return _extrapolated(curve, target)
+    k = below[0]
+    if k == 0:
+        return Reached(float(t[0]), "measured" if e[0] == target else "at most")
+    share = np.log(e[k - 1] / target) / np.log(e[k - 1] / e[k])
+    return Reached(float(t[k - 1] * (t[k] / t[k - 1]) ** share), "measured")
+
+
+def _error_at(curve: Curve, budget: float) -> float | None:
+    ready = np.flatnonzero(curve.seconds <= budget * TOLERANCE)
+    return float(curve.shown[ready[-1]]) if ready.size else None
+
+
+def _extrapolated(curve: Curve, target: float) -> Reached:
+    """Variance falls as 1 / t; used only where the last snapshots bear this out."""
+    t, e = curve.seconds, curve.errors
+    resolved = e > curve.resolved
+    if len(t) < 2 or not resolved[-2:].all():
+        return Reached(np.inf, "never")
+    slope = np.log(e[-1] / e[-2]) / np.log(t[-1] / t[-2])
+    seconds = float(t[-1] * (e[-1] / target) ** 2)
+    if not NOISE_SLOPES[0] <= slope <= NOISE_SLOPES[1] or seconds > FARTHEST * t[-1]:
+        return Reached(np.inf, "never")
+    return Reached(seconds, "extrapolated")

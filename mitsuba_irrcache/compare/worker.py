@@ -1,0 +1,190 @@
+"""The process that runs one integrator: ``python -m mitsuba_irrcache.compare.worker JOB.json``.
+
+A job is JSON; its ``kind`` names one of the functions below. What it finds out goes to the file
+``result``, piece by piece, so that a crash loses only what was not finished. Lines on standard
+output say how far it is.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cli import _essence
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.runtime import require_llvm
+
+from . import runners
+from .reference import reference, reference_path
+from .results import Measurement, write_json
+from .runners import Subject
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
+#: Samples per pixel of the first image, whose kernels are compiled.
+FIRST_SPP = 4
+
+
+def check(job: dict) -> None:
+    """Loads the scene with every integrator once; a name or property that is wrong ends it."""
+    for integrator in job["integrators"]:
+        scene = _subject(job, integrator).load()
+        if not 0 <= job["sensor"] < len(scene.sensors()):
+            raise IrrcacheError(
+                f"--sensor is {job['sensor']}, but the scene has {len(scene.sensors())} sensor(s), "
+                "counted from 0."
+            )
+        film = scene.sensors()[job["sensor"]].film()
+    write_json(
+        Path(job["result"]),
+        {"size": [int(n) for n in film.crop_size()], "sensors": len(scene.sensors())},
+    )
+
+
+def make_reference(job: dict) -> None:
+    """Renders, continues or finds the reference."""
+    where = (Path(job["scene"]), job["parameters"], job["integrator"])
+    folder = Path(job["folder"])
+
+    def advance(spp: int, seconds: float) -> None:
+        print(f"{spp} samples per pixel in each half, {seconds:.0f} s", flush=True)
+
+    found = reference(
+        *where, folder, job["spp"], job["seconds"], sensor=job["sensor"], advance=advance
+    )
+    path = reference_path(*where, job["sensor"], folder)
+    write_json(
+        Path(job["result"]), {"path": str(path), "spp": found.spp, "seconds": found.seconds}
+    )
+
+
+def measure(job: dict) -> None:
+    """A first image with cold kernels, snapshots with warm ones, another view, and memory."""
+    result, images = Path(job["result"]), Path(job["images"])
+    measurement = Measurement(job["integrator"], job["name"])
+    subject, scene = _first_image(job, measurement.cold)
+    measurement.first_spp = FIRST_SPP
+    _note_memory(measurement)
+    measurement.save(result)
+    for snapshot, image in runners.run(subject, scene, job["budgets"]):
+        path = images / f"{job['name']}-{snapshot.budget:g}s.npy"
+        with atomic_write(path) as file:
+            np.save(file, image.astype(np.float32))
+        snapshot.image = f"{images.name}/{path.name}"
+        measurement.snapshots.append(snapshot)
+        _note_memory(measurement)
+        measurement.save(result)
+        print(f"{snapshot.total:.2f} s, {snapshot.spp} samples per pixel", flush=True)
+    measurement.again = _another_view(subject, scene)
+    measurement.save(result)
+
+
+def start(job: dict) -> None:
+    """A first image in a process that finds its kernels compiled."""
+    seconds: dict[str, float] = {}
+    _first_image(job, seconds)
+    write_json(Path(job["result"]), seconds)
+
+
+def _first_image(job: dict, seconds: dict[str, float]) -> tuple[Subject, mi.Scene]:
+    """Loads the scene and renders it twice; what the second time saves is the kernels' share.
+
+    Fills ``seconds``: import, load, cache, image, and of them kernels (tracing, code generation and
+    compilation), whose parts are given by ``dr.kernel_history``.
+    """
+    seconds["import"] = job["imported"] - job["started"]
+    began = time.perf_counter()
+    subject = _subject(job, job["integrator"])
+    scene = subject.load()
+    seconds["load"] = time.perf_counter() - began
+    cached = runners.has_cache(scene)
+    effort = {}
+    if cached and runners.effort_is_free(subject):
+        effort = {runners.EFFORT: runners.LEAST_EFFORT}
+        scene = subject.load(**effort)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        first = _cache_and_image(subject, scene, cached)
+        history = dr.kernel_history()
+    scene = subject.load(**effort) if cached else scene
+    stages = _cache_and_image(subject, scene, cached)
+    seconds["kernels"] = max(sum(first.values()) - sum(stages.values()), 0.0)
+    seconds.update(stages)
+    seconds["codegen"] = 1e-3 * sum(k.get("codegen_time", 0.0) for k in history)
+    seconds["backend"] = 1e-3 * sum(k.get("backend_time", 0.0) for k in history)
+    return subject, scene
+
+
+def _cache_and_image(subject: Subject, scene: mi.Scene, cached: bool) -> dict[str, float]:
+    seconds = {"cache": runners.prepare(scene)} if cached else {}
+    return seconds | {"image": subject.render(scene, FIRST_SPP)[1]}
+
+
+def _another_view(subject: Subject, scene: mi.Scene) -> dict[str, float]:
+    """Seconds by stage of the next sensor's image, or of another seed's where there is one
+    sensor.
+    """
+    sensor = (subject.sensor + 1) % len(scene.sensors())
+    runners.render(scene, sensor, FIRST_SPP, seed=10**6)
+    seconds = {"cache": runners.prepare(scene)} if runners.has_cache(scene) else {}
+    return seconds | {"image": runners.render(scene, sensor, FIRST_SPP, seed=10**6 + 1)[1]}
+
+
+def _note_memory(measurement: Measurement) -> None:
+    """Peak memory of this process in bytes, where the system tells (macOS in bytes, others in
+    KiB).
+    """
+    if resource is None:
+        return
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    measurement.memory = {"first_image": peak} | measurement.memory | {"peak": peak}
+
+
+def _subject(job: dict, integrator: str) -> Subject:
+    return Subject(Path(job["scene"]), job["parameters"], integrator, job["sensor"])
+
+
+def _set_up(job: dict) -> None:
+    """Everything before the scene: variant, log, and the modules that bring other plugins."""
+    if job["variant"] not in mi.variants():
+        raise IrrcacheError(
+            f'Mitsuba has no variant "{job["variant"]}"; it has {", ".join(mi.variants())}.'
+        )
+    if job["variant"].startswith("llvm"):
+        require_llvm()
+    mi.set_variant(job["variant"])
+    mi.set_log_level(mi.LogLevel.Error)
+    for module in job["modules"]:
+        importlib.import_module(module)
+
+
+KINDS = {"check": check, "reference": make_reference, "measure": measure, "start": start}
+
+
+def main() -> int:
+    """Does the job; what goes wrong is written to its ``error`` file."""
+    job = json.loads(Path(sys.argv[1]).read_text())
+    try:
+        _set_up(job)
+        job["imported"] = time.time()
+        KINDS[job["kind"]](job)
+    except Exception as error:
+        write_json(Path(job["error"]), {"error": _essence(error) or type(error).__name__})
+        raise
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,278 @@
+"""The command line, and bad input through the doors that users take: a clear error, and nothing
+left behind.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+
+import mitsuba as mi
+import numpy as np
+import OpenImageIO
+import pytest
+
+from mitsuba_irrcache.cli import main
+
+SCENE = """<scene version="3.0.0">
+    <default name="density" value="density.vol"/>
+    <default name="integrator" value="volpath"/>
+    <integrator type="$integrator"> <integer name="max_depth" value="2"/> </integrator>
+    <sensor type="perspective" id="front">
+        <transform name="to_world">
+            <lookat origin="0, 0, -5" target="0, 0, 0" up="0, 1, 0"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="12"/> <integer name="height" value="8"/>
+        </film>
+        <sampler type="independent"> <integer name="sample_count" value="4"/> </sampler>
+    </sensor>
+    <sensor type="perspective" id="side">
+        <transform name="to_world">
+            <lookat origin="5, 0, 0" target="0, 0, 0" up="0, 1, 0"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="6"/> <integer name="height" value="6"/>
+        </film>
+    </sensor>
+    <shape type="cube" id="box">
+        <bsdf type="null"/>
+        <medium name="interior" type="heterogeneous" id="fog">
+            <volume name="sigma_t" type="gridvolume">
+                <string name="filename" value="$density"/>
+                <transform name="to_world">
+                    <translate value="-.5, -.5, -.5"/> <scale value="2"/>
+                </transform>
+            </volume>
+            <float name="albedo" value="0.8"/>
+        </medium>
+    </shape>
+    <emitter type="constant"/>
+    EXTRA
+</scene>
+"""
+
+
+@pytest.fixture(autouse=True)
+def _variant(rgb):
+    """The command sets a variant for the process; every other test expects this one."""
+    yield
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def folder(tmp_path, scenes):
+    mi.VolumeGrid(scenes.texture((4, 5, 6, 1), 0, 2, 1)).write(str(tmp_path / "density.vol"))
+    (tmp_path / "scene.xml").write_text(SCENE.replace("EXTRA", ""))
+    return tmp_path
+
+
+def run(*arguments) -> int:
+    return main([str(a) for a in arguments])
+
+
+def read(path) -> np.ndarray:
+    return np.array(OpenImageIO.ImageBuf(str(path)).get_pixels(OpenImageIO.FLOAT))
+
+
+# Pictures
+
+
+def test_render(folder, capsys):
+    """An EXR with what made it in its header, a PNG beside it, and where the time went."""
+    assert run("render", folder / "scene.xml", "-o", folder / "out.exr", "--spp", 16) == 0
+    printed = capsys.readouterr().out
+    assert "out.exr" in printed and "out.png" in printed and "cache" in printed
+    image = read(folder / "out.exr")
+    assert image.shape[:2] == (8, 12) and np.isfinite(image).all() and image[..., :3].mean() > 0.1
+    header = OpenImageIO.ImageInput.open(str(folder / "out.exr")).spec()
+    text = str(header.serialize("xml")) if hasattr(header, "serialize") else str(header)
+    for part in (
+        "irrcache:version",
+        "irrcache:spp",
+        "irrcache:integrator",
+        "irrcache:seconds_cache",
+    ):
+        assert part in text
+    assert "max_depth = 2" in header.getattribute("irrcache:integrator")
+    assert set(os.listdir(folder)) == {"scene.xml", "density.vol", "out.exr", "out.png"}
+
+
+def test_the_picture_is_mi_renders(folder):
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", "--spp", 8, "--seed", 3) == 0
+    scene = mi.load_file(str(folder / "scene.xml"), integrator="irrcache")
+    expected = np.array(mi.render(scene, spp=8, seed=3))
+    np.testing.assert_allclose(
+        read(folder / "a.exr")[..., :3], expected[..., :3], rtol=1e-5, atol=1e-6
+    )
+
+
+def test_flags(folder):
+    """Another sensor, variant, integrator and parameter."""
+    mi.VolumeGrid(np.zeros((2, 2, 2, 1), np.float32)).write(str(folder / "empty.vol"))
+    flags = ["-s", 1, "-m", "llvm_ad_mono", "-i", "irrcache{max_depth=1,hide_emitters=true}"]
+    assert (
+        run(
+            "render",
+            folder / "scene.xml",
+            "-o",
+            folder / "a.exr",
+            "-D",
+            "density=empty.vol",
+            *flags,
+        )
+        == 0
+    )
+    image = read(folder / "a.exr")
+    assert image.shape[:2] == (6, 6)
+    assert not image[..., 0].any()
+
+
+def test_a_stock_integrator_when_asked(folder):
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", "-i", "volpath") == 0
+    assert read(folder / "a.exr").any()
+
+
+BAD_CALLS = {
+    "missing scene": (["absent.xml"], r"absent\.xml"),
+    "not XML": (["density.vol"], r"density\.vol"),
+    "output folder": (["scene.xml", "-o", "nowhere/a.exr"], "nowhere.*does not exist"),
+    "output format": (["scene.xml", "-o", "a.jpg"], r"a\.jpg.*\.exr"),
+    "sensor": (["scene.xml", "-s", "2"], r"--sensor is 2.*2 sensor"),
+    "samples": (["scene.xml", "--spp", "-3"], "--spp is -3"),
+    "definition": (["scene.xml", "-D", "density"], "-D .density"),
+    "missing volume": (["scene.xml", "-D", "density=gone.vol"], r"gone\.vol"),
+    "unknown parameter": (["scene.xml", "-D", "wrong=1"], "wrong"),
+    "integrator": (["scene.xml", "-i", "irrcache{step"], "cannot read the integrator"),
+    "unknown integrator": (["scene.xml", "-i", "irrcash"], "irrcash"),
+    "unknown property": (["scene.xml", "-i", "irrcache{stepp=1}"], "stepp"),
+    "unknown quadrature": (["scene.xml", "-i", "irrcache{quadrature=simpson}"], "simpson.*riemann"),
+    "unknown solver": (["scene.xml", "-i", "irrcache{solver=fast}"], "fast.*auto"),
+    "unknown filter": (["scene.xml", "-i", "irrcache{filter=blur}"], "blur.*none"),
+    "negative resolution": (["scene.xml", "-i", "irrcache{resolution=-1}"], "resolution is -1"),
+    "huge resolution": (["scene.xml", "-i", "irrcache{resolution=20000}"], "GiB.*lower resolution"),
+    "resolution of text": (["scene.xml", "-i", "irrcache{resolution=high}"], "resolution.*high"),
+    "max_depth": (["scene.xml", "-i", "irrcache{max_depth=-2}"], "max_depth is -2"),
+    "rr_depth": (["scene.xml", "-i", "irrcache{rr_depth=0}"], "rr_depth is 0"),
+    "cache_spp": (["scene.xml", "-i", "irrcache{cache_spp=-8}"], "cache_spp is -8"),
+    "step": (["scene.xml", "-i", "irrcache{step=0}"], "step is 0"),
+    "step NaN": (["scene.xml", "-i", "irrcache{step=nan}"], "step is nan"),
+    "cache folder": (["scene.xml", "-i", "irrcache{cache_file=nowhere/c}"], "cache_file.*nowhere"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_CALLS.values(), ids=BAD_CALLS)
+def test_bad_calls(folder, capsys, monkeypatch, arguments, message):
+    """Status 1, one line that names the thing, no traceback, no file."""
+    monkeypatch.chdir(folder)
+    before = set(os.listdir(folder))
+    assert run("render", *arguments) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("irrcache: error: ") and "Traceback" not in error
+    assert _matches(message, error), error
+    assert set(os.listdir(folder)) == before
+
+
+def _matches(pattern: str, text: str) -> bool:
+    return re.search(pattern, text, re.DOTALL) is not None
+
+
+NULL = '<bsdf type="null"/>'
+EXTRAS = {
+    "opaque surface": (
+        '<shape type="sphere" id="ball"> <bsdf type="diffuse"/> </shape>',
+        "ball.*diffuse",
+    ),
+    "area light": (
+        f'<shape type="rectangle" id="lamp"> {NULL} <emitter type="area"/> </shape>',
+        "lamp.*area emitter",
+    ),
+    "second medium": (
+        f'<shape type="cube" id="other"> {NULL} <medium name="interior" type="homogeneous"/>'
+        "</shape>",
+        "2 shapes bound media.*box.*other",
+    ),
+    "exterior medium": (
+        f'<shape type="sphere" id="hole"> {NULL} <ref name="exterior" id="fog"/> </shape>',
+        "hole.*exterior",
+    ),
+}
+
+
+@pytest.mark.parametrize(("extra", "message"), EXTRAS.values(), ids=EXTRAS)
+def test_unsupported_scenes(folder, capsys, extra, message):
+    """The object is named, and volpath offered."""
+    (folder / "odd.xml").write_text(SCENE.replace("EXTRA", extra))
+    before = set(os.listdir(folder))
+    assert run("render", folder / "odd.xml") == 1
+    error = capsys.readouterr().err
+    assert _matches(f"(?i){message}", error) and "volpath" in error, error
+    assert set(os.listdir(folder)) == before
+
+
+@pytest.mark.parametrize("value", [np.nan, -1.0])
+def test_bad_voxels(folder, capsys, value):
+    voxels = np.ones((2, 3, 4, 1), np.float32)
+    voxels[1, 2, 3] = value
+    mi.VolumeGrid(voxels).write(str(folder / "bad.vol"))
+    assert run("render", folder / "scene.xml", "-D", "density=bad.vol") == 1
+    error = capsys.readouterr().err
+    assert "sigma_t" in error and "(1, 2, 3)" in error and "fog" in error, error
+    assert not list(folder.glob("*.exr")) + list(folder.glob("*.png"))
+
+
+# Cache files
+
+
+def test_cache_file(folder, capsys):
+    """Made once, read the second time, and refused for another scene without being touched."""
+    flags = ["-i", f"irrcache{{cache_file={folder / 'light.npz'},cache_spp=16}}", "--spp", 4]
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 0
+    content = (folder / "light.npz").read_bytes()
+    assert run("render", folder / "scene.xml", "-o", folder / "b.exr", *flags) == 0
+    np.testing.assert_allclose(read(folder / "a.exr"), read(folder / "b.exr"), rtol=1e-6)
+    assert (folder / "light.npz").read_bytes() == content
+    capsys.readouterr()
+    mi.VolumeGrid(np.ones((4, 5, 6, 1), np.float32)).write(str(folder / "density.vol"))
+    assert run("render", folder / "scene.xml", "-o", folder / "c.exr", *flags) == 1
+    error = capsys.readouterr().err
+    assert "light.npz" in error and "medium" in error and "another scene" in error
+    assert (folder / "light.npz").read_bytes() == content
+    assert not (folder / "c.exr").exists()
+
+
+def test_damaged_cache_file(folder, capsys):
+    file = folder / "light.npz"
+    file.write_bytes(b"PK\x03\x04 nothing")
+    assert run("render", folder / "scene.xml", "-i", f"irrcache{{cache_file={file}}}") == 1
+    assert "light.npz" in capsys.readouterr().err
+    assert file.read_bytes() == b"PK\x03\x04 nothing"
+
+
+def test_interrupted(folder, capsys, monkeypatch):
+    """Ctrl-C while the cache is built: status 130, no picture, no cache file, no traceback."""
+    from mitsuba_irrcache.solvers import path
+
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(path, "refine", interrupted)
+    before = set(os.listdir(folder))
+    flags = ["-i", f"irrcache{{cache_file={folder / 'light.npz'}}}"]
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert set(os.listdir(folder)) == before
+
+
+def test_errors_reach_a_script_too(folder, scenes):
+    """mi.render wraps what an integrator raises in a RuntimeError; its cause is ours, with the
+    remedy.
+    """
+    (folder / "odd.xml").write_text(SCENE.replace("EXTRA", EXTRAS["area light"][0]))
+    scene = mi.load_file(str(folder / "odd.xml"), integrator="irrcache")
+    with pytest.raises((RuntimeError, ValueError)) as caught:
+        mi.render(scene, spp=1)
+    chain = [caught.value]
+    while chain[-1].__cause__ is not None:
+        chain.append(chain[-1].__cause__)
+    assert type(chain[-1]).__name__ == "UnsupportedSceneError" and "lamp" in str(chain[-1])

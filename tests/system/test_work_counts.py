@@ -1,0 +1,248 @@
+"""What is not needed is not done: counted in calls of the solver, samples, and kernels."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections import Counter
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+@pytest.fixture
+def scene(scenes):
+    """A cloud with a second sensor."""
+    return cloud_scene(scenes)
+
+
+def cloud_scene(scenes, density=None, albedo=0.8, **settings) -> mi.Scene:
+    to_world = scenes.placement(turn=20)
+    density = scenes.texture((6, 5, 7), 0.2, 2.0, 1) if density is None else density
+    shape = scenes.boundary(scenes.medium(density, albedo, to_world), to_world)
+    second = scenes.description({}, None, size=12)["sensor"]
+    second["to_world"] = mi.ScalarTransform4f().look_at([4.0, 1.0, 2.0], [0, 0, 0], [0, 1, 0])
+    integrator = {"type": "irrcache", "max_depth": 3, "resolution": 12, "cache_spp": 32}
+    return scenes.load(integrator | settings, shape, second=second)
+
+
+def edit(scene: mi.Scene, ending: str, change) -> None:
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.endswith(ending)]
+    params[key] = change(params[key])
+    params.update()
+
+
+def test_the_cache_is_built_once(scenes, scene, refine_calls):
+    """Another seed, another sensor, more samples, and a moved camera: one call of the solver in
+    all.
+    """
+    scenes.image(scene, spp=2)
+    scenes.image(scene, spp=2, seed=1)
+    scenes.image(scene, spp=5, sensor=1)
+    edit(scene, "second.to_world", lambda m: m @ type(m)().rotate([0, 1, 0], 5))
+    scenes.image(scene, spp=2, sensor=1)
+    assert refine_calls == [32]
+
+
+def test_a_second_picture_runs_the_projection_only(scenes, scene, kernels):
+    """By its kernels: as many as there are passes, none of them of the size of the solver's, none
+    compiled anew.
+    """
+    first = kernels(lambda: scenes.image(scene, spp=2))
+    second = kernels(lambda: scenes.image(scene, spp=2, seed=1))
+    voxels = scene.integrator().cache.active_count
+    assert any(k["size"] >= voxels * 32 for k in first)
+    assert second and len(second) < len(first) / 2
+    assert all(k["size"] < voxels * 32 for k in second)
+    assert all(k["cache_hit"] for k in second)
+
+
+def test_a_second_scene_compiles_nothing(scenes, kernels):
+    """Other densities, placements, lights and seeds of the same kind of scene: the kernels of the
+    first one.
+    """
+    scenes.image(cloud_scene(scenes), spp=2)
+    other = cloud_scene(scenes, scenes.texture((6, 5, 7), 0.1, 3.0, 9), cache_seed=5)
+    again = kernels(lambda: scenes.image(other, spp=2, seed=4))
+    assert any(k["size"] > 10000 for k in again)
+    assert [k["hash"] for k in again if not k["cache_hit"]] == []
+
+
+def test_passes_compile_nothing(scenes, kernels, monkeypatch):
+    """A cache filled in many launches runs the same kernels in each (the last may be shorter)."""
+    from mitsuba_irrcache.solvers import path
+
+    monkeypatch.setattr(path, "LANES", 1 << 12)
+    scene = cloud_scene(scenes, cache_spp=64)
+    history = kernels(lambda: scene.integrator().prepare(scene))
+    launches = Counter(k["hash"] for k in history if k["size"] == 1 << 12)
+    assert min(launches.values()) == max(launches.values()) >= 8
+
+
+def test_a_scene_is_freed_with_all_its_arrays(scenes):
+    """The integrator belongs to the scene, so it may not own it: scenes rendered in a loop would
+    pile up.
+    """
+    scene = cloud_scene(scenes)
+    scenes.image(scene, spp=1)
+    integrator = weakref.ref(scene.integrator())
+    del scene
+    gc.collect()
+    assert integrator() is None
+
+
+EDITS = {
+    "sigma_t.data": lambda v: mi.TensorXf(np.array(v) * 3),
+    "medium.scale": lambda v: v * 3,
+    "albedo.value.value": lambda v: v * 0.25,
+    "emitter.radiance.value": lambda v: v * 0.1,
+    "sun.irradiance.value": lambda v: v * 4,
+}
+
+
+@pytest.mark.parametrize("ending", EDITS)
+def test_edits_renew_the_cache(scenes, scene, refine_calls, ending):
+    """The picture after params.update() is that of the edited scene, to the last bits of a rebuilt
+    cache.
+    """
+    before = scenes.image(scene, spp=8)
+    edit(scene, ending, EDITS[ending])
+    after = scenes.image(scene, spp=8)
+    assert refine_calls == [32, 32]
+    assert np.abs(after - before).mean() > 0.02 * before.mean()
+    fresh = cloud_scene(scenes)
+    edit(fresh, ending, EDITS[ending])
+    np.testing.assert_allclose(after, scenes.image(fresh, spp=8), rtol=1e-4, atol=1e-5)
+
+
+def test_another_scene_renews_the_cache(scenes, scene, refine_calls):
+    """One integrator for two scenes, in turn."""
+    integrator = scene.integrator()
+    other = cloud_scene(scenes, albedo=0.2)
+    own = np.array(mi.render(scene, integrator=integrator, spp=4))
+    borrowed = np.array(mi.render(other, integrator=integrator, spp=4))
+    assert refine_calls == [32, 32]
+    np.testing.assert_allclose(borrowed, scenes.image(other, spp=4), rtol=1e-4, atol=1e-5)
+    assert not np.allclose(own, borrowed)
+
+
+@pytest.mark.parametrize("max_depth", [0, 1])
+def test_no_cache_for_direct_views(scenes, refine_calls, max_depth):
+    scene = cloud_scene(scenes, max_depth=max_depth)
+    scenes.image(scene, spp=2)
+    assert refine_calls == []
+    assert scene.integrator().cache is None
+
+
+def test_no_samples_where_nothing_scatters(scenes, kernels):
+    """Albedo 0 and an empty medium: a cache without voxels, and the picture of max_depth 1."""
+    for density, albedo in ((None, 0.0), (np.zeros((6, 6, 6), np.float32), 0.9)):
+        scene = cloud_scene(scenes, density, albedo)
+        history = kernels(lambda scene=scene: scene.integrator().prepare(scene))
+        assert scene.integrator().cache.active_count == 0
+        assert max((k["size"] for k in history), default=0) < 12**3 * 32
+        plain = cloud_scene(scenes, density, albedo, max_depth=1)
+        np.testing.assert_allclose(
+            scenes.image(scene, spp=4), scenes.image(plain, spp=4), rtol=1e-5
+        )
+
+
+def test_empty_voxels_are_not_sampled(scenes, kernels):
+    """A core in a large empty grid: the largest launch is that of the voxels near the core."""
+    density = np.zeros((40, 40, 40), np.float32)
+    density[16:22, 16:22, 16:22] = 1.0
+    scene = cloud_scene(scenes, density, resolution=40, cache_spp=8)
+    history = kernels(lambda: scene.integrator().prepare(scene))
+    cache = scene.integrator().cache
+    assert cache.active_count < 0.08 * cache.grid.voxel_count
+    # One lane per voxel of the grid marks and lists them; 8 lanes per sampled voxel.
+    assert max(k["size"] for k in history) <= max(
+        cache.grid.voxel_count * 3, cache.active_count * 8
+    )
+
+
+def test_single_scattering_traces_no_paths(scenes):
+    """max_depth 2: the scattered layer is exactly zero."""
+    scene = cloud_scene(scenes, max_depth=2)
+    scene.integrator().prepare(scene)
+    assert not np.array(scene.integrator().cache.scattered).any()
+    assert np.array(scene.integrator().cache.uncollided).any()
+
+
+def test_more_samples_continue_a_file(scenes, refine_calls, tmp_path):
+    """A cache of 32 samples on disk, asked for 64: 32 more, and the same light as 64 in one go."""
+    file = str(tmp_path / "light.npz")
+    cloud_scene(scenes, cache_file=file, cache_spp=32).integrator()
+    for spp in (32, 64, 64):
+        scene = cloud_scene(scenes, cache_file=file, cache_spp=spp)
+        scene.integrator().prepare(scene)
+    assert refine_calls == [32, 32]
+    whole = cloud_scene(scenes, cache_spp=64)
+    whole.integrator().prepare(whole)
+    np.testing.assert_allclose(
+        np.array(scene.integrator().cache.irradiance),
+        np.array(whole.integrator().cache.irradiance),
+        rtol=3e-6,
+    )
+
+
+def test_an_interrupted_build_goes_on(scenes, tmp_path, monkeypatch):
+    """Ctrl-C from the progress callback: the next render completes the cache, and no file is left
+    before that.
+    """
+    from mitsuba_irrcache.solvers import path
+
+    monkeypatch.setattr(path, "LANES", 1 << 13)
+    file = tmp_path / "light.npz"
+    scene = cloud_scene(scenes, cache_spp=64, cache_file=str(file))
+    integrator = scene.integrator()
+    calls = []
+
+    def stop(stage, done, total):
+        calls.append((stage, done, total))
+        if done > total / 2:
+            raise KeyboardInterrupt
+
+    integrator.progress = stop
+    with pytest.raises((KeyboardInterrupt, RuntimeError)):
+        scenes.image(scene, spp=2)
+    assert list(tmp_path.iterdir()) == []
+    assert 0 < integrator.cache.samples < 64
+    integrator.progress = None
+    image = scenes.image(scene, spp=2)
+    assert integrator.cache.samples == 64 and [p.name for p in tmp_path.iterdir()] == ["light.npz"]
+    whole = cloud_scene(scenes, cache_spp=64)
+    np.testing.assert_allclose(image, scenes.image(whole, spp=2), rtol=1e-4, atol=1e-6)
+    assert all(stage == "cache" and total == calls[0][2] for stage, _, total in calls)
+    assert np.all(np.diff([done for _, done, _ in calls]) > 0)
+
+
+def test_wrappers_use_the_cache(scenes, refine_calls):
+    """Nested in ``aov``, as ``sample``: the same picture and one build."""
+    to_world = scenes.placement()
+    shape = scenes.boundary(
+        scenes.medium(scenes.texture((6, 5, 7), 0.2, 2.0, 1), 0.8, to_world), to_world
+    )
+    inner = {"type": "irrcache", "max_depth": 3, "resolution": 12, "cache_spp": 32}
+    plain = scenes.image(scenes.load(inner, shape), spp=64)
+    refine_calls.clear()
+    wrapped = scenes.load({"type": "aov", "aovs": "depth:depth", "inner": inner}, shape)
+    image = scenes.image(wrapped, spp=64, seed=3)
+    scenes.image(wrapped, spp=2, seed=4)
+    assert refine_calls == [32]
+    assert image[..., :3].mean() == pytest.approx(plain.mean(), rel=0.01)
+
+
+def test_gradients_do_not_leak_into_the_cache(scenes, scene):
+    """A medium with gradients enabled renders as one without."""
+    expected = scenes.image(scene, spp=4)
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.endswith("sigma_t.data")]
+    dr.enable_grad(params[key])
+    params.update()
+    np.testing.assert_allclose(scenes.image(scene, spp=4), expected, rtol=1e-4, atol=1e-5)
