@@ -67,7 +67,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - step
        - |float|
-       - Length of a step in shortest voxel edges of the medium's grid. (Default: 1.0)
+       - Length of a step in shortest voxel edges of the medium and the cache. (Default: 1.0)
 
      * - filter
        - |string|
@@ -85,8 +85,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     ``volpath``'s as ``resolution`` and ``cache_spp`` grow and ``step`` falls.
 
     One medium (``heterogeneous`` or ``homogeneous``, isotropic phase function) in a box or sphere
-    with a null BSDF, and emitters that are not surfaces, are supported; whatever else is refused by
-    name. A scene without media is rendered by ``volpath``.
+    with a null BSDF, and emitters that are not surfaces (point-like ones outside of the medium),
+    are supported; whatever else is refused by name. A scene without media is rendered by
+    ``volpath``.
 
     .. tabs::
         .. code-tab:: xml

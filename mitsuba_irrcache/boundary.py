@@ -33,6 +33,12 @@ class Boundary:
         unit = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]])
         return self.to_world @ unit
 
+    def contains(self, position: np.ndarray) -> bool:
+        """Whether a world position (3,) is inside or on the boundary."""
+        local = np.linalg.inv(self.to_world) @ np.append(position, 1.0)
+        order = np.inf if self.kind == "box" else 2
+        return bool(np.linalg.norm(local[:3], order) <= 1.0)
+
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether the ray's line meets the inside, and the distances of entry and exit (entry < 0:
         from within).

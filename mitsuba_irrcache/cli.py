@@ -1,4 +1,4 @@
-"""The command ``irrcache``: render, import, doctor."""
+"""The command ``irrcache``: render, compare, import, doctor."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     from . import doctor, render
+    from .compare import command as compare
     from .volumes import importer
 
     parser = argparse.ArgumentParser(
@@ -38,6 +39,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for name, module, text in (
         ("render", render, "render a scene with irrcache"),
+        ("compare", compare, "measure error against time of any integrators"),
         ("import", importer, "make a scene of a CT, MR or other volume"),
         ("doctor", doctor, "check this machine and say what to install"),
     ):

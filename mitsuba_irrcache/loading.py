@@ -94,7 +94,7 @@ def _replace_integrator(state: mi.parser.ParserState, specification: str, path: 
         raise IrrcacheError(f'"{path}" names no integrator; add <integrator type="{name}"/> to it.')
     inherited = {k: node.props[k] for k in SHARED_PROPERTIES if k in node.props}
     for key in list(node.props.keys()):
-        node.props.remove_property(key)
+        del node.props[key]
     node.props.set_plugin_name(name)
     for key, value in (inherited | properties).items():
         node.props[key] = value

@@ -3,8 +3,8 @@ eq. 1).
 
     L = int T sigma_s Phi / (4 pi) dt + T L_background
 
-One step is as long as the shortest voxel edge of the medium's grid times ``step``; steps end on the
-medium's bounds, never beyond. The lattice of steps is shifted by a random offset per ray, so that
+One step is as long as the shortest voxel edge, of the medium's grids and the cache's, times
+``step``; steps end on the medium's bounds, never beyond. The lattice of steps is shifted by a random offset per ray, so that
 what is left of the discretisation is noise, not bands. Macrocells without extinction are crossed in
 one go.
 """
@@ -34,11 +34,8 @@ class Projection:
         self.irradiance = irradiance
         self.quadrature = quadrature
         grids = [f.grid for f in (medium.sigma_t, medium.albedo, irradiance) if f and f.grid]
-        # A constant medium varies only as its light does; without either one step is exact.
-        reference = medium.sigma_t.grid or (
-            min(grids, key=lambda g: g.voxel_size.min()) if grids else None
-        )
-        length = reference.voxel_size.min() * step if reference else dr.inf
+        # Where nothing varies, one step is exact.
+        length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
         self.step = dr.opaque(mi.Float, float(length))
         brightest = irradiance.maximum * medium.albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         self.brightest = dr.opaque(mi.Float, brightest)
@@ -130,7 +127,7 @@ def exponential_weights(tau_a, tau_b) -> tuple:
 
     ``tau_a``, ``tau_b`` are the extinctions at the ends times the segment's length, sigma(u) is
     linear between them and tau(u) = tau_a u + (tau_b - tau_a) u^2 / 2. By parts near = int 1 -
-    e^-tau(u) du, here with three Gauss-Legendre points: right to 1e-3 up to optical depths of 5,
+    e^-tau(u) du, here with three Gauss-Legendre points: right to 2e-3 up to optical depths of 5,
     and within [0, 1] for all. A source linear in *optical depth* would be simpler, but weights the
     empty end of a segment that enters a surface far too much.
     """

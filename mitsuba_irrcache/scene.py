@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 
-from .boundary import boundary_of
+from .boundary import Boundary, boundary_of
 from .errors import UnsupportedSceneError
 from .medium import MediumGrid, bake
 
@@ -64,4 +65,22 @@ def _refuse(reason: str, hint: str = "") -> None:
 def bake_scene(scene: mi.Scene) -> MediumGrid | None:
     """The scene's medium on its grids, or None where there is none."""
     found = find_medium(scene)
-    return None if found is None else bake(found[0], boundary_of(scene, found[1]))
+    if found is None:
+        return None
+    medium, shape = found
+    boundary = boundary_of(scene, shape)
+    for emitter in scene.emitters():
+        if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+            _check_point_light(emitter, boundary)
+    return bake(medium, boundary)
+
+
+def _check_point_light(emitter: mi.Emitter, boundary: Boundary) -> None:
+    """Refuses a point-like light inside the medium: no grid can hold its 1/r^2."""
+    params = mi.traverse(emitter)
+    position = params["position"] if "position" in params else params["to_world"].translation()
+    position = np.array(position, dtype=np.float64).ravel()
+    if boundary.contains(position):
+        _refuse(
+            f'emitter "{emitter.id()}" ({emitter.class_name()}) is inside the medium, at {position}'
+        )

@@ -64,9 +64,10 @@ def main() -> None:
 def measure(path: Path, depth: int, resolution: int, args: argparse.Namespace) -> dict[str, float]:
     """Errors in units of the mean reference radiance of all pixels, and seconds."""
     parameters = {"max_depth": str(depth), "width": str(args.size), "height": str(args.size)}
-    a, b = reference(
-        path, parameters, REFERENCE[depth], args.reference_spp, args.output / "references"
+    truth = reference(
+        path, parameters, REFERENCE[depth], args.output / "references", args.reference_spp
     )
+    a, b = truth.a, truth.b
     images, cache_seconds, image_seconds = [], 0.0, 0.0
     for seed in (1, 2):
         integrator = (

@@ -183,6 +183,10 @@ EXTRAS = {
         '<shape type="sphere" id="ball"> <bsdf type="diffuse"/> </shape>',
         "ball.*diffuse",
     ),
+    "point light in the medium": (
+        '<emitter type="point" id="bulb"> <point name="position" value="0, 0, 0"/> </emitter>',
+        "bulb.*inside the medium",
+    ),
     "area light": (
         f'<shape type="rectangle" id="lamp"> {NULL} <emitter type="area"/> </shape>',
         "lamp.*area emitter",
