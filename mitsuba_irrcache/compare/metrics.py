@@ -42,9 +42,12 @@ def mean_error(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
 
 
 def mean_error_uncertainty(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Standard error of `mean_error` if the errors of pixels are independent."""
-    difference = np.mean(image - 0.5 * (a + b), axis=-1, dtype=np.float64)
-    return float(difference.std() / np.sqrt(difference.size))
+    """Standard error of `mean_error`, from the spread of the means over about 64 blocks: the errors
+    of nearby pixels may be correlated, as those of a cache and of a filter are.
+    """
+    size = max(1, min(image.shape[:2]) // 8)
+    means = block_means(image - 0.5 * (a + b), size).mean(axis=-1)
+    return float(means.std() / np.sqrt(means.size))
 
 
 def block_error(image: np.ndarray, a: np.ndarray, b: np.ndarray, size: int = 8) -> float:

@@ -93,7 +93,9 @@ def reference(
         return found
     scene = load_scene(scene_file, parameters, integrator)
     saved = time.perf_counter()
-    with tqdm(desc=f"reference {path.stem}", unit="spp", delay=1.0, leave=False, disable=None) as bar:
+    with tqdm(
+        desc=f"reference {path.stem}", unit="spp", delay=1.0, leave=False, disable=None
+    ) as bar:
         while found is None or found.spp < spp or found.seconds < seconds:
             found = _extend(scene, found, sensor, min(CHUNK, spp) if spp else CHUNK)
             bar.update(found.spp - bar.n)

@@ -7,6 +7,9 @@ import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
+
 from mitsuba_irrcache.files import atomic_write
 
 
@@ -18,7 +21,7 @@ class Snapshot:
         budget: seconds that were asked for.
         seconds: of each stage, with compiled kernels: cache (where there is one), image, ...
         spp: camera samples per pixel in the image.
-        image: name of the file, an .npy (height, width, channel), relative to the report.
+        image: name of the EXR file, relative to the report.
         note: how the budget was spent, for people.
     """
 
@@ -32,6 +35,10 @@ class Snapshot:
     def total(self) -> float:
         """Seconds of all stages."""
         return sum(self.seconds.values())
+
+    def read(self, folder: Path) -> np.ndarray:
+        """The image (height, width, channel) of linear radiance, from the report's ``folder``."""
+        return np.asarray(oiio.ImageBuf(str(folder / self.image)).get_pixels(oiio.FLOAT))
 
 
 @dataclass

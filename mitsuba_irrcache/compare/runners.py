@@ -1,8 +1,8 @@
 """How an integrator spends a time budget: by more samples of the image, or on its cache first.
 
 A runner is a generator: given a `Subject` and budgets in seconds it yields pairs (snapshot, image).
-An integrator is told apart by what it offers, never by its name: one with a method ``prepare(scene)``
-has a cache.
+An integrator is told apart by what it offers, never by its name: one with a method
+``prepare(scene)`` has a cache.
 """
 
 from __future__ import annotations

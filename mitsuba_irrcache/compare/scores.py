@@ -29,14 +29,14 @@ METRICS = {
 def score_all(
     measurements: list[Measurement], reference: Reference, folder: Path, exposure: float
 ) -> list[dict]:
-    """One row for each snapshot whose image lies in ``folder``: integrator, budget, seconds, and
+    """One row for each snapshot of the report in ``folder``: integrator, budget, seconds, and
     the errors of `METRICS`.
     """
     rows = []
     for measurement in measurements:
         for snapshot in measurement.snapshots:
-            image = np.load(folder / snapshot.image)
-            rows.append(_row(measurement, snapshot) | score(image, reference, exposure))
+            errors = score(snapshot.read(folder), reference, exposure)
+            rows.append(_row(measurement, snapshot) | errors)
     return rows
 
 

@@ -1,4 +1,4 @@
-"""Who is ahead: errors at equal time and times to equal error, read off curves of error over time."""
+"""Who is ahead: errors at equal time and times to equal error, from curves of error over time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: A snapshot counts for a budget that it exceeds by at most this factor.
+#: The first snapshot counts for a budget that it exceeds by at most this factor.
 TOLERANCE = 1.1
 #: Slopes of log error over log time that pass for Monte Carlo noise, and may be extrapolated.
 NOISE_SLOPES = (-0.65, -0.35)
@@ -14,7 +14,7 @@ NOISE_SLOPES = (-0.65, -0.35)
 FARTHEST = 1e4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Curve:
     """Errors of one integrator over seconds, both rising in time; ``resolved`` is the least error
     that the reference can tell from none.
@@ -52,7 +52,10 @@ def curves(rows: list[dict]) -> list[Curve]:
 
 
 def equal_time(curves: list[Curve], budgets: list[float]) -> list[list[float | None]]:
-    """A row for each budget with the error of every curve; None where nothing is ready by then."""
+    """A row for each budget with the error of every curve; None where nothing is ready by then.
+
+    Between snapshots log-log interpolated, after the last one as it was.
+    """
     return [[_error_at(curve, budget) for curve in curves] for budget in sorted(budgets)]
 
 
@@ -87,8 +90,10 @@ def time_to(curve: Curve, target: float) -> Reached:
 
 
 def _error_at(curve: Curve, budget: float) -> float | None:
-    ready = np.flatnonzero(curve.seconds <= budget * TOLERANCE)
-    return float(curve.shown[ready[-1]]) if ready.size else None
+    if not len(curve.seconds) or curve.seconds[0] > budget * TOLERANCE:
+        return None
+    logs = np.interp(np.log(budget), np.log(curve.seconds), np.log(curve.shown))
+    return float(np.exp(logs))
 
 
 def _extrapolated(curve: Curve, target: float) -> Reached:

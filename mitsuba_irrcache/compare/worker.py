@@ -9,20 +9,22 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mitsuba_irrcache.cli import _essence
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.images import write_image
 from mitsuba_irrcache.runtime import require_llvm
 
 from . import runners
+from .metrics import colours
 from .reference import reference, reference_path
 from .results import Measurement, write_json
 from .runners import Subject
@@ -64,9 +66,7 @@ def make_reference(job: dict) -> None:
         *where, folder, job["spp"], job["seconds"], sensor=job["sensor"], advance=advance
     )
     path = reference_path(*where, job["sensor"], folder)
-    write_json(
-        Path(job["result"]), {"path": str(path), "spp": found.spp, "seconds": found.seconds}
-    )
+    write_json(Path(job["result"]), {"path": str(path), "spp": found.spp, "seconds": found.seconds})
 
 
 def measure(job: dict) -> None:
@@ -78,9 +78,9 @@ def measure(job: dict) -> None:
     _note_memory(measurement)
     measurement.save(result)
     for snapshot, image in runners.run(subject, scene, job["budgets"]):
-        path = images / f"{job['name']}-{snapshot.budget:g}s.npy"
-        with atomic_write(path) as file:
-            np.save(file, image.astype(np.float32))
+        path = images / f"{job['name']}-{snapshot.budget:g}s.exr"
+        about = {"integrator": job["integrator"], "seconds": snapshot.total, "spp": snapshot.spp}
+        write_image(path, colours(image), about)
         snapshot.image = f"{images.name}/{path.name}"
         measurement.snapshots.append(snapshot)
         _note_memory(measurement)
@@ -142,14 +142,25 @@ def _another_view(subject: Subject, scene: mi.Scene) -> dict[str, float]:
 
 
 def _note_memory(measurement: Measurement) -> None:
-    """Peak memory of this process in bytes, where the system tells (macOS in bytes, others in
-    KiB).
+    peak = _peak_memory()
+    if peak:
+        measurement.memory = {"first_image": peak} | measurement.memory | {"peak": peak}
+
+
+def _peak_memory() -> int:
+    """Peak memory of this process in bytes; 0 where the system does not tell.
+
+    Linux lets ``getrusage`` start at the peak of the parent process, so its own count is asked
+    first.
     """
+    with suppress(OSError):
+        text = Path("/proc/self/status").read_text()
+        if found := re.search(r"^VmHWM:\s*(\d+) kB", text, re.MULTILINE):
+            return int(found[1]) * 1024
     if resource is None:
-        return
-    unit = 1 if sys.platform == "darwin" else 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-    measurement.memory = {"first_image": peak} | measurement.memory | {"peak": peak}
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
 
 
 def _subject(job: dict, integrator: str) -> Subject:

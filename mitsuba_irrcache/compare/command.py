@@ -1,0 +1,289 @@
+"""``irrcache compare``: how fast integrators get rid of their error on your scene.
+
+Any integrators of Mitsuba, stock or not; each runs in a process of its own and is measured against
+a reference that is rendered once and kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from mitsuba_irrcache import doctor
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.loading import parse_integrator
+from mitsuba_irrcache.versions import installed_version
+
+from .processes import WorkerError, run_job
+from .reference import Reference, default_folder
+from .results import Measurement, file_name
+
+DEFAULT_REFERENCE = "volpath"
+#: Seconds spent on the reference for every second of the longest budget, unless told otherwise.
+REFERENCE_SHARE = 4
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``irrcache compare``."""
+    add = parser.add_argument
+    add("scene", help="scene XML")
+    add(
+        "-i", "--integrator", action="append", required=True, metavar="NAME{KEY=VALUE,...}",
+        help="integrator to compare, quoted, with properties; repeatable",
+    )  # fmt: skip
+    add("-o", "--output", required=True, metavar="FOLDER", help="folder for the report")
+    add(
+        "--budget", default="1,3,12", metavar="SECONDS,...",
+        help="times to compare errors at, with compiled kernels (default: %(default)s)",
+    )  # fmt: skip
+    add("-m", "--mode", default="llvm_ad_rgb", help="variant of Mitsuba (default: %(default)s)")
+    add(
+        "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
+        help="value of a $parameter of the scene; repeatable",
+    )  # fmt: skip
+    add("-s", "--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    add(
+        "--reference", default=DEFAULT_REFERENCE, metavar="NAME{KEY=VALUE,...}",
+        help="unbiased integrator that makes the reference (default: %(default)s)",
+    )  # fmt: skip
+    effort = parser.add_mutually_exclusive_group()
+    effort.add_argument(
+        "--reference-spp", type=int, default=0, metavar="N",
+        help="samples per pixel of each of the two halves of the reference",
+    )  # fmt: skip
+    effort.add_argument(
+        "--reference-seconds", type=float, default=0.0, metavar="S",
+        help=f"time for the reference (default: {REFERENCE_SHARE} times the longest budget)",
+    )  # fmt: skip
+    add(
+        "--references", type=Path, default=None, metavar="FOLDER",
+        help="where references are kept (default: irrcache/references in your cache folder)",
+    )  # fmt: skip
+    add(
+        "--exposure",
+        type=float,
+        default=0.0,
+        metavar="EV",
+        help="brightness of the pictures, stops",
+    )
+    add(
+        "--import", dest="modules", action="append", default=[], metavar="MODULE",
+        help="Python module that registers integrators of others; repeatable",
+    )  # fmt: skip
+    add("--overwrite", action="store_true", help="replace a report that is in the folder")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measures, writes the report and prints the tables; 1 if an integrator failed."""
+    _require_drawing()
+    job, budgets = _common_job(args), _budgets(args.budget)
+    integrators = _integrators(args)
+    folder = _check_folder(Path(args.output), args.overwrite)
+    with tempfile.TemporaryDirectory(prefix="irrcache-compare-") as scratch:
+        log = Path(scratch) / "log"
+        checked = run_job(
+            "check", job | {"integrators": [*integrators, args.reference]},
+            Path(scratch) / "checked.json", log,
+        )  # fmt: skip
+        reference = _reference(args, job, budgets, Path(scratch) / "reference.json", log)
+    _make_folders(folder)
+    measurements, interrupted = [], False
+    for index, integrator in enumerate(integrators):
+        try:
+            name = file_name(index, integrator)
+            measurements.append(_measure(job, integrator, name, budgets, folder))
+        except KeyboardInterrupt:
+            interrupted = True
+            measurements += _kept(folder, name, integrator, "It was interrupted.")
+            break
+    tables = _write(args, folder, measurements, reference, budgets, checked)
+    for table in tables:
+        print(f"\n{table.as_text()}")
+    print(f"\nreport         {folder / 'report.html'}")
+    for measurement in measurements:
+        if measurement.error:
+            print(f"irrcache: {measurement.integrator}: {measurement.error}", file=sys.stderr)
+    return 130 if interrupted else int(any(m.error for m in measurements))
+
+
+def _measure(
+    job: dict, integrator: str, name: str, budgets: list[float], folder: Path
+) -> Measurement:
+    """One integrator: a cold process with all its budgets, then one that finds its kernels."""
+    result = folder / "measurements" / f"{name}.json"
+    log = folder / "logs" / f"{name}.txt"
+    own = job | {"integrator": integrator, "name": name, "budgets": budgets}
+    own |= {"images": str(folder / "images")}
+    print(f"{integrator}: first image, with an empty kernel cache", flush=True)
+    with tempfile.TemporaryDirectory(prefix="irrcache-kernels-") as kernels:
+        try:
+            run_job("measure", own, result, log, Path(kernels), _progress(integrator))
+            warm = run_job(
+                "start", own, Path(kernels) / "warm.json", Path(kernels) / "log", Path(kernels)
+            )
+        except WorkerError as error:
+            return _kept(folder, name, integrator, str(error))[0]
+    measurement = Measurement.load(result)
+    measurement.warm = warm
+    measurement.save(result)
+    return measurement
+
+
+def _kept(folder: Path, name: str, integrator: str, why: str) -> list[Measurement]:
+    """What an integrator had finished when something ended it."""
+    result = folder / "measurements" / f"{name}.json"
+    measurement = Measurement.load(result) if result.exists() else Measurement(integrator, name)
+    measurement.error = why
+    measurement.save(result)
+    return [measurement]
+
+
+def _reference(
+    args: argparse.Namespace, job: dict, budgets: list[float], result: Path, log: Path
+) -> Reference:
+    seconds = args.reference_seconds
+    if not seconds and not args.reference_spp:
+        seconds = REFERENCE_SHARE * max(budgets)
+    print(f"reference: {args.reference}", flush=True)
+    wanted = {
+        "integrator": args.reference,
+        "folder": str((args.references or default_folder()).resolve()),
+        "spp": args.reference_spp,
+        "seconds": seconds,
+    }
+    found = run_job("reference", job | wanted, result, log, report=_progress("reference"))
+    reference = Reference.load(Path(found["path"]))
+    print(f"reference: {2 * reference.spp} samples per pixel, {found['path']}", flush=True)
+    return reference
+
+
+def _write(
+    args: argparse.Namespace,
+    folder: Path,
+    measurements: list[Measurement],
+    reference: Reference,
+    budgets: list[float],
+    checked: dict,
+) -> list:
+    from .output import Comparison, write_output
+
+    facts = _facts(args, reference, checked)
+    title = f"{' against '.join(m.integrator for m in measurements)} on {Path(args.scene).name}"
+    if len(measurements) > 2:
+        title = f"{len(measurements)} integrators on {Path(args.scene).name}"
+    comparison = Comparison(title, budgets, measurements, reference, facts, args.exposure)
+    return write_output(comparison, folder)
+
+
+def _facts(args: argparse.Namespace, reference: Reference, checked: dict) -> dict[str, str]:
+    system = doctor.examine_system()
+    width, height = checked["size"]
+    parameters = " ".join(args.define)
+    return {
+        "scene": f"{Path(args.scene).name}{f' with {parameters}' if parameters else ''}",
+        "image": f"{width} × {height} pixels",
+        "sensor": f"{args.sensor} of {checked['sensors']}",
+        "integrators": ", ".join(args.integrator),
+        "reference": f"{args.reference}, {2 * reference.spp} samples per pixel in two halves, "
+        f"{reference.seconds:.0f} s",
+        "variant": args.mode,
+        "software": f"Mitsuba {installed_version('mitsuba')}, Dr.Jit {installed_version('drjit')}",
+        "machine": f"{system['processor']}, {system['cores']} cores",
+        "date": time.strftime("%Y-%m-%d %H:%M"),
+    }
+
+
+def _common_job(args: argparse.Namespace) -> dict:
+    source = Path(args.scene)
+    if not source.is_file():
+        raise IrrcacheError(f'there is no scene file "{source}".')
+    parameters = {}
+    for item in args.define:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise IrrcacheError(f'cannot read -D "{item}"; write -D name=value.')
+        parameters[key] = value
+    return {
+        "scene": str(source.resolve()),
+        "parameters": parameters,
+        "sensor": args.sensor,
+        "variant": args.mode,
+        "modules": args.modules,
+    }
+
+
+def _integrators(args: argparse.Namespace) -> list[str]:
+    for specification in [*args.integrator, args.reference]:
+        parse_integrator(specification)
+    doubled = [i for i in args.integrator if args.integrator.count(i) > 1]
+    if doubled:
+        raise IrrcacheError(f"-i {doubled[0]} is given twice; the runs would be the same.")
+    return args.integrator
+
+
+def _budgets(text: str) -> list[float]:
+    try:
+        budgets = sorted({float(part) for part in text.split(",")})
+    except ValueError:
+        budgets = []
+    if not budgets or not all(0 < b < math.inf for b in budgets):
+        raise IrrcacheError(f'--budget is "{text}"; write seconds above 0, for example 1,3,12.')
+    return budgets
+
+
+def _check_folder(folder: Path, overwrite: bool) -> Path:
+    """The folder for the report, before any work is done for it."""
+    if folder.exists() and not folder.is_dir():
+        raise IrrcacheError(f'-o "{folder}" is a file; name a folder.')
+    if not folder.resolve().parent.is_dir():
+        raise IrrcacheError(f'cannot write "{folder}": "{folder.parent}" does not exist.')
+    if folder.is_dir() and any(folder.iterdir()):
+        if not (folder / "measurements").is_dir():
+            raise IrrcacheError(
+                f'"{folder}" is not empty and holds no report; name another folder.'
+            )
+        if not overwrite:
+            raise IrrcacheError(
+                f'"{folder}" holds a report already; name another folder, or add --overwrite.'
+            )
+    return folder
+
+
+def _make_folders(folder: Path) -> None:
+    """An empty folder with its sub-folders; only what a former report put there is removed."""
+    folder.mkdir(exist_ok=True)
+    for name in ("results.json", "results.csv", "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    for name in ("images", "figures", "logs", "measurements"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+    for name in ("images", "logs", "measurements"):
+        (folder / name).mkdir()
+
+
+def _progress(name: str) -> Callable[[str], None]:
+    """Prints lines of progress, a few seconds apart."""
+    printed = time.monotonic()
+
+    def report(line: str) -> None:
+        nonlocal printed
+        if time.monotonic() - printed >= 5:
+            printed = time.monotonic()
+            print(f"{name}: {line}", flush=True)
+
+    return report
+
+
+def _require_drawing() -> None:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        raise IrrcacheError(
+            "irrcache compare draws with matplotlib, which is not installed. Remedy: "
+            f'{sys.executable} -m pip install "mitsuba_irrcache[compare]"'
+        ) from None

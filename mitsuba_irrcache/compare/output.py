@@ -1,0 +1,143 @@
+"""From measurements to what people and programs read: JSON, CSV, figures, images, the report."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.images import write_image
+
+from . import pictures, plots
+from .metrics import colours
+from .reference import Reference
+from .report import Figure, Section, findings, write_report
+from .results import Measurement, write_json
+from .scores import reference_noise, score_all
+from .summary import curves
+from .tables import Table, equal_error_table, equal_time_table, metrics_table, stages_table
+
+
+@dataclass
+class Comparison:
+    """All that was measured on one scene."""
+
+    title: str
+    budgets: list[float]
+    measurements: list[Measurement]
+    reference: Reference
+    facts: dict[str, str]
+    exposure: float = 0.0
+
+
+def write_output(comparison: Comparison, folder: Path) -> list[Table]:
+    """Fills ``folder``: results.json, results.csv, report.html, figures/, images/.
+
+    Returns the tables for the terminal.
+    """
+    rows = score_all(comparison.measurements, comparison.reference, folder, comparison.exposure)
+    write_json(folder / "results.json", _record(comparison, rows))
+    _write_csv(folder / "results.csv", rows)
+    truth = comparison.reference
+    write_image(folder / "images" / "reference.exr", colours(truth.mean), {"spp": 2 * truth.spp})
+    drawn = curves(rows)
+    tables = [
+        equal_time_table(drawn, comparison.budgets),
+        equal_error_table(drawn),
+        stages_table(comparison.measurements),
+    ]
+    sections = _sections(comparison, rows, tables, folder) if rows else []
+    write_report(
+        folder / "report.html",
+        comparison.title,
+        findings(drawn, comparison.budgets, rows),
+        sections,
+        [m for m in comparison.measurements if m.error],
+        comparison.facts,
+    )
+    return tables if rows else tables[2:]
+
+
+def _sections(
+    comparison: Comparison, rows: list[dict], tables: list[Table], folder: Path
+) -> list[Section]:
+    figures = folder / "figures"
+    figures.mkdir(exist_ok=True)
+    files = {
+        name: figures / f"{name}.png"
+        for name in ("error", "metrics", "strip", "differences", "blocks", "stages")
+    }
+    measured, truth = comparison.measurements, comparison.reference
+    plots.error_over_time(files["error"], curves(rows), reference_noise(truth))
+    plots.small_multiples(files["metrics"], rows)
+    pictures.strip(files["strip"], measured, truth, folder, comparison.exposure)
+    pictures.differences(files["differences"], measured, truth, folder)
+    pictures.differences(files["blocks"], measured, truth, folder, block=8)
+    plots.stages(files["stages"], measured)
+    equal_time, equal_error, stages = tables
+    captions = {
+        "error": "Error against time. Hollow: smaller than what the reference can resolve.",
+        "strip": "The pictures, as a display shows them.",
+        "differences": "Signed difference to the reference, whose own noise shows in it.",
+        "blocks": "The same, averaged over 8 × 8 pixels: noise fades, what stays is blotches, "
+        "bands and bias.",
+        "stages": "Seconds to a first image, by stage.",
+        "metrics": "Other measures of error against seconds.",
+    }
+    figure = {name: Figure(files[name], caption) for name, caption in captions.items()}
+    return [
+        Section("Error against time", [figure["error"]]),
+        Section("Error after equal time", [equal_time]),
+        Section("Time to equal error", [equal_error]),
+        Section("Pictures", [figure["strip"]]),
+        Section("Where they are wrong", [figure["differences"], figure["blocks"]]),
+        Section("Where the time goes", [figure["stages"], stages]),
+        Section("All errors", [figure["metrics"], metrics_table(rows)]),
+    ]
+
+
+def _record(comparison: Comparison, rows: list[dict]) -> dict:
+    errors = {(row["integrator"], row["budget"]): row for row in rows}
+    measurements = []
+    for measurement in comparison.measurements:
+        record = asdict(measurement)
+        for snapshot in record["snapshots"]:
+            row = errors[measurement.integrator, snapshot["budget"]]
+            snapshot["errors"] = {k: _plain(v) for k, v in row.items() if k not in _OWN_COLUMNS}
+        measurements.append(record)
+    reference = comparison.reference
+    return {
+        "title": comparison.title,
+        "facts": comparison.facts,
+        "budgets": comparison.budgets,
+        "reference": {
+            "spp": 2 * reference.spp,
+            "seconds": reference.seconds,
+            "mean_radiance": float(colours(reference.mean).mean()),
+            "noise": reference_noise(reference),
+        },
+        "measurements": measurements,
+    }
+
+
+#: Columns of a row that say what was measured rather than how wrong it is.
+_OWN_COLUMNS = ("integrator", "budget", "spp", "note", "image")
+
+
+def _plain(value: object) -> object:
+    """NaN and infinity have no place in JSON."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _write_csv(path: Path, rows: list[dict]) -> None:
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_write(path) as file:
+        file.write(text.getvalue().encode())

@@ -1,0 +1,142 @@
+"""The tables of a comparison, as text in cells: the terminal and the report show the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .results import Measurement
+from .scores import METRICS
+from .summary import Curve, Reached, equal_error, equal_time, targets
+
+STAGES = ("import", "load", "kernels", "cache", "image")
+
+
+@dataclass
+class Table:
+    """Cells of text under a heading; ``best`` are the (row, column) of the cells to emphasise."""
+
+    title: str
+    head: list[str]
+    rows: list[list[str]]
+    note: str = ""
+    best: set[tuple[int, int]] = field(default_factory=set)
+
+    def as_text(self) -> str:
+        """Columns aligned with spaces, the best cells marked by a star."""
+        cells = [self.head] + [
+            [f"{cell} *" if (r, c) in self.best else cell for c, cell in enumerate(row)]
+            for r, row in enumerate(self.rows)
+        ]
+        widths = [max(len(row[c]) for row in cells) for c in range(len(self.head))]
+        lines = [
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
+            for row in cells
+        ]
+        return "\n".join([self.title, *("  " + line for line in lines)])
+
+
+def equal_time_table(curves: list[Curve], budgets: list[float]) -> Table:
+    """RMSE after each budget."""
+    rows, best = [], set()
+    for r, (budget, errors) in enumerate(
+        zip(sorted(budgets), equal_time(curves, budgets), strict=True)
+    ):
+        rows.append([f"{budget:g} s", *("—" if e is None else percent(e) for e in errors)])
+        known = [e for e in errors if e is not None]
+        best |= {(r, c + 1) for c, e in enumerate(errors) if len(known) > 1 and e == min(known)}
+    note = (
+        "RMSE in units of the mean radiance of the reference, whose own noise is removed. "
+        "Interpolated between snapshots. A dash: no image by then. Kernels are compiled beforehand."
+    )
+    return Table("Error after equal time", ["budget", *_names(curves)], rows, note, best)
+
+
+def equal_error_table(curves: list[Curve]) -> Table:
+    """Time to reach round errors."""
+    goals, best, rows = targets(curves), set(), []
+    for r, (goal, reached) in enumerate(zip(goals, equal_error(curves, goals), strict=True)):
+        rows.append([percent(goal), *map(_reached, reached)])
+        least = min(reached, key=lambda x: x.seconds).seconds
+        known = sum(np.isfinite(x.seconds) for x in reached)
+        best |= {(r, c + 1) for c, x in enumerate(reached) if known > 1 and x.seconds == least}
+    note = (
+        "Interpolated between snapshots. “≤”: the first snapshot was better already. “≈”: beyond "
+        "the measurement, extrapolated as noise (variance over time). A dash: not reached, and the "
+        "error does not fall like noise, so nothing can be said."
+    )
+    return Table("Time to equal error", ["RMSE", *_names(curves)], rows, note, best)
+
+
+def stages_table(measurements: list[Measurement]) -> Table:
+    """Where the time to a first image goes, and memory."""
+    rows = []
+    for m in measurements:
+        for label, stages in (("cold", m.cold), ("warm kernels", m.warm), ("next view", m.again)):
+            if stages:
+                total = sum(stages.get(s, 0.0) for s in STAGES)
+                cells = [seconds(stages[s]) if s in stages else "—" for s in STAGES]
+                memory = (
+                    f"{m.memory['peak'] / 2**20:.0f} MiB" if label == "cold" and m.memory else ""
+                )
+                rows.append([m.integrator, label, *cells, seconds(total), memory])
+    note = (
+        "Seconds to a first, noisy image (a few samples per pixel; the smallest cache where there "
+        "is one). Cold: new process, no compiled kernel on disk. Warm kernels: new process that "
+        "finds them. Next view: same process, next sensor, or another seed where there is "
+        "only one. “Kernels” is what the first image takes longer than the second: tracing, code generation "
+        "and compilation. Memory: peak of the whole run, of the process on the CPU side."
+    )
+    head = ["integrator", "start", *STAGES, "total", "peak memory"]
+    return Table("Where the time goes", head, rows, note)
+
+
+def metrics_table(rows: list[dict]) -> Table:
+    """All errors of all snapshots."""
+    cells = []
+    for row in rows:
+        values = [_metric(row, name) for name in METRICS]
+        cells.append([row["integrator"], f"{row['seconds']:.3g} s", str(row["spp"]), *values])
+    head = ["integrator", "time", "spp", *(label for label, _, _ in METRICS.values())]
+    note = "; ".join(f"{label}: {meaning}" for label, _, meaning in METRICS.values())
+    unit = "%: of the mean radiance of the reference. "
+    missing = (
+        "" if all(r["flip"] is not None for r in rows)
+        else " FLIP is not installed: pip install flip-evaluator."
+    )  # fmt: skip
+    return Table("All errors", head, cells, f"{unit}{note}.{missing}")
+
+
+def percent(value: float) -> str:
+    """Three digits, in percent."""
+    return f"{100 * value:.3g} %"
+
+
+def seconds(value: float) -> str:
+    """Three digits at most, in seconds."""
+    return f"{value:.0f}" if value >= 99.95 else f"{value:.3g}" if value >= 0.1 else f"{value:.2f}"
+
+
+def _names(curves: list[Curve]) -> list[str]:
+    return [curve.integrator for curve in curves]
+
+
+def _reached(reached: Reached) -> str:
+    if reached.how == "never":
+        return "—"
+    sign = {"at most": "≤ ", "extrapolated": "≈ "}.get(reached.how, "")
+    return f"{sign}{seconds(reached.seconds)} s"
+
+
+def _metric(row: dict, name: str) -> str:
+    value, unit = row[name], METRICS[name][1]
+    if value is None:
+        return "not installed"
+    if not np.isfinite(value):
+        return "—"
+    if name == "rmse" and value < row["rmse_resolved"]:
+        return f"< {percent(row['rmse_resolved'])}"
+    if name == "bias":
+        return f"{100 * value:+.2g} ± {100 * row['bias_uncertainty']:.1g} %"
+    return percent(value) if unit == "%" else f"{value:.3g}{unit}"
