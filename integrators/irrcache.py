@@ -14,6 +14,7 @@ from mitsuba_irrcache.projection import QUADRATURES, Projection
 from mitsuba_irrcache.rendering import render_film
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.variants import require_variant
+from mitsuba_irrcache.versions import check_versions
 
 SOLVERS = ("auto", "path")
 FILTERS = ("none",)
@@ -105,6 +106,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         require_variant(mi.variant())
         require_llvm()
+        check_versions()
         super().__init__(props)
         self._hide_emitters = bool(props.get("hide_emitters", False))
         self._settings = CacheSettings(
@@ -143,7 +145,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         if medium is None:
             self._projection = None
         elif changed or self._projection is None:
-            field = cache.field() if cache is not None else None
+            lit = cache is not None and cache.active_count
+            field = cache.field() if lit else None
             self._projection = Projection(medium, field, self._quadrature, self._step)
 
     def sample(

@@ -80,6 +80,7 @@ class CacheBuilder:
     def _start_cache(self, scene: mi.Scene, medium: MediumGrid, edited: bool) -> IrradianceCache:
         settings = self.settings
         grid = Grid.near_cubic(medium.frame, settings.resolution or choose_resolution(medium))
+        grid = grid.shared(medium.sigma_t.grid, medium.albedo.grid)
         _check_memory(grid)
         active = active_voxels(medium, grid)
         if medium.albedo.maximum == 0:

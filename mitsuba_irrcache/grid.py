@@ -60,6 +60,18 @@ class Grid:
         """World lengths of the edges of one voxel."""
         return self.side_lengths / self.resolution
 
+    def shared(self, *others: Grid | None) -> Grid:
+        """The first of ``others`` with the same voxels as this grid, else this grid.
+
+        Lookups through one and the same grid share the arithmetic of their coordinates.
+        """
+        for other in others:
+            if other is not None and other.shape == self.shape:
+                tolerance = 1e-6 * self.side_lengths.max()
+                if np.abs(other.to_world - self.to_world).max() <= tolerance:
+                    return other
+        return self
+
     def centers(self, index: mi.UInt32) -> mi.Point3f:
         """World positions of the voxels with the flat indices ``index`` (x fastest)."""
         _, ny, nx = self.shape

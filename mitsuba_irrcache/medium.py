@@ -93,6 +93,8 @@ def bake(medium: mi.Medium, boundary: Boundary) -> MediumGrid:
         )
     sigma_t = _field(volumes["sigma_t"], f"sigma_t of {name}", scale)
     albedo = _field(volumes["albedo"], f"albedo of {name}", 1.0)
+    if sigma_t.grid is not None and albedo.grid is not None:
+        albedo.grid = albedo.grid.shared(sigma_t.grid)
     if albedo.maximum > 1.0 + 1e-6:
         raise IrrcacheError(
             f"irrcache: the albedo of {name} reaches {albedo.maximum:g}; above 1 a medium creates "

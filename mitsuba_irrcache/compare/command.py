@@ -23,6 +23,7 @@ from mitsuba_irrcache.versions import installed_version
 from .processes import WorkerError, run_job
 from .reference import Reference, default_folder
 from .results import Measurement, file_name
+from .summary import maximum_depths
 
 DEFAULT_REFERENCE = "volpath"
 #: Seconds spent on the reference for every second of the longest budget, unless told otherwise.
@@ -121,9 +122,13 @@ def _measure(
     own = job | {"integrator": integrator, "name": name, "budgets": budgets}
     own |= {"images": str(folder / "images")}
     print(f"{integrator}: first image, with an empty kernel cache", flush=True)
+
+    def report(line: str) -> None:
+        print(f"{integrator}: {line}", flush=True)
+
     with tempfile.TemporaryDirectory(prefix="irrcache-kernels-") as kernels:
         try:
-            run_job("measure", own, result, log, Path(kernels), _progress(integrator))
+            run_job("measure", own, result, log, Path(kernels), report)
             warm = run_job(
                 "start", own, Path(kernels) / "warm.json", Path(kernels) / "log", Path(kernels)
             )
@@ -157,7 +162,7 @@ def _reference(
         "spp": args.reference_spp,
         "seconds": seconds,
     }
-    found = run_job("reference", job | wanted, result, log, report=_progress("reference"))
+    found = run_job("reference", job | wanted, result, log, report=_now_and_then("reference"))
     reference = Reference.load(Path(found["path"]))
     print(f"reference: {2 * reference.spp} samples per pixel, {found['path']}", flush=True)
     return reference
@@ -174,10 +179,12 @@ def _write(
     from .output import Comparison, write_output
 
     facts = _facts(args, reference, checked)
-    title = f"{' against '.join(m.integrator for m in measurements)} on {Path(args.scene).name}"
+    depths = maximum_depths(checked["described"])
+    who = " against ".join(m.integrator for m in measurements)
     if len(measurements) > 2:
-        title = f"{len(measurements)} integrators on {Path(args.scene).name}"
-    comparison = Comparison(title, budgets, measurements, reference, facts, args.exposure)
+        who = f"{len(measurements)} integrators"
+    title = f"{who} on {_scene_name(args)}"
+    comparison = Comparison(title, budgets, measurements, reference, facts, depths, args.exposure)
     return write_output(comparison, folder)
 
 
@@ -186,10 +193,10 @@ def _facts(args: argparse.Namespace, reference: Reference, checked: dict) -> dic
     width, height = checked["size"]
     parameters = " ".join(args.define)
     return {
-        "scene": f"{Path(args.scene).name}{f' with {parameters}' if parameters else ''}",
+        "scene": f"{_scene_name(args)}{f' with {parameters}' if parameters else ''}",
         "image": f"{width} × {height} pixels",
         "sensor": f"{args.sensor} of {checked['sensors']}",
-        "integrators": ", ".join(args.integrator),
+        "integrators": "; ".join(checked["described"][i] for i in args.integrator),
         "reference": f"{args.reference}, {2 * reference.spp} samples per pixel in two halves, "
         f"{reference.seconds:.0f} s",
         "variant": args.mode,
@@ -197,6 +204,11 @@ def _facts(args: argparse.Namespace, reference: Reference, checked: dict) -> dic
         "machine": f"{system['processor']}, {system['cores']} cores",
         "date": time.strftime("%Y-%m-%d %H:%M"),
     }
+
+
+def _scene_name(args: argparse.Namespace) -> str:
+    """The file with its folder: many scenes are called scene.xml."""
+    return "/".join(Path(args.scene).resolve().parts[-2:])
 
 
 def _common_job(args: argparse.Namespace) -> dict:
@@ -266,7 +278,7 @@ def _make_folders(folder: Path) -> None:
         (folder / name).mkdir()
 
 
-def _progress(name: str) -> Callable[[str], None]:
+def _now_and_then(name: str) -> Callable[[str], None]:
     """Prints lines of progress, a few seconds apart."""
     printed = time.monotonic()
 

@@ -31,6 +31,7 @@ class Comparison:
     measurements: list[Measurement]
     reference: Reference
     facts: dict[str, str]
+    depths: dict[str, int]
     exposure: float = 0.0
 
 
@@ -54,7 +55,7 @@ def write_output(comparison: Comparison, folder: Path) -> list[Table]:
     write_report(
         folder / "report.html",
         comparison.title,
-        findings(drawn, comparison.budgets, rows),
+        findings(drawn, comparison.budgets, rows, comparison.depths),
         sections,
         [m for m in comparison.measurements if m.error],
         comparison.facts,

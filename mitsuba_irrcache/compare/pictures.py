@@ -32,7 +32,7 @@ def strip(
             for ax, budget in zip(row, budgets, strict=False):
                 snapshot = _snapshot(measurement, budget)
                 if snapshot is None:
-                    _empty(ax, budget)
+                    _empty(ax, budget, truth.shape)
                     continue
                 image = np.nan_to_num(snapshot.read(folder))
                 ax.imshow(display(image, exposure), interpolation="nearest")
@@ -62,7 +62,7 @@ def differences(
             for ax, budget in zip(row, budgets, strict=True):
                 snapshot = _snapshot(measurement, budget)
                 if snapshot is None:
-                    _empty(ax, budget)
+                    _empty(ax, budget, truth.shape)
                     continue
                 last = ax.imshow(
                     panels[measurement.name, budget], cmap=style.SIGNED, vmin=-limit, vmax=limit,
@@ -106,8 +106,12 @@ def _label(row: np.ndarray, measurement: Measurement) -> None:
     row[0].set_ylabel(text if len(text) < 24 else text.replace("{", "{\n", 1), fontsize=8)
 
 
-def _empty(ax: Axes, budget: float) -> None:
-    ax.text(0.5, 0.5, "no image\nyet", ha="center", va="center", color=style.GREY, fontsize=8)
+def _empty(ax: Axes, budget: float, shape: tuple[int, ...]) -> None:
+    ax.imshow(np.ones((*shape[:2], 3)))  # takes the room of a picture
+    ax.text(
+        0.5, 0.5, "no image\nyet", transform=ax.transAxes, ha="center", va="center",
+        color=style.GREY, fontsize=8,
+    )  # fmt: skip
     ax.set_title(f"{budget:g} s", color=style.GREY)
 
 

@@ -120,7 +120,7 @@ def _logarithmic(ax: Axes) -> None:
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         low, high = axis.get_view_interval()
-        if high < 12 * low:  # too short for powers of ten to tell the scale
+        if high < 100 * low:  # too short for powers of ten to tell the scale
             axis.set_minor_formatter(FuncFormatter(_minor_label))
         else:
             axis.set_minor_formatter(NullFormatter())
@@ -129,7 +129,7 @@ def _logarithmic(ax: Axes) -> None:
 
 def _minor_label(value: float, _: int) -> str:
     digit = round(value / 10 ** np.floor(np.log10(value)))
-    return f"{value:g}" if digit in (2, 3, 5) else ""
+    return f"{value:g}" if digit in (2, 5) else ""
 
 
 def _drawable(value: float | None) -> bool:

@@ -66,7 +66,7 @@ def reference_path(
     """
     parts = (scene_digest(scene_file, parameters), integrator, sensor, mi.variant(), mi.__version__)
     digest = hashlib.sha256(repr(parts).encode()).hexdigest()
-    return folder / f"{scene_file.parent.resolve().name}-{scene_file.stem}-{digest[:16]}.npz"
+    return folder / f"{scene_file.stem}-{digest[:16]}.npz"
 
 
 def reference(

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
+import numpy as np
+
 from mitsuba_irrcache.files import atomic_write
 
 from .results import Measurement
-from .summary import Curve, Reached, equal_time, time_to
-from .tables import Table, percent, seconds
+from .summary import Curve, Reached, equal_time, time_to, uncertainty
+from .tables import Table, percent, seconds, with_uncertainty
 
 CSS = """
 :root { color-scheme: light; }
@@ -78,13 +80,17 @@ def write_report(
         file.write(page.encode())
 
 
-def findings(curves: list[Curve], budgets: list[float], rows: list[dict]) -> list[str]:
+def findings(
+    curves: list[Curve], budgets: list[float], rows: list[dict], depths: dict[str, int]
+) -> list[str]:
     """What a reader should take home, a sentence each; errors are RMSE."""
     if not curves:
         return ["No integrator produced an image."]
     said = []
-    longest = max(budgets)
-    errors = dict(zip(curves, equal_time(curves, [longest])[0], strict=True))
+    table = dict(zip(sorted(budgets), equal_time(curves, budgets), strict=True))
+    # The longest time of those at which most integrators have an image.
+    longest = max(table, key=lambda budget: (sum(e is not None for e in table[budget]), budget))
+    errors = dict(zip(curves, table[longest], strict=True))
     ranked = sorted((c for c in curves if errors[c] is not None), key=lambda c: errors[c])
     if ranked:
         others = ", ".join(f"{c.integrator} {percent(errors[c])}" for c in ranked[1:])
@@ -93,6 +99,12 @@ def findings(curves: list[Curve], budgets: list[float], rows: list[dict]) -> lis
             f"{percent(errors[ranked[0]])} of the mean radiance{f'; {others}' if others else ''}."
         )
     said += [_ratio(ranked[0], other, errors[other]) for other in ranked[1:]]
+    if len(set(depths.values())) > 1:
+        said.append(
+            "Their images need not agree, for max_depth differs: "
+            f"{', '.join(f'{depth} in {name}' for name, depth in depths.items())}. Plugins have "
+            "different defaults; say it in braces."
+        )
     said += [_biased(row) for row in _last_rows(rows) if _is_biased(row)]
     said += [
         f"{row['integrator']}: {percent(row['invalid'])} of the values are not finite; "
@@ -104,6 +116,8 @@ def findings(curves: list[Curve], budgets: list[float], rows: list[dict]) -> lis
 
 
 def _ratio(best: Curve, other: Curve, error: float) -> str:
+    if error - best.shown[-1] < 2 * np.hypot(uncertainty(best), uncertainty(other)):
+        return f"{other.integrator} is as good as {best.integrator} within the uncertainty."
     ours = time_to(best, error)
     ratio = float(other.seconds[-1]) / ours.seconds
     at_least = "at least " if ours.how == "at most" else ""
@@ -126,11 +140,11 @@ def _is_biased(row: dict) -> bool:
 
 
 def _biased(row: dict) -> str:
+    error = with_uncertainty(row["bias"], row["bias_uncertainty"])
     return (
-        f"{row['integrator']} is off by {100 * row['bias']:+.2g} % (± "
-        f"{100 * row['bias_uncertainty']:.1g} %) of the mean radiance on average in its last "
-        "image, more than noise explains that is independent between distant pixels: bias, most "
-        "likely, which no further sample removes."
+        f"{row['integrator']} is off by {error} of the mean radiance on average in its last image, "
+        "more than noise explains that is independent between distant pixels: bias, most likely, "
+        "which no further sample removes."
     )
 
 

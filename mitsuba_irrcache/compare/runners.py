@@ -7,6 +7,7 @@ An integrator is told apart by what it offers, never by its name: one with a met
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -71,7 +72,9 @@ def prepare(scene: mi.Scene) -> float:
 
 def has_cache(scene: mi.Scene) -> bool:
     """Whether the integrator builds a cache before it renders."""
-    return callable(getattr(scene.integrator(), "prepare", None))
+    method = getattr(scene.integrator(), "prepare", None)
+    # Mitsuba's differentiable integrators have another method of this name.
+    return callable(method) and "scene" in inspect.signature(method).parameters
 
 
 def effort_is_free(subject: Subject) -> bool:
@@ -128,7 +131,7 @@ def accumulate(
 def _fitted(subject: Subject, budgets: list[float], spp: int) -> Frames:
     """For each budget a run of its own, with as much effort on the cache as it allows."""
     costs = [_cache_cost(subject, LEAST_EFFORT)]
-    for budget in sorted(budgets):
+    for budget in without_unreachable(budgets, costs[0][1]):
         effort = choose_effort(costs, CACHE_SHARE * budget)
         scene = subject.load(**{EFFORT: effort})
         seconds = prepare(scene)
@@ -136,6 +139,12 @@ def _fitted(subject: Subject, budgets: list[float], spp: int) -> Frames:
         for snapshot, image in accumulate(subject, scene, [budget], spp, {"cache": seconds}):
             snapshot.note = f"{EFFORT}={effort}"
             yield snapshot, image
+
+
+def without_unreachable(budgets: list[float], least: float) -> list[float]:
+    """The budgets in order; of those below ``least`` seconds only the largest, for an image."""
+    early = [b for b in budgets if b < least]
+    return ([max(early)] if early else []) + sorted(b for b in budgets if b >= least)
 
 
 def _cache_cost(subject: Subject, effort: int) -> tuple[int, float]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
 
-#: The first snapshot counts for a budget that it exceeds by at most this factor.
+#: The first and the last snapshot count for a budget that is off by at most this factor.
 TOLERANCE = 1.1
 #: Slopes of log error over log time that pass for Monte Carlo noise, and may be extrapolated.
 NOISE_SLOPES = (-0.65, -0.35)
@@ -51,10 +52,22 @@ def curves(rows: list[dict]) -> list[Curve]:
     return result
 
 
-def equal_time(curves: list[Curve], budgets: list[float]) -> list[list[float | None]]:
-    """A row for each budget with the error of every curve; None where nothing is ready by then.
+def uncertainty(curve: Curve) -> float:
+    """Standard error of the last error, if pixels are independent."""
+    # resolved = sqrt(2 u) with u, the standard error of the square; d sqrt(s) = ds / (2 sqrt(s))
+    return float(curve.resolved[-1] ** 2 / 4 / curve.shown[-1])
 
-    Between snapshots log-log interpolated, after the last one as it was.
+
+def maximum_depths(described: dict[str, str]) -> dict[str, int]:
+    """``max_depth`` of each integrator that prints one, -1 for all orders."""
+    found = {name: re.search(r"max_depth = (-?\d+)", text) for name, text in described.items()}
+    depths = {name: int(match[1]) for name, match in found.items() if match}
+    return {name: -1 if depth >= 2**31 else depth for name, depth in depths.items()}
+
+
+def equal_time(curves: list[Curve], budgets: list[float]) -> list[list[float | None]]:
+    """A row for each budget with the error of every curve; None before the first snapshot
+    and after the last; in between log-log interpolated.
     """
     return [[_error_at(curve, budget) for curve in curves] for budget in sorted(budgets)]
 
@@ -65,15 +78,20 @@ def equal_error(curves: list[Curve], targets: list[float]) -> list[list[Reached]
 
 
 def targets(curves: list[Curve], count: int = 6) -> list[float]:
-    """Round errors (1, 2, 5) within what the curves span, from coarse to fine."""
+    """Round errors within what the curves span, from coarse to fine: of steps 1, 2, 5 or, where
+    these are few, finer ones.
+    """
     values = np.concatenate([curve.shown for curve in curves]) if curves else np.array([])
     values = values[values > 0]
     if not values.size:
         return []
     decades = range(int(np.floor(np.log10(values.min()))), int(np.ceil(np.log10(values.max()))) + 1)
-    round_values = [m * 10.0**d for d in decades for m in (1, 2, 5)]
-    inside = [v for v in round_values if values.min() <= v <= values.max()]
-    return inside[::-1][-count:] or [float(values.min())]
+    for steps in ((1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 7, 8, 9)):
+        inside = [m * 10.0**d for d in decades for m in steps]
+        inside = [v for v in inside if values.min() <= v <= values.max()][:count]
+        if len(inside) >= 3:
+            break
+    return inside[::-1] or [float(values.min())]
 
 
 def time_to(curve: Curve, target: float) -> Reached:
@@ -90,7 +108,8 @@ def time_to(curve: Curve, target: float) -> Reached:
 
 
 def _error_at(curve: Curve, budget: float) -> float | None:
-    if not len(curve.seconds) or curve.seconds[0] > budget * TOLERANCE:
+    t = curve.seconds
+    if not len(t) or not t[0] / TOLERANCE <= budget <= t[-1] * TOLERANCE:
         return None
     logs = np.interp(np.log(budget), np.log(curve.seconds), np.log(curve.shown))
     return float(np.exp(logs))

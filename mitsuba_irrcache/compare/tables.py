@@ -48,7 +48,7 @@ def equal_time_table(curves: list[Curve], budgets: list[float]) -> Table:
         best |= {(r, c + 1) for c, e in enumerate(errors) if len(known) > 1 and e == min(known)}
     note = (
         "RMSE in units of the mean radiance of the reference, whose own noise is removed. "
-        "Interpolated between snapshots. A dash: no image by then. Kernels are compiled beforehand."
+        "Interpolated between snapshots. A dash: no image by then, or none so late. Kernels are compiled beforehand."
     )
     return Table("Error after equal time", ["budget", *_names(curves)], rows, note, best)
 
@@ -85,8 +85,8 @@ def stages_table(measurements: list[Measurement]) -> Table:
         "Seconds to a first, noisy image (a few samples per pixel; the smallest cache where there "
         "is one). Cold: new process, no compiled kernel on disk. Warm kernels: new process that "
         "finds them. Next view: same process, next sensor, or another seed where there is "
-        "only one. “Kernels” is what the first image takes longer than the second: tracing, code generation "
-        "and compilation. Memory: peak of the whole run, of the process on the CPU side."
+        "only one. “Kernels” is what the first image takes longer than the second: tracing, code "
+        "generation and compilation. Memory: peak of the whole run, of the process on the CPU side."
     )
     head = ["integrator", "start", *STAGES, "total", "peak memory"]
     return Table("Where the time goes", head, rows, note)
@@ -97,8 +97,9 @@ def metrics_table(rows: list[dict]) -> Table:
     cells = []
     for row in rows:
         values = [_metric(row, name) for name in METRICS]
-        cells.append([row["integrator"], f"{row['seconds']:.3g} s", str(row["spp"]), *values])
-    head = ["integrator", "time", "spp", *(label for label, _, _ in METRICS.values())]
+        spent = [row["integrator"], f"{row['seconds']:.3g} s", _spent(row), str(row["spp"])]
+        cells.append(spent + values)
+    head = ["integrator", "time", "stages", "spp", *(label for label, _, _ in METRICS.values())]
     note = "; ".join(f"{label}: {meaning}" for label, _, meaning in METRICS.values())
     unit = "%: of the mean radiance of the reference. "
     missing = (
@@ -111,6 +112,12 @@ def metrics_table(rows: list[dict]) -> Table:
 def percent(value: float) -> str:
     """Three digits, in percent."""
     return f"{100 * value:.3g} %"
+
+
+def with_uncertainty(value: float, uncertainty: float) -> str:
+    """In percent, to the first digit that the uncertainty leaves."""
+    digits = int(np.clip(-np.floor(np.log10(max(100 * uncertainty, 1e-9))), 0, 6))
+    return f"{100 * value:+.{digits}f} ± {100 * uncertainty:.{digits}f} %"
 
 
 def seconds(value: float) -> str:
@@ -129,6 +136,13 @@ def _reached(reached: Reached) -> str:
     return f"{sign}{seconds(reached.seconds)} s"
 
 
+def _spent(row: dict) -> str:
+    """The stages of a snapshot, where there are several, and how the budget was spent."""
+    stages = {k.removeprefix("seconds_"): v for k, v in row.items() if k.startswith("seconds_")}
+    parts = [f"{stage} {seconds(value)}" for stage, value in stages.items()]
+    return ", ".join((parts if len(parts) > 1 else []) + [row["note"]] * bool(row["note"]))
+
+
 def _metric(row: dict, name: str) -> str:
     value, unit = row[name], METRICS[name][1]
     if value is None:
@@ -138,5 +152,5 @@ def _metric(row: dict, name: str) -> str:
     if name == "rmse" and value < row["rmse_resolved"]:
         return f"< {percent(row['rmse_resolved'])}"
     if name == "bias":
-        return f"{100 * value:+.2g} ± {100 * row['bias_uncertainty']:.1g} %"
+        return with_uncertainty(value, row["bias_uncertainty"])
     return percent(value) if unit == "%" else f"{value:.3g}{unit}"

@@ -40,6 +40,7 @@ FIRST_SPP = 4
 
 def check(job: dict) -> None:
     """Loads the scene with every integrator once; a name or property that is wrong ends it."""
+    described = {}
     for integrator in job["integrators"]:
         scene = _subject(job, integrator).load()
         if not 0 <= job["sensor"] < len(scene.sensors()):
@@ -48,10 +49,23 @@ def check(job: dict) -> None:
                 "counted from 0."
             )
         film = scene.sensors()[job["sensor"]].film()
+        described[integrator] = _described(scene.integrator())
     write_json(
         Path(job["result"]),
-        {"size": [int(n) for n in film.crop_size()], "sensors": len(scene.sensors())},
+        {
+            "size": [int(n) for n in film.crop_size()],
+            "sensors": len(scene.sensors()),
+            "described": described,
+        },
     )
+
+
+def _described(integrator: mi.Integrator) -> str:
+    """What the integrator prints of itself, on one line; its class where it prints nothing."""
+    try:
+        return " ".join(str(integrator).split())
+    except RuntimeError:  # a plugin in Python without to_string
+        return type(integrator).__name__
 
 
 def make_reference(job: dict) -> None:

@@ -1,0 +1,247 @@
+"""``irrcache compare`` from the command line to the report: what users see, and what survives when
+something goes wrong.
+"""
+
+from __future__ import annotations
+
+import ast
+import csv
+import json
+import os
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
+import pytest
+
+import mitsuba_irrcache.compare
+from mitsuba_irrcache.cli import main
+
+SCENE = """<scene version="3.0.0">
+    <default name="density" value="1"/>
+    <integrator type="volpath"> <integer name="max_depth" value="3"/> </integrator>
+    <sensor type="perspective">
+        <transform name="to_world">
+            <lookat origin="0, 0, -5" target="0, 0, 0" up="0, 1, 0"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="24"/>
+            <integer name="height" value="16"/>
+            <string name="pixel_format" value="rgba"/>
+        </film>
+    </sensor>
+    <shape type="cube">
+        <bsdf type="null"/>
+        <medium name="interior" type="homogeneous">
+            <float name="sigma_t" value="$density"/>
+            <rgb name="albedo" value="0.9, 0.8, 0.5"/>
+        </medium>
+    </shape>
+    <emitter type="directional"> <vector name="direction" x="1" y="-1" z="1"/> </emitter>
+</scene>
+"""
+
+# An integrator of somebody else: it renders as volpath does, until it does not.
+PLUGIN = """
+import os, signal
+import mitsuba as mi
+
+class Mortal(mi.SamplingIntegrator):
+    def __init__(self, props):
+        super().__init__(props)
+        self.left = int(props.get("lives", 1000))
+        self.inner = mi.load_dict({"type": "volpath", "max_depth": props.get("max_depth", -1)})
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        self.left -= 1
+        if self.left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self.inner.render(scene, sensor, seed, spp, develop, evaluate)
+
+mi.register_integrator("mortal", lambda props: Mortal(props))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A scene, and beside it the module of a plugin that can be imported."""
+    folder = tmp_path_factory.mktemp("compare")
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "mortal_plugin.py").write_text(PLUGIN)
+    return folder
+
+
+def compare(folder: Path, *arguments) -> int:
+    references = ["--references", folder / "references", "--reference-spp", 4096]
+    return main(["compare", str(folder / "scene.xml"), *map(str, [*references, *arguments])])
+
+
+@pytest.fixture(scope="module")
+def report(folder):
+    """A report in which one integrator of three is killed after its first snapshot."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+        integrators = ["-i", "volpath", "-i", "mortal{lives=20}", "-i", "irrcache{resolution=12}"]
+        options = ["--budget", "0.1,1.5", "--import", "mortal_plugin", "-o", folder / "report"]
+        status = compare(folder, *integrators, *options)
+    assert status == 1 and (folder / "report" / "report.html").exists()  # one has failed
+    return folder / "report"
+
+
+def read(report: Path) -> dict:
+    return json.loads((report / "results.json").read_text())
+
+
+def test_finished_measurements_are_kept(report):
+    """The others are complete; of the one that was killed the first snapshot is there."""
+    stock, killed, ours = read(report)["measurements"]
+    for measurement in (stock, ours):
+        assert not measurement["error"]
+        assert [s["budget"] for s in measurement["snapshots"]] == [0.1, 1.5]
+        assert all(measurement[start] for start in ("cold", "warm", "again", "memory"))
+    assert "SIGKILL" in killed["error"]
+    assert [s["budget"] for s in killed["snapshots"]] == [0.1]
+    assert "mortal{lives=20} did not finish" in (report / "report.html").read_text()
+
+
+def test_stages(report):
+    """A cold start compiles, a warm one finds the kernels; another view needs no new cache."""
+    stock, _, ours = read(report)["measurements"]
+    for measurement in (stock, ours):
+        cold, warm = measurement["cold"], measurement["warm"]
+        assert cold["backend"] > 5 * warm["backend"]
+        assert cold["kernels"] > warm["kernels"]
+        assert 0 < cold["import"] < 60 and cold["load"] > 0
+    assert "cache" not in stock["cold"]
+    assert ours["again"]["cache"] < 0.2 * ours["cold"]["cache"]
+    for snapshot in ours["snapshots"]:
+        assert set(snapshot["seconds"]) == {"cache", "image"}
+
+
+def test_errors(report):
+    """volpath's error is noise and falls with time as noise does; both agree on the picture."""
+    stock, _, ours = read(report)["measurements"]
+    first, last = stock["snapshots"]
+    fall = first["errors"]["rmse"] / last["errors"]["rmse"]
+    assert fall == pytest.approx(np.sqrt(last["spp"] / first["spp"]), rel=0.35)
+    assert ours["snapshots"][-1]["errors"]["rmse"] < 0.1
+    errors = last["errors"]
+    assert abs(errors["bias"]) < 5 * errors["bias_uncertainty"] + 0.005
+    assert errors["invalid"] == 0
+
+
+def test_json_csv_and_images_agree(report):
+    with open(report / "results.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    snapshots = [s for m in read(report)["measurements"] for s in m["snapshots"]]
+    assert len(rows) == len(snapshots) == 5
+    for row, snapshot in zip(rows, snapshots, strict=True):
+        assert float(row["rmse"]) == pytest.approx(snapshot["errors"]["rmse"])
+        assert float(row["seconds"]) == pytest.approx(sum(snapshot["seconds"].values()))
+        image = oiio.ImageBuf(str(report / snapshot["image"]))
+        assert (image.spec().width, image.spec().height, image.nchannels) == (24, 16, 3)
+        assert image.spec().format == oiio.FLOAT
+
+
+def test_memory_is_the_integrators_own(report):
+    """Not inherited from the process that started it."""
+    memory = read(report)["measurements"][0]["memory"]
+    assert 2**26 < memory["first_image"] <= memory["peak"] < 2**31
+
+
+def test_the_report_is_self_contained(report):
+    """Nothing is loaded from elsewhere, every figure is in it, and its tags are balanced."""
+
+    class Page(HTMLParser):
+        def __init__(self):
+            super().__init__()
+            self.images, self.links, self.open = 0, [], []
+
+        def handle_starttag(self, tag, attributes):
+            if tag not in ("meta", "img", "br"):
+                self.open.append(tag)
+            self.images += tag == "img"
+            self.links += [v for k, v in attributes if k in ("src", "href")]
+
+        def handle_endtag(self, tag):
+            assert self.open.pop() == tag
+
+    text = (report / "report.html").read_text()
+    page = Page()
+    page.feed(text)
+    assert not page.open
+    assert page.images == len(list((report / "figures").glob("*.png"))) == 6
+    assert all(link.startswith("data:image/png;base64,") for link in page.links)
+    assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+def test_nothing_temporary_is_left(report):
+    names = {path.name for path in report.iterdir()}
+    folders = {"figures", "images", "logs", "measurements"}
+    assert names == folders | {"report.html", "results.json", "results.csv"}
+    assert not [path for path in report.rglob(".*")]
+
+
+def test_another_run_finds_the_reference(folder, report, capsys):
+    """The report is not replaced unless asked; the reference is not rendered again."""
+    kept = {p: p.stat().st_mtime_ns for p in (folder / "references").iterdir()}
+    before = (report / "report.html").read_bytes()
+    assert compare(folder, "-i", "path", "--budget", "0.1", "-o", report) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert (report / "report.html").read_bytes() == before
+    other = folder / "other"
+    assert compare(folder, "-i", "path", "-i", "volpathmis", "--budget", "0.1", "-o", other) == 0
+    assert "Error after equal time" in capsys.readouterr().out
+    assert {p: p.stat().st_mtime_ns for p in (folder / "references").iterdir()} == kept
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["-i", "volpth"], "volpth"),
+        (["-i", "volpath{rr_dpth=5}"], "rr_dpth"),
+        (["-i", "volpath", "--reference", "volpaht"], "volpaht"),
+        (["-i", "volpath", "-i", "volpath"], "twice"),
+        (["-i", "volpath", "--budget", "1,-3"], "--budget"),
+        (["-i", "volpath", "-s", "3"], "--sensor is 3"),
+        (["-i", "volpath", "-m", "llvm_rgb"], "llvm_rgb"),
+        (["-i", "volpath", "-D", "densty=3"], "densty"),
+        (["-i", "volpath{"], "volpath{"),
+    ],
+)
+def test_wrong_arguments(folder, capsys, arguments, said):
+    """Named, before anything is rendered, and nothing is left behind."""
+    before = set(folder.iterdir())
+    assert compare(folder, *arguments, "-o", folder / "never") == 1
+    error = capsys.readouterr().err
+    assert said in error and error.startswith("irrcache: error:") and "Traceback" not in error
+    assert set(folder.iterdir()) == before
+
+
+def test_wrong_folders(folder, capsys):
+    """Neither a file, nor somebody's folder, nor one without a parent is written to."""
+    for output, said in (("scene.xml", "is a file"), (".", "no report"), ("a/b", "does not exist")):
+        assert compare(folder, "-i", "volpath", "-o", folder / output) == 1
+        assert said in capsys.readouterr().err
+
+
+def test_a_scene_that_does_not_load(tmp_path, capsys):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE.replace("homogeneous", "heterogenious"))
+    assert main(["compare", str(scene), "-i", "volpath", "-o", str(tmp_path / "out")]) == 1
+    assert "heterogenious" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [scene]
+
+
+def test_integrators_are_known_by_name_only():
+    """No module of the harness imports anything of our method."""
+    shared = {"cli", "doctor", "errors", "files", "images", "loading", "runtime", "versions"}
+    for file in Path(mitsuba_irrcache.compare.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and not node.level:
+                package, _, rest = node.module.partition(".")
+                names = {rest.split(".")[0]} if rest else {alias.name for alias in node.names}
+                assert package != "mitsuba_irrcache" or names <= shared, file.name
+            assert not (isinstance(node, ast.ImportFrom) and node.level > 1), file.name
