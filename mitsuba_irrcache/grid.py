@@ -200,7 +200,9 @@ Field = ConstantField | GridField
 
 
 def _stencil(u: mi.Float, n: mi.Int32) -> tuple[mi.Int32, mi.Float, mi.Bool]:
-    """The lower of the two voxels around ``u``, the weight of the upper, and whether there is one."""
+    """The lower of the two voxels around ``u``, the weight of the upper, and whether there is
+    one.
+    """
     s = dr.clip(u - 0.5, 0.0, mi.Float(n - 1))
     lower = mi.Int32(s)
     return lower, s - mi.Float(lower), lower < n - 1

@@ -4,9 +4,9 @@ eq. 1).
     L = int T sigma_s Phi / (4 pi) dt + T L_background
 
 One step is as long as the shortest voxel edge, of the medium's grids and the cache's, times
-``step``; steps end on the medium's bounds, never beyond. The lattice of steps is shifted by a random offset per ray, so that
-what is left of the discretisation is noise, not bands. Macrocells without extinction are crossed in
-one go.
+``step``; steps end on the medium's bounds, never beyond. The lattice of steps is shifted by a
+random offset per ray, so that what is left of the discretisation is noise, not bands. Macrocells
+without extinction are crossed in one go.
 """
 
 from __future__ import annotations

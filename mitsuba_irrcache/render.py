@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
-        help="integrator to use, with properties (default: the scene's if it is irrcache, else irrcache)",
+        help="integrator and its properties (default: irrcache in place of a path tracer)",
     )  # fmt: skip
     parser.add_argument(
         "--spp", type=int, default=0, help="samples per pixel (default: the scene's)"

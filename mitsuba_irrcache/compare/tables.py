@@ -48,7 +48,8 @@ def equal_time_table(curves: list[Curve], budgets: list[float]) -> Table:
         best |= {(r, c + 1) for c, e in enumerate(errors) if len(known) > 1 and e == min(known)}
     note = (
         "RMSE in units of the mean radiance of the reference, whose own noise is removed. "
-        "Interpolated between snapshots. A dash: no image by then, or none so late. Kernels are compiled beforehand."
+        "Interpolated between snapshots. A dash: no image by then, or none so late. Kernels "
+        "are compiled beforehand."
     )
     return Table("Error after equal time", ["budget", *_names(curves)], rows, note, best)
 
