@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Sequence
 
-from .errors import IrrcacheError
+from .errors import IrrcacheError, essence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (IrrcacheError, OSError) as error:
         message = str(error)
     except RuntimeError as error:  # how Mitsuba reports a scene it cannot load
-        message = _essence(error)
+        message = essence(error)
     print(f"irrcache: error: {message.removeprefix('irrcache: ')}", file=sys.stderr)
     return 1
 
@@ -47,13 +46,3 @@ def _parser() -> argparse.ArgumentParser:
         module.add_arguments(command)
         command.set_defaults(run=module.run)
     return parser
-
-
-def _essence(error: BaseException) -> str:
-    """Mitsuba wraps what a Python plugin raises, as text or as a cause; the reader wants the
-    origin.
-    """
-    while error.__cause__ is not None:
-        error = error.__cause__
-    raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", str(error), re.MULTILINE)
-    return raised[-1] if raised else str(error).strip()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 
 class IrrcacheError(ValueError):
     """Input that cannot be used, with the remedy in the message."""
@@ -13,3 +15,13 @@ class UnsupportedSceneError(IrrcacheError):
 
 class CacheFileError(IrrcacheError):
     """A cache file that is damaged, foreign, or belongs to another scene."""
+
+
+def essence(error: BaseException) -> str:
+    """Mitsuba wraps what a Python plugin raises, as text or as a cause; the reader wants the
+    origin.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", str(error), re.MULTILINE)
+    return raised[-1] if raised else str(error).strip()

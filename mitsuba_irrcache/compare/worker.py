@@ -18,8 +18,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cli import _essence
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, essence
 from mitsuba_irrcache.images import write_image
 from mitsuba_irrcache.runtime import require_llvm
 
@@ -206,7 +205,7 @@ def main() -> int:
         job["imported"] = time.time()
         KINDS[job["kind"]](job)
     except Exception as error:
-        write_json(Path(job["error"]), {"error": _essence(error) or type(error).__name__})
+        write_json(Path(job["error"]), {"error": essence(error) or type(error).__name__})
         raise
     return 0
 
