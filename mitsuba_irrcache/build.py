@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
@@ -48,7 +47,6 @@ class CacheBuilder:
         self.settings = settings
         self.medium: MediumGrid | None = None
         self.cache: IrradianceCache | None = None
-        self.seconds = 0.0
         # Not the scene itself: it owns the integrator, and neither would ever be freed.
         self._scene_id = 0
         self._snapshot: Snapshot | None = None
@@ -139,7 +137,6 @@ class CacheBuilder:
         )
 
     def _fill(self, scene: mi.Scene, progress: Progress | None) -> None:
-        started = perf_counter()
         settings, cache = self.settings, self.cache
         path.refine(
             scene,
@@ -151,7 +148,6 @@ class CacheBuilder:
             progress=None if progress is None else lambda *n: progress("cache", *n),
         )
         dr.sync_thread()
-        self.seconds = perf_counter() - started
         if settings.file and cache.fingerprint:
             cache.save(settings.file)
 

@@ -26,10 +26,7 @@ def load_scene(
     Raises IrrcacheError if the file is missing or has no integrator to replace.
     """
     path = Path(path)
-    if not path.is_file():
-        raise IrrcacheError(f'there is no scene file "{path}".')
-    config = mi.parser.ParserConfig(mi.variant())
-    state = mi.parser.parse_file(config, str(path), **(parameters or {}))
+    config, state = _parse(path, parameters)
     with _search_path(path.parent):
         mi.parser.transform_all(config, state)
         if integrator is not None:
@@ -40,8 +37,7 @@ def load_scene(
 
 def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) -> str:
     """Name of the integrator plugin in a scene file; "path" where it names none, as in Mitsuba."""
-    config = mi.parser.ParserConfig(mi.variant())
-    state = mi.parser.parse_file(config, str(path), **(parameters or {}))
+    _, state = _parse(Path(path), parameters)
     node = _integrator_node(state)
     return "path" if node is None else node.props.plugin_name()
 
@@ -67,6 +63,15 @@ def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
             )
         properties[key.strip()] = _literal(value.strip())
     return name, properties
+
+
+def _parse(
+    path: Path, parameters: dict[str, str] | None
+) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
+    if not path.is_file():
+        raise IrrcacheError(f'there is no scene file "{path}".')
+    config = mi.parser.ParserConfig(mi.variant())
+    return config, mi.parser.parse_file(config, str(path), **(parameters or {}))
 
 
 def _literal(text: str) -> object:

@@ -70,8 +70,6 @@ def run(args: argparse.Namespace) -> int:
     seconds: dict[str, float] = {}
     with _stopwatch(seconds, "load"):
         parameters = _definitions(args.define)
-        if not source.is_file():
-            raise IrrcacheError(f'there is no scene file "{source}".')
         integrator = args.integrator
         if integrator is None and integrator_of(source, parameters) in REPLACED:
             integrator = "irrcache"

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cli import main as irrcache
+from mitsuba_irrcache.compare import metrics
 from mitsuba_irrcache.images import write_image
 from mitsuba_irrcache.loading import load_scene
 from mitsuba_irrcache.render import progress_bar
@@ -93,10 +94,9 @@ def compare(scene_file: Path, output: Path, size: int, reference_spp: int) -> No
     ]
     print(f"\n{'':<20}{'cache [s]':>12}{'image [s]':>12}{'RMSE':>10}{'mean error':>12}")
     for name, cache, projection, result in rows:
-        print(
-            f"{name:<20}{cache:>12}{projection:>12}{_net_rmse(result, halves) / mean:>10.2%}"
-            f"{(np.mean(result) - mean) / mean:>12.2%}"
-        )
+        rmse = metrics.net_rmse(result, *halves) / mean
+        bias = metrics.mean_error(result, *halves) / mean
+        print(f"{name:<20}{cache:>12}{projection:>12}{rmse:>10.2%}{bias:>12.2%}")
     print(
         f"(in units of the mean radiance, {size} x {size} pixels; the reference's noise is removed)"
     )
@@ -115,14 +115,6 @@ def _render(scene: mi.Scene, spp: int, seed: int = 0) -> tuple[np.ndarray, float
     dr.eval(image)
     dr.sync_thread()
     return np.array(image), time.perf_counter() - started
-
-
-def _net_rmse(image: np.ndarray, halves: list[np.ndarray]) -> float:
-    """RMSE against a noisy reference: the noise of its two independent halves drops out of the
-    product.
-    """
-    product = np.mean((image - halves[0]) * (image - halves[1]), dtype=np.float64)
-    return float(np.sqrt(max(product, 0.0)))
 
 
 if __name__ == "__main__":
