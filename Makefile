@@ -5,7 +5,7 @@ READY := .venv/.ready
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint clean
+.PHONY: help setup demo paper test lint clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -14,6 +14,9 @@ setup: $(READY) ## install the package, what it needs, and an LLVM that Dr.Jit c
 
 demo: setup ## render a chest with irrcache and compare it with volpath
 	$(BIN)/python -m experiments.demo.run
+
+paper: setup ## compute the paper's figures and tables, half an hour; FULL=1: the paper's sizes
+	$(BIN)/python -m experiments.paper.run $(if $(FULL),--full)
 
 test: setup ## run the tests
 	$(BIN)/python -m pytest

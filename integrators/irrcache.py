@@ -4,20 +4,26 @@ to one.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from time import perf_counter
+
 import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.build import CacheBuilder, CacheSettings
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.filtering import FILTERS, filter_illumination
+from mitsuba_irrcache.layers import AOVS, Layers, parse_aovs
+from mitsuba_irrcache.progressive import Frame, Targets, frames
 from mitsuba_irrcache.projection import QUADRATURES, Projection
-from mitsuba_irrcache.rendering import render_film
+from mitsuba_irrcache.rendering import fill_film, planes, render_film
 from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.uncertainty import uncertainty_of
 from mitsuba_irrcache.variants import require_variant
 from mitsuba_irrcache.versions import check_versions
 
 SOLVERS = ("auto", "path")
-FILTERS = ("none",)
 _NO_GRADIENTS = 'irrcache computes no gradients; use the integrator "prbvolpath" for them.'
 
 
@@ -72,7 +78,18 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - filter
        - |string|
-       - Filter of the illumination image: ``none``. (Default: ``none``)
+       - Filter of the illumination image: ``bilateral``, whose strength follows the standard error
+         of the cache and fades to nothing as it converges; ``fixed``, a bilateral filter of one
+         strength (the paper's, which biases a converged image); ``none``. (Default: ``none``)
+
+     * - aovs
+       - |string|
+       - Further images, in the form of the ``aov`` integrator: a list of ``name:type`` or ``type``,
+         separated by commas, of these types: ``colour``, ``illumination`` and ``background`` (the
+         image is colour times illumination plus background), ``transmittance``, ``depth`` (mean
+         distance of what is seen of the medium), ``noise`` (standard error of the luminance, from
+         the noise of the cache), ``bias`` (expected error of the luminance, from the resolution of
+         the cache). (Default: none)
 
      * - cache_file
        - |string|
@@ -109,6 +126,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         check_versions()
         super().__init__(props)
         self._hide_emitters = bool(props.get("hide_emitters", False))
+        self._filter = _choice(props, "filter", "none", FILTERS)
+        self._aovs = parse_aovs(str(props.get("aovs", "")))
         self._settings = CacheSettings(
             max_depth=_integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0"),
             rr_depth=_integer(props, "rr_depth", 5, 1, "at least 1"),
@@ -117,6 +136,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             samples=_integer(props, "cache_spp", 0, 0, "0 (chosen) or a number of samples"),
             seed=_integer(props, "cache_seed", 0, 0, "at least 0"),
             file=str(props.get("cache_file", "")),
+            with_error=self._with_error,
         )
         self._quadrature = _choice(props, "quadrature", "exponential", QUADRATURES)
         self._step = float(props.get("step", 1.0))
@@ -124,10 +144,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             raise IrrcacheError(
                 f"irrcache: step is {self._step:g}; it must lie between 0.001 and 1000 voxel edges."
             )
-        self._filter = _choice(props, "filter", "none", FILTERS)
         self._builder = CacheBuilder(self._settings)
         self._projection: Projection | None = None
+        self._revision = 0  # of the builder, when the projection was made
         self._volpath: mi.Integrator | None = None
+        #: seconds that stages of the last image took, of those that can be told apart
+        self.seconds: dict[str, float] = {}
         #: called with (stage, done, total) while the cache is built; what it raises ends the build
         self.progress = None
 
@@ -138,16 +160,45 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """
         return self._builder.cache
 
+    @property
+    def cache_spp(self) -> int:
+        """Samples per cache voxel to build up to; 0: chosen. Once it is raised, the next rendering
+        refines the cache: the random stream goes on, nothing is computed again.
+        """
+        return self._builder.samples
+
+    @cache_spp.setter
+    def cache_spp(self, samples: int) -> None:
+        self._builder.samples = _checked("cache_spp", samples, 0, "0 (chosen) or a number")
+
     def prepare(self, scene: mi.Scene) -> None:
         """Builds or completes the cache for ``scene``, unless it is up to date."""
-        changed = self._builder.update(scene, self.progress)
+        self._builder.update(scene, self.progress)
         medium, cache = self._builder.medium, self._builder.cache
         if medium is None:
             self._projection = None
-        elif changed or self._projection is None:
+        elif self._projection is None or self._revision != self._builder.revision:
             lit = cache is not None and cache.active_count
             field = cache.field() if lit else None
-            self._projection = Projection(medium, field, self._quadrature, self._step)
+            uncertainty = uncertainty_of(cache) if lit and self._with_error else None
+            self._projection = Projection(
+                medium, field, self._quadrature, self._step, self._layered, uncertainty
+            )
+            self._revision = self._builder.revision
+
+    @property
+    def _layered(self) -> bool:
+        """Whether anything is asked for that the radiance alone cannot tell."""
+        return bool(self._aovs) or self._filter != "none"
+
+    @property
+    def _with_error(self) -> bool:
+        """Whether the error of the cache has to be projected with its light."""
+        return self._filter == "bilateral" or bool({"noise", "bias"} & {*self._aovs.values()})
+
+    def aov_names(self) -> list[str]:
+        """Names of the channels beside colour and alpha, in the film's order."""
+        return [f"{name}.{c}" for name, kind in self._aovs.items() for c in AOVS[kind]]
 
     def sample(
         self,
@@ -162,9 +213,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """
         self.prepare(scene)
         if self._projection is None:
-            return self._fallback().sample(scene, sampler, ray, medium, active)
-        radiance, alpha = self._radiance(scene, sampler, ray, medium is not None, mi.Bool(active))
-        return radiance, sampler.next_1d(active) < alpha, []
+            radiance, valid, _ = self._fallback().sample(scene, sampler, ray, medium, active)
+            return radiance, valid, self._aov_values(Layers.background_only(radiance))
+        radiance, alpha, layers = self._radiance(
+            scene, sampler, ray, medium is not None, mi.Spectrum(1), mi.Bool(active)
+        )
+        return radiance, sampler.next_1d(active) < alpha, self._aov_values(layers)
 
     def render(
         self,
@@ -180,15 +234,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         with dr.suspend_grad():
             self.prepare(scene)
             if self._projection is None:
-                return self._fallback().render(scene, sensor, seed, spp, develop, evaluate)
-            inside = sensor.get_medium() is not None
-            film = render_film(
-                sensor,
-                lambda sampler, ray, active: self._radiance(scene, sampler, ray, inside, active),
-                seed,
-                spp,
-                self.should_stop,
-            )
+                film = self._render_empty(scene, sensor, seed, spp)
+            else:
+                film = self._render(scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -197,11 +245,72 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                 dr.sync_thread()
             return image
 
+    def progressive(
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+        **targets: object,
+    ) -> Iterator[Frame]:
+        """Images of ``scene`` while the cache is refined, until one of the ``targets`` is reached;
+        see `mitsuba_irrcache.progressive.Targets` for these.
+        """
+
+        def image() -> tuple[mi.TensorXf, float]:
+            tensor = self.render(scene, sensor, seed, spp)
+            return tensor, self.seconds.get("filter", 0.0)
+
+        return frames(self._builder, scene, image, Targets(**targets), self.progress)
+
     def render_forward(self, *args: object, **kwargs: object) -> mi.TensorXf:
         raise NotImplementedError(_NO_GRADIENTS)
 
     def render_backward(self, *args: object, **kwargs: object) -> None:
         raise NotImplementedError(_NO_GRADIENTS)
+
+    def _render(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
+        inside = sensor.get_medium() is not None
+
+        def radiance(sampler, ray, weight, active) -> tuple:
+            found = self._radiance(scene, sampler, ray, inside, weight, active)
+            return *found[:2], found[2].channels() if found[2] else []
+
+        count = self._projection.channel_count
+        names = [f"layer.{i}" for i in range(count)]
+        film = render_film(sensor, radiance, seed, spp, self.should_stop, names)
+        if not count:
+            return film
+        _, alpha, channels = planes(film, count)
+        self._finish(film, Layers.of(channels), alpha)
+        return film
+
+    def _render_empty(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
+        """A scene without media, by volpath: all of the image is background."""
+        self._fallback().render(scene, sensor, seed, spp)
+        film = sensor.film()
+        if self._aovs:
+            colour, alpha, _ = planes(film, 0)
+            channels = (colour * 3)[: dr.size_v(mi.Spectrum)]
+            self._finish(film, Layers.background_only(mi.Spectrum(*channels)), alpha)
+        return film
+
+    def _finish(self, film: mi.Film, layers: Layers, alpha: mi.Float | None) -> None:
+        """From layers to the image: filter, recombine, and tell how long that took."""
+        if self._filter != "none":
+            dr.eval(layers)
+            dr.sync_thread()
+        started = perf_counter()
+        filtered = filter_illumination(self._filter, layers, film.crop_size())
+        if filtered is not None:
+            dr.eval(filtered)
+            dr.sync_thread()
+        self.seconds = {"filter": perf_counter() - started}
+        aovs = dict(zip(self.aov_names(), self._aov_values(layers), strict=True))
+        fill_film(film, layers.radiance(filtered), alpha, aovs)
+
+    def _aov_values(self, layers: Layers | None) -> list[mi.Float]:
+        return [value for kind in self._aovs.values() for value in layers.aov(kind)]
 
     def _radiance(
         self,
@@ -209,8 +318,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         sampler: mi.Sampler,
         ray: mi.Ray3f,
         inside: bool,
+        weight: mi.Spectrum,
         active: mi.Bool,
-    ) -> tuple[mi.Spectrum, mi.Float]:
+    ) -> tuple[mi.Spectrum, mi.Float, Layers | None]:
+        """Radiance times ``weight``, alpha, and the layers of the radiance if they are asked
+        for.
+        """
         ray = mi.Ray3f(ray)
         background = mi.Spectrum(0)
         environment = scene.environment()
@@ -229,11 +342,15 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         entered = entry > -1e-5 * (leave - entry)
         hit &= (far > 0) if inside else entered
         near = dr.maximum(near, 0)
-        scattered, transmittance = self._projection.march(
+        scattered, transmittance, gathered = self._projection.march(
             ray, near, far, background, 1 - sampler.next_1d(active), active & hit
         )
         alpha = mi.Float(1) if visible else 1 - dr.mean(transmittance)
-        return scattered + transmittance * background, alpha
+        background = transmittance * background
+        layers = None
+        if self._layered:
+            layers = self._projection.layers(scattered, transmittance, gathered, background, weight)
+        return (scattered + background) * weight, alpha, layers
 
     def _fallback(self) -> mi.Integrator:
         if self._volpath is None:
@@ -253,16 +370,19 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             f"IrradianceCachingIntegrator[\n  max_depth = {s.max_depth},\n  rr_depth = "
             f"{s.rr_depth},\n"
             f"  hide_emitters = {str(self._hide_emitters).lower()},\n  solver = {s.solver},\n"
-            f"  resolution = {s.resolution},\n  cache_spp = {s.samples},\n  cache_seed = "
+            f"  resolution = {s.resolution},\n  cache_spp = {self.cache_spp},\n  cache_seed = "
             f"{s.seed},\n"
             f"  quadrature = {self._quadrature},\n  step = {self._step:g},\n  filter = "
-            f"{self._filter},\n"
+            f"{self._filter},\n  aovs = {self._aovs},\n"
             f'  cache_file = "{s.file}"\n]'
         )
 
 
 def _integer(props: mi.Properties, name: str, default: int, least: int, wanted: str) -> int:
-    value = props.get(name, default)
+    return _checked(name, props.get(name, default), least, wanted)
+
+
+def _checked(name: str, value: object, least: int, wanted: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
         raise IrrcacheError(f"irrcache: {name} is {value!r}; it must be {wanted}.")
     return value

@@ -13,6 +13,7 @@ runtime.prepare_llvm()  # before Dr.Jit is imported for the first time
 from . import _register  # noqa: E402,F401
 from .cache import IrradianceCache  # noqa: E402
 from .errors import CacheFileError, IrrcacheError, UnsupportedSceneError  # noqa: E402
+from .progressive import render_progressive  # noqa: E402
 
 __version__ = "0.1.0"
 
@@ -22,4 +23,5 @@ __all__ = [
     "IrrcacheError",
     "UnsupportedSceneError",
     "__version__",
+    "render_progressive",
 ]

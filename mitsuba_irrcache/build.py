@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
@@ -14,10 +16,19 @@ from .cache import BATCH, IrradianceCache, active_voxels
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import Snapshot, digests
 from .grid import Grid
+from .layers import luminance
 from .medium import MediumGrid
 from .memory import available_memory
 from .scene import bake_scene
 from .solvers import path
+
+#: Between two checkpoints: at least so many seconds, and the time of writing over this share.
+CHECKPOINT_SECONDS = 30.0
+CHECKPOINT_SHARE = 0.1
+
+#: Optical depth of a voxel at the boundary of a medium from which on the pixels there are off by
+#: more than 10 % (a homogeneous cube; at half of it, by 5 %).
+DENSE_BORDER = 1.0
 
 #: called with (stage, done, total)
 Progress = Callable[[str, int, int], None]
@@ -34,6 +45,7 @@ class CacheSettings:
     samples: int = 0
     seed: int = 0
     file: str = ""
+    with_error: bool = False  # enough samples for a standard error: two batches at least
 
 
 class CacheBuilder:
@@ -45,14 +57,21 @@ class CacheBuilder:
 
     def __init__(self, settings: CacheSettings) -> None:
         self.settings = settings
+        #: samples per voxel to build up to (0: chosen); a higher number refines the cache
+        self.samples = settings.samples
+        #: goes up with every change of ``medium`` or ``cache``
+        self.revision = 0
+        #: samples per voxel in the file
+        self.saved_samples = 0
         self.medium: MediumGrid | None = None
         self.cache: IrradianceCache | None = None
         # Not the scene itself: it owns the integrator, and neither would ever be freed.
         self._scene_id = 0
         self._snapshot: Snapshot | None = None
+        self._saves_when_filled = True
 
-    def update(self, scene: mi.Scene, progress: Progress | None = None) -> bool:
-        """Makes ``medium`` and ``cache`` fit ``scene``; True if anything changed."""
+    def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
+        """Makes ``medium`` and ``cache`` fit ``scene``."""
         snapshot = Snapshot(scene)
         changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
         stale = self._snapshot is None or bool(changes)
@@ -62,26 +81,55 @@ class CacheBuilder:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             self.medium = self.cache = self._snapshot = None
+            self.revision += 1
             self.medium = bake_scene(scene)
             if self.medium is not None and self.settings.max_depth not in (0, 1):
                 self.cache = self._start_cache(scene, self.medium, edited)
             self._scene_id, self._snapshot = id(scene), snapshot
-        if self.cache is not None and self.cache.samples < self._target:
+        if self.cache is not None and self.cache.samples < self.target:
             self._fill(scene, progress)
-            return True
-        return stale
 
     @property
-    def _target(self) -> int:
-        return -(-(self.settings.samples or choose_samples(self.cache)) // BATCH) * BATCH
+    def target(self) -> int:
+        """Samples per voxel that `update` builds up to, a multiple of ``BATCH``."""
+        samples = self.samples or choose_samples(self.cache)
+        return max(-(-samples // BATCH), 2 if self.settings.with_error else 1) * BATCH
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether the cache is zero, or there is none: samples change nothing."""
+        return self.cache is None or not self.cache.active_count
+
+    @contextmanager
+    def checkpoints(self) -> Iterator[Callable[[], None]]:
+        """For a cache that is filled in many passes: they do not save it while this lasts. The
+        function that it gives does, when it is time; and its end does, however it comes.
+        """
+        ended, took = perf_counter(), 0.0
+
+        def checkpoint() -> None:
+            nonlocal ended, took
+            started = perf_counter()
+            if started - ended >= max(CHECKPOINT_SECONDS, took / CHECKPOINT_SHARE):
+                self._save()
+                ended = perf_counter()
+                took = ended - started
+
+        self._saves_when_filled = False
+        try:
+            yield checkpoint
+        finally:
+            self._saves_when_filled = True
+            self._save()
 
     def _start_cache(self, scene: mi.Scene, medium: MediumGrid, edited: bool) -> IrradianceCache:
         settings = self.settings
         grid = Grid.near_cubic(medium.frame, settings.resolution or choose_resolution(medium))
         grid = grid.shared(medium.sigma_t.grid, medium.albedo.grid)
         _check_memory(grid)
+        _warn_of_dense_border(medium, grid)
         active = active_voxels(medium, grid)
-        if medium.albedo.maximum == 0:
+        if medium.albedo.maximum == 0 or not scene.emitters():
             active = mi.UInt32()
         mi.Log(
             mi.LogLevel.Info,
@@ -91,6 +139,7 @@ class CacheBuilder:
         )
         channels = 1 if mi.is_monochromatic else 3
         cache = IrradianceCache(grid, active, channels, settings.max_depth)
+        self.saved_samples = 0
         if not settings.file:
             return cache
         cache.fingerprint = digests(scene, medium) | {
@@ -115,6 +164,7 @@ class CacheBuilder:
         ]
         if not differing:
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
+            self.saved_samples = stored.samples
             return stored
         if edited:
             mi.Log(
@@ -138,18 +188,28 @@ class CacheBuilder:
 
     def _fill(self, scene: mi.Scene, progress: Progress | None) -> None:
         settings, cache = self.settings, self.cache
-        path.refine(
-            scene,
-            self.medium,
-            cache,
-            self._target - cache.samples,
-            settings.seed,
-            settings.rr_depth,
-            progress=None if progress is None else lambda *n: progress("cache", *n),
-        )
+        try:
+            path.refine(
+                scene,
+                self.medium,
+                cache,
+                self.target - cache.samples,
+                settings.seed,
+                settings.rr_depth,
+                progress=None if progress is None else lambda *n: progress("cache", *n),
+            )
+        finally:
+            self.revision += 1  # the solver may have been stopped half-way
         dr.sync_thread()
-        if settings.file and cache.fingerprint:
-            cache.save(settings.file)
+        if self._saves_when_filled:
+            self._save()
+
+    def _save(self) -> None:
+        """Writes the cache to its file, where it has one that has fewer samples."""
+        file, cache = self.settings.file, self.cache
+        if file and cache is not None and cache.fingerprint and cache.samples > self.saved_samples:
+            cache.save(file)
+            self.saved_samples = cache.samples
 
 
 def choose_resolution(medium: MediumGrid) -> int:
@@ -168,6 +228,31 @@ def choose_resolution(medium: MediumGrid) -> int:
 def choose_samples(cache: IrradianceCache) -> int:
     """Samples per voxel: about 2^24 in all, 16 to 256 each."""
     return int(np.clip(2**24 // max(cache.active_count, 1), 16, 256))
+
+
+def _warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
+    """Tells where the cache is too coarse for matter that the boundary cuts: light falls off within
+    a fraction of a mean free path there, and nothing is known of it beyond the outermost voxels.
+    """
+    depth = _border_extinction(medium) * grid.voxel_size.max()
+    if depth > DENSE_BORDER:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"irrcache: dense matter reaches the boundary of the medium (optical depth {depth:.2g} "
+            "per cache voxel), whose light is known poorly in the outermost layer. Raise "
+            "resolution, or leave two voxels of empty space around the matter.",
+        )
+
+
+def _border_extinction(medium: MediumGrid) -> float:
+    """What 95 % of the medium's faces do not exceed: sigma_t [1/scene unit]."""
+    rng = mi.PCG32(4096)
+    face = dr.arange(mi.UInt32, 4096) % 6
+    place = [rng.next_float32() for _ in range(3)]
+    side = mi.Float(face % 2)
+    u = mi.Point3f([dr.select(face // 2 == axis, side, p) for axis, p in enumerate(place)])
+    sigma_t = medium.sigma_t.at_world(Grid((1, 1, 1), medium.frame).world.point(u))
+    return float(np.quantile(np.array(luminance(mi.Spectrum(sigma_t))), 0.95))
 
 
 def _check_memory(grid: Grid) -> None:

@@ -90,11 +90,32 @@ class IrradianceCache:
             ]
         )
 
+    def mean_and_error(self) -> tuple[mi.Float, mi.Float]:
+        """Irradiance and its standard error at the active voxels, means over the channels (which
+        share their samples: their errors add). The error is 0 before there are two batches.
+        """
+        means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        variances = [self._variance(c) for c in range(self.channels)]
+        errors = [mi.Float(0 if v is None else dr.sqrt(v)) for v in variances]
+        return sum(means) / self.channels, sum(errors) / self.channels
+
+    @property
+    def relative_error(self) -> float:
+        """Root mean square of the voxels' standard errors, in units of the mean irradiance; NaN
+        before there are two batches of samples. It falls as the root of the samples.
+        """
+        if self.samples < 2 * BATCH:
+            return float("nan")
+        double = dr.float64_array_t(mi.Float)
+        mean, error = (double(values) for values in self.mean_and_error())
+        scale = dr.mean(mean)[0]
+        return float(dr.sqrt(dr.mean(dr.square(error)))[0] / scale) if scale > 0 else 0.0
+
     def _variance(self, channel: int):
         """Squared standard error of the irradiance (float64), None before there are two batches."""
-        n = self.samples // BATCH
-        if n < 2:
+        if self.samples < 2 * BATCH:
             return None
+        n = self._batch_count
         variance = 0
         for layer in range(len(LAYERS)):
             total, squares = self._sums[layer * self.channels + channel]
@@ -105,28 +126,29 @@ class IrradianceCache:
     def field(self) -> RootField:
         """Phi for lookups: one channel where all channels agree to the last bit."""
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
-        roots = [dr.sqrt(m) * self._root_correction(m, c) for c, m in enumerate(means)]
+        noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
+        roots = [dr.sqrt(m) * _root_correction(v) for m, v in zip(means, noise, strict=True)]
         if all(dr.all(r == roots[0])[0] for r in roots[1:]):
             roots = roots[:1]
-        return RootField(self.grid, self._tensor(roots).array, len(roots))
+        roots, noise = (self._tensor(x).array for x in (roots, noise[: len(roots)]))
+        return RootField(self.grid, roots, dr.width(roots) // self.grid.voxel_count, noise)
 
-    def _root_correction(self, mean: mi.Float, channel: int) -> mi.Float:
-        """Makes interpolated roots of noisy values right on average.
-
-        With relative variance v of the voxels, E[(sum w_i sqrt(x_i))^2] = mu (1 - (1 - sum w_i^2) v
-        / 4) to first order, and sum w_i^2 is (2/3)^3 on average over a cell. Without it 16 samples
-        read some 1 % too little light.
-        """
+    def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
+        """Variance of the voxels over their squared mean, at most 1; 0 where it is not known."""
         variance = self._variance(channel)
         if variance is None:
-            return mi.Float(1)
-        relative = dr.select(mean > 0, mi.Float(variance) / dr.square(mean), 0)
-        return dr.rsqrt(1 - (1 - 8 / 27) / 4 * dr.minimum(relative, 1))
+            return dr.zeros(mi.Float, dr.width(mean))
+        return dr.minimum(dr.select(mean > 0, mi.Float(variance) / dr.square(mean), 0), 1)
 
     def _means(self, layer: int) -> list[mi.Float]:
-        n = max(self.samples // BATCH, 1)
+        n = self._batch_count
         first = layer * self.channels
         return [mi.Float(total / n) for total, _ in self._sums[first : first + self.channels]]
+
+    @property
+    def _batch_count(self):
+        """Batches per voxel, at least 1 (float64); opaque, since it changes from pass to pass."""
+        return dr.opaque(dr.float64_array_t(mi.Float), max(self.samples // BATCH, 1))
 
     def _tensor(self, values: list[mi.Float]) -> mi.TensorXf:
         count = len(values)
@@ -140,20 +162,23 @@ class IrradianceCache:
 
     def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
         """Adds ``samples`` per voxel of the stream ``seed``: for each block of voxels and then each
-        layer and channel, the sum of batch means and of their squares. Merged in float64.
+        layer and channel, the sums of batch means and of their squares, in float64.
         """
-        double = dr.float64_array_t(mi.Float)
+        sums = []
         for i, pair in enumerate(self._sums):
-            for j in range(2):
-                pieces = [block[i][j] for block in blocks]
-                total = dr.concat(pieces) if len(pieces) > 1 else pieces[0]
-                pair[j] = pair[j] + double(total)
-        dr.eval(self._sums)
-        self.note_samples(seed, samples)
+            pieces = [[block[i][j] for block in blocks] for j in range(2)]
+            totals = [dr.concat(p) if len(p) > 1 else p[0] for p in pieces]
+            sums.append([old + new for old, new in zip(pair, totals, strict=True)])
+        dr.eval(sums)
+        # An interrupt comes before or after this line, never between the two.
+        self._sums, self.streams = sums, self._streams_with(seed, samples)
 
     def note_samples(self, seed: int, samples: int) -> None:
         """Counts samples whose contribution is already in (or exactly zero)."""
-        self.streams[seed] = self.streams.get(seed, 0) + samples
+        self.streams = self._streams_with(seed, samples)
+
+    def _streams_with(self, seed: int, samples: int) -> dict[int, int]:
+        return self.streams | {seed: self.streams.get(seed, 0) + samples}
 
     def merge(self, other: IrradianceCache) -> None:
         """Adds the samples of ``other``, made with other seeds, perhaps elsewhere.
@@ -277,6 +302,16 @@ class IrradianceCache:
         write_vol(
             path, np.array(self.irradiance), (corners[:3].min(axis=1), corners[:3].max(axis=1))
         )
+
+
+def _root_correction(variance: mi.Float) -> mi.Float:
+    """Makes interpolated roots of noisy values right on average.
+
+    With relative ``variance`` v of the voxels, E[(sum w_i sqrt(x_i))^2] = mu (1 - (1 - sum w_i^2) v
+    / 4) to first order, and sum w_i^2 is (2/3)^3 on average over a cell. Without it 16 samples read
+    some 1 % too little light.
+    """
+    return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:

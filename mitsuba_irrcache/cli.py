@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from .errors import IrrcacheError, essence
+from .errors import IrrcacheError, essence, origin
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -16,12 +16,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(arguments)
     try:
         return args.run(args)
-    except KeyboardInterrupt:
-        print("irrcache: interrupted; no output was written", file=sys.stderr)
-        return 130
     except (IrrcacheError, OSError) as error:
         message = str(error)
-    except RuntimeError as error:  # how Mitsuba reports a scene it cannot load
+    except (KeyboardInterrupt, RuntimeError) as error:  # the latter is how Mitsuba reports both
+        if isinstance(origin(error), KeyboardInterrupt):
+            what_is_left = f"; {origin(error)}" if str(origin(error)) else ""
+            print(f"irrcache: interrupted{what_is_left}", file=sys.stderr)
+            return 130
         message = essence(error)
     print(f"irrcache: error: {message.removeprefix('irrcache: ')}", file=sys.stderr)
     return 1

@@ -17,11 +17,17 @@ class CacheFileError(IrrcacheError):
     """A cache file that is damaged, foreign, or belongs to another scene."""
 
 
-def essence(error: BaseException) -> str:
-    """Mitsuba wraps what a Python plugin raises, as text or as a cause; the reader wants the
-    origin.
-    """
+def origin(error: BaseException) -> BaseException:
+    """The first cause: Mitsuba and Dr.Jit wrap what Python raises below them, even an interrupt."""
     while error.__cause__ is not None:
         error = error.__cause__
+    return error
+
+
+def essence(error: BaseException) -> str:
+    """What went wrong, for a reader: Mitsuba wraps what a Python plugin raises, as text or as a
+    cause.
+    """
+    error = origin(error)
     raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", str(error), re.MULTILINE)
     return raised[-1] if raised else str(error).strip()

@@ -19,6 +19,9 @@ import numpy as np
 
 from .errors import IrrcacheError
 
+#: Largest ratio of neighbouring roots of irradiance that is extrapolated beyond the border.
+STEEPEST = 4.0
+
 
 class Grid:
     """A voxel grid: ``shape`` is ``(z, y, x)``, ``to_world`` a 4x4 affine map of the unit cube
@@ -156,7 +159,7 @@ class GridField:
     def _interpolate(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         nx, ny, _ = self.grid.sides
         corners, weights, steps = zip(
-            *(_stencil(c, n) for c, n in zip(u, self.grid.sides, strict=True)), strict=True
+            *(stencil(c, n) for c, n in zip(u, self.grid.sides, strict=True)), strict=True
         )
         # One product per lookup; the other corners are a stride away, or 0 at the border.
         base = ((corners[2] * ny + corners[1]) * nx + corners[0]) * self.channels
@@ -186,20 +189,88 @@ class RootField(GridField):
     Irradiance falls off like an exponential inside dense matter, where it is convex and plain
     interpolation reads too much light: +1.3 % of the mean radiance on a CT head, against +0.4 % for
     roots (experiments/accuracy). Roots are still exact for constants and of second order.
+
+    Beyond the outermost centres values go on as they change from there inwards: dense matter that
+    the border cuts is brightest in just that half of a voxel. Clamped, a cube of 0.6 mean free
+    paths per voxel lost 20 % of its light.
     """
 
-    def __init__(self, grid: Grid, roots: mi.Float, channels: int) -> None:
-        super().__init__(grid, roots, channels)
+    def __init__(
+        self, grid: Grid, roots: mi.Float, channels: int, variance: mi.Float | None = None
+    ) -> None:
+        """``variance`` is that of the values, relative, where they are noisy."""
+        self.inner, extension = grid, Extension(grid)
+        roots = extrapolated(extension, roots, channels, variance)
+        super().__init__(extension.grid, roots, channels)
         self.maximum = self.maximum**2
 
     def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        return dr.square(super().at(u, active))
+        """Trilinear value at the voxel coordinates ``u`` of the grid without its extension."""
+        return dr.square(super().at(u + 1, active))
+
+    def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        return self.at(self.inner.coordinates.point(p), active)
+
+
+class Extension:
+    """A grid with one more voxel at both ends of each axis: ``grid``. For each of its voxels
+    ``inside`` is the nearest one of the grid without them, and ``inwards`` along each axis the next
+    one from there: the same, unless the voxel lies beyond that end.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        sides = [int(n) for n in grid.resolution]
+        place = grid.to_world @ np.diag([*((n + 2) / n for n in sides), 1.0])
+        place[:3, 3] = grid.to_world[:3, 3] - grid.to_world[:3, :3] @ (1 / grid.resolution)
+        self.grid = Grid(tuple(n + 2 for n in grid.shape), place)
+        index = dr.arange(mi.Int32, self.grid.voxel_count)
+        row, width, height = index // (sides[0] + 2), sides[0] + 2, sides[1] + 2
+        at = [index - row * width - 1, row % height - 1, row // height - 1]
+        nearest = [dr.clip(i, 0, n - 1) for i, n in zip(at, sides, strict=True)]
+        strides = (1, sides[0], sides[0] * sides[1])
+        inside = sum(i * stride for i, stride in zip(nearest, strides, strict=True))
+        self.inside = mi.UInt32(inside)
+        self.inwards = [
+            mi.UInt32(inside + stride * (dr.clip(n - i, -1, 1) if side > 1 else 0))
+            for i, n, side, stride in zip(at, nearest, sides, strides, strict=True)
+        ]
+        dr.eval(self.inside, self.inwards)
+
+
+def extrapolated(
+    extension: Extension, roots: mi.Float, channels: int = 1, variance: mi.Float | None = None
+) -> mi.Float:
+    """Roots on the extended grid: beyond an end the outermost value times its ratio to the next one
+    inwards, at most `STEEPEST`, axis by axis.
+
+    Ratios of noisy values are too large on average. With relative variances v and v' of the two,
+    extrapolated and interpolated values are right on average over the half voxel with 1 - 0.36 (v +
+    v') (second moments of the weights 0 to 1/2, and 4/9 for the other two axes).
+    """
+    index = dr.arange(mi.UInt32, extension.grid.voxel_count * channels)
+    voxel = index // channels
+    channel = index - voxel * channels
+    inside = dr.gather(mi.UInt32, extension.inside, voxel)
+    outermost = dr.gather(mi.Float, roots, inside * channels + channel)
+    result = outermost
+    for inwards in extension.inwards:
+        further = dr.gather(mi.UInt32, inwards, voxel)
+        beyond, place = further != inside, further * channels + channel
+        other = dr.gather(mi.Float, roots, place)
+        known = beyond & (outermost > 0) & (other > 0)
+        ratio = dr.clip(outermost / dr.select(known, other, 1), 1 / STEEPEST, STEEPEST)
+        if variance is not None:
+            noise = dr.gather(mi.Float, variance, inside * channels + channel)
+            ratio = ratio * (1 - 0.36 * (noise + dr.gather(mi.Float, variance, place)))
+        result = dr.select(known, result * ratio, result)
+    dr.eval(result)
+    return result
 
 
 Field = ConstantField | GridField
 
 
-def _stencil(u: mi.Float, n: mi.Int32) -> tuple[mi.Int32, mi.Float, mi.Bool]:
+def stencil(u: mi.Float, n: mi.Int32) -> tuple[mi.Int32, mi.Float, mi.Bool]:
     """The lower of the two voxels around ``u``, the weight of the upper, and whether there is
     one.
     """

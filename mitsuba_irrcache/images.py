@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
 
 from .errors import IrrcacheError
+
+#: Names of the channels of an image, by their number.
+CHANNELS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def check_output(path: str | Path) -> Path:
@@ -25,21 +29,32 @@ def check_output(path: str | Path) -> Path:
     return path
 
 
-def write_image(path: str | Path, image: np.ndarray, metadata: dict[str, object]) -> Path:
-    """Writes ``image`` (height, width, 1 | 3 | 4), linear radiance, to ``path`` (.exr) and as sRGB
-    to a PNG.
+def write_image(
+    path: str | Path,
+    image: np.ndarray,
+    metadata: dict[str, object],
+    further: Sequence[str] = (),
+) -> Path:
+    """Writes ``image`` (height, width, channel), linear radiance, to ``path`` (.exr) and as sRGB to
+    a PNG.
 
-    ``metadata`` goes into the EXR's header under ``irrcache:``. Returns the PNG's path.
+    Channels are luminance or RGB, perhaps alpha, and then those that ``further`` names, which go
+    into the EXR only. ``metadata`` goes into its header under ``irrcache:``. Returns the PNG's
+    path.
     """
     path = check_output(path)
     image = np.ascontiguousarray(image, dtype=np.float32)
     buffer = oiio.ImageBuf(image)
+    shown = image.shape[2] - len(further)
+    if further:
+        buffer.specmod().channelnames = (*CHANNELS[shown], *further)
     for key, value in metadata.items():
         buffer.specmod().attribute(
             f"irrcache:{key}", value if isinstance(value, float | int) else str(value)
         )
     _write(buffer, path, oiio.FLOAT)
     png = path.with_suffix(".png")
+    buffer = oiio.ImageBuf(np.ascontiguousarray(image[..., :shown]))
     _write(oiio.ImageBufAlgo.colorconvert(buffer, "linear", "sRGB"), png, oiio.UINT8)
     return png
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import mitsuba as mi
@@ -11,6 +12,10 @@ from .errors import IrrcacheError
 
 #: Properties that every volumetric path integrator shares, and that keep their meaning here.
 SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+
+
+#: What stands between commas, of which those in quotes do not count.
+_ITEM = r"""(?:[^,"']|"[^"]*"|'[^']*')+"""
 
 
 def load_scene(
@@ -22,7 +27,8 @@ def load_scene(
     ``irrcache{step=0.5}``.
 
     Depth, Russian roulette and visibility of emitters are taken over from the scene's own
-    integrator, unless the specification sets them. With None the scene's integrator stays as it is.
+    integrator, unless the specification sets them or the plugin does not know them. With None the
+    scene's integrator stays as it is.
     Raises IrrcacheError if the file is missing or has no integrator to replace.
     """
     path = Path(path)
@@ -45,7 +51,8 @@ def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) ->
 def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
     """Splits ``name`` or ``name{key=value,...}`` into the plugin's name and its properties.
 
-    Values become booleans (true, false), integers, floats or strings, whichever they look like.
+    Values become booleans (true, false), integers, floats or strings, whichever they look like;
+    those with commas have to be quoted.
     """
     match = re.fullmatch(r"\s*([A-Za-z_]\w*)\s*(?:\{(.*)\})?\s*", specification, re.DOTALL)
     if match is None:
@@ -55,7 +62,7 @@ def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
         )
     name, body = match.groups()
     properties: dict[str, object] = {}
-    for item in filter(None, (part.strip() for part in (body or "").split(","))):
+    for item in filter(None, map(str.strip, re.findall(_ITEM, body or ""))):
         key, equals, value = item.partition("=")
         if not equals or not key.strip():
             raise IrrcacheError(
@@ -63,6 +70,34 @@ def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
             )
         properties[key.strip()] = _literal(value.strip())
     return name, properties
+
+
+def unknown_properties(specification: str) -> list[str]:
+    """Those of the properties in ``name{key=value,...}`` that the plugin does not read; none where
+    that cannot be told, because the plugin refuses what it reads.
+    """
+    name, properties = parse_integrator(specification)
+    return _unread(name, properties)
+
+
+def _unread(name: str, properties: dict[str, object]) -> list[str]:
+    trial = mi.Properties(name)
+    for key, value in properties.items():
+        trial[key] = value
+    with suppress(Exception):  # loading the scene will tell it, with the place in the file
+        mi.PluginManager.instance().create_object(trial)
+        return trial.unqueried()
+    return []
+
+
+def describe_integrator(name: str, properties: dict[str, object]) -> str:
+    """The inverse of `parse_integrator`."""
+    return f"{name}{{{','.join(f'{key}={_quoted(value)}' for key, value in properties.items())}}}"
+
+
+def _quoted(value: object) -> str:
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return f"'{text}'" if "," in text else text
 
 
 def _parse(
@@ -101,6 +136,8 @@ def _replace_integrator(state: mi.parser.ParserState, specification: str, path: 
     for key in list(node.props.keys()):
         del node.props[key]
     node.props.set_plugin_name(name)
+    unread = _unread(name, inherited | properties)
+    inherited = {k: v for k, v in inherited.items() if k not in unread}
     for key, value in (inherited | properties).items():
         node.props[key] = value
 

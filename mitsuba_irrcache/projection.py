@@ -15,7 +15,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .grid import GridField
+from .layers import Layers, luminance
 from .medium import MediumGrid
+from .uncertainty import UncertaintyField
 
 QUADRATURES = ("riemann", "trapezoid", "exponential")
 
@@ -25,14 +27,26 @@ EARLY_STOP = 1e-4
 
 
 class Projection:
-    """Everything a camera ray needs: the medium, the cached irradiance, and the quadrature rule."""
+    """Everything a camera ray needs: the medium, the cached irradiance, and the quadrature rule.
+
+    With ``layered``, rays also gather what `Layers` holds beside the radiance; with an
+    ``uncertainty``, the error of the cache too.
+    """
 
     def __init__(
-        self, medium: MediumGrid, irradiance: GridField | None, quadrature: str, step: float
+        self,
+        medium: MediumGrid,
+        irradiance: GridField | None,
+        quadrature: str,
+        step: float,
+        layered: bool = False,
+        uncertainty: UncertaintyField | None = None,
     ) -> None:
         self.medium = medium
         self.irradiance = irradiance
         self.quadrature = quadrature
+        self.layered = layered
+        self.uncertainty = uncertainty
         grids = [f.grid for f in (medium.sigma_t, medium.albedo, irradiance) if f and f.grid]
         # Where nothing varies, one step is exact.
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
@@ -40,15 +54,17 @@ class Projection:
         brightest = irradiance.maximum * medium.albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         self.brightest = dr.opaque(mi.Float, brightest)
 
-    def source(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
-        """Albedo Phi / (4 pi): in-scattered radiance per unit of optical depth."""
+    def source(self, p: mi.Point3f, active: mi.Bool) -> tuple:
+        """Albedo Phi / (4 pi), in-scattered radiance per unit of optical depth; and what layers
+        need to know of the point: the albedo, and the relative errors of Phi.
+        """
         if self.irradiance is None:
-            return mi.Float(0)
-        return (
-            self.medium.albedo.at_world(p, active)
-            * self.irradiance.at_world(p, active)
-            * dr.inv_four_pi
-        )
+            return mi.Float(0), [self.medium.albedo.at_world(p, active)] if self.layered else []
+        albedo, phi = self.medium.albedo.at_world(p, active), self.irradiance.at_world(p, active)
+        known = [albedo] if self.layered else []
+        if self.uncertainty is not None:
+            known += self.uncertainty.at_world(p, phi, active)
+        return albedo * phi * dr.inv_four_pi, known
 
     @dr.syntax
     def march(
@@ -61,7 +77,7 @@ class Projection:
         active: mi.Bool,
     ):
         """Scattered radiance and transmittance between ``near`` and ``far``, as two
-        ``mi.Spectrum``.
+        ``mi.Spectrum``, and the sums that `layers` makes `Layers` of.
 
         ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is the
         radiance behind the medium, which early termination has to know.
@@ -72,11 +88,12 @@ class Projection:
         t = mi.Float(near)
         p = ray(t)
         extinction = sigma_t.at_world(p, active)
-        source = self.source(p, active)
+        source, known = self.source(p, active)
         before, before_source, before_length = extinction, source, mi.Float(dr.inf)
         grey = sigma_t.channels == 1
         transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
         radiance = mi.Spectrum(0)
+        gathered = self._nothing()
         brightest = dr.maximum(self.brightest, dr.max(background))
         # A float counts steps exactly up to 2^24; longer lattices are coarser, not endless.
         limit = dr.minimum(dr.ceil((far - near) / self.step) + 1, 2**24)
@@ -93,7 +110,7 @@ class Projection:
             end = dr.select(mi.Float(k) < limit, end, far)
             p = ray(end)
             next_extinction = sigma_t.at_world(p, active)
-            next_source = self.source(p, active)
+            next_source, next_known = self.source(p, active)
             length = end - t
             ratio = length / before_length
             ratio = dr.select(ratio < 2, ratio, 0)  # a short first step tells no curvature
@@ -103,14 +120,81 @@ class Projection:
                     curved(before, extinction, next_extinction, ratio),
                     curved(before_source, source, next_source, ratio),
                 )
-            emitted, passed = segment(self.quadrature, *ends, length)
+            weights, passed = segment(self.quadrature, ends[0], length)
+            near_light, far_light = weights[0] * ends[1][0], weights[1] * ends[1][1]
+            emitted = near_light + far_light
             radiance = dr.select(active, radiance + transmittance * emitted, radiance)
+            if dr.hint(self.layered, mode="scalar"):
+                gathered = _gather(
+                    gathered,
+                    active,
+                    transmittance,
+                    (1 - passed) * (0.5 * (t + end)),
+                    weights,
+                    (near_light, far_light),
+                    (known, next_known),
+                )
             transmittance = dr.select(active, transmittance * passed, transmittance)
             before, before_source, before_length = extinction, source, length
             extinction, source, t = next_extinction, next_source, end
+            known = next_known
             left = mi.Spectrum(transmittance)
             active &= (t < far) & (dr.max(left) * brightest > EARLY_STOP * dr.max(radiance))
-        return radiance, mi.Spectrum(transmittance)
+        return radiance, mi.Spectrum(transmittance), gathered
+
+    @property
+    def channel_count(self) -> int:
+        """Values in `Layers`, 0 without them."""
+        errors = self.uncertainty.count if self.uncertainty is not None else 1
+        return 4 * dr.size_v(mi.Spectrum) + 1 + errors if self.layered else 0
+
+    def _nothing(self) -> list:
+        """What has been gathered at the start of a ray: colour, depth, errors."""
+        if not self.layered:
+            return []
+        errors = self.uncertainty.count if self.uncertainty is not None else 0
+        return [mi.Spectrum(0), mi.Float(0), *(mi.Float(0) for _ in range(errors))]
+
+    def layers(
+        self,
+        scattered: mi.Spectrum,
+        transmittance: mi.Spectrum,
+        gathered: list,
+        background: mi.Spectrum,
+        weight: mi.Spectrum,
+    ) -> Layers:
+        """What `march` returned, with names; ``weight`` is the sensor's weight of the radiance."""
+        colour, depth, *errors = gathered
+        scale = luminance(weight)
+        return Layers(
+            scattered=scattered * weight,
+            colour=colour,
+            background=background * weight,
+            transmittance=transmittance,
+            depth=depth,
+            probes=[scale * e for e in errors[:-1]],
+            bias=scale * errors[-1] if errors else mi.Float(0),
+        )
+
+
+def _gather(
+    gathered: list,
+    active: mi.Bool,
+    transmittance: mi.Float | mi.Color3f,
+    distance: mi.Float | mi.Color3f,
+    weights: tuple,
+    light: tuple,
+    known: tuple[list, list],
+) -> list:
+    """Adds a segment to colour, depth and errors: the sources' weights times the albedo, absorbed
+    light times distance, and the radiance from both ends times its relative errors.
+    """
+    (near_albedo, *near_errors), (far_albedo, *far_errors) = known
+    colour = mi.Spectrum(transmittance * (weights[0] * near_albedo + weights[1] * far_albedo))
+    near, far = (luminance(mi.Spectrum(transmittance * end)) for end in light)
+    errors = [near * a + far * b for a, b in zip(near_errors, far_errors, strict=True)]
+    added = [colour, luminance(mi.Spectrum(transmittance * distance)), *errors]
+    return [dr.select(active, old + new, old) for old, new in zip(gathered, added, strict=True)]
 
 
 def curved(before, a, b, ratio: mi.Float) -> tuple:
@@ -126,24 +210,23 @@ def curved(before, a, b, ratio: mi.Float) -> tuple:
     return a * scale, b * scale
 
 
-def segment(quadrature: str, sigma: tuple, source: tuple, length: mi.Float):
-    """Radiance that a segment adds at its start, and its transmittance.
+def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
+    """Weights of the sources albedo Phi / (4 pi) at both ends of a segment, and its transmittance.
 
-    ``sigma`` is the extinction and ``source`` = albedo Phi / (4 pi) at both ends. ``riemann`` (the
-    paper's rule, order 1) takes all from the start; ``trapezoid`` (order 2) takes extinction and
-    sigma_s Phi / (4 pi) as linear in distance; ``exponential`` takes extinction and source as
-    linear in distance (``curved`` ends make it of order 3 where both are smooth) and the
-    transmittance as exact, so that opaque and long segments stay right.
+    ``sigma`` is the extinction at both ends. ``riemann`` (the paper's rule, order 1) takes all from
+    the start; ``trapezoid`` (order 2) takes extinction and sigma_s Phi / (4 pi) as linear in
+    distance; ``exponential`` takes extinction and source as linear in distance (``curved`` ends
+    make it of order 3 where both are smooth) and the transmittance as exact, so that opaque and
+    long segments stay right.
     """
-    (sigma_a, sigma_b), (source_a, source_b) = sigma, source
+    sigma_a, sigma_b = sigma
     if quadrature == "riemann":
         absorbed = absorptance(sigma_a * length)
-        return source_a * absorbed, 1 - absorbed
+        return (absorbed, dr.zeros(type(absorbed))), 1 - absorbed
     passed = dr.exp(-0.5 * (sigma_a + sigma_b) * length)
     if quadrature == "trapezoid":
-        return 0.5 * length * (sigma_a * source_a + passed * sigma_b * source_b), passed
-    near, far = exponential_weights(sigma_a * length, sigma_b * length)
-    return near * source_a + far * source_b, passed
+        return (0.5 * length * sigma_a, 0.5 * length * (passed * sigma_b)), passed
+    return exponential_weights(sigma_a * length, sigma_b * length), passed
 
 
 def exponential_weights(tau_a, tau_b) -> tuple:

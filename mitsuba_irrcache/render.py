@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import math
+import signal
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib import metadata
 from pathlib import Path
 
@@ -14,9 +16,10 @@ import numpy as np
 from tqdm import tqdm
 
 from . import __version__
-from .errors import IrrcacheError
+from .errors import IrrcacheError, origin
 from .images import check_output, write_image
 from .loading import integrator_of, load_scene
+from .progressive import Frame, render_progressive
 from .runtime import require_llvm
 from .variants import SUPPORTED
 
@@ -52,6 +55,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed", type=int, default=0, help="seed of the camera samples (default: 0)"
     )
+    parser.add_argument(
+        "--budget", type=float, metavar="SECONDS",
+        help="refine the cache and render again and again, for so many seconds once the scene is "
+        "loaded; Ctrl-C ends it earlier",
+    )  # fmt: skip
+    parser.add_argument(
+        "--error", type=float, metavar="E",
+        help="refine until the standard error of the cache is this part of its mean, e.g. 0.02",
+    )  # fmt: skip
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
 
 
@@ -63,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
         raise IrrcacheError(
             f"--spp is {args.spp}; it must be at least 1 (or 0 for the scene's own)."
         )
+    _check_targets(args)
     if args.mode.startswith("llvm"):
         require_llvm()
     mi.set_variant(args.mode)
@@ -79,22 +92,90 @@ def run(args: argparse.Namespace) -> int:
             f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), "
             "counted from 0."
         )
-    image = _render(scene, args, seconds)
-    png = write_image(output, image, _describe(scene, args, seconds))
-    print(f"wrote {output} and {png}")
-    print("  ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
+    if args.budget or args.error:
+        _require_progressive(scene, integrator or integrator_of(source, parameters))
+        _render_progressive(scene, args, seconds, output)
+    else:
+        image = _render(scene, args, seconds)
+        _write(output, image, scene, _describe(scene, args, seconds), seconds)
     return 0
 
 
 def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]) -> np.ndarray:
     integrator = scene.integrator()
-    if hasattr(integrator, "prepare"):
-        with _stopwatch(seconds, "cache"), progress_bar(integrator):
-            integrator.prepare(scene)
-    with _stopwatch(seconds, "projection" if "cache" in seconds else "render"):
-        image = mi.render(scene, sensor=args.sensor, seed=args.seed, spp=args.spp)
-        dr.sync_thread()
+    try:
+        if hasattr(integrator, "prepare"):
+            with _stopwatch(seconds, "cache"), progress_bar(integrator):
+                integrator.prepare(scene)
+        with _stopwatch(seconds, "projection" if "cache" in seconds else "render"):
+            image = mi.render(scene, sensor=args.sensor, seed=args.seed, spp=args.spp)
+            dr.sync_thread()
+    except (KeyboardInterrupt, RuntimeError) as error:
+        _say_what_is_left(error, "no image was written")
+        raise
     return np.array(image)
+
+
+def _render_progressive(
+    scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], output: Path
+) -> None:
+    """Writes the last image there is, whether the run reaches its end or is stopped."""
+    frame = None
+    targets = {"seconds": args.budget or math.inf, "standard_error": args.error or 0.0}
+    try:
+        with (
+            progress_bar(scene.integrator()),
+            _terminated_like_interrupted(),
+            closing(
+                render_progressive(scene, args.sensor, args.spp, args.seed, **targets)
+            ) as frames,
+        ):
+            for frame in frames:
+                tqdm.write(f"{frame.elapsed:8.2f} s  {_reached(frame)}")
+    except (KeyboardInterrupt, RuntimeError) as error:
+        left = f"the image of {_reached(frame)} was written" if frame else "no image was written"
+        _say_what_is_left(error, left)
+        raise
+    finally:
+        if frame is not None:
+            seconds |= frame.seconds
+            about = _describe(scene, args, seconds, frame.samples)
+            _write(output, np.array(frame.image), scene, about, seconds)
+
+
+def _say_what_is_left(error: BaseException, left: str) -> None:
+    """Gives an interrupt a message; other errors have one."""
+    if isinstance(origin(error), KeyboardInterrupt):
+        raise KeyboardInterrupt(left) from None
+
+
+def _reached(frame: Frame) -> str:
+    if not frame.samples:
+        return "no cache"
+    error = "" if math.isnan(frame.standard_error) else f", error {frame.standard_error:.2%}"
+    return f"{frame.samples} samples per voxel{error}"
+
+
+def _write(
+    output: Path,
+    image: np.ndarray,
+    scene: mi.Scene,
+    about: dict[str, object],
+    seconds: dict[str, float],
+) -> None:
+    png = write_image(output, image, about, scene.integrator().aov_names())
+    print(f"wrote {output} and {png}")
+    print("  ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
+
+
+@contextmanager
+def _terminated_like_interrupted():
+    """A request to terminate ends the block as Ctrl-C does."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -121,6 +202,23 @@ def _stopwatch(seconds: dict[str, float], name: str):
     seconds[name] = time.perf_counter() - started
 
 
+def _check_targets(args: argparse.Namespace) -> None:
+    for name, value, wanted in (
+        ("budget", args.budget, "a number of seconds"),
+        ("error", args.error, "a part of the mean, for example 0.02,"),
+    ):
+        if value is not None and not 0 < value < math.inf:
+            raise IrrcacheError(f"--{name} is {value:g}; it must be {wanted} above 0.")
+
+
+def _require_progressive(scene: mi.Scene, integrator: str) -> None:
+    if not hasattr(scene.integrator(), "progressive"):
+        raise IrrcacheError(
+            f'--budget and --error need an integrator with a cache to refine, and "{integrator}" '
+            "has none; use irrcache, or --spp."
+        )
+
+
 def _definitions(items: list[str]) -> dict[str, str]:
     result = {}
     for item in items:
@@ -132,9 +230,11 @@ def _definitions(items: list[str]) -> dict[str, str]:
 
 
 def _describe(
-    scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]
+    scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], samples: int = 0
 ) -> dict[str, object]:
-    """What made the image, for the header of the EXR."""
+    """What made the image, for the header of the EXR; ``samples`` per voxel of the cache that it
+    shows, if it is not the cache as it is now.
+    """
     described = {
         "version": __version__,
         "mitsuba": metadata.version("mitsuba"),
@@ -148,7 +248,6 @@ def _describe(
     }
     cache = getattr(scene.integrator(), "cache", None)
     if cache is not None:
-        described["cache"] = (
-            f"{'x'.join(map(str, cache.grid.shape[::-1]))} voxels, {cache.samples} samples"
-        )
+        sides = "x".join(map(str, cache.grid.shape[::-1]))
+        described["cache"] = f"{sides} voxels, {samples or cache.samples} samples"
     return described | {f"seconds_{name}": value for name, value in seconds.items()}

@@ -1,11 +1,13 @@
 """From camera samples to the film, for integrators written in Python.
 
 Mitsuba's own loop for this knows only opaque or empty samples; a medium needs fractional alpha.
+And it knows only images that are final once the samples are in: here they may be developed first
+and put on the film afterwards.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -13,8 +15,9 @@ import mitsuba as mi
 #: Camera samples in one kernel launch: bounds the memory of the sampler's state (16 bytes each).
 LANES = 1 << 24
 
-#: (sampler, ray, active) -> radiance, alpha
-RadianceFunction = Callable[[mi.Sampler, mi.RayDifferential3f, mi.Bool], tuple]
+#: (sampler, ray, the sensor's weight of it, active) -> radiance, alpha, values of the further
+#: channels; the weight is in the radiance
+RadianceFunction = Callable[[mi.Sampler, mi.RayDifferential3f, mi.Spectrum, mi.Bool], tuple]
 
 
 def render_film(
@@ -23,10 +26,10 @@ def render_film(
     seed: int,
     spp: int,
     should_stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[int, int], None] | None = None,
+    channels: Sequence[str] = (),
 ) -> mi.Film:
     """Renders ``radiance`` to the sensor's film, ``spp`` samples per pixel (0: the sampler's own
-    count).
+    count); ``channels`` names those beside radiance and alpha.
     """
     film, sampler = sensor.film(), sensor.sampler().clone()
     if spp:
@@ -35,7 +38,7 @@ def render_film(
     border = film.rfilter().border_size() if film.sample_border() else 0
     size = mi.ScalarVector2u(film.crop_size()) + 2 * border
     pixels = int(size.x) * int(size.y)
-    film.prepare([])
+    film.prepare(list(channels))
     if not pixels:
         return film
     per_pass = _divisor(spp, max(1, LANES // pixels))
@@ -44,18 +47,51 @@ def render_film(
     block = film.create_block()
     block.set_offset(film.crop_offset())
     block.set_coalesce(block.coalesce() and per_pass >= 4)
-    for done in range(0, spp, per_pass):
+    for _ in range(0, spp, per_pass):
         _splat(sensor, sampler, block, size, border, per_pass, spp, radiance)
         if per_pass < spp:
             sampler.advance()
             sampler.schedule_state()
             dr.eval(block.tensor())
-        if progress is not None:
-            progress(done + per_pass, spp)
         if should_stop():
             break
     film.put_block(block)
     return film
+
+
+def planes(film: mi.Film, count: int) -> tuple[list[mi.Float], mi.Float | None, list[mi.Float]]:
+    """The developed film as arrays of a value for each pixel: colour (or luminance), alpha (None
+    without), and the last ``count`` channels.
+    """
+    image = film.develop()
+    height, width, depth = image.shape
+    index = dr.arange(mi.UInt32, height * width) * depth
+    values = [dr.gather(mi.Float, image.array, index + i) for i in range(depth)]
+    further = values[depth - count :]
+    values = values[: depth - count]
+    alpha = values.pop() if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else None
+    return values, alpha, further
+
+
+def fill_film(
+    film: mi.Film,
+    radiance: mi.Spectrum,
+    alpha: mi.Float | None,
+    channels: dict[str, mi.Float],
+) -> None:
+    """Puts a finished image on a film, in place of what was there."""
+    film.prepare(list(channels))
+    rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
+    alphas = [] if alpha is None else [alpha]
+    values = [*rgb, *alphas, mi.Float(1), *channels.values()]
+    width, height = (int(n) for n in film.crop_size())
+    count = len(values)
+    flat = dr.zeros(mi.Float, width * height * count)
+    index = dr.arange(mi.UInt32, width * height) * count
+    for i, value in enumerate(values):
+        dr.scatter(flat, value, index + i)
+    tensor = mi.TensorXf(flat, (height, width, count))
+    film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
 
 
 def _divisor(n: int, limit: int) -> int:
@@ -90,19 +126,11 @@ def _splat(
         time += sampler.next_1d() * sensor.shutter_open_time()
     ray, weight = sensor.sample_ray_differential(time, 0, on_film, aperture)
     ray.scale_differential(dr.rsqrt(float(spp)))
-    value, alpha = radiance(sampler, ray, mi.Bool(True))
-    value = value * weight
-    flags = film.flags()
-    if mi.has_flag(flags, mi.FilmFlags.Special):
-        channels = film.prepare_sample(
-            value, ray.wavelengths, block.channel_count(), 1.0, alpha, mi.Bool(True)
-        )
-    else:
-        rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
-        channels = (
-            [*rgb, alpha, mi.Float(1)]
-            if mi.has_flag(flags, mi.FilmFlags.Alpha)
-            else [*rgb, mi.Float(1)]
-        )
+    value, alpha, further = radiance(sampler, ray, weight, mi.Bool(True))
+    rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
+    alphas = [alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
     # With a box filter the sample's place in the pixel does not matter; its rounding would.
-    block.put(pixel if film.rfilter().is_box_filter() else position, channels)
+    block.put(
+        pixel if film.rfilter().is_box_filter() else position,
+        [*rgb, *alphas, mi.Float(1), *further],
+    )

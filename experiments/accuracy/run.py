@@ -11,27 +11,25 @@ output/accuracy/results.json; finished rows are kept.
 from __future__ import annotations
 
 import argparse
-import json
-import time
+from functools import partial
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from experiments.scenes import IMPORTS, scene_file
-from mitsuba_irrcache.compare import metrics
+from experiments.cached import measure
+from experiments.scenes import SOURCES, scene_file
+from experiments.store import Store
 from mitsuba_irrcache.compare.reference import reference
-from mitsuba_irrcache.loading import load_scene
 from mitsuba_irrcache.runtime import require_llvm
 
+SCENES = ["phantom", "cloud", "head"]
 REFERENCE = {2: "volpath{rr_depth=1000}", -1: "volpath{rr_depth=20}"}
 
 
 def main() -> None:
     """Computes the rows that are missing and prints all."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", nargs="+", default=list(IMPORTS), choices=list(IMPORTS))
+    parser.add_argument("--scenes", nargs="+", default=SCENES, choices=list(SOURCES))
     parser.add_argument("--depths", nargs="+", type=int, default=[2, -1])
     parser.add_argument("--resolutions", nargs="+", type=int, default=[32, 64, 128])
     parser.add_argument("--cache-spp", type=int, default=16)
@@ -44,8 +42,7 @@ def main() -> None:
     require_llvm()
     mi.set_variant("llvm_ad_rgb")
     args.output.mkdir(parents=True, exist_ok=True)
-    store = args.output / "results.json"
-    rows = json.loads(store.read_text()) if store.exists() and not args.force else {}
+    store = Store(args.output / "results.json", args.force)
     for name in args.scenes:
         path = scene_file(name, args.output)
         if path is None:
@@ -55,44 +52,17 @@ def main() -> None:
                 key = (
                     f"{name} {depth} {resolution} {args.cache_spp} {args.size} {args.reference_spp}"
                 )
-                if key not in rows:
-                    rows[key] = measure(path, depth, resolution, args)
-                    store.write_text(json.dumps(rows, indent=1))
-                print_row(name, depth, resolution, rows[key])
+                row = store.row(key, partial(compute, path, depth, resolution, args))
+                print_row(name, depth, resolution, row)
 
 
-def measure(path: Path, depth: int, resolution: int, args: argparse.Namespace) -> dict[str, float]:
-    """Errors in units of the mean reference radiance of all pixels, and seconds."""
+def compute(path: Path, depth: int, resolution: int, args: argparse.Namespace) -> dict[str, float]:
+    """One row, with the reference that it needs."""
     parameters = {"max_depth": str(depth), "width": str(args.size), "height": str(args.size)}
     truth = reference(
         path, parameters, REFERENCE[depth], args.output / "references", args.reference_spp
     )
-    a, b = truth.a, truth.b
-    images, cache_seconds, image_seconds = [], 0.0, 0.0
-    for seed in (1, 2):
-        integrator = (
-            f"irrcache{{resolution={resolution},cache_spp={args.cache_spp},cache_seed={seed}}}"
-        )
-        scene = load_scene(path, parameters, integrator)
-        started = time.perf_counter()
-        scene.integrator().prepare(scene)
-        cache_seconds = time.perf_counter() - started
-        started = time.perf_counter()
-        images.append(np.array(mi.render(scene, spp=64, seed=seed), dtype=np.float64))
-        dr.sync_thread()
-        image_seconds = time.perf_counter() - started
-    x, y = images
-    mean = float(np.mean(0.5 * (a + b)))
-    return {
-        "mean_error": metrics.mean_error(0.5 * (x + y), a, b) / mean,
-        "net_rmse": metrics.net_rmse(x, a, b) / mean,
-        "noise": metrics.noise(x, y) / mean,
-        "discretisation": metrics.discretisation_error(x, y, a, b) / mean,
-        "blocks": metrics.block_error(x, a, b) / mean,
-        "reference_noise": metrics.noise(a, b) / 2**0.5 / mean,
-        "cache_seconds": cache_seconds,
-        "image_seconds": image_seconds,
-    }
+    return measure(path, parameters, truth, resolution=resolution, cache_spp=args.cache_spp)
 
 
 def print_row(name: str, depth: int, resolution: int, row: dict[str, float]) -> None:

@@ -15,6 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from experiments.analysis import rms
+from experiments.marching import unjittered
 from mitsuba_irrcache.build import CacheBuilder, CacheSettings
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.projection import QUADRATURES, Projection
@@ -60,13 +62,13 @@ def main() -> None:
     print(f"(noise of the caches, projected: about {projected_noise(builder.cache):.1e})")
 
 
-def gaussian_ball() -> dict:
-    """A smooth heterogeneous medium of optical depth 4 under a white sky, and no noise in its
-    placement.
+def gaussian_ball(peak: float = 6.0, falloff: float = 6.0) -> dict:
+    """A smooth heterogeneous medium under a white sky: the extinction is ``peak`` in the middle and
+    e^-``falloff`` of it one unit away, where its box ends. The default has an optical depth of 4.
     """
     c = (np.arange(32) + 0.5) / 32 * 2 - 1
     z, y, x = np.meshgrid(c, c, c, indexing="ij")
-    sigma_t = (6 * np.exp(-6 * (x**2 + y**2 + z**2))).astype(np.float32)
+    sigma_t = (peak * np.exp(-falloff * (x**2 + y**2 + z**2))).astype(np.float32)
     to_world = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     return {
         "type": "scene",
@@ -88,26 +90,22 @@ def gaussian_ball() -> dict:
 
 
 def image(medium, field, quadrature: str, step: float) -> np.ndarray:
-    """Scattered radiance of 48 x 48 parallel, slightly oblique rays, without jitter."""
+    """Scattered radiance of `parallel_rays`, without jitter."""
+    return unjittered(Projection(medium, field, quadrature, step), parallel_rays())[0]
+
+
+def parallel_rays() -> mi.Ray3f:
+    """48 x 48 parallel, slightly oblique rays through the ball."""
     side = 48
     u = (dr.arange(mi.Float, side) + 0.5) / side * 1.6 - 0.8
     x, y = dr.meshgrid(u, u)
     direction = dr.normalize(mi.Vector3f(0.1, 0.2, 1))
-    ray = mi.Ray3f(mi.Point3f(x, y, 0) - 3 * direction, direction)
-    hit, near, far = medium.intersect(ray)
-    projection = Projection(medium, field, quadrature, step)
-    radiance, _ = projection.march(ray, near, far, mi.Spectrum(0), mi.Float(1), hit)
-    return np.array(radiance, dtype=np.float64)
+    return mi.Ray3f(mi.Point3f(x, y, 0) - 3 * direction, direction)
 
 
 def projected_noise(cache: IrradianceCache) -> float:
     """Rough: standard error of a voxel over the number of voxels that a ray averages."""
     return float(np.nanmean(np.array(cache.standard_error))) / (4 * np.pi) / 4
-
-
-def rms(x: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(x))))
 
 
 def print_orders(name: str, errors: list[float], scale: float) -> None:

@@ -1,7 +1,8 @@
 """``irrcache compare``: how fast integrators get rid of their error on your scene.
 
 Any integrators of Mitsuba, stock or not; each runs in a process of its own and is measured against
-a reference that is rendered once and kept.
+a reference that is rendered once and kept. Any of them may be given ``filter=bilateral``: one that
+knows no such property has its images filtered here, as a fair opponent of one that does.
 """
 
 from __future__ import annotations

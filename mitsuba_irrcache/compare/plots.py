@@ -18,7 +18,7 @@ from .tables import STAGES
 SMALL = ("relative_mse", "display_rmse", "block_rmse", "ciede2000", "flip")
 
 STAGE_COLOURS = dict(
-    zip(STAGES, ("#c8c8c8", "#9a9a9a", "#E69F00", "#009E73", "#0072B2"), strict=True)
+    zip(STAGES, ("#c8c8c8", "#9a9a9a", "#E69F00", "#009E73", "#0072B2", "#CC79A7"), strict=True)
 )
 
 

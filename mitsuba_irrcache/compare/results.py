@@ -19,7 +19,7 @@ class Snapshot:
 
     Attributes:
         budget: seconds that were asked for.
-        seconds: of each stage, with compiled kernels: cache (where there is one), image, ...
+        seconds: of each stage, with compiled kernels: cache (where there is one), image, filter.
         spp: camera samples per pixel in the image.
         image: name of the EXR file, relative to the report.
         note: how the budget was spent, for people.

@@ -1,32 +1,50 @@
-"""How an integrator spends a time budget: by more samples of the image, or on its cache first.
+"""How an integrator spends time budgets.
 
 A runner is a generator: given a `Subject` and budgets in seconds it yields pairs (snapshot, image).
-An integrator is told apart by what it offers, never by its name: one with a method
-``prepare(scene)`` has a cache.
+An integrator is told apart by what it offers, never by its name:
+
+* ``progressive(scene, sensor, seed, spp, times)`` iterates over frames while a cache is refined,
+  one at each of the ``times``; each has an ``image``, ``samples`` of the cache, and ``seconds`` by
+  stage since the beginning, without those between frames. Images that are rendered there show the
+  cache as it is. All snapshots are of one run.
+* ``prepare(scene)`` builds a cache; images are averaged after it.
+* Others have images only, which are averaged.
 """
 
 from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.loading import load_scene, parse_integrator
+from mitsuba_irrcache.loading import (
+    describe_integrator,
+    load_scene,
+    parse_integrator,
+    unknown_properties,
+)
 
+from .metrics import colours
 from .results import Snapshot
 
 #: The property by which an integrator with a cache is told how much to spend on it, and its
 #: smallest value.
 EFFORT = "cache_spp"
 LEAST_EFFORT = 8
-#: Part of a budget that goes into the cache; the rest goes into samples of the image.
+#: Where an integrator has no such property, its averaged images are filtered here.
+FILTER = ("filter", "bilateral")
+#: Part of the time that goes into a cache that is refined, and images meanwhile; the rest goes into
+#: more samples of the snapshots.
 CACHE_SHARE = 0.85
+#: A frame may come early: from this part of its time on it counts.
+REACHED = 0.95
 #: Most samples per pixel of one launch.
 MOST_SPP = 64
 
@@ -35,31 +53,92 @@ Frames = Iterator[tuple[Snapshot, np.ndarray]]
 
 @dataclass
 class Subject:
-    """An integrator on a scene, seen by one sensor."""
+    """An integrator on a scene, seen by one sensor; ``filter_seconds`` is what filtering took the
+    last time.
+    """
 
     scene_file: Path
     parameters: dict[str, str]
     integrator: str
     sensor: int = 0
     launches: int = field(default=0, init=False)
+    filter_seconds: float = field(default=0.0, init=False)
+
+    @cached_property
+    def is_filtered_here(self) -> bool:
+        """Whether the integrator is asked for a filter that it does not know."""
+        name, value = FILTER
+        asked = parse_integrator(self.integrator)[1].get(name) == value
+        return asked and name in unknown_properties(self.integrator)
+
+    def specification(self, **properties: object) -> str:
+        """The integrator, which gets some more properties."""
+        name, given = parse_integrator(self.integrator)
+        if self.is_filtered_here:
+            del given[FILTER[0]]
+        return describe_integrator(name, given | properties)
 
     def load(self, **properties: object) -> mi.Scene:
         """The scene with the integrator, which gets some more properties."""
-        name, given = parse_integrator(self.integrator)
-        body = ",".join(f"{k}={_text(v)}" for k, v in (given | properties).items())
-        return load_scene(self.scene_file, self.parameters, f"{name}{{{body}}}")
+        return load_scene(self.scene_file, self.parameters, self.specification(**properties))
 
-    def render(self, scene: mi.Scene, spp: int) -> tuple[np.ndarray, float]:
-        """An image with a seed of its own, and the seconds it took."""
+    def render(self, scene: mi.Scene, spp: int) -> tuple[np.ndarray, dict[str, float]]:
+        """An image with a seed of its own, and the seconds it took by stage."""
         self.launches += 1
         return render(scene, self.sensor, spp, self.launches)
 
+    def finish(self, average: Average) -> tuple[np.ndarray, dict[str, float]]:
+        """The averaged image, or its colours filtered if that is done here, and the seconds it
+        took.
+        """
+        if not self.is_filtered_here:
+            return average.mean, {}
+        from mitsuba_irrcache.filtering import denoise
 
-def render(scene: mi.Scene, sensor: int, spp: int, seed: int) -> tuple[np.ndarray, float]:
-    """An image (height, width, channel), float32, and the seconds until it was there."""
+        started = time.perf_counter()
+        image = denoise(colours(average.mean), average.standard_error)
+        self.filter_seconds = time.perf_counter() - started
+        return image, {"filter": self.filter_seconds}
+
+
+class Average:
+    """The mean of images, and the standard error that their scatter tells."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._total, self._grey, self._squares = 0.0, 0.0, 0.0
+
+    def add(self, image: np.ndarray) -> None:
+        """One more image (height, width, channel), independent of the others."""
+        grey = colours(image).mean(axis=-1, dtype=np.float64)
+        self.count += 1
+        self._total = self._total + image.astype(np.float64)
+        self._grey, self._squares = self._grey + grey, self._squares + grey**2
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The mean (height, width, channel), float64."""
+        return self._total / self.count
+
+    @property
+    def standard_error(self) -> np.ndarray:
+        """Standard error of the mean over the colours (height, width), from at least two images."""
+        variance = self._squares / self.count - (self._grey / self.count) ** 2
+        return np.sqrt(np.maximum(variance, 0) / (self.count - 1))
+
+
+def render(
+    scene: mi.Scene, sensor: int, spp: int, seed: int
+) -> tuple[np.ndarray, dict[str, float]]:
+    """An image (height, width, channel), float32, and the seconds until it was there by stage:
+    image, and filter where the integrator says that it has spent some on one.
+    """
     started = time.perf_counter()
     image = np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed))
-    return image, time.perf_counter() - started
+    seconds = time.perf_counter() - started
+    filtering = getattr(scene.integrator(), "seconds", {}).get("filter", 0.0)
+    stages = {"image": seconds - filtering}
+    return image, stages | ({"filter": filtering} if filtering else {})
 
 
 def prepare(scene: mi.Scene) -> float:
@@ -77,28 +156,32 @@ def has_cache(scene: mi.Scene) -> bool:
     return callable(method) and "scene" in inspect.signature(method).parameters
 
 
+def is_progressive(scene: mi.Scene) -> bool:
+    """Whether the integrator gives images while it refines its cache."""
+    return callable(getattr(scene.integrator(), "progressive", None))
+
+
 def effort_is_free(subject: Subject) -> bool:
-    """Whether the effort spent on the cache may be chosen to fit a budget: the integrator knows the
-    property, and the user has not set it.
+    """Whether the effort spent on the cache may be chosen: the integrator knows the property, and
+    the user has not set it.
     """
     if EFFORT in parse_integrator(subject.integrator)[1]:
         return False
-    try:
-        subject.load(**{EFFORT: LEAST_EFFORT})
-    except RuntimeError:  # Mitsuba refuses a property that the plugin does not read
-        return False
-    return True
+    return EFFORT not in unknown_properties(subject.specification(**{EFFORT: LEAST_EFFORT}))
 
 
 def run(subject: Subject, scene: mi.Scene, budgets: list[float]) -> Frames:
     """The runner that fits the integrator of ``scene``, which has rendered an image already: its
     kernels are compiled.
     """
+    if is_progressive(scene) and effort_is_free(subject) and not subject.is_filtered_here:
+        yield from _refined(subject, scene, budgets)
+        return
     spp = _samples_per_launch(subject, scene, min(budgets))
+    if subject.is_filtered_here:
+        _warm_up_filter(subject, scene, spp)
     if not has_cache(scene):
         yield from accumulate(subject, scene, budgets, spp, {})
-    elif effort_is_free(subject):
-        yield from _fitted(subject, budgets, spp)
     else:
         scene = subject.load()
         yield from accumulate(subject, scene, budgets, spp, {"cache": prepare(scene)})
@@ -114,68 +197,86 @@ def accumulate(
     """Averages images of ``spp`` samples and different seeds; a snapshot at every budget.
 
     ``spent`` are the seconds of earlier stages. Where they outlast several budgets, the first image
-    stands for the largest of these.
+    stands for the largest of these. A filter needs two images, to know their noise.
     """
-    waiting = sorted(budgets)
-    total, launches, seconds = 0.0, 0, 0.0
+    waiting, average, seconds = sorted(budgets), Average(), dict(spent)
     while waiting:
         image, took = subject.render(scene, spp)
-        total, launches, seconds = total + image.astype(np.float64), launches + 1, seconds + took
-        reached = [b for b in waiting if sum(spent.values()) + seconds + 0.5 * took >= b]
+        average.add(image)
+        seconds = _sum(seconds, took)
+        expected = sum(seconds.values()) + 0.5 * sum(took.values()) + subject.filter_seconds
+        reached = [b for b in waiting if expected >= b]
+        if reached and average.count >= 1 + subject.is_filtered_here:
+            waiting = waiting[len(reached) :]
+            image, filtering = subject.finish(average)
+            yield Snapshot(reached[-1], seconds | filtering, spp * average.count), image
+
+
+def follow(
+    subject: Subject, scene: mi.Scene, frames: Iterable, budgets: list[float], spp: int
+) -> Frames:
+    """Snapshots of a progressive run, whose frames have ``spp`` samples: for every budget the first
+    frame that reaches `CACHE_SHARE` of it, averaged with further images until the budget is spent.
+    """
+    waiting, between = sorted(budgets), {}
+    for frame in frames:
+        elapsed = sum(frame.seconds.values())
+        reached = [b for b in waiting if elapsed >= REACHED * CACHE_SHARE * b]
         if reached:
             waiting = waiting[len(reached) :]
-            snapshot = Snapshot(reached[-1], spent | {"image": seconds}, spp * launches)
-            yield snapshot, total / launches
+            average, took = Average(), {}
+            average.add(np.array(frame.image))
+            while elapsed + sum(between.values()) + 0.5 * sum(took.values()) < reached[-1]:
+                image, took = subject.render(scene, spp)
+                average.add(image)
+                between = _sum(between, took)
+            note = f"{frame.samples} samples per voxel"
+            seconds = _sum(frame.seconds, between)
+            yield Snapshot(reached[-1], seconds, spp * average.count, note=note), average.mean
+        if not waiting:
+            return
 
 
-def _fitted(subject: Subject, budgets: list[float], spp: int) -> Frames:
-    """For each budget a run of its own, with as much effort on the cache as it allows."""
-    costs = [_cache_cost(subject, LEAST_EFFORT)]
-    for budget in without_unreachable(budgets, costs[0][1]):
-        effort = choose_effort(costs, CACHE_SHARE * budget)
-        scene = subject.load(**{EFFORT: effort})
-        seconds = prepare(scene)
-        costs.append((effort, seconds))
-        for snapshot, image in accumulate(subject, scene, [budget], spp, {"cache": seconds}):
-            snapshot.note = f"{EFFORT}={effort}"
-            yield snapshot, image
+def _refined(subject: Subject, scene: mi.Scene, budgets: list[float]) -> Frames:
+    """One progressive run; if it ends early, with a cache that is complete, images are averaged."""
+    times = [CACHE_SHARE * b for b in budgets]
+
+    def frames(scene: mi.Scene, spp: int) -> Iterator:
+        return scene.integrator().progressive(
+            scene, sensor=subject.sensor, seed=0, spp=spp, times=times
+        )
+
+    # Compiles the kernels that only such a run has, and tells when the first image is there.
+    first = next(iter(frames(subject.load(), 1)))
+    spp = _samples_per_launch(subject, scene, max(min(budgets), sum(first.seconds.values())))
+    scene, last = subject.load(), 0.0
+    for snapshot, image in follow(subject, scene, frames(scene, spp), budgets, spp):
+        last = snapshot.budget
+        yield snapshot, image
+    if left := [b for b in budgets if b > last]:
+        yield from accumulate(subject, scene, left, spp, {"cache": prepare(scene)})
 
 
-def without_unreachable(budgets: list[float], least: float) -> list[float]:
-    """The budgets in order; of those below ``least`` seconds only the largest, for an image."""
-    early = [b for b in budgets if b < least]
-    return ([max(early)] if early else []) + sorted(b for b in budgets if b >= least)
+def _sum(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
+    return {key: a.get(key, 0.0) + b.get(key, 0.0) for key in a | b}
 
 
-def _cache_cost(subject: Subject, effort: int) -> tuple[int, float]:
-    return effort, prepare(subject.load(**{EFFORT: effort}))
-
-
-def choose_effort(costs: list[tuple[int, float]], seconds: float) -> int:
-    """The effort that takes about ``seconds``, from pairs (effort, seconds) that were measured; the
-    cost is taken to be a constant plus a part proportional to effort.
-    """
-    (least, base), (most, top) = min(costs), max(costs)
-    rate = (top - base) / (most - least) if most > least else base / least
-    if rate <= 0:
-        return most * 2
-    effort = least + (seconds - base) / rate
-    limit = 32 * most  # far beyond what was measured the line cannot be trusted
-    return int(np.clip(effort // LEAST_EFFORT * LEAST_EFFORT, LEAST_EFFORT, limit))
+def _warm_up_filter(subject: Subject, scene: mi.Scene, spp: int) -> None:
+    """Compiles the filter's kernels, and measures it."""
+    average = Average()
+    for _ in range(2):
+        average.add(subject.render(scene, spp)[0])
+    for _ in range(2):
+        subject.finish(average)
 
 
 def _samples_per_launch(subject: Subject, scene: mi.Scene, budget: float) -> int:
     """Samples per launch: a power of two that takes about a tenth of the smallest budget, or 50 ms
     if that is longer. The kernels for it are compiled afterwards.
     """
-    _, once = min((subject.render(scene, 1) for _ in range(2)), key=lambda pair: pair[1])
-    _, more = min((subject.render(scene, 4) for _ in range(2)), key=lambda pair: pair[1])
+    once, more = (min(sum(subject.render(scene, n)[1].values()) for _ in range(2)) for n in (1, 4))
     rate = max((more - once) / 3, 1e-4)
     wanted = 1 + (max(0.1 * budget, 0.05) - once) / rate
     spp = 2 ** int(np.log2(np.clip(wanted, 1, MOST_SPP)))
     subject.render(scene, spp)
     return spp
-
-
-def _text(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -10,7 +10,7 @@ from .results import Measurement
 from .scores import METRICS
 from .summary import Curve, Reached, equal_error, equal_time, targets
 
-STAGES = ("import", "load", "kernels", "cache", "image")
+STAGES = ("import", "load", "kernels", "cache", "image", "filter")
 
 
 @dataclass

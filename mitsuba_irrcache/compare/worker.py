@@ -113,8 +113,8 @@ def start(job: dict) -> None:
 def _first_image(job: dict, seconds: dict[str, float]) -> tuple[Subject, mi.Scene]:
     """Loads the scene and renders it twice; what the second time saves is the kernels' share.
 
-    Fills ``seconds``: import, load, cache, image, and of them kernels (tracing, code generation and
-    compilation), whose parts are given by ``dr.kernel_history``.
+    Fills ``seconds``: import, load, cache, image, filter, and of them kernels (tracing, code
+    generation and compilation), whose parts are given by ``dr.kernel_history``.
     """
     seconds["import"] = job["imported"] - job["started"]
     began = time.perf_counter()
@@ -141,7 +141,7 @@ def _first_image(job: dict, seconds: dict[str, float]) -> tuple[Subject, mi.Scen
 
 def _cache_and_image(subject: Subject, scene: mi.Scene, cached: bool) -> dict[str, float]:
     seconds = {"cache": runners.prepare(scene)} if cached else {}
-    return seconds | {"image": subject.render(scene, FIRST_SPP)[1]}
+    return seconds | subject.render(scene, FIRST_SPP)[1]
 
 
 def _another_view(subject: Subject, scene: mi.Scene) -> dict[str, float]:
@@ -151,7 +151,7 @@ def _another_view(subject: Subject, scene: mi.Scene) -> dict[str, float]:
     sensor = (subject.sensor + 1) % len(scene.sensors())
     runners.render(scene, sensor, FIRST_SPP, seed=10**6)
     seconds = {"cache": runners.prepare(scene)} if runners.has_cache(scene) else {}
-    return seconds | {"image": runners.render(scene, sensor, FIRST_SPP, seed=10**6 + 1)[1]}
+    return seconds | runners.render(scene, sensor, FIRST_SPP, seed=10**6 + 1)[1]
 
 
 def _note_memory(measurement: Measurement) -> None:

@@ -49,7 +49,7 @@ def refine(
         return
     estimator = _Estimator(scene, medium, cache, orders, seed, rr_depth)
     total, done = cache.active_count * samples, 0
-    if total > LANES:
+    if total > 16 * LANES:
         seconds = estimator.seconds(total)
         mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
     block = min(cache.active_count, LANES // BATCH)
@@ -111,13 +111,18 @@ class _Estimator:
             self.rr_depth,
             self.multiple,
         )
-        result = []
+        # In float64 sums of float32 values are exact (unless these span a factor of 2^25): it does
+        # not matter in which passes the batches come.
+        double = dr.float64_array_t(mi.Float)
+        terms = []
         for value in layers:
             for channel in range(cache.channels):
                 # A layer that is zero throughout comes as a literal without a width.
                 samples = value[channel] + dr.zeros(mi.Float, dr.width(lane))
                 mean = dr.block_sum(samples, BATCH) / BATCH
-                result.append((dr.block_sum(mean, count), dr.block_sum(dr.square(mean), count)))
+                terms.append((double(mean), double(dr.square(mean))))
+        dr.eval(terms)  # by one kernel, also where the sum over one batch would be a part of it
+        result = [tuple(dr.block_sum(term, count) for term in pair) for pair in terms]
         dr.eval(result)
         dr.sync_thread()
         return tuple(result)

@@ -103,7 +103,7 @@ def test_white_furnace(scenes, scale):
     to_world = scenes.placement((2.0, 1.2, 0.4), turn=40)
     sigma_t = scenes.texture((4, 6, 5), 0.0, 1.0, 11)
     shape = scenes.boundary(scenes.medium(sigma_t, 1.0, to_world, scale=scale), to_world)
-    integrator = {"type": "irrcache", "resolution": 8, "cache_spp": 2048, "rr_depth": 100000}
+    integrator = {"type": "irrcache", "resolution": 8, "cache_spp": 4096, "rr_depth": 100000}
     scene = scenes.load(integrator, shape, size=16, emitter=SKY)
     image = scenes.image(scene, spp=64)
     cache = scene.integrator().cache
@@ -136,7 +136,7 @@ def radiance(medium, cache, cosine: float, step: float) -> float:
     ray = mi.Ray3f(mi.Point3f(-direction), direction)
     _, near, far = medium.intersect(ray)
     projection = Projection(medium, cache.field(), "exponential", step)
-    result, _ = projection.march(ray, near, far, mi.Spectrum(0), mi.Float(1), mi.Bool(True))
+    result, *_ = projection.march(ray, near, far, mi.Spectrum(0), mi.Float(1), mi.Bool(True))
     return float(result.x[0])
 
 
@@ -166,7 +166,7 @@ def test_half_space(scenes, albedo, surface, normal, oblique):
     error = float(np.array(top.standard_error).ravel()[0]) / (4 * np.pi)
     assert error < 1.2e-3 * surface
     assert measured == pytest.approx(surface, abs=4 * error + 1e-4)
-    medium, cache = column(scene, (0.0, 12.0), 120, 2048, -1)
+    medium, cache = column(scene, (0.0, 12.0), 120, 8192, -1)
     assert radiance(medium, cache, 1.0, 0.5) == pytest.approx(normal, rel=7e-3)
     assert radiance(medium, cache, 0.5, 0.5) == pytest.approx(oblique, rel=7e-3)
 

@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 
 import mitsuba as mi
 import numpy as np
 import OpenImageIO
 import pytest
 
+from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.cli import main
 
 SCENE = """<scene version="3.0.0">
@@ -157,6 +159,13 @@ BAD_CALLS = {
     "cache_spp": (["scene.xml", "-i", "irrcache{cache_spp=-8}"], "cache_spp is -8"),
     "step": (["scene.xml", "-i", "irrcache{step=0}"], "step is 0"),
     "step NaN": (["scene.xml", "-i", "irrcache{step=nan}"], "step is nan"),
+    "budget": (["scene.xml", "--budget", "-1"], "--budget is -1.*seconds above 0"),
+    "endless budget": (["scene.xml", "--budget", "inf"], "--budget is inf.*seconds"),
+    "error": (["scene.xml", "--error", "nan"], r"--error is nan.*0\.02"),
+    "budget without a cache": (
+        ["scene.xml", "--budget", "1", "-i", "volpath"],
+        '"volpath".*irrcache',
+    ),
     "cache folder": (["scene.xml", "-i", "irrcache{cache_file=nowhere/c}"], "cache_file.*nowhere"),
 }  # fmt: skip
 
@@ -257,14 +266,82 @@ def test_interrupted(folder, capsys, monkeypatch):
     """Ctrl-C while the cache is built: status 130, no picture, no cache file, no traceback."""
     from mitsuba_irrcache.solvers import path
 
-    def interrupted(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(path, "refine", interrupted)
+    monkeypatch.setattr(path, "refine", interrupt)
     before = set(os.listdir(folder))
     flags = ["-i", f"irrcache{{cache_file={folder / 'light.npz'}}}"]
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 130
-    assert "interrupted" in capsys.readouterr().err
+    assert "interrupted; no image was written" in capsys.readouterr().err
+    assert set(os.listdir(folder)) == before
+
+
+def test_interrupted_image(folder, capsys, monkeypatch):
+    """Ctrl-C while the image is rendered, which Mitsuba wraps in an error of its own."""
+    from mitsuba_irrcache.integrators import irrcache
+
+    monkeypatch.setattr(irrcache, "render_film", interrupt)
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr") == 130
+    assert "interrupted; no image was written" in capsys.readouterr().err
+    assert not (folder / "a.exr").exists()
+
+
+def interrupt(*args, **kwargs):
+    raise KeyboardInterrupt
+
+
+# Progressive rendering
+
+
+def test_budget(folder, capsys):
+    """However small it is there is an image; what it shows is in its header."""
+    flags = ["--budget", 0.01, "--spp", 2, "-i", "irrcache{resolution=8}"]
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 0
+    printed = capsys.readouterr().out
+    assert "16 samples per voxel, error" in printed and "wrote" in printed and "cache" in printed
+    assert read(folder / "a.exr").any() and (folder / "a.png").exists()
+    header = OpenImageIO.ImageInput.open(str(folder / "a.exr")).spec()
+    assert "16 samples" in header.getattribute("irrcache:cache")
+    assert header.getattribute("irrcache:seconds_image") > 0
+
+
+def test_wanted_error(folder, capsys):
+    flags = ["--error", 0.05, "--spp", 2, "-i", "irrcache{resolution=8}"]
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 0
+    errors = [float(e) for e in re.findall(r"error ([\d.]+)%", capsys.readouterr().out)]
+    assert errors == sorted(errors, reverse=True) and errors[-1] <= 5
+
+
+@pytest.mark.parametrize("how", ["interrupt", "terminate"])
+def test_a_stopped_progressive_render(folder, capsys, monkeypatch, how):
+    """Ctrl-C or SIGTERM in the second pass: status 130, the last finished image, and a cache file
+    of the samples that it shows; what was reached is printed.
+    """
+    from mitsuba_irrcache.solvers import path
+
+    refine, calls = path.refine, []
+
+    def stopped(*args, **kwargs):
+        calls.append(1)
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGINT if how == "interrupt" else signal.SIGTERM)
+        refine(*args, **kwargs)
+
+    monkeypatch.setattr(path, "refine", stopped)
+    before = signal.getsignal(signal.SIGTERM)
+    flags = ["-i", f"irrcache{{resolution=8,cache_file={folder / 'light.npz'}}}", "--budget", 100]
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 130
+    assert "interrupted; the image of 16 samples" in capsys.readouterr().err
+    assert read(folder / "a.exr").any() and (folder / "a.png").exists()
+    assert IrradianceCache.load(folder / "light.npz").samples == 16
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_stopped_before_the_first_image(folder, capsys, monkeypatch):
+    from mitsuba_irrcache.solvers import path
+
+    monkeypatch.setattr(path, "refine", interrupt)
+    before = set(os.listdir(folder))
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", "--budget", 9) == 130
+    assert "interrupted; no image was written" in capsys.readouterr().err
     assert set(os.listdir(folder)) == before
 
 

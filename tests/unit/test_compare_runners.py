@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import itertools
+import sys
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mitsuba_irrcache.compare import runners
-from mitsuba_irrcache.compare.runners import accumulate, choose_effort, without_unreachable
+from mitsuba_irrcache.compare.runners import Average, accumulate, follow
 
 
-class Renderer:
-    """Stands for a `Subject`: an image of the next number, in a time that is given."""
+class Renderer(runners.Subject):
+    """A subject that renders an image of the next number, in a time that is given."""
 
-    def __init__(self, seconds: float) -> None:
-        self.seconds, self.numbers = seconds, itertools.count(1)
+    def __init__(self, seconds: float, **stages: float) -> None:
+        super().__init__(None, {}, "nothing")
+        self.took = {"image": seconds} | stages
+        self.numbers = itertools.count(1)
 
     def render(self, scene, spp):
-        return np.full((1, 1, 1), float(next(self.numbers))), self.seconds
+        return np.full((1, 1, 1), float(next(self.numbers))), self.took
 
 
 def spend(budgets, seconds=0.1, spent=None):
@@ -46,17 +50,176 @@ def test_budgets_that_the_cache_outlasts():
     assert frames[1][0].total == pytest.approx(8.0, abs=0.25)
 
 
-def test_effort_on_a_straight_line():
-    """Measured costs of 1 s + 0.01 s per unit give back the line, down to whole steps."""
-    costs = [(n, 1 + 0.01 * n) for n in (8, 64, 512)]
-    assert choose_effort(costs, 3.0) == 200
-    assert choose_effort(costs, 1.0) == runners.LEAST_EFFORT
-    assert choose_effort(costs[:1], 1e9) == 32 * 8  # one point is no reason to go far
+def test_stages_of_images_are_kept_apart():
+    """An integrator that filters its images itself."""
+    ((snapshot, _),) = accumulate(Renderer(0.3, filter=0.2), None, [2.0], 4, {"cache": 1.0})
+    assert snapshot.seconds == pytest.approx({"cache": 1.0, "image": 0.6, "filter": 0.4})
 
 
-def test_early_budgets():
-    assert without_unreachable([8, 0.5, 3, 1], 2.0) == [1, 3, 8]
-    assert without_unreachable([3, 8], 2.0) == [3, 8]
+def test_an_average_knows_its_error():
+    """The claimed error of means of 8 images is the scatter of such means (4096 pixels: 2 %), of
+    the mean over the colours; alpha is none.
+    """
+    images = np.random.default_rng(1).normal(1.0, [0.1, 0.2, 0.3, 9.0], (8, 64, 64, 4))
+    average = Average()
+    for image in images:
+        average.add(image.astype(np.float32))
+    expected = np.sqrt(0.1**2 + 0.2**2 + 0.3**2) / 3 / np.sqrt(8)
+    assert average.standard_error.shape == (64, 64)
+    assert np.sqrt(np.mean(average.standard_error**2)) == pytest.approx(expected, rel=0.05)
+    np.testing.assert_allclose(average.mean, images.mean(axis=0), rtol=1e-4, atol=1e-5)
+
+
+# A filter from outside
+
+
+class Filtered(Renderer):
+    """Its images have an alpha channel, which is not filtered."""
+
+    is_filtered_here = True
+
+    def render(self, scene, spp):
+        image, took = super().render(scene, spp)
+        return np.dstack([image] * 3 + [np.ones((1, 1))]), took
+
+
+@pytest.fixture
+def denoise(monkeypatch):
+    """The filter, made up: it halves the image, and takes 0.25 s. Its calls are listed."""
+    calls, now = [], [0.0]
+
+    def halve(image, standard_error):
+        calls.append((image, standard_error))
+        now[0] += 0.25
+        return 0.5 * image
+
+    module = ModuleType("filtering")
+    module.denoise = halve
+    monkeypatch.setitem(sys.modules, "mitsuba_irrcache.filtering", module)
+    monkeypatch.setattr(runners.time, "perf_counter", lambda: now[0])
+    return calls
+
+
+def test_averages_are_filtered(denoise):
+    """Once for a snapshot, of two images at least, with the error of their mean; the time counts,
+    but not twice.
+    """
+    subject = Filtered(0.1)
+    subject.filter_seconds = 0.25
+    first, second = accumulate(subject, None, [0.2, 2.0], 4, {})
+    assert [s.spp for s, _ in (first, second)] == [8, 68]
+    assert first[0].seconds == {"image": pytest.approx(0.2), "filter": 0.25}
+    assert second[0].total == pytest.approx(2.0, abs=0.06)
+    image, error = denoise[0]
+    assert image.ravel().tolist() == [1.5] * 3 and error == pytest.approx(0.5)
+    assert first[1].mean() == 0.75 and len(denoise) == 2
+
+
+@pytest.mark.usefixtures("rgb")
+@pytest.mark.parametrize(
+    ("integrator", "expected"),
+    [
+        ("volpath{filter=bilateral}", True),
+        ("volpath{filter=bilateral,max_depth=3}", True),
+        ("irrcache{filter=bilateral}", False),
+        ("volpath", False),
+        ("volpath{filter=blur}", False),
+    ],
+)
+def test_who_is_filtered_here(tmp_path, integrator, expected):
+    """An integrator that does not know the property, which is not handed on to it."""
+    subject = runners.Subject(tmp_path, {}, integrator)
+    assert subject.is_filtered_here is expected
+    assert ("filter" in subject.specification(max_depth=3)) == (
+        "filter" in integrator and not expected
+    )
+    assert "max_depth=3" in subject.specification(max_depth=3)
+
+
+# Progressive runs
+
+
+def frame(seconds: float, number: int = 0) -> SimpleNamespace:
+    stages = {"cache": 0.75 * seconds, "image": 0.25 * seconds}
+    return SimpleNamespace(image=np.full((1, 1, 1), number), samples=8 * number, seconds=stages)
+
+
+def followed(times, budgets, seconds=0.01):
+    """(budget, samples of the cache, camera samples, seconds) of each snapshot, where an image
+    takes ``seconds``.
+    """
+    frames = (frame(t, i) for i, t in enumerate(times))
+    snapshots = [s for s, _ in follow(Renderer(seconds), None, frames, budgets, 4)]
+    return [(s.budget, s.note.split()[0], s.spp, s.total) for s in snapshots]
+
+
+def test_snapshots_of_a_run():
+    """The first frame that reaches its share of a budget; the rest is spent on more images, to half
+    an image, and counts for all that follow.
+    """
+    first, second = followed([0.3, 0.85, 1.5, 2.56, 9.0], [3, 1])
+    assert first == (1, "8", 4 * 16, pytest.approx(1.0, abs=0.006))
+    assert second == (3, "24", pytest.approx(4 * 30, abs=4), pytest.approx(3.0, abs=0.006))
+
+
+def test_snapshots_are_means_of_one_cache():
+    """The frame's image (its number) and those that follow it (1, 2, 3, ...), none of before."""
+    frames = [frame(0.85, 7), frame(1.7, 9)]
+    snapshots = follow(Renderer(0.05), None, frames, [1.0, 2.0], 4)
+    means = [float(image.mean()) for _, image in snapshots]
+    assert means == [pytest.approx((7 + 1 + 2 + 3) / 4), pytest.approx((9 + 4 + 5 + 6) / 4)]
+
+
+def test_budgets_that_a_frame_outlasts():
+    """It stands for the largest of them, as it is."""
+    first, second = followed([2.5, 3.9], [1, 2, 4], seconds=0.5)
+    assert first == (2, "0", 4, 2.5)
+    assert second == (4, "8", 8, pytest.approx(4.4))
+
+
+def test_a_run_is_not_continued_in_vain():
+    """No frame is asked for after the last budget."""
+
+    def frames():
+        yield frame(1.0)
+        raise AssertionError
+
+    assert len(list(follow(Renderer(1.0), None, frames(), [0.5], 4))) == 1
+
+
+class Refining:
+    """An integrator of somebody else, with a cache that is complete after four samples."""
+
+    def prepare(self, scene):
+        self.prepared = True
+
+    def progressive(self, scene, sensor, seed, spp, times):
+        assert (sensor, times) == (3, pytest.approx([0.85, 1.7, 7.65]))
+        assert spp in (1, 4)  # to see when a first image is there, and then as many as fit
+        yield frame(0.1, 1)
+        yield frame(0.9, 2)
+        yield frame(1.2, 4)
+
+
+def test_any_integrator_may_offer_frames(monkeypatch):
+    """What is left of the budgets when its cache is complete goes into more images."""
+    integrator = Refining()
+    scene = SimpleNamespace(integrator=lambda: integrator)
+    subject = Renderer(0.5)
+    subject.sensor = 3
+    monkeypatch.setattr(subject, "load", lambda **properties: scene, raising=False)
+    monkeypatch.setattr(runners, "_samples_per_launch", lambda *_: 4)
+    monkeypatch.setattr(runners, "effort_is_free", lambda _: True)
+    monkeypatch.setattr(runners, "prepare", lambda _: 1.4)
+    snapshots = [s for s, _ in runners.run(subject, scene, [1.0, 2.0, 9.0])]
+    assert [s.budget for s in snapshots] == [1.0, 2.0, 9.0]
+    assert [s.note for s in snapshots] == ["16 samples per voxel", "", ""]
+    assert snapshots[0].spp == 8
+    assert snapshots[1].seconds == {"cache": 1.4, "image": 0.5}
+    assert snapshots[2].total == pytest.approx(9.0, abs=0.25)
+
+
+# What an integrator offers
 
 
 @pytest.mark.usefixtures("rgb")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.loading import integrator_of, load_scene, parse_integrator
+from mitsuba_irrcache.loading import integrator_of, load_scene, parse_integrator, unknown_properties
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -79,6 +79,38 @@ def test_integrator_takes_over_what_is_shared(file):
     text = str(load_scene(file, integrator="irrcache{step=0.5}").integrator())
     assert "max_depth = 3" in text and "rr_depth = 7" in text and "step = 0.5" in text
     assert "max_depth = 9" in str(load_scene(file, integrator="irrcache{max_depth=9}").integrator())
+
+
+@pytest.mark.parametrize("integrator", ["direct", "depth", "aov{aovs=d:depth}", "volpath"])
+def test_what_a_plugin_does_not_know_is_not_taken_over(file, integrator):
+    """``direct`` has no depths; unless the user asks for one, which stays an error."""
+    load_scene(file, integrator=integrator)
+    with pytest.raises(RuntimeError, match="foo"):
+        load_scene(
+            file,
+            integrator=integrator.removesuffix("}")
+            + ("," if "{" in integrator else "{")
+            + "foo=1}",
+        )
+
+
+def test_depth_of_a_plugin_without_depth(file):
+    with pytest.raises(RuntimeError, match="max_depth"):
+        load_scene(file, integrator="direct{max_depth=2}")
+
+
+@pytest.mark.parametrize(
+    ("integrator", "expected"),
+    [
+        ("volpath{max_depth=2,filter=bilateral}", ["filter"]),
+        ("irrcache{filter=bilateral,step=0.5}", []),
+        ("irrcache{cache_spp=8,blur=1}", ["blur"]),
+        ("irrcache{step=-1,blur=1}", []),  # refused: it cannot be told
+        ("nowhere{blur=1}", []),
+    ],
+)
+def test_unknown_properties(integrator, expected):
+    assert unknown_properties(integrator) == expected
 
 
 def test_search_path_is_restored(file):

@@ -33,8 +33,11 @@ def march(projection, origin, direction, background=0.0, offset=1.0, lanes=1):
     ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
     _, near, far = projection.medium.intersect(ray)
     near = dr.maximum(near, 0) + dr.zeros(mi.Float, lanes)
-    result = projection.march(ray, near, far, mi.Spectrum(background), shift, mi.Bool(True))
-    return tuple(np.array(value.x, dtype=np.float64) for value in result)
+    radiance, transmittance, gathered = projection.march(
+        ray, near, far, mi.Spectrum(background), shift, mi.Bool(True)
+    )
+    assert not gathered, "without layers nothing else is gathered"
+    return tuple(np.array(value.x, dtype=np.float64) for value in (radiance, transmittance))
 
 
 # Weights
@@ -70,7 +73,8 @@ def test_constant_segment_far_and_near_opaque(quadrature):
     small.
     """
     sigma, source, length = mi.Float(3.0), mi.Float(0.7), mi.Float([0.0, 1e-4, 0.01, 1.0, 1e30])
-    added, passed = segment(quadrature, (sigma, sigma), (source, source), length)
+    (near, far), passed = segment(quadrature, (sigma, sigma), length)
+    added = near * source + far * source
     tau = 3.0 * np.float64(length)
     few = slice(0, 3) if quadrature == "trapezoid" else slice(None)
     np.testing.assert_allclose(passed, np.exp(-tau), rtol=1e-6)
@@ -194,9 +198,8 @@ def test_skipping_empty_macrocells_changes_nothing():
     for cells in (medium.macrocells, occupied):
         medium.macrocells = cells
         projection = Projection(medium, irradiance, "exponential", 1.0)
-        results.append(
-            [np.array(v.x) for v in projection.march(ray, near, far, mi.Spectrum(1), offset, hit)]
-        )
+        radiance, passed, _ = projection.march(ray, near, far, mi.Spectrum(1), offset, hit)
+        results.append([np.array(v.x) for v in (radiance, passed)])
     assert results[0][0].max() > 0.1
     np.testing.assert_allclose(results[0], results[1], rtol=1e-4, atol=1e-5)
 

@@ -1,0 +1,66 @@
+"""What the scripts of all experiments have in common: sizes, folders and the command line."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+
+from mitsuba_irrcache.runtime import require_llvm
+
+
+@dataclass(frozen=True)
+class Size:
+    """How big the paper's experiments are.
+
+    Attributes:
+        longest: voxels of a volume along its longest side.
+        pixels: of an image, per side.
+        horizon: seconds that every method gets on the chest.
+        others: seconds that every method gets on the other volumes.
+        reference: seconds that go into the reference of the chest; half of it into the others'.
+    """
+
+    longest: int
+    pixels: int
+    horizon: float
+    others: float
+    reference: float
+
+
+#: As many cache voxels for a pixel as in the paper, in about half an hour on two cores.
+QUICK = Size(longest=96, pixels=128, horizon=60, others=20, reference=180)
+#: The paper's: a chest of 512 x 150 x 350 voxels, 1024 x 1024 pixels, 5 minutes.
+FULL = Size(longest=512, pixels=1024, horizon=300, others=100, reference=3600)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Size, where files go, and whether to compute again what is there."""
+
+    size: Size = QUICK
+    output: Path = Path("output")
+    force: bool = False
+
+    def folder(self, experiment: str) -> Path:
+        """The folder of an experiment; the full size has its own."""
+        path = self.output / ("full" if self.size == FULL else "") / experiment
+        path.mkdir(parents=True, exist_ok=True)
+        return path
+
+
+def parse(description: str | None) -> Options:
+    """Options from the command line; sets Mitsuba's variant."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--full", action="store_true", help="the paper's sizes: hours")
+    parser.add_argument("--force", action="store_true", help="compute again what is there")
+    parser.add_argument("-o", "--output", type=Path, default=Path("output"))
+    args = parser.parse_args()
+    require_llvm()
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    return Options(FULL if args.full else QUICK, args.output, args.force)

@@ -1,0 +1,71 @@
+"""Grids of pictures with labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
+from matplotlib.axes import Axes
+
+from mitsuba_irrcache.compare import style
+from mitsuba_irrcache.compare.perceptual import display
+
+
+def tiles(
+    path: Path,
+    rows: list[list[np.ndarray | None]],
+    row_labels: list[str],
+    titles: list[list[str]],
+    width: float = 1.9,
+) -> None:
+    """Draws ``rows`` of images of linear radiance as a display shows them, each with a title; None
+    leaves an empty tile. ``width`` is that of a picture in inches.
+    """
+    shape = next(image.shape for row in rows for image in row if image is not None)
+    size = (len(rows[0]) * (width + 0.1) + 0.4, len(rows) * (width * shape[0] / shape[1] + 0.3))
+    with style.figure(path, len(rows), len(rows[0]), figsize=size) as (_, axes):
+        for line, images, label, above in zip(axes, rows, row_labels, titles, strict=True):
+            line[0].set_ylabel(label)
+            for ax, image, title in zip(line, images, above, strict=True):
+                _bare(ax)
+                if image is None:
+                    ax.imshow(np.ones((*shape[:2], 3)))  # takes the room of a picture
+                    ax.text(
+                        0.5, 0.5, "no image\nyet", transform=ax.transAxes, ha="center",
+                        va="center", color=style.GREY,
+                    )  # fmt: skip
+                else:
+                    ax.imshow(display(image), interpolation="nearest")
+                ax.set_title(title)
+
+
+def read(picked: dict) -> np.ndarray | None:
+    """The image of what `recording.Session.picked` picked, if there is one."""
+    if not picked["image"]:
+        return None
+    return np.asarray(oiio.ImageBuf(picked["image"]).get_pixels(oiio.FLOAT))
+
+
+def error_title(picked: dict) -> str:
+    """Label, and the error of the displayed picture."""
+    error = picked["display"]
+    return picked["label"] if error is None else f"{picked['label']}: {error:.4f}"
+
+
+def crop(image: np.ndarray, centre: tuple[float, float], share: float) -> np.ndarray:
+    """A square part of an image: ``share`` of its height, about a point given as parts of width and
+    height.
+    """
+    side = max(8, round(share * image.shape[0]))
+    x, y = (round(c * n) - side // 2 for c, n in zip(centre, image.shape[1::-1], strict=True))
+    y, x = np.clip((y, x), 0, (image.shape[0] - side, image.shape[1] - side))
+    return image[y : y + side, x : x + side]
+
+
+def _bare(ax: Axes) -> None:
+    ax.set_xticks([])
+    ax.set_yticks([])
+    ax.grid(False)
+    for spine in ax.spines.values():
+        spine.set_visible(False)

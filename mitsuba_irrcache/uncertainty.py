@@ -1,0 +1,121 @@
+"""The error of the cache as a field, to be projected to the screen like the light itself.
+
+*Noise*: voxels are estimated independently of each other, so the variance of a pixel is the sum of
+those of its voxels, each times the square of the voxel's share in the pixel. These shares are never
+known one by one; but of random errors, +- one standard error per voxel, the squared projection is
+that variance on average (Hutchinson's estimator of a trace). `PROBES` such errors are projected.
+
+*Bias*: the field at half the resolution differs from the field by more than the field differs from
+the truth, by a known ratio where the light is smooth (Richardson).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .cache import IrradianceCache
+from .grid import Extension, Grid, GridField, extrapolated, stencil
+
+#: Random errors that are projected; their signs are kept in the last bits of a float.
+PROBES = 4
+#: Of the random numbers for the signs: after the usual 4, neighbours' are correlated by up to 0.5.
+ROUNDS = 8
+#: What is left of the difference to half the resolution. Of roots r on voxels of edge h, trilinear
+#: interpolation errs by 1/12 h^2 Laplacian(r) on average over all places. Averages over 2^3 voxels
+#: err by 1/8, and interpolating these between voxels of edge 2h to the centres of the fine ones,
+#: where the difference is taken, by 3/8 (1/3 on average over all places).
+COARSE_TO_FINE = (1 / 12) / (1 / 8 + 3 / 8)
+
+
+class UncertaintyField:
+    """Relative errors of the irradiance: `PROBES` random ones and the bias; ``count`` in all.
+
+    ``data`` holds two values per voxel, both times the root of Phi, since lookups interpolate
+    roots: the relative standard error, and the relative bias.
+    """
+
+    count = PROBES + 1
+
+    def __init__(self, grid: Grid, data: mi.Float) -> None:
+        self.grid, self.data = grid, data
+
+    def at_world(self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool) -> list:
+        """Relative errors at ``p``, where the irradiance is ``phi``."""
+        root = dr.sqrt(phi if isinstance(phi, mi.Float) else dr.sum(phi) / 3)
+        sums = [mi.Float(0)] * self.count  # one array: added to below, never in place
+        for voxel, weight in self._corners(self.grid.coordinates.point(p)):
+            deviation, bias = dr.gather(mi.Vector2f, self.data, voxel, active)
+            bits = dr.reinterpret_array(mi.UInt32, deviation)
+            for k in range(PROBES):
+                sign = (bits << (31 - k)) & 0x80000000
+                sums[k] = sums[k] + weight * dr.reinterpret_array(mi.Float, bits ^ sign)
+            sums[PROBES] = sums[PROBES] + weight * bias
+        inverse = dr.select(root > 0, dr.rcp(root), 0)
+        return [s * inverse for s in sums]
+
+    def _corners(self, u: mi.Point3f) -> list[tuple[mi.UInt32, mi.Float]]:
+        """The eight voxels around ``u`` and their trilinear weights."""
+        axes = []
+        for c, n in zip(u, self.grid.sides, strict=True):
+            lower, weight, more = stencil(c, n)
+            axes.append(((lower, 1 - weight), (lower + dr.select(more, 1, 0), weight)))
+        nx, ny, _ = self.grid.sides
+        return [
+            (mi.UInt32((z * ny + y) * nx + x), wx * wy * wz)
+            for z, wz in axes[2]
+            for y, wy in axes[1]
+            for x, wx in axes[0]
+        ]
+
+
+def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
+    """The errors of ``cache``, which has at least two batches of samples (one tells no noise)."""
+    phi, error = cache.mean_and_error()
+    root = dr.sqrt(phi)
+    # Of twice the size in Phi, relatively; without a quotient, which explodes in shadows.
+    bias = 2 * COARSE_TO_FINE * (_at_half_resolution(cache, root) - root)
+    extension = Extension(cache.grid)
+    roots, deviations, biases = (
+        _everywhere(cache, values) for values in (root, dr.select(phi > 0, error / root, 0), bias)
+    )
+    beyond = sum(dr.select(i != extension.inside, mi.Float(1), 0) for i in extension.inwards)
+    inner = dr.gather(mi.Float, roots, extension.inside)
+    growth = extrapolated(extension, roots) / dr.select(inner > 0, inner, 1)
+    # a^2 / b of two values that err alike errs as the root of 2^2 + 1 of them, mostly as a does.
+    deviation = dr.gather(mi.Float, deviations, extension.inside) * growth * 5 ** (0.5 * beyond)
+    random, _ = mi.sample_tea_32(extension.inside, mi.UInt32(0x5EED), ROUNDS)
+    bits = dr.reinterpret_array(mi.UInt32, deviation) & ~mi.UInt32(2**PROBES - 1)
+    signed = dr.reinterpret_array(mi.Float, bits | (random >> (32 - PROBES)))
+    data = dr.zeros(mi.Float, 2 * extension.grid.voxel_count)
+    voxel = dr.arange(mi.UInt32, extension.grid.voxel_count)
+    dr.scatter(data, signed, 2 * voxel)
+    dr.scatter(data, dr.gather(mi.Float, biases, extension.inside) * growth, 2 * voxel + 1)
+    return UncertaintyField(extension.grid, data)
+
+
+def _everywhere(cache: IrradianceCache, values: mi.Float) -> mi.Float:
+    """Values of the active voxels on all of the grid, 0 elsewhere."""
+    result = dr.zeros(mi.Float, cache.grid.voxel_count)
+    dr.scatter(result, values, cache.active)
+    return result
+
+
+def _at_half_resolution(cache: IrradianceCache, root: mi.Float) -> mi.Float:
+    """The root of the irradiance at the active voxels, from its averages over 2^3 of them."""
+    _, ny, nx = cache.grid.shape
+    halves = tuple(-(-n // 2) for n in cache.grid.shape)
+    index = cache.active
+    x, y, z = index % nx, (index // nx) % ny, index // (nx * ny)
+    parent = ((z // 2) * halves[1] + y // 2) * halves[2] + x // 2
+    count = int(np.prod(halves))
+    total, members = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)
+    dr.scatter_reduce(dr.ReduceOp.Add, total, root, parent)
+    dr.scatter_reduce(dr.ReduceOp.Add, members, mi.Float(1), parent)
+    known = dr.select(members > 0, mi.Float(1), 0)
+    # Cells without a voxel have no value: they count with weight 0.
+    grid = Grid(halves, np.eye(4))
+    roots, weights = (GridField(grid, v, 1) for v in (total / dr.maximum(members, 1), known))
+    u = mi.Point3f(x, y, z) * 0.5 + 0.25
+    return roots.at(u) / weights.at(u)

@@ -1,0 +1,105 @@
+"""When a progressive run refines and when it renders, on machines that are made up."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+
+import pytest
+
+from mitsuba_irrcache.cache import BATCH
+from mitsuba_irrcache.progressive import EARLY_FRAMES, FIRST, IMAGE_SHARE, Schedule
+
+
+def play(schedule, fixed=0.01, each=0.01, image=0.05, compile=0.0, noise=0.0, frames=40):
+    """Runs a schedule where a pass takes ``fixed`` seconds and ``each`` for a sample; yields
+    (elapsed, samples, seconds of images) of every frame.
+    """
+    rng = random.Random(1)
+
+    def took(seconds):
+        return seconds * (1 + noise * rng.uniform(-1, 1))
+
+    done = FIRST
+    schedule.note_pass(done, took(fixed + each * done) + compile)
+    for frame in itertools.count():
+        while samples := schedule.next_pass(done, math.inf):
+            assert samples > 0 and samples % BATCH == 0
+            done += samples
+            schedule.note_pass(samples, took(fixed + each * samples))
+        schedule.note_image(took(image) + (compile if frame == 0 else 0))
+        yield schedule.elapsed, done, schedule.seconds["image"]
+        if schedule.is_over or frame + 1 == frames:
+            return
+
+
+COSTS = [(0.01, 0.01, 0.05), (0.0, 1e-4, 3.0), (0.2, 0.001, 0.01), (0.0, 0.5, 0.2)]
+
+
+@pytest.mark.parametrize("costs", COSTS)
+def test_images_take_a_fifth_of_the_time(costs):
+    """Once the first few are there; and every frame shows more samples than the one before."""
+    frames = list(play(Schedule(), *costs))
+    assert len(frames) == 40
+    start, _, images = frames[EARLY_FRAMES - 1]
+    for elapsed, _, seconds in frames[EARLY_FRAMES:]:
+        assert seconds - images <= IMAGE_SHARE * (elapsed - start) * 1.001
+    samples = [n for _, n, _ in frames]
+    assert samples == sorted(set(samples)) and samples[0] == FIRST
+
+
+def test_compiling_does_not_delay_the_next_frames():
+    """A first pass and image that took 5 s longer are no measure for the second and third."""
+    (first, _, _), _, (third, _, _) = play(Schedule(), compile=5.0, frames=3)
+    assert third - first < 2
+
+
+@pytest.mark.parametrize("costs", COSTS)
+@pytest.mark.parametrize("limit", [0.1, 5.0, 60.0, 1000.0])
+@pytest.mark.parametrize("compile", [0.0, 4.0])
+def test_a_time_limit_is_kept(costs, limit, compile):
+    """With costs that vary by 5 %, the run ends in time, unless the first frame alone takes longer;
+    and it does not stop while another batch would fit in easily.
+    """
+    frames = list(play(Schedule(limit), *costs, compile=compile, noise=0.05, frames=1000))
+    assert frames[-1][0] <= limit or len(frames) == 1
+    fixed, each, image = costs
+    if len(frames) > 4:
+        assert limit - frames[-1][0] < 0.1 * limit + 1.3 * (fixed + BATCH * each + image)
+
+
+@pytest.mark.parametrize("each", [0.001, 0.004])
+def test_wanted_times_are_met(each):
+    """To a tenth, where a batch is short against them; and the last one ends the run."""
+    times = [1.0, 1.5, 12.0, 13.0, 100.0]
+    frames = list(play(Schedule(times=times), each=each, noise=0.03))
+    assert len(frames) <= len(times) + 2
+    for wanted in times:
+        assert min(abs(elapsed - wanted) for elapsed, _, _ in frames) <= 0.1 * wanted
+
+
+def test_times_that_passes_are_too_coarse_for():
+    """Each frame comes with the first batch that reaches its time; the last one ends the run."""
+    frames = list(play(Schedule(times=[1, 2, 30, 31]), each=1.0))
+    reached = [next(e for e, _, _ in frames if e >= 0.97 * t) for t in (1, 2, 30, 31)]
+    assert reached[0] == reached[1] == frames[0][0]
+    assert reached[3] == frames[-1][0] < 31 + BATCH + 1
+
+
+def test_needed_samples_are_not_exceeded():
+    schedule = Schedule()
+    schedule.note_pass(FIRST, 0.1)
+    schedule.note_image(0.01)
+    assert schedule.next_pass(64, 8) == BATCH
+    assert schedule.next_pass(64, 20.5) == 3 * BATCH
+    assert schedule.next_pass(64, math.inf) == 64
+
+
+def test_a_cache_from_a_file_is_shown_at_once():
+    """No pass has been measured yet: the first one is a small one."""
+    schedule = Schedule(limit=10)
+    schedule.note_pass(0, 0.01)
+    assert schedule.next_pass(512, math.inf) == 0
+    schedule.note_image(0.1)
+    assert 0 < schedule.next_pass(512, math.inf) <= 512

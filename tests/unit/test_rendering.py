@@ -1,0 +1,139 @@
+"""The film: images put on it and taken off it again."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+CROP = {"crop_offset_x": 2, "crop_offset_y": 3, "crop_width": 4, "crop_height": 2}
+NAMES = ["noise.Y", "light.R", "light.G"]
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
+
+
+def rendering():
+    """The module; it can be imported only once a variant is set."""
+    from mitsuba_irrcache import rendering as module
+
+    return module
+
+
+def film_of(pixel_format: str, **properties) -> mi.Film:
+    return mi.load_dict(
+        {
+            "type": "hdrfilm",
+            "width": 7,
+            "height": 6,
+            "pixel_format": pixel_format,
+            "component_format": "float32",
+            "rfilter": {"type": "gaussian"},
+        }
+        | properties
+    )
+
+
+def values(count: int, film: mi.Film) -> list[np.ndarray]:
+    """A different number for each pixel and channel, row by row."""
+    pixels = int(film.crop_size().x) * int(film.crop_size().y)
+    rng = np.random.default_rng(1)
+    return [rng.uniform(0.1, 2, pixels).astype(np.float32) for _ in range(count)]
+
+
+def filled(film: mi.Film, image: list[np.ndarray], alpha, further: list[np.ndarray]) -> None:
+    radiance = mi.Spectrum(*(mi.Float(c) for c in image))
+    channels = {name: mi.Float(v) for name, v in zip(NAMES, further, strict=True)}
+    rendering().fill_film(film, radiance, None if alpha is None else mi.Float(alpha), channels)
+
+
+def expected_colour(image: list[np.ndarray], pixel_format: str) -> list[np.ndarray]:
+    """What a film of this format makes of an RGB image."""
+    return [LUMINANCE @ np.array(image)] if pixel_format.startswith("lum") else image
+
+
+@pytest.mark.parametrize("pixel_format", ["rgb", "rgba", "luminance", "luminance_alpha"])
+@pytest.mark.parametrize("crop", [{}, CROP], ids=["whole", "crop"])
+def test_a_film_gives_back_what_was_put_on_it(rgb, pixel_format, crop):
+    """Bit for bit in colour, alpha and further channels, whatever the reconstruction filter; a
+    wrong place for the weight's channel, a transposed image or a second reconstruction show.
+    """
+    film = film_of(pixel_format, **crop)
+    image, further = values(6, film)[:3], values(6, film)[3:]
+    alpha = values(7, film)[6] if pixel_format.endswith(("rgba", "alpha")) else None
+    filled(film, image, alpha, further)
+    colour, found_alpha, found_further = rendering().planes(film, 3)
+    for found, put in zip(colour, expected_colour(image, pixel_format), strict=True):
+        np.testing.assert_allclose(np.array(found), put, rtol=2e-7 if len(colour) == 3 else 1e-6)
+    assert (found_alpha is None) == (alpha is None)
+    if alpha is not None:
+        np.testing.assert_array_equal(np.array(found_alpha), alpha)
+    np.testing.assert_array_equal(np.array([np.array(v) for v in found_further]), further)
+
+
+def test_the_image_has_rows_and_columns(rgb):
+    """The developed tensor: (height, width, channel), x fastest."""
+    film = film_of("rgb", **CROP)
+    image, further = values(6, film)[:3], values(6, film)[3:]
+    filled(film, image, None, further)
+    tensor = np.array(film.develop())
+    assert tensor.shape == (2, 4, 6)
+    np.testing.assert_allclose(tensor, np.stack(image + further, -1).reshape(2, 4, 6), rtol=2e-7)
+
+
+@pytest.mark.parametrize("pixel_format", ["rgba", "luminance", "luminance_alpha"])
+def test_mono(mono, pixel_format):
+    """One luminance, and the rest as in RGB; alpha where the film has it, whatever it was asked
+    for.
+    """
+    film = film_of(pixel_format)
+    image, further = values(1, film), values(4, film)[1:]
+    has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+    filled(film, image, np.ones(42, np.float32) if has_alpha else None, further)
+    colour, found_alpha, found_further = rendering().planes(film, 3)
+    assert (found_alpha is not None) == has_alpha
+    for channel in colour:
+        np.testing.assert_allclose(np.array(channel), image[0], rtol=1e-6)
+    np.testing.assert_array_equal(np.array([np.array(v) for v in found_further]), further)
+
+
+def test_filling_replaces_an_image_and_its_channels(rgb):
+    """Nothing of the samples that were on the film before is left, their channels neither."""
+    film = film_of("rgb")
+    before = values(8, film)
+    film.prepare([f"old.{i}" for i in range(5)])
+    block = film.create_block()
+    dr.eval(block.put(mi.Point2f(3.5, 3.5), [mi.Float(9)] * (4 + 5)))
+    film.put_block(block)
+    filled(film, before[:3], None, before[3:6])
+    colour, _, further = rendering().planes(film, 3)
+    np.testing.assert_allclose(np.array([np.array(c) for c in colour]), before[:3], rtol=2e-7)
+    np.testing.assert_array_equal(np.array([np.array(c) for c in further]), before[3:6])
+    assert [field.name for field in film.bitmap().struct_()] == ["R", "G", "B", *NAMES]
+
+
+def test_numbers_that_do_not_vary_fill_the_image(rgb):
+    """A literal, as the alpha of a scene under a sky is one."""
+    film = film_of("rgba")
+    rendering().fill_film(film, mi.Color3f(0.5), mi.Float(1), {"noise.Y": mi.Float(0.25)})
+    tensor = np.array(film.develop())
+    np.testing.assert_array_equal(tensor, np.broadcast_to([0.5, 0.5, 0.5, 1, 0.25], (6, 7, 5)))
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
+def test_further_channels_are_reconstructed_like_the_colour(rgb, rfilter):
+    """A channel that carries the red radiance is the red of the image to the bit, so layers add up
+    after any reconstruction.
+    """
+    film = film_of("rgba", rfilter={"type": rfilter})
+    sensor = mi.load_dict({"type": "perspective", "film": film, "sampler": {"type": "independent"}})
+
+    def radiance(sampler, ray, weight, active):
+        red = sampler.next_1d()
+        return mi.Color3f(red, 1, 2) * weight, mi.Float(1), [red, red * red]
+
+    rendering().render_film(sensor, radiance, seed=1, spp=5, channels=["a", "b"])
+    colour, alpha, (same, other) = rendering().planes(sensor.film(), 2)
+    np.testing.assert_array_equal(np.array(colour[0]), np.array(same))
+    assert np.abs(np.array(other) - np.array(same)).max() > 0.05
+    np.testing.assert_allclose(np.array(alpha), 1, rtol=1e-5)
+    np.testing.assert_allclose(np.array(colour[2]), 2, rtol=1e-5)
