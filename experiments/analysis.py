@@ -18,7 +18,7 @@ from mitsuba_irrcache.compare.summary import Curve, Reached, time_to
 #: What the fading filter is asked for: at most this factor above the better of the two others.
 CLOSE = 1.1
 #: Standard errors within which two errors count as equal; several pairs are compared.
-NOISE = 3.0
+NOISE = 2.0
 
 
 def errors(recording: Recording, truth: Reference) -> dict[str, list[float]]:

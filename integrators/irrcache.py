@@ -345,7 +345,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         scattered, transmittance, gathered = self._projection.march(
             ray, near, far, background, 1 - sampler.next_1d(active), active & hit
         )
-        alpha = mi.Float(1) if visible else 1 - dr.mean(transmittance)
+        alpha = mi.Float(1)
+        if not visible:  # dr.mean would write the number of samples into the kernel
+            alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
         background = transmittance * background
         layers = None
         if self._layered:

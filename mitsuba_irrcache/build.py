@@ -257,10 +257,10 @@ def _border_extinction(medium: MediumGrid) -> float:
 
 def _check_memory(grid: Grid) -> None:
     """Refuses a cache that cannot be held: float64 sums and squares of two layers, and the float32
-    field.
+    field with what it is made of.
     """
     channels = 1 if mi.is_monochromatic else 3
-    needed = grid.voxel_count * (channels * (2 * 2 * 8 + 4) + 4)
+    needed = grid.voxel_count * (channels * (2 * 2 * 8 + 3 * 4) + 5 * 4)
     available = available_memory()
     if needed > available or grid.voxel_count >= 2**32:
         sides = " x ".join(map(str, grid.shape[::-1]))

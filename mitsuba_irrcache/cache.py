@@ -138,7 +138,9 @@ class IrradianceCache:
         variance = self._variance(channel)
         if variance is None:
             return dr.zeros(mi.Float, dr.width(mean))
-        return dr.minimum(dr.select(mean > 0, mi.Float(variance) / dr.square(mean), 0), 1)
+        # Not the quotient of squares: these vanish for light of 1e-19 and less.
+        error = mi.Float(dr.sqrt(variance)) / dr.select(mean > 0, mean, 1)
+        return dr.minimum(dr.square(error), 1)
 
     def _means(self, layer: int) -> list[mi.Float]:
         n = self._batch_count

@@ -5,7 +5,8 @@
     I = E / C                            illumination
 
 The film carries C and E, which are linear in the light; I is formed after the film's
-reconstruction, so that C I + background is the image, whatever the film's filter. (The paper
+reconstruction, so that C I + background is the image, whatever the film's filter. (Where a filter
+with negative lobes leaves no colour, E passes as it is, and I is 0.) (The paper
 multiplies the averages of two images, which is right only where one of them is constant.)
 """
 

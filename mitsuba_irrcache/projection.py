@@ -129,7 +129,7 @@ class Projection:
                     gathered,
                     active,
                     transmittance,
-                    (1 - passed) * (0.5 * (t + end)),
+                    weights[0] * t + weights[1] * end,
                     weights,
                     (near_light, far_light),
                     (known, next_known),
@@ -139,7 +139,9 @@ class Projection:
             extinction, source, t = next_extinction, next_source, end
             known = next_known
             left = mi.Spectrum(transmittance)
-            active &= (t < far) & (dr.max(left) * brightest > EARLY_STOP * dr.max(radiance))
+            matters = dr.max(left) * brightest > EARLY_STOP * dr.max(radiance)
+            matters |= (brightest == 0) & (dr.max(left) > EARLY_STOP)  # opacity needs no light
+            active &= (t < far) & matters
         return radiance, mi.Spectrum(transmittance), gathered
 
     @property

@@ -17,7 +17,7 @@ LANES = 1 << 24
 
 #: (sampler, ray, the sensor's weight of it, active) -> radiance, alpha, values of the further
 #: channels; the weight is in the radiance
-RadianceFunction = Callable[[mi.Sampler, mi.RayDifferential3f, mi.Spectrum, mi.Bool], tuple]
+RadianceFunction = Callable[..., tuple]
 
 
 def render_film(

@@ -19,16 +19,17 @@ import numpy as np
 
 from experiments import methods
 from experiments.analysis import difference_of_squares, judge
-from experiments.options import FULL, Options, parse
+from experiments.options import Options, parse
 from experiments.recording import Subject
 from experiments.store import Store
 from mitsuba_irrcache.compare import metrics
 from mitsuba_irrcache.compare.reference import Reference
 from mitsuba_irrcache.loading import load_scene
 
-#: Samples per cache voxel.
-QUICK_SAMPLES = (8, 16, 32, 64)
-FULL_SAMPLES = (8, 16, 32, 64, 128, 256)
+#: Samples per cache voxel: 1, 4, 16 and 64 passes.
+SAMPLES = (16, 64, 256, 1024)
+#: A coarse cache has little enough voxels for so many samples, and the same noise in each.
+RESOLUTION = 48
 PIXEL_SAMPLES = 64
 
 
@@ -37,19 +38,19 @@ def run(options: Options) -> None:
     folder = options.folder("fading")
     subject = Subject.of("chest", options)
     truth = subject.reference(options.output, options.size.reference)
-    samples = FULL_SAMPLES if options.size == FULL else QUICK_SAMPLES
     store = Store(folder / "results.json", options.force)
-    store.row("chest", partial(refine, subject, truth, samples, folder / "chest.cache"))
+    store.row("chest", partial(refine, subject, truth, folder / "chest.cache"))
 
 
-def refine(subject: Subject, truth: Reference, samples: tuple[int, ...], file: Path) -> dict:
+def refine(subject: Subject, truth: Reference, file: Path) -> dict:
     """A row for each number of samples of a cache that is kept in ``file`` meanwhile."""
     file.unlink(missing_ok=True)
     rows = []
-    for count in samples:
+    for count in SAMPLES:
         print(f"fading: {count} samples per voxel", flush=True)
+        cache = {"resolution": RESOLUTION, "cache_spp": count, "cache_file": file}
         images = [
-            render(subject, methods.specify(method.integrator, cache_spp=count, cache_file=file))
+            render(subject, methods.specify(method.integrator, **cache))
             for method in (methods.CACHE, methods.FIXED, methods.FADING)
         ]
         rows.append({"samples": count} | judged(images, truth))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mitsuba_irrcache.compare.worker import _peak_memory
+from mitsuba_irrcache.compare.worker import peak_memory
 from mitsuba_irrcache.loading import load_scene
 from mitsuba_irrcache.runtime import require_llvm
 
@@ -33,7 +33,7 @@ def main() -> None:
     mi.set_log_level(mi.LogLevel.Error)
     parameters = {"max_depth": "2", "width": pixels, "height": pixels}
     mi.render(load_scene(path, parameters, integrator), spp=1)
-    print(_peak_memory())
+    print(peak_memory())
 
 
 if __name__ == "__main__":

@@ -155,12 +155,12 @@ def _another_view(subject: Subject, scene: mi.Scene) -> dict[str, float]:
 
 
 def _note_memory(measurement: Measurement) -> None:
-    peak = _peak_memory()
+    peak = peak_memory()
     if peak:
         measurement.memory = {"first_image": peak} | measurement.memory | {"peak": peak}
 
 
-def _peak_memory() -> int:
+def peak_memory() -> int:
     """Peak memory of this process in bytes; 0 where the system does not tell.
 
     Linux lets ``getrusage`` start at the peak of the parent process, so its own count is asked

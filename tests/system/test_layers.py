@@ -402,10 +402,11 @@ def test_a_second_filtered_picture_compiles_nothing(scenes, kernels):
     """
     second = scenes.description({}, None, 24)["sensor"] | {"fov": 21.0}
     scene = noisy(scenes, {"cache_spp": 16, "filter": "bilateral", "aovs": ALL}, second=second)
-    scenes.image(scene, spp=2)
+    # By hash: whether a kernel is found on disk depends on what ran before.
+    first = {k["hash"] for k in kernels(lambda: scenes.image(scene, spp=2))}
     for options in ({"seed": 1}, {"sensor": 1}):
         history = kernels(lambda options=options: scenes.image(scene, spp=2, **options))
-        assert history and [k["hash"] for k in history if not k["cache_hit"]] == []
+        assert history and {k["hash"] for k in history} <= first
 
 
 def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
@@ -447,10 +448,9 @@ def test_mono(mono, scenes):
     assert filtered.mean() == pytest.approx(found["image"][..., :1].mean(), rel=0.05)
 
 
-# Known errors
+# What once went wrong
 
 
-@pytest.mark.xfail(reason="the march ends where nothing brightens it, opaque or not")
 @pytest.mark.parametrize("settings", [{"max_depth": 1}, {"albedo": 0.0}])
 def test_opacity_needs_no_light(scenes, settings):
     """Hidden emitters and no scattering: alpha and transmittance are still those of the medium."""
@@ -465,7 +465,6 @@ def test_opacity_needs_no_light(scenes, settings):
     np.testing.assert_allclose(found["image"][..., 3], 1 - np.exp(-1.5), rtol=1e-3)
 
 
-@pytest.mark.xfail(reason="variance / mean^2 in float32: 0 / 0 where the irradiance is below 1e-19")
 def test_the_dimmest_light_is_not_nan(scenes):
     """The far side of an optically thick box, in the dark to 1e-38 of the light."""
     sun = {"type": "directional", "direction": [0.0, 0.0, -1.0], "irradiance": 3.0}
@@ -475,22 +474,22 @@ def test_the_dimmest_light_is_not_nan(scenes):
     assert np.isfinite(image).all()
 
 
-@pytest.mark.xfail(reason="alpha by dr.mean writes the number of samples into the kernel")
 def test_alpha_with_other_sample_counts_compiles_nothing(scenes, kernels):
     """As without alpha: the projection's kernel is that of the first picture."""
     sensor = scenes.description({}, None, 8)["sensor"]
     sensor["film"] = film_of(scenes, 8, pixel_format="rgba")
     settings = {"type": "irrcache", "resolution": 8, "cache_spp": 8, "hide_emitters": True}
     scene = scenes.load(settings | {"max_depth": 2}, cloud(scenes), sensor=sensor)
-    scenes.image(scene, spp=7)
-    again = kernels(lambda: scenes.image(scene, spp=11))
-    assert [k["operation_count"] for k in again if not k["cache_hit"]] == []
+    scene.integrator().prepare(scene)
+    first, again = (kernels(lambda n=n: scenes.image(scene, spp=n)) for n in (7, 11))
+    assert {k["hash"] for k in again} <= {k["hash"] for k in first}
 
 
-@pytest.mark.xfail(reason="one step crosses a homogeneous medium without a cache: its middle")
 def test_depth_in_one_step(scenes):
-    """max_depth 1 through a homogeneous box, optical depth 20: its front, a mean free path in."""
+    """max_depth 1 through a homogeneous box, optical depth 20: its front, a mean free path in; the
+    exponential rule weights the ends of so long a step to 0.03.
+    """
     shape = scenes.boundary(scenes.medium(10.0, 0.9), scenes.placement())
     settings = {"type": "irrcache", "max_depth": 1, "aovs": "depth"}
     found = layered(scenes.load(settings, shape, sensor=facing(scenes, 4)), spp=1)
-    np.testing.assert_allclose(found["depth"], 2.1, atol=0.02)
+    np.testing.assert_allclose(found["depth"], 2.1, atol=0.06)
