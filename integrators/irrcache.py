@@ -174,7 +174,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def prepare(self, scene: mi.Scene) -> None:
         """Builds or completes the cache for ``scene``, unless it is up to date."""
         self._builder.update(scene, self.progress)
-        medium, cache = self._builder.medium, self._builder.cache
+        medium, cache = self._builder.medium, self._builder.shown
         if medium is None:
             self._projection = None
         elif self._projection is None or self._revision != self._builder.revision:

@@ -69,6 +69,10 @@ class CacheBuilder:
         self._scene_id = 0
         self._snapshot: Snapshot | None = None
         self._saves_when_filled = True
+        #: whether the first two batches may be shown in pieces; see `path.Opening`
+        self.early = False
+        self._opening: path.Opening | None = None
+        self._preview: IrradianceCache | None = None
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
         """Makes ``medium`` and ``cache`` fit ``scene``."""
@@ -81,13 +85,27 @@ class CacheBuilder:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             self.medium = self.cache = self._snapshot = None
+            self._opening = self._preview = None
             self.revision += 1
             self.medium = bake_scene(scene)
             if self.medium is not None and self.settings.max_depth not in (0, 1):
                 self.cache = self._start_cache(scene, self.medium, edited)
             self._scene_id, self._snapshot = id(scene), snapshot
-        if self.cache is not None and self.cache.samples < self.target:
+        if self.early and not self.is_dark and not self.cache.samples:
+            self._open(scene, progress)
+        elif self.cache is not None and self.cache.samples < self.target:
             self._fill(scene, progress)
+
+    def close(self) -> None:
+        """Ends `early`; incomplete batches are dropped."""
+        if self._preview is not None:
+            self.revision += 1
+        self.early, self._opening, self._preview = False, None, None
+
+    @property
+    def shown(self) -> IrradianceCache | None:
+        """The cache, or the incomplete batches that stand for it so far."""
+        return self._preview or self.cache
 
     @property
     def target(self) -> int:
@@ -185,6 +203,28 @@ class CacheBuilder:
             f"differ{detail}. "
             "Delete the file, or give this scene a cache_file of its own."
         )
+
+    def _open(self, scene: mi.Scene, progress: Progress | None) -> None:
+        """Adds to the first two batches up to ``samples`` in all."""
+        cache, settings = self.cache, self.settings
+        if self._opening is None:
+            self._opening = path.Opening(
+                scene, self.medium, cache, settings.seed, settings.rr_depth
+            )
+        size = min(self.samples // 2, BATCH)
+        if size <= self._opening.size:
+            return
+        report = None if progress is None else lambda *n: progress("cache", *n)
+        self._opening.grow(size, report)
+        self.revision += 1
+        if size == BATCH:
+            self._opening.fill(cache)
+            self._opening = self._preview = None
+        else:
+            self._preview = IrradianceCache(
+                cache.grid, cache.active, cache.channels, cache.max_depth, batch=size
+            )
+            self._opening.fill(self._preview)
 
     def _fill(self, scene: mi.Scene, progress: Progress | None) -> None:
         settings, cache = self.settings, self.cache

@@ -42,8 +42,10 @@ class IrradianceCache:
         channels: int,
         max_depth: int,
         fingerprint: dict[str, str] | None = None,
+        batch: int = BATCH,
     ) -> None:
         self.grid = grid
+        self.batch = batch  #: samples per batch
         self.active = active
         self.active_count = dr.width(active)
         self.channels = channels
@@ -104,7 +106,7 @@ class IrradianceCache:
         """Root mean square of the voxels' standard errors, in units of the mean irradiance; NaN
         before there are two batches of samples. It falls as the root of the samples.
         """
-        if self.samples < 2 * BATCH:
+        if self.samples < 2 * self.batch:
             return float("nan")
         double = dr.float64_array_t(mi.Float)
         mean, error = (double(values) for values in self.mean_and_error())
@@ -113,7 +115,7 @@ class IrradianceCache:
 
     def _variance(self, channel: int):
         """Squared standard error of the irradiance (float64), None before there are two batches."""
-        if self.samples < 2 * BATCH:
+        if self.samples < 2 * self.batch:
             return None
         n = self._batch_count
         variance = 0
@@ -150,7 +152,7 @@ class IrradianceCache:
     @property
     def _batch_count(self):
         """Batches per voxel, at least 1 (float64); opaque, since it changes from pass to pass."""
-        return dr.opaque(dr.float64_array_t(mi.Float), max(self.samples // BATCH, 1))
+        return dr.opaque(dr.float64_array_t(mi.Float), max(self.samples // self.batch, 1))
 
     def _tensor(self, values: list[mi.Float]) -> mi.TensorXf:
         count = len(values)

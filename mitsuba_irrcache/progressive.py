@@ -21,8 +21,10 @@ from .build import CacheBuilder, Progress
 from .cache import BATCH
 from .errors import IrrcacheError
 
-#: Samples per voxel of the first pass: two batches, so that there is a standard error.
-FIRST = 2 * BATCH
+#: Samples per voxel of the first pass: two for each of two batches, for a standard error.
+FIRST = 4
+#: As long as these are incomplete, passes may be smaller than a batch.
+OPENING = 2 * BATCH
 #: Frames that follow each other as fast as the samples double; those after them are spaced.
 EARLY_FRAMES = 3
 #: Between frames pass at least the time of an image over this share, ...
@@ -157,6 +159,7 @@ def frames(
                     return
         finally:
             builder.samples = own
+            builder.close()
 
 
 class _Run:
@@ -174,7 +177,8 @@ class _Run:
         """Makes the cache, or finds it, with a first pass if it needs one."""
         own = self.builder.samples
         goal = self.targets.cache_spp if self.targets.given else own
-        self._update(min(FIRST, goal or FIRST), lambda: None)
+        self.builder.early = not 0 < goal < OPENING
+        self._update(FIRST if self.builder.early else goal, lambda: None)
         self.goal = self.targets.cache_spp or math.inf
         if not self.targets.given and self.builder.cache is not None:
             first, self.builder.samples = self.builder.samples, own
@@ -182,7 +186,11 @@ class _Run:
 
     def refine(self, samples: int, checkpoint: Callable[[], None]) -> None:
         """A pass of so many samples per voxel."""
-        self._update(self.builder.cache.samples + samples, checkpoint)
+        done = self._samples
+        # A pass that is larger than what the opening lacks would be one of a size of its own.
+        self._update(
+            done + samples if done >= OPENING else min(done + samples, OPENING), checkpoint
+        )
 
     def frame(self, image: Callable[[], tuple[mi.TensorXf, float]]) -> Frame:
         """An image of the cache as it is."""
@@ -209,7 +217,7 @@ class _Run:
 
     @property
     def _samples(self) -> int:
-        return 0 if self.builder.cache is None else self.builder.cache.samples
+        return 0 if self.builder.shown is None else self.builder.shown.samples
 
     @property
     def _has_arrived(self) -> bool:
@@ -225,7 +233,7 @@ class _Run:
         cache = self.builder.cache
         if cache is not old:
             before = self.builder.saved_samples  # what a new one has, it has from its file
-        self.error = 0.0 if cache is None else cache.relative_error
+        self.error = 0.0 if self.builder.is_dark else self.builder.shown.relative_error
         checkpoint()
         self.schedule.note_pass(max(self._samples - before, 0), perf_counter() - started)
 
@@ -241,6 +249,7 @@ class Schedule:
         self._last_frame = 0.0  # when it was finished
         self._image = 0.0  # what it took
         self._fresh = False  # whether there has been a pass since
+        self._grain = FIRST  # samples of the smallest pass
 
     @property
     def elapsed(self) -> float:
@@ -251,7 +260,7 @@ class Schedule:
     def is_over(self) -> bool:
         """Whether after a frame no better one can follow in time, or is wanted."""
         wanted = not self.times or self._last_frame < REACHED * self.times[-1]
-        return not wanted or self._samples_within(self._left) < BATCH
+        return not wanted or self._samples_within(self._left) < self._grain
 
     def note_pass(self, samples: int, seconds: float) -> None:
         """``samples`` per voxel took so long; 0 samples: the cache was found in a file."""
@@ -269,19 +278,21 @@ class Schedule:
         self._image, self._last_frame, self._fresh = seconds, self.elapsed, False
 
     def next_pass(self, done: int, needed: float) -> int:
-        """Samples per voxel of the next pass, a multiple of `BATCH`, where ``done`` are there and
-        ``needed`` more are asked for; 0 when it is time for an image.
+        """Samples per voxel of the next pass, whole batches after the opening, where ``done`` are
+        there and ``needed`` more are asked for; 0 when it is time for an image.
         """
+        self._grain = grain = BATCH if done >= OPENING else FIRST
         possible = self._samples_within(self._left)
+        possible -= possible % grain if possible < math.inf else 0
         due = self._due
         soonest = due * (REACHED if self.times else 1)
-        if possible < BATCH or (self._fresh and self.elapsed + self._image >= soonest):
+        if possible < grain or (self._fresh and self.elapsed + self._image >= soonest):
             return 0
         # Predictions carry no farther than to twice the samples.
         samples = min(needed, possible, done)
         if self._frames >= EARLY_FRAMES or self.times:
             samples = min(samples, self._samples_within(due - self.elapsed - self._image))
-        return max(BATCH, -(-int(samples) // BATCH) * BATCH)
+        return max(grain, -(-int(samples) // grain) * grain)
 
     @property
     def _left(self) -> float:
@@ -310,11 +321,11 @@ class Schedule:
         if seconds == math.inf:
             return math.inf
         if not self._passes:
-            return FIRST if seconds > 0 else 0
+            return BATCH if seconds > 0 else 0
         measured = self._passes[1:] or self._passes  # the first one may have compiled kernels
         (least, short), (most, long) = min(measured), max(measured)
         if seconds < long and short < long and least < most:
             samples = most - (long - seconds) * (most - least) / (long - short)
         else:
             samples = most * seconds / max(long, 1e-9)
-        return samples // BATCH * BATCH
+        return samples // FIRST * FIRST

@@ -70,6 +70,49 @@ def refine(
         remaining -= count
 
 
+class Opening:
+    """The first two batches of a stream, a few samples of both at a time, for early images: two are
+    enough for a standard error. Complete, they are what `refine` begins with.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int, rr_depth: int
+    ) -> None:
+        orders = cache.max_depth - 1 if cache.max_depth >= 0 else 0xFFFFFFFF
+        self.cache, self.seed = cache, seed
+        self.size = 0  #: samples of each batch so far
+        self._estimator = _Estimator(scene, medium, cache, orders, seed, rr_depth)
+        # In blocks of voxels, for each layer and channel: the sums of both batches.
+        self._blocks: list[list] = []
+
+    def grow(self, size: int, progress: Progress | None = None) -> None:
+        """Adds samples until there are ``size`` in each batch, at most `BATCH`."""
+        more, active = size - self.size, self.cache.active_count
+        block = min(active, LANES // (2 * BATCH))
+        blocks = []
+        for i, start in enumerate(range(0, active, block)):
+            width = min(block, active - start)
+            voxels = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, start)
+            sums = self._estimator.sums(voxels, 0, 2, self.size, more)
+            if self._blocks:
+                sums = [old + new for old, new in zip(self._blocks[i], sums, strict=True)]
+            dr.eval(sums)
+            dr.sync_thread()
+            blocks.append(sums)
+            if progress is not None:
+                progress((start + width) * 2 * more, active * 2 * more)
+        self._blocks, self.size = blocks, size
+
+    def fill(self, cache: IrradianceCache) -> None:
+        """Puts both batches into an empty ``cache`` for batches of this size."""
+        blocks = []
+        for sums in self._blocks:
+            means = [total / self.size for total in sums]
+            terms = [(mean, dr.square(mean)) for mean in means]
+            blocks.append([tuple(dr.block_sum(term, 2) for term in pair) for pair in terms])
+        cache.add(self.seed, 2 * self.size, blocks)
+
+
 class _Estimator:
     """One kernel for all passes: whatever differs between them is opaque to it."""
 
@@ -92,40 +135,49 @@ class _Estimator:
         """Estimates ``count`` batches from the batch ``first`` on.
 
         ``voxels`` are places in the list of active voxels. Returns, for every layer and channel,
-        the sum of the batch means and the sum of their squares, per voxel.
+        the sum of the batch means and the sum of their squares, per voxel (float64).
+        """
+        means = [total / BATCH for total in self.sums(voxels, first, count, 0, BATCH)]
+        pairs = [(mean, dr.square(mean)) for mean in means]
+        dr.eval(pairs)  # by one kernel, also where the sum over one batch would be a part of it
+        result = [tuple(dr.block_sum(term, count) for term in pair) for pair in pairs]
+        dr.eval(result)
+        dr.sync_thread()
+        return tuple(result)
+
+    def sums(self, voxels: mi.UInt32, first: int, count: int, start: int, size: int) -> list:
+        """Sums of the samples ``start`` to ``start + size`` of the batches ``first`` to ``first +
+        count``, for every layer and channel; all batches of a voxel in a row.
+
+        In float64 sums of float32 values are exact (unless these span a factor of 2^25): it does
+        not matter in which passes the samples come.
         """
         cache = self.cache
-        lane = dr.arange(mi.UInt32, dr.width(voxels) * count * BATCH)
-        batch = (lane // BATCH) % dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-        place = dr.gather(mi.UInt32, voxels, lane // dr.opaque(mi.UInt32, BATCH * count))
+        per_batch, per_voxel = (dr.opaque(mi.UInt32, n) for n in (size, size * count))
+        lane = dr.arange(mi.UInt32, dr.width(voxels) * count * size)
+        row = lane // per_batch
+        batch = row % dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+        within = lane - row * per_batch + dr.opaque(mi.UInt32, start)
+        place = dr.gather(mi.UInt32, voxels, lane // per_voxel)
         voxel = dr.gather(mi.UInt32, cache.active, place)
         layers = _estimate(
             self.scene,
             self.medium,
             cache.grid.centers(voxel),
             batch,
-            lane % BATCH,
+            within,
             voxel,
             self.seed,
             self.orders,
             self.rr_depth,
             self.multiple,
         )
-        # In float64 sums of float32 values are exact (unless these span a factor of 2^25): it does
-        # not matter in which passes the batches come.
         double = dr.float64_array_t(mi.Float)
-        terms = []
-        for value in layers:
-            for channel in range(cache.channels):
-                # A layer that is zero throughout comes as a literal without a width.
-                samples = value[channel] + dr.zeros(mi.Float, dr.width(lane))
-                mean = dr.block_sum(samples, BATCH) / BATCH
-                terms.append((double(mean), double(dr.square(mean))))
-        dr.eval(terms)  # by one kernel, also where the sum over one batch would be a part of it
-        result = [tuple(dr.block_sum(term, count) for term in pair) for pair in terms]
-        dr.eval(result)
-        dr.sync_thread()
-        return tuple(result)
+        # A layer that is zero throughout comes as a literal without a width.
+        none = dr.zeros(mi.Float, dr.width(lane))
+        values = [double(v[c] + none) for v in layers for c in range(cache.channels)]
+        dr.eval(values)
+        return [dr.block_sum(value, size) for value in values]
 
     def seconds(self, samples: int) -> float:
         """Predicts the time for ``samples`` from one batch at voxels all over the medium."""

@@ -77,10 +77,10 @@ def test_passes_compile_nothing(scenes, kernels, monkeypatch):
     """A cache filled in many launches runs the same kernels in each (the last may be shorter)."""
     from mitsuba_irrcache.solvers import path
 
-    monkeypatch.setattr(path, "LANES", 1 << 12)
+    monkeypatch.setattr(path, "LANES", 1 << 11)
     scene = cloud_scene(scenes, cache_spp=64)
     history = kernels(lambda: scene.integrator().prepare(scene))
-    launches = Counter(k["hash"] for k in history if k["size"] == 1 << 12)
+    launches = Counter(k["hash"] for k in history if k["size"] == 1 << 11)
     assert min(launches.values()) == max(launches.values()) >= 8
 
 
@@ -160,10 +160,9 @@ def test_empty_voxels_are_not_sampled(scenes, kernels):
     history = kernels(lambda: scene.integrator().prepare(scene))
     cache = scene.integrator().cache
     assert cache.active_count < 0.08 * cache.grid.voxel_count
-    # One lane per voxel of the grid marks and lists them; 8 lanes per sampled voxel.
-    assert max(k["size"] for k in history) <= max(
-        cache.grid.voxel_count * 3, cache.active_count * 8
-    )
+    # One lane per voxel of the grid marks and lists them, and one per value of the field, which
+    # has a voxel more on each side; 8 lanes per sampled voxel.
+    assert max(k["size"] for k in history) <= max(42**3 * 3, cache.active_count * 8)
 
 
 def test_single_scattering_traces_no_paths(scenes):

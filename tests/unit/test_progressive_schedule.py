@@ -9,7 +9,7 @@ import random
 import pytest
 
 from mitsuba_irrcache.cache import BATCH
-from mitsuba_irrcache.progressive import EARLY_FRAMES, FIRST, IMAGE_SHARE, Schedule
+from mitsuba_irrcache.progressive import EARLY_FRAMES, FIRST, IMAGE_SHARE, OPENING, Schedule
 
 
 def play(schedule, fixed=0.01, each=0.01, image=0.05, compile=0.0, noise=0.0, frames=40):
@@ -25,7 +25,9 @@ def play(schedule, fixed=0.01, each=0.01, image=0.05, compile=0.0, noise=0.0, fr
     schedule.note_pass(done, took(fixed + each * done) + compile)
     for frame in itertools.count():
         while samples := schedule.next_pass(done, math.inf):
-            assert samples > 0 and samples % BATCH == 0
+            assert samples > 0 and samples % (BATCH if done >= OPENING else FIRST) == 0
+            if done < OPENING:
+                samples = min(samples, OPENING - done)
             done += samples
             schedule.note_pass(samples, took(fixed + each * samples))
         schedule.note_image(took(image) + (compile if frame == 0 else 0))
