@@ -49,8 +49,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - Hide directly visible emitters. (Default: no, i.e. |false|)
 
      * - solver
-       - |string| - How the cache is computed: ``path`` (Monte Carlo at every voxel) or ``auto``.
-       (Default: ``auto``)
+       - |string|
+       - How the cache is computed: ``path`` (Monte Carlo at every voxel) or ``auto``. (Default:
+         ``auto``)
 
      * - resolution
        - |int|

@@ -47,8 +47,10 @@ def render_film(
     block = film.create_block()
     block.set_offset(film.crop_offset())
     block.set_coalesce(block.coalesce() and per_pass >= 4)
-    for _ in range(0, spp, per_pass):
-        _splat(sensor, sampler, block, size, border, per_pass, spp, radiance)
+    spread = PixelPositions(sampler, seed)
+    for done in range(0, spp, per_pass):
+        spread.first = dr.opaque(mi.UInt32, done)
+        _splat(sensor, sampler, spread, block, size, border, per_pass, spp, radiance)
         if per_pass < spp:
             sampler.advance()
             sampler.schedule_state()
@@ -99,9 +101,40 @@ def _divisor(n: int, limit: int) -> int:
     return next(d for d in range(min(n, limit), 0, -1) if n % d == 0)
 
 
+class PixelPositions:
+    """Where in their pixels the camera samples lie.
+
+    Mitsuba's ``independent`` sampler knows nothing of the other samples of a pixel. With noise-free
+    light that is most of an image's noise, so they are spread evenly here, each still uniform: by
+    the two-dimensional golden ratio, shifted at random in every pixel. Other samplers do it their
+    way.
+    """
+
+    #: 2^32 over the root of x^3 = x + 1, and over its square
+    STEPS = (3242174889, 2447445414)
+
+    def __init__(self, sampler: mi.Sampler, seed: int) -> None:
+        self.sampler = sampler
+        self.independent = sampler.class_name() == "IndependentSampler"
+        # Wrappers hand on a seed that is an array.
+        given = isinstance(seed, mi.UInt32)
+        self.seed = seed if given else dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+        self.first = dr.opaque(mi.UInt32, 0)
+
+    def next(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
+        """The position in [0, 1)^2 of a ``sample`` of this pass."""
+        if not self.independent:
+            return self.sampler.next_2d()
+        shifts = mi.sample_tea_32(pixel, self.seed, 8)
+        number = self.first + sample
+        bits = [s + number * mi.UInt32(k) for s, k in zip(shifts, self.STEPS, strict=True)]
+        return mi.Point2f([mi.Float(b >> 8) * 2.0**-24 for b in bits])
+
+
 def _splat(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
+    spread: PixelPositions,
     block: mi.ImageBlock,
     size: mi.ScalarVector2u,
     border: int,
@@ -110,14 +143,13 @@ def _splat(
     radiance: RadianceFunction,
 ) -> None:
     film = sensor.film()
-    index = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass) // dr.opaque(
-        mi.UInt32, per_pass
-    )
+    lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
+    index = lane // dr.opaque(mi.UInt32, per_pass)
     width = dr.opaque(mi.UInt32, int(size.x))
     row = index // width
     pixel = mi.Vector2f(mi.Vector2i(mi.Int32(index - row * width), mi.Int32(row)) - border)
     pixel += mi.Vector2f(film.crop_offset())
-    position = pixel + sampler.next_2d()
+    position = pixel + spread.next(index, lane - index * dr.opaque(mi.UInt32, per_pass))
     scale = 1 / mi.ScalarVector2f(film.crop_size())
     on_film = (position - mi.Vector2f(film.crop_offset())) * scale
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)

@@ -42,7 +42,7 @@ LEAST_EFFORT = 8
 FILTER = ("filter", "bilateral")
 #: Part of the time that goes into a cache that is refined, and images meanwhile; the rest goes into
 #: more samples of the snapshots.
-CACHE_SHARE = 0.85
+CACHE_SHARE = 0.7
 #: A frame may come early: from this part of its time on it counts.
 REACHED = 0.95
 #: Most samples per pixel of one launch.
@@ -276,7 +276,8 @@ def _samples_per_launch(subject: Subject, scene: mi.Scene, budget: float) -> int
     """
     once, more = (min(sum(subject.render(scene, n)[1].values()) for _ in range(2)) for n in (1, 4))
     rate = max((more - once) / 3, 1e-4)
-    wanted = 1 + (max(0.1 * budget, 0.05) - once) / rate
+    # What every launch costs, whatever its samples (a filter, say), should not be most of it.
+    wanted = max(1 + (max(0.1 * budget, 0.05) - once) / rate, once / rate)
     spp = 2 ** int(np.log2(np.clip(wanted, 1, MOST_SPP)))
     subject.render(scene, spp)
     return spp

@@ -147,13 +147,13 @@ def test_wrapped_like_a_stock_integrator(scenes):
     for kind, inner in (("volpath", {"type": "volpath"}), ("irrcache", ours)):
         inner |= {"max_depth": 2}
         scene = scenes.load({"type": "aov", "aovs": "z:depth", "inner": inner}, cloud(scenes), 8)
-        assert np.isfinite(scenes.image(scene, spp=64)).all()
+        assert np.isfinite(scenes.image(scene, spp=1024)).all()
         bitmap = scene.sensors()[0].film().bitmap()
         names[kind], values[kind] = [f.name for f in bitmap.struct_()], np.array(bitmap)
     further = [f"inner.{name}" for name in ("far.T", "c.R", "c.G", "c.B")]
     after = names["volpath"].index("z.T")
     assert names["irrcache"] == names["volpath"][:after] + further + names["volpath"][after:]
-    outside = layered(scenes.load(ours | {"max_depth": 2}, cloud(scenes), 8), spp=64)
+    outside = layered(scenes.load(ours | {"max_depth": 2}, cloud(scenes), 8), spp=1024)
     for wrapped, expected in ((0, outside["image"]), (after + 1, outside["c"])):
         inside = values["irrcache"][..., wrapped : wrapped + 3]
         assert np.abs(inside - expected).mean() < 0.02 * expected.mean()

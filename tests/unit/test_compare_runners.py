@@ -194,7 +194,7 @@ class Refining:
         self.prepared = True
 
     def progressive(self, scene, sensor, seed, spp, times):
-        assert (sensor, times) == (3, pytest.approx([0.85, 1.7, 7.65]))
+        assert (sensor, times) == (3, pytest.approx([0.7, 1.4, 6.3]))
         assert spp in (1, 4)  # to see when a first image is there, and then as many as fit
         yield frame(0.1, 1)
         yield frame(0.9, 2)
