@@ -15,7 +15,7 @@ setup: $(READY) ## install the package, what it needs, and an LLVM that Dr.Jit c
 demo: setup ## render a chest with irrcache and compare it with volpath
 	$(BIN)/python -m experiments.demo.run
 
-paper: setup ## compute the paper's figures and tables, half an hour; FULL=1: the paper's sizes
+paper: setup ## compute the paper's figures and tables, 20 minutes; FULL=1: the paper's sizes
 	$(BIN)/python -m experiments.paper.run $(if $(FULL),--full)
 
 test: setup ## run the tests

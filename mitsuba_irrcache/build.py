@@ -144,7 +144,7 @@ class CacheBuilder:
         settings = self.settings
         grid = Grid.near_cubic(medium.frame, settings.resolution or choose_resolution(medium))
         grid = grid.shared(medium.sigma_t.grid, medium.albedo.grid)
-        _check_memory(grid)
+        _check_memory(grid, settings.with_error)
         _warn_of_dense_border(medium, grid)
         active = active_voxels(medium, grid)
         if medium.albedo.maximum == 0 or not scene.emitters():
@@ -295,12 +295,13 @@ def _border_extinction(medium: MediumGrid) -> float:
     return float(np.quantile(np.array(luminance(mi.Spectrum(sigma_t))), 0.95))
 
 
-def _check_memory(grid: Grid) -> None:
+def _check_memory(grid: Grid, with_error: bool) -> None:
     """Refuses a cache that cannot be held: float64 sums and squares of two layers, and the float32
-    field with what it is made of.
+    field with what it is made of; for the field of its errors as much again (experiments/memory).
     """
     channels = 1 if mi.is_monochromatic else 3
     needed = grid.voxel_count * (channels * (2 * 2 * 8 + 3 * 4) + 5 * 4)
+    needed *= 2 if with_error else 1
     available = available_memory()
     if needed > available or grid.voxel_count >= 2**32:
         sides = " x ".join(map(str, grid.shape[::-1]))

@@ -296,10 +296,10 @@ def test_budget(folder, capsys):
     flags = ["--budget", 0.01, "--spp", 2, "-i", "irrcache{resolution=8}"]
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 0
     printed = capsys.readouterr().out
-    assert "16 samples per voxel, error" in printed and "wrote" in printed and "cache" in printed
+    assert " 4 samples per voxel, error" in printed and "wrote" in printed and "cache" in printed
     assert read(folder / "a.exr").any() and (folder / "a.png").exists()
     header = OpenImageIO.ImageInput.open(str(folder / "a.exr")).spec()
-    assert "16 samples" in header.getattribute("irrcache:cache")
+    assert ", 4 samples" in header.getattribute("irrcache:cache")
     assert header.getattribute("irrcache:seconds_image") > 0
 
 
@@ -312,7 +312,7 @@ def test_wanted_error(folder, capsys):
 
 @pytest.mark.parametrize("how", ["interrupt", "terminate"])
 def test_a_stopped_progressive_render(folder, capsys, monkeypatch, how):
-    """Ctrl-C or SIGTERM in the second pass: status 130, the last finished image, and a cache file
+    """Ctrl-C or SIGTERM in the pass after the opening: status 130, the last finished image, and a cache file
     of the samples that it shows; what was reached is printed.
     """
     from mitsuba_irrcache.solvers import path
@@ -321,7 +321,7 @@ def test_a_stopped_progressive_render(folder, capsys, monkeypatch, how):
 
     def stopped(*args, **kwargs):
         calls.append(1)
-        if len(calls) == 2:
+        if len(calls) == 1:
             os.kill(os.getpid(), signal.SIGINT if how == "interrupt" else signal.SIGTERM)
         refine(*args, **kwargs)
 
@@ -338,7 +338,7 @@ def test_a_stopped_progressive_render(folder, capsys, monkeypatch, how):
 def test_stopped_before_the_first_image(folder, capsys, monkeypatch):
     from mitsuba_irrcache.solvers import path
 
-    monkeypatch.setattr(path, "refine", interrupt)
+    monkeypatch.setattr(path.Opening, "grow", interrupt)
     before = set(os.listdir(folder))
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", "--budget", 9) == 130
     assert "interrupted; no image was written" in capsys.readouterr().err
