@@ -312,8 +312,8 @@ def test_wanted_error(folder, capsys):
 
 @pytest.mark.parametrize("how", ["interrupt", "terminate"])
 def test_a_stopped_progressive_render(folder, capsys, monkeypatch, how):
-    """Ctrl-C or SIGTERM in the pass after the opening: status 130, the last finished image, and a cache file
-    of the samples that it shows; what was reached is printed.
+    """Ctrl-C or SIGTERM in the pass after the opening: status 130, the last finished image, and a
+    cache file of the samples that it shows; what was reached is printed.
     """
     from mitsuba_irrcache.solvers import path
 
