@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
 from matplotlib.axes import Axes
 
 from mitsuba_irrcache.compare import style
 from mitsuba_irrcache.compare.perceptual import display
+from mitsuba_irrcache.images import read_image
 
 
 def tiles(
@@ -44,7 +44,7 @@ def read(picked: dict) -> np.ndarray | None:
     """The image of what `recording.Session.picked` picked, if there is one."""
     if not picked["image"]:
         return None
-    return np.asarray(oiio.ImageBuf(picked["image"]).get_pixels(oiio.FLOAT))
+    return read_image(picked["image"])
 
 
 def error_title(picked: dict) -> str:

@@ -214,8 +214,7 @@ class CacheBuilder:
         size = min(self.samples // 2, BATCH)
         if size <= self._opening.size:
             return
-        report = None if progress is None else lambda *n: progress("cache", *n)
-        self._opening.grow(size, report)
+        self._opening.grow(size, _of_the_cache(progress))
         self.revision += 1
         if size == BATCH:
             self._opening.fill(cache)
@@ -236,7 +235,7 @@ class CacheBuilder:
                 self.target - cache.samples,
                 settings.seed,
                 settings.rr_depth,
-                progress=None if progress is None else lambda *n: progress("cache", *n),
+                progress=_of_the_cache(progress),
             )
         finally:
             self.revision += 1  # the solver may have been stopped half-way
@@ -250,6 +249,11 @@ class CacheBuilder:
         if file and cache is not None and cache.fingerprint and cache.samples > self.saved_samples:
             cache.save(file)
             self.saved_samples = cache.samples
+
+
+def _of_the_cache(progress: Progress | None) -> path.Progress | None:
+    """``progress`` for a solver, which does not know its stage."""
+    return None if progress is None else lambda *n: progress("cache", *n)
 
 
 def choose_resolution(medium: MediumGrid) -> int:

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .layers import Layers, luminance
+from .layers import Layers, interleaved, luminance
 from .uncertainty import PROBES, ROUNDS
 
 #: ``bilateral`` fades; ``fixed`` has one strength, as in the paper.
@@ -143,7 +143,7 @@ def _least_risk(
     )
     filtered, perturbed = (bilateral(packed, size, pixel, k, stride, strength) for k in (0, 1))
     before, noise, weight = (
-        dr.gather(mi.Spectrum, _interleaved(value), pixel) for value in (image, change, colour)
+        dr.gather(mi.Spectrum, interleaved(value), pixel) for value in (image, change, colour)
     )
     response = (perturbed - filtered) / PERTURBATION
     seen = dr.square(weight)
@@ -199,7 +199,7 @@ def _pack(images: list[mi.Spectrum], error: mi.Float) -> mi.Float:
     """Images one after the other, the values of a pixel beside its standard error (-1: not
     valid).
     """
-    rows = [_interleaved([*image, error]) for image in images]
+    rows = [interleaved([*image, error]) for image in images]
     packed = dr.concat(rows) if len(rows) > 1 else rows[0]
     dr.eval(packed)
     return packed
@@ -209,15 +209,6 @@ def _unpack(packed: mi.Float, pixel: mi.UInt32, active: mi.Bool) -> tuple[mi.Spe
     kind = mi.Vector2f if mi.is_monochromatic else mi.Vector4f
     *image, error = dr.gather(kind, packed, pixel, active)
     return mi.Spectrum(*image), error
-
-
-def _interleaved(planes: mi.Spectrum | list[mi.Float]) -> mi.Float:
-    values, width = list(planes), max(map(dr.width, planes))
-    flat = dr.zeros(mi.Float, width * len(values))
-    index = dr.arange(mi.UInt32, width) * len(values)
-    for i, value in enumerate(values):
-        dr.scatter(flat, value, index + i)
-    return flat
 
 
 def _fill_channels(image: mi.Spectrum, valid: list[mi.Bool]) -> tuple[mi.Spectrum, mi.Bool]:

@@ -59,6 +59,11 @@ def write_image(
     return png
 
 
+def read_image(path: str | Path) -> np.ndarray:
+    """The pixels of an image file (height, width, channel), float32, as they are stored."""
+    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
+
+
 def _write(buffer: oiio.ImageBuf, path: Path, kind: oiio.BASETYPE) -> None:
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:

@@ -90,6 +90,17 @@ def _unread(name: str, properties: dict[str, object]) -> list[str]:
     return []
 
 
+def parse_parameters(definitions: list[str]) -> dict[str, str]:
+    """The ``$parameters`` that options ``-D name=value`` give."""
+    result = {}
+    for item in definitions:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise IrrcacheError(f'cannot read -D "{item}"; write -D name=value.')
+        result[key] = value
+    return result
+
+
 def describe_integrator(name: str, properties: dict[str, object]) -> str:
     """The inverse of `parse_integrator`."""
     return f"{name}{{{','.join(f'{key}={_quoted(value)}' for key, value in properties.items())}}}"

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from . import __version__
 from .errors import IrrcacheError, origin
 from .images import check_output, write_image
-from .loading import integrator_of, load_scene
+from .loading import integrator_of, load_scene, parse_parameters
 from .progressive import Frame, render_progressive
 from .runtime import require_llvm
 from .variants import SUPPORTED
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     seconds: dict[str, float] = {}
     with _stopwatch(seconds, "load"):
-        parameters = _definitions(args.define)
+        parameters = parse_parameters(args.define)
         integrator = args.integrator
         if integrator is None and integrator_of(source, parameters) in REPLACED:
             integrator = "irrcache"
@@ -217,16 +217,6 @@ def _require_progressive(scene: mi.Scene, integrator: str) -> None:
             f'--budget and --error need an integrator with a cache to refine, and "{integrator}" '
             "has none; use irrcache, or --spp."
         )
-
-
-def _definitions(items: list[str]) -> dict[str, str]:
-    result = {}
-    for item in items:
-        key, equals, value = item.partition("=")
-        if not equals or not key:
-            raise IrrcacheError(f'cannot read -D "{item}"; write -D name=value.')
-        result[key] = value
-    return result
 
 
 def _describe(

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 import drjit as dr
 import mitsuba as mi
 
+from .layers import interleaved
+
 #: Camera samples in one kernel launch: bounds the memory of the sampler's state (16 bytes each).
 LANES = 1 << 24
 
@@ -87,12 +89,8 @@ def fill_film(
     alphas = [] if alpha is None else [alpha]
     values = [*rgb, *alphas, mi.Float(1), *channels.values()]
     width, height = (int(n) for n in film.crop_size())
-    count = len(values)
-    flat = dr.zeros(mi.Float, width * height * count)
-    index = dr.arange(mi.UInt32, width * height) * count
-    for i, value in enumerate(values):
-        dr.scatter(flat, value, index + i)
-    tensor = mi.TensorXf(flat, (height, width, count))
+    flat = interleaved(values, width * height)
+    tensor = mi.TensorXf(flat, (height, width, len(values)))
     film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from .cache import IrradianceCache
 from .grid import Extension, Grid, GridField, extrapolated, stencil
+from .layers import interleaved
 
 #: Random errors that are projected; their signs are kept in the last bits of a float.
 PROBES = 4
@@ -88,11 +89,8 @@ def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     random, _ = mi.sample_tea_32(extension.inside, mi.UInt32(0x5EED), ROUNDS)
     bits = dr.reinterpret_array(mi.UInt32, deviation) & ~mi.UInt32(2**PROBES - 1)
     signed = dr.reinterpret_array(mi.Float, bits | (random >> (32 - PROBES)))
-    data = dr.zeros(mi.Float, 2 * extension.grid.voxel_count)
-    voxel = dr.arange(mi.UInt32, extension.grid.voxel_count)
-    dr.scatter(data, signed, 2 * voxel)
-    dr.scatter(data, dr.gather(mi.Float, biases, extension.inside) * growth, 2 * voxel + 1)
-    return UncertaintyField(extension.grid, data)
+    bias = dr.gather(mi.Float, biases, extension.inside) * growth
+    return UncertaintyField(extension.grid, interleaved([signed, bias]))
 
 
 def _everywhere(cache: IrradianceCache, values: mi.Float) -> mi.Float:

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from experiments.analysis import rms
 from experiments.methods import STOCK, specify
 from experiments.options import Options, parse
 from experiments.scenes import scene_file
@@ -99,11 +100,6 @@ def bins(predicted: np.ndarray, squared: np.ndarray) -> list[tuple[float, float]
     return [
         (rms(predicted[g]), float(np.sqrt(max(squared[g].mean(), 0)))) for g in groups if g.size
     ]
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 if __name__ == "__main__":

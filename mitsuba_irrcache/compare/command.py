@@ -18,7 +18,7 @@ from pathlib import Path
 
 from mitsuba_irrcache import doctor
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.loading import parse_integrator
+from mitsuba_irrcache.loading import parse_integrator, parse_parameters
 from mitsuba_irrcache.versions import installed_version
 
 from .processes import WorkerError, run_job
@@ -216,15 +216,9 @@ def _common_job(args: argparse.Namespace) -> dict:
     source = Path(args.scene)
     if not source.is_file():
         raise IrrcacheError(f'there is no scene file "{source}".')
-    parameters = {}
-    for item in args.define:
-        key, equals, value = item.partition("=")
-        if not equals or not key:
-            raise IrrcacheError(f'cannot read -D "{item}"; write -D name=value.')
-        parameters[key] = value
     return {
         "scene": str(source.resolve()),
-        "parameters": parameters,
+        "parameters": parse_parameters(args.define),
         "sensor": args.sensor,
         "variant": args.mode,
         "modules": args.modules,

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
 
 from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.images import read_image
 
 
 @dataclass
@@ -38,7 +38,7 @@ class Snapshot:
 
     def read(self, folder: Path) -> np.ndarray:
         """The image (height, width, channel) of linear radiance, from the report's ``folder``."""
-        return np.asarray(oiio.ImageBuf(str(folder / self.image)).get_pixels(oiio.FLOAT))
+        return read_image(folder / self.image)
 
 
 @dataclass

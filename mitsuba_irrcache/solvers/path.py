@@ -11,7 +11,7 @@ cache, the others the *scattered* one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from time import perf_counter
 
 import drjit as dr
@@ -43,11 +43,10 @@ def refine(
     The stream goes on where an earlier call with the same seed stopped. If ``progress`` raises,
     passes that are complete stay in the cache.
     """
-    orders = cache.max_depth - 1 if cache.max_depth >= 0 else 0xFFFFFFFF
-    if not cache.active_count or orders < 1 or not scene.emitters():
+    if not cache.active_count or _orders(cache) < 1 or not scene.emitters():
         cache.note_samples(seed, samples)
         return
-    estimator = _Estimator(scene, medium, cache, orders, seed, rr_depth)
+    estimator = _Estimator(scene, medium, cache, seed, rr_depth)
     total, done = cache.active_count * samples, 0
     if total > 16 * LANES:
         seconds = estimator.seconds(total)
@@ -59,15 +58,34 @@ def refine(
         count = min(batches_at_once, remaining)
         first = cache.streams.get(seed, 0) // BATCH
         layers = []
-        for start in range(0, cache.active_count, block):
-            width = min(block, cache.active_count - start)
-            voxels = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, start)
+        for voxels in _blocks(cache.active_count, block):
             layers.append(estimator.batches(voxels, first, count))
-            done += width * BATCH * count
+            done += dr.width(voxels) * BATCH * count
             if progress is not None:
                 progress(done, total)
         cache.add(seed, BATCH * count, layers)
         remaining -= count
+
+
+def _orders(cache: IrradianceCache) -> int:
+    """Scattering orders that the cache holds: 0 .. max_depth - 2, or all of them."""
+    return cache.max_depth - 1 if cache.max_depth >= 0 else 0xFFFFFFFF
+
+
+def _blocks(count: int, width: int) -> Iterator[mi.UInt32]:
+    """The numbers below ``count`` in arrays of ``width``, the last of which may be shorter."""
+    for start in range(0, count, width):
+        yield dr.arange(mi.UInt32, min(width, count - start)) + dr.opaque(mi.UInt32, start)
+
+
+def _statistics(totals: list, size: int, count: int) -> tuple:
+    """From sums over batches of ``size`` samples, ``count`` batches of a voxel in a row: for every
+    layer and channel the sum of the batch means and the sum of their squares, per voxel.
+    """
+    means = [total / size for total in totals]
+    pairs = [(mean, dr.square(mean)) for mean in means]
+    dr.eval(pairs)  # by one kernel, also where the sum over one batch would be a part of it
+    return tuple(tuple(dr.block_sum(term, count) for term in pair) for pair in pairs)
 
 
 class Opening:
@@ -78,38 +96,31 @@ class Opening:
     def __init__(
         self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int, rr_depth: int
     ) -> None:
-        orders = cache.max_depth - 1 if cache.max_depth >= 0 else 0xFFFFFFFF
         self.cache, self.seed = cache, seed
         self.size = 0  #: samples of each batch so far
-        self._estimator = _Estimator(scene, medium, cache, orders, seed, rr_depth)
+        self._estimator = _Estimator(scene, medium, cache, seed, rr_depth)
         # In blocks of voxels, for each layer and channel: the sums of both batches.
-        self._blocks: list[list] = []
+        self._totals: list[list] = []
 
     def grow(self, size: int, progress: Progress | None = None) -> None:
         """Adds samples until there are ``size`` in each batch, at most `BATCH`."""
         more, active = size - self.size, self.cache.active_count
-        block = min(active, LANES // (2 * BATCH))
-        blocks = []
-        for i, start in enumerate(range(0, active, block)):
-            width = min(block, active - start)
-            voxels = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, start)
+        totals, done = [], 0
+        for i, voxels in enumerate(_blocks(active, min(active, LANES // (2 * BATCH)))):
             sums = self._estimator.sums(voxels, 0, 2, self.size, more)
-            if self._blocks:
-                sums = [old + new for old, new in zip(self._blocks[i], sums, strict=True)]
+            if self._totals:
+                sums = [old + new for old, new in zip(self._totals[i], sums, strict=True)]
             dr.eval(sums)
             dr.sync_thread()
-            blocks.append(sums)
+            totals.append(sums)
+            done += dr.width(voxels) * 2 * more
             if progress is not None:
-                progress((start + width) * 2 * more, active * 2 * more)
-        self._blocks, self.size = blocks, size
+                progress(done, active * 2 * more)
+        self._totals, self.size = totals, size
 
     def fill(self, cache: IrradianceCache) -> None:
         """Puts both batches into an empty ``cache`` for batches of this size."""
-        blocks = []
-        for sums in self._blocks:
-            means = [total / self.size for total in sums]
-            terms = [(mean, dr.square(mean)) for mean in means]
-            blocks.append([tuple(dr.block_sum(term, 2) for term in pair) for pair in terms])
+        blocks = [_statistics(sums, self.size, 2) for sums in self._totals]
         cache.add(self.seed, 2 * self.size, blocks)
 
 
@@ -121,10 +132,10 @@ class _Estimator:
         scene: mi.Scene,
         medium: MediumGrid,
         cache: IrradianceCache,
-        orders: int,
         seed: int,
         rr_depth: int,
     ) -> None:
+        orders = _orders(cache)
         self.scene, self.medium, self.cache = scene, medium, cache
         self.multiple = orders > 1
         self.orders, self.seed, self.rr_depth = (
@@ -137,13 +148,10 @@ class _Estimator:
         ``voxels`` are places in the list of active voxels. Returns, for every layer and channel,
         the sum of the batch means and the sum of their squares, per voxel (float64).
         """
-        means = [total / BATCH for total in self.sums(voxels, first, count, 0, BATCH)]
-        pairs = [(mean, dr.square(mean)) for mean in means]
-        dr.eval(pairs)  # by one kernel, also where the sum over one batch would be a part of it
-        result = [tuple(dr.block_sum(term, count) for term in pair) for pair in pairs]
+        result = _statistics(self.sums(voxels, first, count, 0, BATCH), BATCH, count)
         dr.eval(result)
         dr.sync_thread()
-        return tuple(result)
+        return result
 
     def sums(self, voxels: mi.UInt32, first: int, count: int, start: int, size: int) -> list:
         """Sums of the samples ``start`` to ``start + size`` of the batches ``first`` to ``first +
