@@ -23,7 +23,8 @@ class Source:
     Attributes:
         about: what it is, for a caption.
         arguments: of ``irrcache import``. "data:" marks files below DATA, "tar:" archives there
-            that are unpacked first, "phantom" a chest of the size that is asked for.
+            that are unpacked first, "phantom" a chest and "phantom:cloud" a cloud of the size
+            that is asked for.
         longest: voxels along the longest side, unless told otherwise; 0: those of the data.
         substitute: name of the source that takes its place where its data are not at hand.
     """
@@ -48,6 +49,9 @@ SOURCES = {
     "cloud": Source(
         "Disney cloud, 1/16",
         ("data:wdas_cloud/wdas_cloud_sixteenth.vol", "--density", "40", "--albedo", "0.99"),
+    ),
+    "procedural": Source(
+        "procedural cloud", ("phantom:cloud", "--density", "20", "--albedo", "0.99"), 128
     ),
     "head": Source("UNC CT head", (*_CT_HEAD, "--preset", "ct-bone"), 128, "phantom-bones"),
     "chest": Source(
@@ -85,7 +89,7 @@ def scene_file(name: str, output: Path, longest: int = 0) -> Path | None:
             print(f"{name}: no {argument.partition(':')[2]} in {DATA}")
             return None
         arguments += found
-    if size and source.arguments[0] != "phantom":
+    if size and source.arguments[0].partition(":")[0] != "phantom":
         arguments += ["--longest", str(size)]
     path.parent.parent.mkdir(parents=True, exist_ok=True)
     if irrcache(["import", *arguments, "-o", str(path.parent)]):
@@ -107,6 +111,8 @@ def _resolve(argument: str, output: Path, longest: int) -> list[str]:
     marker, _, pattern = argument.partition(":")
     if argument == "phantom":
         return [f"phantom:thorax:{longest},{5 * longest // 8},{7 * longest // 8}"]
+    if argument == "phantom:cloud":
+        return [f"phantom:cloud:{longest},{longest},{longest}"]
     if marker == "data":
         return [str(path) for path in sorted(DATA.glob(pattern), key=_natural)]
     if marker == "tar":

@@ -23,7 +23,7 @@ from mitsuba_irrcache.volumes.transfer import (
     preset_names,
 )
 
-_PHANTOM = "phantom:thorax"
+_PHANTOMS = ("thorax", "cloud")
 # Air is -1000 HU; data in Hounsfield units without any would be rare.
 _AIR_LIKE = -200
 
@@ -35,7 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="INPUT",
         help="NRRD, NIfTI, MetaImage or .vol file, DICOM folder, raw file(s) in one or in slices, "
-        f"or {_PHANTOM} (a chest made here; {_PHANTOM}:X,Y,Z for another size)",
+        "or one made here: phantom:thorax (a chest), phantom:cloud (needs --density), each with "
+        ":X,Y,Z after it for another size",
     )
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="a new folder, or FOLDER/scene.xml"
@@ -167,20 +168,22 @@ def _read(args: argparse.Namespace) -> VolumeData:
 
 
 def _phantom(source: str) -> VolumeData:
-    """``phantom:thorax``, or ``phantom:thorax:X,Y,Z`` with the number of voxels."""
-    # The phantom is needed for this one input only.
-    from mitsuba_irrcache.volumes.phantom import thorax
+    """``phantom:NAME``, or ``phantom:NAME:X,Y,Z`` with the number of voxels."""
+    # Phantoms are needed for this one input only.
+    from mitsuba_irrcache.volumes import phantom
 
     name, _, size = source.removeprefix("phantom:").partition(":")
-    if name != "thorax":
-        raise IrrcacheError(f"no phantom {name!r}; there is {_PHANTOM}")
+    if name not in _PHANTOMS:
+        known = " and ".join(f"phantom:{known}" for known in _PHANTOMS)
+        raise IrrcacheError(f"no phantom {name!r}; there are {known}")
+    make = getattr(phantom, name)
     if not size:
-        return thorax()
+        return make()
     try:
         x, y, z = _counts(size)
     except (argparse.ArgumentTypeError, ValueError) as error:
         raise IrrcacheError(f"phantom size {size!r}: give X,Y,Z, e.g. 128,96,128") from error
-    return thorax((z, y, x))
+    return make((z, y, x))
 
 
 def _process(volume: VolumeData, args: argparse.Namespace) -> VolumeData:

@@ -12,8 +12,17 @@ from hypothesis import strategies as st
 ndimage = pytest.importorskip("scipy.ndimage", reason="phantoms need the extra 'volumes'")
 
 from mitsuba_irrcache.errors import IrrcacheError  # noqa: E402
-from mitsuba_irrcache.volumes.phantom import anatomy, organs, skeleton, thorax  # noqa: E402
+from mitsuba_irrcache.volumes.phantom import (  # noqa: E402
+    anatomy,
+    cloud,
+    organs,
+    skeleton,
+    thorax,
+)
 from mitsuba_irrcache.volumes.phantom.canvas import Canvas, Tissue  # noqa: E402
+from mitsuba_irrcache.volumes.phantom.cloud import (  # noqa: E402
+    BYTES_PER_VOXEL as CLOUD_BYTES_PER_VOXEL,
+)
 from mitsuba_irrcache.volumes.phantom.distance import Drum, Ellipsoid, Segment  # noqa: E402
 from mitsuba_irrcache.volumes.phantom.thorax import BYTES_PER_VOXEL  # noqa: E402
 from mitsuba_irrcache.volumes.phantom.vessels import MURRAY_EXPONENT, vessel_tree  # noqa: E402
@@ -266,3 +275,81 @@ def test_memory_stays_within_what_is_promised():
     finally:
         tracemalloc.stop()
     assert peak < BYTES_PER_VOXEL * np.prod(COARSE)
+
+
+# The cloud
+
+
+@pytest.fixture(scope="module")
+def cumulus():
+    return cloud()
+
+
+def test_equal_shapes_give_equal_clouds():
+    digests = {hashlib.sha256(cloud((37, 41, 53)).values.tobytes()).hexdigest() for _ in range(2)}
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize("shape", [(32, 32, 32), (33, 64, 48), (64, 40, 96), (300, 32, 35)])
+def test_cloud_lies_about_the_origin_within_empty_borders(shape):
+    volume = cloud(shape)
+    assert volume.values.shape == shape
+    assert volume.values.dtype == np.float32
+    assert volume.values.min() == 0 and 0.9 < volume.values.max() <= 1
+    inner = volume.values[2:-2, 2:-2, 2:-2]
+    assert np.count_nonzero(inner) == np.count_nonzero(volume.values)
+    np.testing.assert_allclose(volume.physical_size, 2 * np.array(shape[::-1]) / max(shape))
+    corners = volume.to_world @ np.array([[0, 0, 0, 1], [1, 1, 1, 1]]).T
+    np.testing.assert_allclose(corners[:3].sum(axis=1), 0, atol=1e-12)
+
+
+def test_cloud_is_the_same_at_every_resolution(cumulus):
+    half = cloud((64, 64, 64))
+    # Densities averaged over blocks of 1/32 of the side; they reach 1.
+    difference = np.abs(blocked(half, 2) - blocked(cumulus, 4))
+    assert difference.mean() < 0.004
+    assert difference.max() < 0.1
+    assert half.values.mean() == pytest.approx(cumulus.values.mean(), rel=0.002)
+
+
+def test_cloud_is_mostly_empty_and_neither_binary_nor_blurry(cumulus):
+    values = cumulus.values
+    assert 0.6 < (values == 0).mean() < 0.75
+    # Across an edge, relative to the density behind it: the ramp as a share of the side.
+    behind = ndimage.maximum_filter(values, 11)
+    edge = (values > 0.25 * behind) & (values < 0.75 * behind) & (behind > 0.3)
+    slope = np.sqrt(sum(part**2 for part in np.gradient(values)))[edge] / behind[edge]
+    assert 0.03 < 1 / np.median(slope) / len(values) < 0.06
+
+
+def test_cloud_is_flat_below_and_round_above(cumulus):
+    places = np.indices(cumulus.values.shape)[0]
+    occupied = cumulus.values > 0.1
+    columns = occupied.any(axis=0)
+    below = np.where(occupied, places, len(places)).min(axis=0)[columns]
+    above = np.where(occupied, places, -1).max(axis=0)[columns]
+    # Half of the columns begin at nearly the same height; they end at very different ones.
+    assert np.subtract(*np.percentile(below, [60, 10])) < len(cumulus.values) / 16
+    assert np.subtract(*np.percentile(above, [60, 10])) > len(cumulus.values) / 6
+
+
+@pytest.mark.parametrize("shape", [(31, 64, 64), (64, 64), (64, 64, 64.5), 64, (-64,) * 3])
+def test_cloud_refuses_what_is_no_shape(shape):
+    with pytest.raises(IrrcacheError, match=r"shape is .*three integers .* at least 32"):
+        cloud(shape)
+
+
+def test_cloud_refuses_what_memory_cannot_hold():
+    with pytest.raises(IrrcacheError, match=r"bytes.*smaller shape"):
+        cloud((100_000, 100_000, 100_000))
+
+
+def test_cloud_takes_no_more_memory_than_promised():
+    shape = (128, 160, 192)
+    tracemalloc.start()
+    try:
+        cloud(shape)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < CLOUD_BYTES_PER_VOXEL * np.prod(shape)

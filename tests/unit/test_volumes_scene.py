@@ -284,11 +284,25 @@ def test_import_of_the_phantom(tmp_path):
     assert read_vol(tmp_path / "out" / "sigma_t.vol")[0].shape == (28, 20, 32, 1)
 
 
+def test_import_of_the_cloud(tmp_path):
+    pytest.importorskip("mitsuba_irrcache.volumes.phantom")
+    arguments = ["--density", "12", "--albedo", "0.99", "-o", tmp_path / "out"]
+    importer.run(parse("phantom:cloud:48,40,32", *arguments))
+    sigma_t = read_vol(tmp_path / "out" / "sigma_t.vol")[0]
+    assert sigma_t.shape == (32, 40, 48, 1) and 11 < sigma_t.max() <= 12
+    scene = mi.load_file(str(tmp_path / "out" / "scene.xml"), width=16, height=16)
+    image = np.array(mi.render(scene, spp=32, seed=1))
+    # The cloud fills the middle and is framed: the corners show the sky.
+    assert image[7:9, 7:9].mean() < 0.7
+    np.testing.assert_allclose(image[[0, 0, -1, -1], [0, -1, 0, -1]], 1.0, atol=0.05)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["phantom:skull", "--preset", "ct-bone"], "no phantom 'skull'"),
+        (["phantom:skull", "--preset", "ct-bone"], "'skull'.* phantom:thorax and phantom:cloud"),
         (["phantom:thorax:9", "--preset", "ct-bone"], "phantom size '9'"),
+        (["phantom:cloud:9,9,9", "--density"], "at least 32"),
         (["missing.nrrd", "--preset", "ct-bone"], "does not exist"),
         (["a.vol", "--preset", "ct"], "no preset 'ct'"),
         (["a.vol", "--transfer-function", "no.json"], "no.json does not exist"),

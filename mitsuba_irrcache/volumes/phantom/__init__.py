@@ -1,7 +1,8 @@
-"""Procedural phantoms: volumes in Hounsfield units for machines that have no scan at hand."""
+"""Procedural phantoms, for machines that have no data at hand: a chest CT and a cloud."""
 
 from __future__ import annotations
 
+from mitsuba_irrcache.volumes.phantom.cloud import cloud
 from mitsuba_irrcache.volumes.phantom.thorax import thorax
 
-__all__ = ["thorax"]
+__all__ = ["cloud", "thorax"]

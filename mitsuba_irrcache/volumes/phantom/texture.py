@@ -30,12 +30,12 @@ def texture(
         # sqrt(12) is the inverse deviation of a uniform deviate; interpolation halves it.
         lattice = (lattice - 0.5) * np.float32(weight * 12**0.5)
         for axis, (coordinate, low) in enumerate(zip(coordinates, lower, strict=True)):
-            lattice = _interpolate(lattice, (coordinate - low) / pitch, 2 - axis)
+            lattice = interpolate(lattice, (coordinate - low) / pitch, 2 - axis)
         total += lattice
     return total
 
 
-def _interpolate(lattice: np.ndarray, position: np.ndarray, axis: int) -> np.ndarray:
+def interpolate(lattice: np.ndarray, position: np.ndarray, axis: int) -> np.ndarray:
     """Linear interpolation along one axis at fractional indices ``position``."""
     index = np.clip(np.floor(position).astype(np.intp), 0, lattice.shape[axis] - 2)
     shape = [1, 1, 1]

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
-import operator
 from collections.abc import Sequence
 
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.phantom import anatomy
 from mitsuba_irrcache.volumes.phantom.body import paint_body
 from mitsuba_irrcache.volumes.phantom.canvas import Canvas
 from mitsuba_irrcache.volumes.phantom.organs import paint_cavities, paint_mediastinum
+from mitsuba_irrcache.volumes.phantom.shape import check_memory, checked_shape
 from mitsuba_irrcache.volumes.phantom.skeleton import paint_skeleton
 
 SMALLEST_SIDE = 8
@@ -44,12 +42,12 @@ def thorax(shape: Sequence[int] = (350, 150, 512), memory_limit: int = 8 * 2**30
         IrrcacheError: a shape of other than three integers, a side below 8, or a volume that needs
             more than ``memory_limit``.
     """
-    shape = _checked_shape(shape)
+    shape = checked_shape(shape, SMALLEST_SIDE)
     size = np.subtract(anatomy.UPPER, anatomy.LOWER)
     spacing = size / shape[::-1]
     factors = np.ceil(spacing / COARSEST_SPACING - 1e-9).astype(int)[::-1]
     painted = tuple(int(n * k) for n, k in zip(shape, factors, strict=True))
-    _check_memory(shape, painted, memory_limit)
+    check_memory(shape, painted, BYTES_PER_VOXEL, memory_limit)
     canvas = Canvas(painted, anatomy.LOWER, anatomy.UPPER, anatomy.AIR)
     paint_body(canvas)
     paint_cavities(canvas)
@@ -64,27 +62,6 @@ def thorax(shape: Sequence[int] = (350, 150, 512), memory_limit: int = 8 * 2**30
         unit="HU",
         source="phantom:thorax",
     )
-
-
-def _checked_shape(shape: Sequence[int]) -> tuple[int, int, int]:
-    try:
-        sides = tuple(operator.index(side) for side in shape)
-    except TypeError:
-        sides = ()
-    if len(sides) != 3 or min(sides) < SMALLEST_SIDE:
-        raise IrrcacheError(
-            f"phantom shape is {shape!r}; give three integers (z, y, x) of at least {SMALLEST_SIDE}"
-        )
-    return sides
-
-
-def _check_memory(shape: Sequence[int], painted: Sequence[int], memory_limit: int) -> None:
-    needed = BYTES_PER_VOXEL * math.prod(painted)
-    if needed > memory_limit:
-        raise IrrcacheError(
-            f"a phantom of shape {shape} (z, y, x) needs {needed} bytes, more than the limit of "
-            f"{memory_limit} bytes; give a smaller shape or a larger memory_limit"
-        )
 
 
 def _block_means(values: np.ndarray, factors: np.ndarray) -> np.ndarray:

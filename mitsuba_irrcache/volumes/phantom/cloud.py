@@ -1,0 +1,157 @@
+"""A procedural cumulus cloud, for machines that have no cloud at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.phantom.shape import check_memory, checked_shape
+from mitsuba_irrcache.volumes.phantom.texture import interpolate
+
+SMALLEST_SIDE = 32
+
+# Places and lengths are those of a cubic box, [-1, 1]^3. Nothing lies beyond LIMIT along any axis,
+# so that the outermost two voxels are empty even where there are fewest.
+LIMIT = 1 - 4 / SMALLEST_SIDE
+
+# Centres (x, y, z) and radii of the balls that billow, and the height that is cut off below.
+BALLS = (
+    ((0.04, 0.04, -0.08), 0.52),
+    ((-0.42, -0.14, -0.46), 0.36),
+    ((0.42, -0.22, -0.44), 0.34),
+    ((0.03, -0.42, -0.50), 0.34),
+    ((-0.05, 0.42, -0.40), 0.34),
+    ((-0.14, 0.00, 0.38), 0.34),
+    ((0.28, 0.12, 0.24), 0.32),
+    ((-0.38, 0.35, -0.50), 0.34),
+    ((0.40, 0.34, -0.48), 0.34),
+)
+BASE = -0.68
+
+# Pitch of the lattices of noise whose folds are the billows, and how far these reach.
+OCTAVES = ((0.45, 0.14), (0.23, 0.10), (0.12, 0.06), (0.063, 0.03))
+# What is left of the billows at the base.
+BASE_BILLOWS = 0.3
+
+# The length over which the cloud thickens from its surface inwards.
+EDGE = 0.09
+# Density between the billows, and how fast it rises with their reach; it ends at 1.
+CREVICE, RISE = 0.5, 3.0
+
+# Peak use in bytes per voxel, but for small volumes, and voxels that are made at a time.
+BYTES_PER_VOXEL = 6
+_AT_A_TIME = 1 << 17
+
+
+def cloud(shape: Sequence[int] = (128, 128, 128), memory_limit: int = 8 * 2**30) -> VolumeData:
+    """A cumulus with a flattish base and billows of several sizes, as densities of 0 to 1.
+
+    The voxels are cubes, and the box, whose longest side is 2, lies about the origin with +z up;
+    the cloud is stretched to its sides. Equal shapes give equal volumes, and a place relative to
+    the sides has the same density at every resolution. Two voxels at least are empty (exactly 0)
+    along every side.
+
+    Args:
+        shape: voxel counts ``(z, y, x)``, each at least 32.
+        memory_limit: the most memory in bytes that may be used.
+
+    Returns:
+        Values float32, shape ``shape``.
+
+    Raises:
+        IrrcacheError: a shape of other than three integers, a side below 32, or a volume that needs
+            more than ``memory_limit``.
+    """
+    shape = checked_shape(shape, SMALLEST_SIDE)
+    check_memory(shape, shape, BYTES_PER_VOXEL, memory_limit)
+    z, y, x = (((np.arange(n) + 0.5) * (2 / n) - 1).astype(np.float32) for n in shape)
+    lattices = _lattices()
+    values = np.empty(shape, dtype=np.float32)
+    step = max(1, _AT_A_TIME // (y.size * x.size))
+    for start in range(0, z.size, step):
+        part = slice(start, start + step)
+        values[part] = _density((x, y, z[part]), lattices)
+    spacing = 2 / max(shape)
+    return VolumeData(
+        values=values,
+        spacing=(spacing,) * 3,
+        origin=tuple(spacing * (1 - n) / 2 for n in shape[::-1]),
+        source="phantom:cloud",
+    )
+
+
+def _density(coordinates: Sequence[np.ndarray], lattices: Sequence[np.ndarray]) -> np.ndarray:
+    """Density (z, y, x) at a grid's x, y and z."""
+    x, y, z = _open_grid(coordinates)
+    billows = np.zeros((z.size, y.size, x.size), dtype=np.float32)
+    for lattice, (pitch, reach) in zip(lattices, OCTAVES, strict=True):
+        billows += np.float32(reach) * np.abs(_noise(lattice, coordinates, pitch))
+    depth = billows - _distance(x, y, z)
+    np.minimum(depth, z - np.float32(BASE) + np.float32(BASE_BILLOWS) * billows, out=depth)
+    for axis in (x, y, z):
+        np.minimum(depth, np.float32(LIMIT) - np.abs(axis), out=depth)
+    depth *= np.float32(1 / EDGE)
+    density = np.clip(depth, 0, 1, out=depth)
+    billows *= np.float32(RISE)
+    billows += np.float32(CREVICE)
+    density *= np.minimum(billows, 1, out=billows)
+    return density
+
+
+def _distance(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Signed distance to the union of the balls, negative inside."""
+    nearest = np.full((z.size, y.size, x.size), np.inf, dtype=np.float32)
+    for centre, radius in BALLS:
+        cx, cy, cz = np.float32(centre)
+        distance = (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2
+        np.sqrt(distance, out=distance)
+        distance -= np.float32(radius)
+        np.minimum(nearest, distance, out=nearest)
+    return nearest
+
+
+def _lattices(seed: int = 28) -> list[np.ndarray]:
+    """Random linear functions at the points of each octave's lattice, (4, z, y, x).
+
+    The first three are the gradient along x, y and z, the last the value at the box's lower corner.
+    Only uniform deviates of a fixed bit generator are drawn, whose stream NumPy keeps stable.
+    """
+    generator = np.random.Generator(np.random.PCG64(seed))
+    lattices = []
+    for pitch, _ in OCTAVES:
+        count = int(np.ceil(2 / pitch)) + 1
+        lattice = 2 * generator.random((4, count, count, count), dtype=np.float32) - 1
+        # Values are drawn at the lattice points; moved to the corner, they need no distances.
+        for gradient, index in zip(
+            lattice[:3], _open_grid([np.arange(count, dtype=np.float32)] * 3), strict=True
+        ):
+            lattice[3] -= gradient * index
+        lattices.append(lattice)
+    return lattices
+
+
+def _noise(lattice: np.ndarray, coordinates: Sequence[np.ndarray], pitch: float) -> np.ndarray:
+    """Smooth noise (z, y, x): the linear functions, blended by quintic weights."""
+    positions = [(axis + 1) / np.float32(pitch) for axis in coordinates]
+    total = _blend(lattice[3], positions)
+    for gradient, position in zip(lattice[:3], _open_grid(positions), strict=True):
+        total += _blend(gradient, positions) * position
+    return total
+
+
+def _blend(lattice: np.ndarray, positions: Sequence[np.ndarray]) -> np.ndarray:
+    """Quintic interpolation at fractional indices along x, y and z."""
+    # Along z first, where the grid has the fewest points.
+    for axis, position in enumerate(positions[::-1]):
+        index = np.floor(position)
+        t = position - index
+        weight = t * t * t * (t * (6 * t - 15) + 10)
+        lattice = interpolate(lattice, index + weight, axis)
+    return lattice
+
+
+def _open_grid(axes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    x, y, z = axes
+    return x[None, None, :], y[None, :, None], z[:, None, None]
