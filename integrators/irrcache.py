@@ -23,7 +23,7 @@ from mitsuba_irrcache.uncertainty import uncertainty_of
 from mitsuba_irrcache.variants import require_variant
 from mitsuba_irrcache.versions import check_versions
 
-SOLVERS = ("auto", "path")
+SOLVERS = ("auto", "path", "sweep")
 _NO_GRADIENTS = 'irrcache computes no gradients; use the integrator "prbvolpath" for them.'
 
 

@@ -39,6 +39,13 @@ class Boundary:
         order = np.inf if self.kind == "box" else 2
         return bool(np.linalg.norm(local[:3], order) <= 1.0)
 
+    def surrounds(self, p: mi.Point3f) -> mi.Bool:
+        """Whether world positions are inside."""
+        local = self._to_local.point(p)
+        if self.kind == "box":
+            return dr.max(dr.abs(local)) <= 1
+        return dr.squared_norm(local) <= 1
+
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether the ray's line meets the inside, and the distances of entry and exit (entry < 0:
         from within).

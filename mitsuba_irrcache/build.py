@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .cache import BATCH, IrradianceCache, active_voxels
+from .cache import IrradianceCache, active_voxels
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import Snapshot, digests
 from .grid import Grid
@@ -20,7 +20,7 @@ from .layers import luminance
 from .medium import MediumGrid
 from .memory import available_memory
 from .scene import bake_scene
-from .solvers import path
+from .solvers import path, sweep
 
 #: Between two checkpoints: at least so many seconds, and the time of writing over this share.
 CHECKPOINT_SECONDS = 30.0
@@ -29,6 +29,11 @@ CHECKPOINT_SHARE = 0.1
 #: Optical depth of a voxel at the boundary of a medium from which on the pixels there are off by
 #: more than 10 % (a homogeneous cube; at half of it, by 5 %).
 DENSE_BORDER = 1.0
+
+#: Voxels of a cache that ``resolution`` 0 leads to, at most.
+MOST_VOXELS = 1 << 25
+#: Directions per voxel of the solver ``sweep``, unless told otherwise.
+SWEEP_SAMPLES = 128
 
 #: called with (stage, done, total)
 Progress = Callable[[str, int, int], None]
@@ -73,6 +78,9 @@ class CacheBuilder:
         self.early = False
         self._opening: path.Opening | None = None
         self._preview: IrradianceCache | None = None
+        #: the solver of ``cache``: path or sweep
+        self.solver = ""
+        self._sweep: sweep.Sweep | None = None
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
         """Makes ``medium`` and ``cache`` fit ``scene``."""
@@ -85,13 +93,14 @@ class CacheBuilder:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             self.medium = self.cache = self._snapshot = None
-            self._opening = self._preview = None
+            self._opening = self._preview = self._sweep = None
             self.revision += 1
             self.medium = bake_scene(scene)
             if self.medium is not None and self.settings.max_depth not in (0, 1):
                 self.cache = self._start_cache(scene, self.medium, edited)
             self._scene_id, self._snapshot = id(scene), snapshot
-        if self.early and not self.is_dark and not self.cache.samples:
+        opens = self.early and self.solver == "path"
+        if opens and not self.is_dark and not self.cache.samples:
             self._open(scene, progress)
         elif self.cache is not None and self.cache.samples < self.target:
             self._fill(scene, progress)
@@ -109,9 +118,9 @@ class CacheBuilder:
 
     @property
     def target(self) -> int:
-        """Samples per voxel that `update` builds up to, a multiple of ``BATCH``."""
-        samples = self.samples or choose_samples(self.cache)
-        return max(-(-samples // BATCH), 2 if self.settings.with_error else 1) * BATCH
+        """Samples per voxel that `update` builds up to, a multiple of the cache's batch."""
+        samples, batch = self.samples or choose_samples(self.cache, self.solver), self.cache.batch
+        return max(-(-samples // batch), 2 if self.settings.with_error else 1) * batch
 
     @property
     def is_dark(self) -> bool:
@@ -142,8 +151,8 @@ class CacheBuilder:
 
     def _start_cache(self, scene: mi.Scene, medium: MediumGrid, edited: bool) -> IrradianceCache:
         settings = self.settings
-        grid = Grid.near_cubic(medium.frame, settings.resolution or choose_resolution(medium))
-        grid = grid.shared(medium.sigma_t.grid, medium.albedo.grid)
+        self.solver, reason = choose_solver(scene, settings)
+        grid, size_reason = choose_grid(medium, settings.resolution, self.solver)
         _check_memory(grid, settings.with_error)
         _warn_of_dense_border(medium, grid)
         active = active_voxels(medium, grid)
@@ -151,17 +160,25 @@ class CacheBuilder:
             active = mi.UInt32()
         mi.Log(
             mi.LogLevel.Info,
-            f"irrcache: cache of {' x '.join(map(str, grid.shape[::-1]))} voxels, "
-            f"{dr.width(active)} of "
-            f"{grid.voxel_count} see the medium; solver path",
+            f"irrcache: solver {self.solver} ({reason}); cache of "
+            f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {dr.width(active)} "
+            f"of {grid.voxel_count} see the medium",
         )
         channels = 1 if mi.is_monochromatic else 3
-        cache = IrradianceCache(grid, active, channels, settings.max_depth)
+        by_sweep = {"batch": sweep.batch_size(settings.max_depth), "double": False}
+        cache = IrradianceCache(
+            grid,
+            active,
+            channels,
+            settings.max_depth,
+            **by_sweep if self.solver == "sweep" else {},
+        )
         self.saved_samples = 0
         if not settings.file:
             return cache
         cache.fingerprint = digests(scene, medium) | {
-            "settings": f"solver path, max_depth {settings.max_depth}, grid {grid.shape[::-1]}"
+            "settings": f"solver {self.solver}, max_depth {settings.max_depth}, "
+            f"grid {grid.shape[::-1]}"
         }
         return self._resume(cache, edited)
 
@@ -211,12 +228,12 @@ class CacheBuilder:
             self._opening = path.Opening(
                 scene, self.medium, cache, settings.seed, settings.rr_depth
             )
-        size = min(self.samples // 2, BATCH)
+        size = min(self.samples // 2, cache.batch)
         if size <= self._opening.size:
             return
         self._opening.grow(size, _of_the_cache(progress))
         self.revision += 1
-        if size == BATCH:
+        if size == cache.batch:
             self._opening.fill(cache)
             self._opening = self._preview = None
         else:
@@ -227,16 +244,16 @@ class CacheBuilder:
 
     def _fill(self, scene: mi.Scene, progress: Progress | None) -> None:
         settings, cache = self.settings, self.cache
+        missing, progress = self.target - cache.samples, _of_the_cache(progress)
         try:
-            path.refine(
-                scene,
-                self.medium,
-                cache,
-                self.target - cache.samples,
-                settings.seed,
-                settings.rr_depth,
-                progress=_of_the_cache(progress),
-            )
+            if self.solver == "sweep":
+                if self._sweep is None:
+                    self._sweep = sweep.Sweep(scene, self.medium, cache, settings.seed)
+                self._sweep.refine(missing, progress)
+            else:
+                path.refine(
+                    scene, self.medium, cache, missing, settings.seed, settings.rr_depth, progress
+                )
         finally:
             self.revision += 1  # the solver may have been stopped half-way
         dr.sync_thread()
@@ -256,21 +273,46 @@ def _of_the_cache(progress: Progress | None) -> path.Progress | None:
     return None if progress is None else lambda *n: progress("cache", *n)
 
 
-def choose_resolution(medium: MediumGrid) -> int:
-    """Cache voxels along the longest side: as many as the medium has, at most 128.
+def choose_solver(scene: mi.Scene, settings: CacheSettings) -> tuple[str, str]:
+    """The solver for a scene, and why."""
+    if settings.solver != "auto":
+        return settings.solver, "as told"
+    for emitter in scene.emitters():
+        if not sweep.takes(emitter):
+            return "path", f'emitter "{emitter.id()}" is neither far away nor a point'
+    return "sweep", "all light comes from far away or from points"
 
-    For the same number of samples, more voxels with fewer samples each give the smaller error: a
-    camera ray averages the noise of many voxels, but not their discretisation. A homogeneous medium
-    gets half a mean free path per voxel.
+
+def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid, str]:
+    """The voxels of the cache, and why.
+
+    With ``resolution`` 0 those of the medium: the light of coarser ones lacks its detail, and that
+    of finer ones would see it interpolated twice. ``path`` takes at most 128 along the longest
+    side, which are work enough; ``sweep`` as many as memory lets it. A homogeneous medium gets half
+    a mean free path per voxel.
     """
-    if medium.sigma_t.grid is not None:
-        return min(max(medium.sigma_t.grid.shape), 128)
-    longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
-    return int(np.clip(np.ceil(2 * longest * medium.sigma_t.maximum), 32, 96))
+    data, frame = medium.sigma_t.grid, medium.frame
+    if resolution:
+        grid, reason = Grid.near_cubic(frame, resolution), "as told"
+    elif data is None:
+        longest = np.linalg.norm(frame[:3, :3], axis=0).max()
+        count = np.clip(np.ceil(2 * longest * medium.sigma_t.maximum), 32, 96)
+        grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"
+    elif solver == "sweep" and data.voxel_count <= MOST_VOXELS:
+        grid, reason = Grid(data.shape, frame), "those of the medium"
+    else:
+        most = 128 if solver == "path" else round(MOST_VOXELS ** (1 / 3))
+        grid = Grid.near_cubic(frame, min(max(data.shape), most))
+        reason = f"of the medium, at most {most}"
+    return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
 
 
-def choose_samples(cache: IrradianceCache) -> int:
-    """Samples per voxel: about 2^24 in all, 16 to 256 each."""
+def choose_samples(cache: IrradianceCache, solver: str) -> int:
+    """Samples per voxel: for ``path`` about 2^24 in all, 16 to 256 each. For ``sweep`` the
+    directions that leave an error of some 0.3 % on a cloud.
+    """
+    if solver == "sweep":
+        return SWEEP_SAMPLES
     return int(np.clip(2**24 // max(cache.active_count, 1), 16, 256))
 
 

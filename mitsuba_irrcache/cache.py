@@ -21,7 +21,8 @@ from .grid import Affine, Grid, RootField
 BATCH = 8
 
 LAYERS = ("uncollided", "scattered")
-FORMAT = "mitsuba_irrcache 1"
+FORMAT = "mitsuba_irrcache 2"
+ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description
 
 
 class IrradianceCache:
@@ -43,7 +44,9 @@ class IrradianceCache:
         max_depth: int,
         fingerprint: dict[str, str] | None = None,
         batch: int = BATCH,
+        double: bool = True,
     ) -> None:
+        """``double``: whether sums are kept in float64, as very many batches need."""
         self.grid = grid
         self.batch = batch  #: samples per batch
         self.active = active
@@ -53,9 +56,11 @@ class IrradianceCache:
         self.fingerprint = fingerprint or {}
         #: samples taken per voxel from each random stream
         self.streams: dict[int, int] = {}
-        zeros = dr.zeros(dr.float64_array_t(mi.Float), max(self.active_count, 1))
-        # For each layer and channel: the sum of batch means and the sum of their squares.
-        self._sums = [[zeros, zeros] for _ in range(len(LAYERS) * channels)]
+        self.real = dr.float64_array_t(mi.Float) if double else mi.Float
+        # Sums of batch means for each layer and channel, and for each channel the sum of squared
+        # deviations of the batches' irradiance, both layers, from its mean. None stands for 0.
+        self._totals: list = [None] * (len(LAYERS) * channels)
+        self._spreads: list = [None] * channels
 
     # ------------------------------------------------------------------ statistics
 
@@ -114,16 +119,11 @@ class IrradianceCache:
         return float(dr.sqrt(dr.mean(dr.square(error)))[0] / scale) if scale > 0 else 0.0
 
     def _variance(self, channel: int):
-        """Squared standard error of the irradiance (float64), None before there are two batches."""
+        """Squared standard error of the irradiance, None before there are two batches."""
         if self.samples < 2 * self.batch:
             return None
-        n = self._batch_count
-        variance = 0
-        for layer in range(len(LAYERS)):
-            total, squares = self._sums[layer * self.channels + channel]
-            # The layers are drawn independently of each other: their variances add.
-            variance = variance + dr.maximum(squares / n - dr.square(total / n), 0) / (n - 1)
-        return variance
+        n, spread = self._batch_count, self._spreads[channel]
+        return self._zeros if spread is None else spread / (n * (n - 1))
 
     def field(self) -> RootField:
         """Phi for lookups: one channel where all channels agree to the last bit."""
@@ -145,14 +145,19 @@ class IrradianceCache:
         return dr.minimum(dr.square(error), 1)
 
     def _means(self, layer: int) -> list[mi.Float]:
-        n = self._batch_count
-        first = layer * self.channels
-        return [mi.Float(total / n) for total, _ in self._sums[first : first + self.channels]]
+        n, first = self._batch_count, layer * self.channels
+        totals = self._totals[first : first + self.channels]
+        return [mi.Float(self._zeros if t is None else t / n) for t in totals]
+
+    @property
+    def _zeros(self):
+        """No light at the active voxels."""
+        return dr.zeros(self.real, max(self.active_count, 1))
 
     @property
     def _batch_count(self):
-        """Batches per voxel, at least 1 (float64); opaque, since it changes from pass to pass."""
-        return dr.opaque(dr.float64_array_t(mi.Float), max(self.samples // self.batch, 1))
+        """Batches per voxel, at least 1; opaque, since it changes from pass to pass."""
+        return dr.opaque(self.real, max(self.samples // self.batch, 1))
 
     def _tensor(self, values: list[mi.Float]) -> mi.TensorXf:
         count = len(values)
@@ -165,17 +170,33 @@ class IrradianceCache:
     # ------------------------------------------------------------------ growing
 
     def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
-        """Adds ``samples`` per voxel of the stream ``seed``: for each block of voxels and then each
-        layer and channel, the sums of batch means and of their squares, in float64.
+        """Adds ``samples`` per voxel of the stream ``seed``.
+
+        For each block of voxels: the sums of batch means for each layer and channel, and for each
+        channel the squared deviations of the batches' irradiance from their mean. None stands for 0
+        in all blocks.
         """
-        sums = []
-        for i, pair in enumerate(self._sums):
-            pieces = [[block[i][j] for block in blocks] for j in range(2)]
-            totals = [dr.concat(p) if len(p) > 1 else p[0] for p in pieces]
-            sums.append([old + new for old, new in zip(pair, totals, strict=True)])
-        dr.eval(sums)
+        totals, spreads = (
+            [_joined(part) for part in zip(*parts, strict=True)]
+            for parts in zip(*blocks, strict=True)
+        )
+        merged = self._merged(totals, spreads, samples // self.batch)
+        dr.eval(merged)
         # An interrupt comes before or after this line, never between the two.
-        self._sums, self.streams = sums, self._streams_with(seed, samples)
+        self._totals, self._spreads, self.streams = *merged, self._streams_with(seed, samples)
+
+    def _merged(self, totals: list, spreads: list, count: int) -> tuple[list, list]:
+        """Sums and spreads with those of ``count`` more batches (Chan et al.)."""
+        known = self.samples // self.batch
+        result = []
+        for c, spread in enumerate(spreads):
+            old, new = (_sum(t[c :: self.channels]) for t in (self._totals, totals))
+            if known and (old is not None or new is not None):
+                n, more = (dr.opaque(self.real, k) for k in (known, count))
+                apart = (0 if old is None else old / n) - (0 if new is None else new / more)
+                spread = _sum([spread, dr.square(apart) * (n * more / (n + more))])
+            result.append(_sum([self._spreads[c], spread]))
+        return [_sum(pair) for pair in zip(self._totals, totals, strict=True)], result
 
     def note_samples(self, seed: int, samples: int) -> None:
         """Counts samples whose contribution is already in (or exactly zero)."""
@@ -194,7 +215,10 @@ class IrradianceCache:
                 raise IrrcacheError(
                     f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
                 )
-        if self.grid.shape != other.grid.shape or self.max_depth != other.max_depth:
+        alike = ("max_depth", "channels", "batch", "real")
+        if self.grid.shape != other.grid.shape or any(
+            getattr(self, name) != getattr(other, name) for name in alike
+        ):
             raise IrrcacheError(
                 f"IrradianceCache.merge: shape {self.grid.shape} with max_depth {self.max_depth} "
                 "does not fit "
@@ -207,8 +231,9 @@ class IrradianceCache:
                 "their samples are the "
                 "same, not independent; make one of them with another cache_seed."
             )
-        for mine, theirs in zip(self._sums, other._sums, strict=True):
-            mine[:] = [a + b for a, b in zip(mine, theirs, strict=True)]
+        self._totals, self._spreads = self._merged(
+            other._totals, other._spreads, other.samples // other.batch
+        )
         self.streams |= other.streams
 
     # ------------------------------------------------------------------ files
@@ -220,6 +245,7 @@ class IrradianceCache:
             "shape": self.grid.shape,
             "to_world": self.grid.to_world.tolist(),
             "channels": self.channels,
+            "batch": self.batch,
             "max_depth": self.max_depth,
             "streams": {str(seed): n for seed, n in self.streams.items()},
             "fingerprint": self.fingerprint,
@@ -229,8 +255,12 @@ class IrradianceCache:
                 file,
                 description=np.frombuffer(json.dumps(description).encode(), dtype=np.uint8),
                 active=np.array(self.active),
-                sums=np.array([[np.array(s) for s in pair] for pair in self._sums]),
+                totals=self._plain(self._totals),
+                spreads=self._plain(self._spreads),
             )
+
+    def _plain(self, values: list) -> np.ndarray:
+        return np.array([np.array(self._zeros if v is None else v) for v in values])
 
     @classmethod
     def load(cls, path: str | Path) -> IrradianceCache:
@@ -266,7 +296,7 @@ class IrradianceCache:
     @classmethod
     def _restore(cls, description: dict, arrays: dict[str, np.ndarray]) -> IrradianceCache:
         grid = Grid(tuple(int(n) for n in description["shape"]), np.array(description["to_world"]))
-        active, sums = arrays["active"], arrays["sums"]
+        active, totals, spreads = (arrays[name] for name in ARRAYS)
         channels = int(description["channels"])
         if active.dtype != np.uint32 or active.ndim != 1 or active.size > grid.voxel_count:
             raise ValueError("its list of voxels does not fit its grid")
@@ -274,10 +304,13 @@ class IrradianceCache:
             int(active[-1]) >= grid.voxel_count or (np.diff(active.astype(np.int64)) <= 0).any()
         ):
             raise ValueError("its list of voxels is out of order")
-        expected = (len(LAYERS) * channels, 2, max(active.size, 1))
-        if channels not in (1, 3) or sums.dtype != np.float64 or sums.shape != expected:
-            raise ValueError(f"sums of shape {sums.shape} where {expected} is expected")
-        if not np.isfinite(sums).all():
+        width = max(active.size, 1)
+        expected = (len(LAYERS) * channels, width), (channels, width)
+        if channels not in (1, 3) or (totals.shape, spreads.shape) != expected:
+            raise ValueError(f"sums of shape {totals.shape} where {expected[0]} is expected")
+        if totals.dtype not in (np.float32, np.float64) or totals.dtype != spreads.dtype:
+            raise ValueError(f"sums of type {totals.dtype}")
+        if not (np.isfinite(totals).all() and np.isfinite(spreads).all()):
             raise ValueError("it holds values that are not finite")
         cache = cls(
             grid,
@@ -285,10 +318,12 @@ class IrradianceCache:
             channels,
             int(description["max_depth"]),
             dict(description["fingerprint"]),
+            int(description["batch"]),
+            totals.dtype == np.float64,
         )
         cache.streams = {int(seed): int(n) for seed, n in description["streams"].items()}
-        double = dr.float64_array_t(mi.Float)
-        cache._sums = [[double(total), double(squares)] for total, squares in sums]
+        cache._totals = [cache.real(t) if t.any() else None for t in totals]
+        cache._spreads = [cache.real(t) if t.any() else None for t in spreads]
         return cache
 
     def export_vol(self, path: str | Path) -> None:
@@ -308,6 +343,19 @@ class IrradianceCache:
         )
 
 
+def _joined(pieces: tuple):
+    """The values of all blocks, or None."""
+    if pieces[0] is None:
+        return None
+    return dr.concat(list(pieces)) if len(pieces) > 1 else pieces[0]
+
+
+def _sum(terms):
+    """Of arrays, or None for 0."""
+    known = [t for t in terms if t is not None]
+    return sum(known[1:], known[0]) if known else None
+
+
 def _root_correction(variance: mi.Float) -> mi.Float:
     """Makes interpolated roots of noisy values right on average.
 
@@ -324,7 +372,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
         if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
             raise ValueError("it is compressed")
     with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in ("description", "active", "sums")}
+        return {name: archive[name] for name in ("description", *ARRAYS)}
 
 
 def active_voxels(medium, grid: Grid) -> mi.UInt32:

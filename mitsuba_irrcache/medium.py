@@ -56,6 +56,21 @@ class MediumGrid:
     def homogeneous(self) -> bool:
         return self.sigma_t.grid is None
 
+    @property
+    def shortest_edge(self) -> float:
+        """Of a voxel of the extinction [scene units]; infinite where nothing varies."""
+        return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
+
+    def contains(self, p: mi.Point3f) -> mi.Bool:
+        """Whether a point is in the medium."""
+        inside = self.boundary.surrounds(p)
+        return inside if self.bbox is None else inside & self._clip.contains(p)
+
+    def fills(self, grid: Grid) -> bool:
+        """Whether the medium is all of the box that ``grid`` covers."""
+        same = np.abs(self.boundary.frame - grid.to_world).max() <= 1e-6 * grid.side_lengths.max()
+        return self.boundary.kind == "box" and self.bbox is None and bool(same)
+
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether the ray's line meets the medium, and its distances of entry and exit."""
         hit, near, far = self.boundary.intersect(ray)

@@ -171,6 +171,7 @@ class _Run:
         self.builder, self.scene, self.progress = builder, scene, progress
         self.targets = targets
         self.schedule = Schedule(targets.seconds, targets.times)
+        self._opening = OPENING  # samples up to which passes may be smaller than a batch
         self.error = math.nan
 
     def begin(self) -> None:
@@ -179,6 +180,9 @@ class _Run:
         goal = self.targets.cache_spp if self.targets.given else own
         self.builder.early = not 0 < goal < OPENING
         self._update(FIRST if self.builder.early else goal, lambda: None)
+        if self.builder.cache is not None and self.builder.solver != "path":
+            self._opening = 0
+            self.schedule.batch = self.schedule.first = self.builder.cache.batch
         self.goal = self.targets.cache_spp or math.inf
         if not self.targets.given and self.builder.cache is not None:
             first, self.builder.samples = self.builder.samples, own
@@ -189,7 +193,8 @@ class _Run:
         done = self._samples
         # A pass that is larger than what the opening lacks would be one of a size of its own.
         self._update(
-            done + samples if done >= OPENING else min(done + samples, OPENING), checkpoint
+            done + samples if done >= self._opening else min(done + samples, self._opening),
+            checkpoint,
         )
 
     def frame(self, image: Callable[[], tuple[mi.TensorXf, float]]) -> Frame:
@@ -205,7 +210,9 @@ class _Run:
         if self._has_arrived:
             return 0
         needed = self.goal - self._samples
-        if self.targets.standard_error:
+        if self.targets.standard_error and math.isnan(self.error):
+            needed = min(needed, 1)
+        elif self.targets.standard_error:
             ratio = self.error / self.targets.standard_error
             needed = min(needed, self._samples * (ratio**2 - 1))
         return self.schedule.next_pass(self._samples, needed)
@@ -249,6 +256,8 @@ class Schedule:
         self._last_frame = 0.0  # when it was finished
         self._image = 0.0  # what it took
         self._fresh = False  # whether there has been a pass since
+        #: samples of the very first pass, and of a batch, of which later ones are made
+        self.first, self.batch = FIRST, BATCH
         self._grain = FIRST  # samples of the smallest pass
 
     @property
@@ -281,7 +290,7 @@ class Schedule:
         """Samples per voxel of the next pass, whole batches after the opening, where ``done`` are
         there and ``needed`` more are asked for; 0 when it is time for an image.
         """
-        self._grain = grain = BATCH if done >= OPENING else FIRST
+        self._grain = grain = self.batch if done >= 2 * self.batch else self.first
         possible = self._samples_within(self._left)
         possible -= possible % grain if possible < math.inf else 0
         due = self._due
@@ -321,11 +330,11 @@ class Schedule:
         if seconds == math.inf:
             return math.inf
         if not self._passes:
-            return BATCH if seconds > 0 else 0
+            return self.batch if seconds > 0 else 0
         measured = self._passes[1:] or self._passes  # the first one may have compiled kernels
         (least, short), (most, long) = min(measured), max(measured)
         if seconds < long and short < long and least < most:
             samples = most - (long - seconds) * (most - least) / (long - short)
         else:
             samples = most * seconds / max(long, 1e-9)
-        return samples // FIRST * FIRST
+        return samples // self.first * self.first

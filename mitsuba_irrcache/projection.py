@@ -6,17 +6,22 @@ eq. 1).
 One step is as long as the shortest voxel edge, of the medium's grids and the cache's, times
 ``step``; steps end on the medium's bounds, never beyond. The lattice of steps is shifted by a
 random offset per ray, so that what is left of the discretisation is noise, not bands. Macrocells
-without extinction are crossed in one go.
+without extinction are crossed many at a time, and what is hardly seen in longer steps.
+
+Rays read copies of the fields that are laid out for them, four floats per voxel (`packets`).
 """
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from .grid import GridField
+from .grid import ConstantField, Field, GridField
 from .layers import Layers, luminance
+from .macrocells import Macrocells, Walk
 from .medium import MediumGrid
+from .packets import Lookups
 from .uncertainty import UncertaintyField
 
 QUADRATURES = ("riemann", "trapezoid", "exponential")
@@ -24,6 +29,11 @@ QUADRATURES = ("riemann", "trapezoid", "exponential")
 #: A ray ends early once nothing ahead, not even the brightest cache voxel or the background seen
 #: through the transmittance left, can change its radiance by more than this fraction.
 EARLY_STOP = 1e-4
+#: Where no more than these fractions of a ray's radiance can still be added, steps are twice and
+#: four times as long: what they miss, they miss of a small rest only.
+COARSER, COARSEST = 0.2, 0.03
+#: Macrocells that rays look ahead for matter.
+REACH = 8
 
 
 class Projection:
@@ -47,24 +57,31 @@ class Projection:
         self.quadrature = quadrature
         self.layered = layered
         self.uncertainty = uncertainty
+        albedo = _constant_if_it_is(medium.albedo)
         grids = [f.grid for f in (medium.sigma_t, medium.albedo, irradiance) if f and f.grid]
         # Where nothing varies, one step is exact.
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
         self.step = dr.opaque(mi.Float, float(length))
-        brightest = irradiance.maximum * medium.albedo.maximum / (4 * dr.pi) if irradiance else 0.0
+        brightest = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         self.brightest = dr.opaque(mi.Float, brightest)
+        self.clearance = Clearance(medium.macrocells)
+        needed = [medium.sigma_t]
+        needed += [irradiance] if irradiance else []
+        needed += [albedo] if irradiance or layered else []
+        self.lookups = Lookups(needed)
 
-    def source(self, p: mi.Point3f, active: mi.Bool) -> tuple:
-        """Albedo Phi / (4 pi), in-scattered radiance per unit of optical depth; and what layers
-        need to know of the point: the albedo, and the relative errors of Phi.
+    def fetch(self, p: mi.Point3f, active: mi.Bool) -> tuple:
+        """Extinction; albedo Phi / (4 pi), in-scattered radiance per unit of optical depth; and
+        what layers need to know of the point: the albedo, and the relative errors of Phi.
         """
+        sigma_t, *rest = self.lookups.at_world(p, active)
+        known = [rest[-1]] if self.layered else []
         if self.irradiance is None:
-            return mi.Float(0), [self.medium.albedo.at_world(p, active)] if self.layered else []
-        albedo, phi = self.medium.albedo.at_world(p, active), self.irradiance.at_world(p, active)
-        known = [albedo] if self.layered else []
+            return sigma_t, mi.Float(0), known
+        phi, albedo = rest
         if self.uncertainty is not None:
             known += self.uncertainty.at_world(p, phi, active)
-        return albedo * phi * dr.inv_four_pi, known
+        return sigma_t, albedo * phi * dr.inv_four_pi, known
 
     @dr.syntax
     def march(
@@ -82,67 +99,88 @@ class Projection:
         ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is the
         radiance behind the medium, which early termination has to know.
         """
-        sigma_t, walk = self.medium.sigma_t, self.medium.macrocells.walk(ray)
+        walk = self.medium.macrocells.walk(ray)
         active = mi.Bool(active) & (near < far)
-        k = mi.UInt32(0)
-        t = mi.Float(near)
-        p = ray(t)
-        extinction = sigma_t.at_world(p, active)
-        source, known = self.source(p, active)
+        # Points of the lattice are counted from 1; number 0 is ``near``, reached by a first step
+        # of no length that only finds the values there.
+        k, stride = mi.UInt32(0), mi.UInt32(1)
+        t, step = mi.Float(near), self.step
+        extinction, source, known = self._nowhere()
         before, before_source, before_length = extinction, source, mi.Float(dr.inf)
-        grey = sigma_t.channels == 1
+        grey = self.medium.sigma_t.channels == 1
         transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
         radiance = mi.Spectrum(0)
         gathered = self._nothing()
         brightest = dr.maximum(self.brightest, dr.max(background))
         # A float counts steps exactly up to 2^24; longer lattices are coarser, not endless.
-        limit = dr.minimum(dr.ceil((far - near) / self.step) + 1, 2**24)
+        limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
         while dr.hint(active, label="ray march"):
-            # In an empty macrocell, go on at the last lattice point but one inside it: the step
-            # that enters matter needs to know the one before.
-            cell = walk.cell(t)
-            wall, _ = walk.exit(cell, t)
-            beyond = dr.floor((dr.minimum(wall, far) - near) / self.step - offset)
-            empty = walk.majorant(cell, active) == 0
-            skip = empty & (beyond > mi.Float(k + 1))
-            k = dr.select(skip, mi.UInt32(dr.minimum(beyond, limit)), k + 1)
-            end = dr.minimum(dr.fma(mi.Float(k) - 1 + offset, self.step, near), far)
-            end = dr.select(mi.Float(k) < limit, end, far)
-            p = ray(end)
-            next_extinction = sigma_t.at_world(p, active)
-            next_source, next_known = self.source(p, active)
-            length = end - t
-            ratio = length / before_length
-            ratio = dr.select(ratio < 2, ratio, 0)  # a short first step tells no curvature
-            ends = (extinction, next_extinction), (source, next_source)
-            if dr.hint(self.quadrature == "exponential", mode="scalar"):
-                ends = (
-                    curved(before, extinction, next_extinction, ratio),
-                    curved(before_source, source, next_source, ratio),
-                )
-            weights, passed = segment(self.quadrature, ends[0], length)
-            near_light, far_light = weights[0] * ends[1][0], weights[1] * ends[1][1]
-            emitted = near_light + far_light
-            radiance = dr.select(active, radiance + transmittance * emitted, radiance)
-            if dr.hint(self.layered, mode="scalar"):
-                gathered = _gather(
-                    gathered,
-                    active,
-                    transmittance,
-                    weights[0] * t + weights[1] * end,
-                    weights,
-                    (near_light, far_light),
-                    (known, next_known),
-                )
-            transmittance = dr.select(active, transmittance * passed, transmittance)
-            before, before_source, before_length = extinction, source, length
-            extinction, source, t = next_extinction, next_source, end
-            known = next_known
-            left = mi.Spectrum(transmittance)
-            matters = dr.max(left) * brightest > EARLY_STOP * dr.max(radiance)
-            matters |= (brightest == 0) & (dr.max(left) > EARLY_STOP)  # opacity needs no light
-            active &= (t < far) & matters
+            # In empty space, go on at the last point of the lattice inside it.
+            empty, wall = self.clearance.exit(walk, t, active)
+            last = dr.floor((dr.minimum(wall, far) - near) / step - offset) + 1
+            skip = empty & ((last >= mi.Float(k)) & (last >= 1) | (wall >= far))
+            k = dr.select(skip, mi.UInt32(dr.clip(last, 0, limit)), k + stride - 1)
+            end = dr.minimum(dr.fma(mi.Float(k) - 1 + offset, step, near), far)
+            end = dr.select(k == 0, near, end)
+            end = dr.select((mi.Float(k) >= limit) | (empty & (wall >= far)), far, end)
+            if active & ~skip:
+                next_extinction, next_source, next_known = self.fetch(ray(end), True)
+                # The light of a segment that enters matter comes from its far end.
+                enters = dr.max(mi.Spectrum(extinction)) == 0
+                source = dr.select(enters, next_source, source)
+                before_source = dr.select(enters, next_source, before_source)
+                known = _select(enters, next_known, known)
+                length = end - t
+                ratio = length / before_length
+                ratio = dr.select(ratio < 2, ratio, 0)  # a short first step tells no curvature
+                ends = (extinction, next_extinction), (source, next_source)
+                if dr.hint(self.quadrature == "exponential", mode="scalar"):
+                    ends = (
+                        curved(before, extinction, next_extinction, ratio),
+                        curved(before_source, source, next_source, ratio),
+                    )
+                weights, passed = segment(self.quadrature, ends[0], length)
+                near_light, far_light = weights[0] * ends[1][0], weights[1] * ends[1][1]
+                radiance += transmittance * (near_light + far_light)
+                if dr.hint(self.layered, mode="scalar"):
+                    gathered = _gather(
+                        gathered,
+                        transmittance,
+                        weights[0] * t + weights[1] * end,
+                        weights,
+                        (near_light, far_light),
+                        (known, next_known),
+                    )
+                transmittance *= passed
+                before, before_source, before_length = extinction, source, length
+                extinction, source, known = next_extinction, next_source, next_known
+                # The most that can still be added, over what there is (without any light: 1).
+                left = dr.max(mi.Spectrum(transmittance)) * dr.select(brightest == 0, 1, brightest)
+                sofar = dr.select(brightest == 0, 1, dr.max(radiance))
+                active &= left > EARLY_STOP * sofar
+                if dr.hint(self.quadrature == "exponential", mode="scalar"):
+                    stride = dr.select(left > COARSER * sofar, mi.UInt32(1), 2)
+                    stride = dr.select(left > COARSEST * sofar, stride, 4)
+            extinction = dr.select(skip, 0, extinction)
+            before = dr.select(skip, 0, before)
+            before_length = dr.select(skip, step, before_length)
+            t = end
+            k += 1
+            active &= t < far
         return radiance, mi.Spectrum(transmittance), gathered
+
+    def _nowhere(self) -> tuple:
+        """What `fetch` returns, of no place."""
+
+        def zero(*fields: Field) -> mi.Float | mi.Color3f:
+            return (mi.Color3f if any(f.channels == 3 for f in fields) else mi.Float)(0)
+
+        albedo = self.medium.albedo
+        source = zero(albedo, self.irradiance) if self.irradiance else mi.Float(0)
+        known = [zero(albedo)] if self.layered else []
+        if self.uncertainty is not None and self.irradiance:
+            known += [mi.Float(0)] * self.uncertainty.count
+        return zero(self.medium.sigma_t), source, known
 
     @property
     def channel_count(self) -> int:
@@ -179,9 +217,74 @@ class Projection:
         )
 
 
+class Clearance:
+    """For each macrocell the Chebyshev distance to the nearest one with extinction, in macrocells:
+    0 where it has some itself, at most `REACH`.
+    """
+
+    def __init__(self, cells: Macrocells) -> None:
+        self.cells = cells
+        nz, ny, nx = cells.shape
+        distance = dr.select(cells.majorant > 0, mi.UInt32(0), mi.UInt32(REACH))
+        dr.eval(distance)
+        for side, stride in ((nx, 1), (ny, nx), (nz, nx * ny)):
+            distance = _spread(distance, *(dr.opaque(mi.Int32, n) for n in (side, stride)))
+        self.distance = distance
+
+    def exit(self, walk: Walk, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Float]:
+        """Whether the place at ``t`` is empty, and the distance along the ray, at least ``t``, up
+        to which it remains so.
+        """
+        cell = walk.cell(t)
+        clearance = mi.Int32(dr.gather(mi.UInt32, self.distance, walk.index(cell), active))
+        reach = clearance - 1
+        forward = walk.rcp > 0
+        wall = mi.Vector3f(cell + dr.select(forward, mi.Vector3i(clearance), -reach))
+        limits = mi.Vector3i(*self.cells.sides) - 1
+        # Border cells reach to infinity.
+        last = dr.select(forward, cell + reach >= limits, cell - reach <= 0)
+        distance = dr.select(last, dr.inf, (wall - walk.origin) * walk.rcp)
+        return clearance > 0, dr.maximum(dr.min(distance), t)
+
+
+@dr.syntax
+def _spread(distance: mi.UInt32, side: mi.Int32, stride: mi.Int32) -> mi.UInt32:
+    """One axis of the distance transform: the least of max(|k|, distance of the cell k further)."""
+    index = dr.arange(mi.Int32, dr.width(distance))
+    place = index // stride % side
+    k, nearest = mi.Int32(1 - REACH), mi.UInt32(distance)
+    while dr.hint(k < REACH, label="clearance"):
+        inside = (place + k >= 0) & (place + k < side)
+        there = dr.gather(mi.UInt32, distance, mi.UInt32(index + k * stride), inside)
+        nearest = dr.select(
+            inside, dr.minimum(nearest, dr.maximum(mi.UInt32(dr.abs(k)), there)), nearest
+        )
+        k += 1
+    dr.eval(nearest)
+    return nearest
+
+
+def _constant_if_it_is(field: Field) -> Field:
+    """A grid that holds one value only, as that value."""
+    if not isinstance(field, GridField):
+        return field
+    channels = [
+        dr.gather(mi.Float, field.data, dr.arange(mi.UInt32, field.grid.voxel_count) * n + c)
+        for n in [field.channels]
+        for c in range(n)
+    ]
+    ends = [(dr.min(c)[0], dr.max(c)[0]) for c in channels]
+    if any(a != b for a, b in ends):
+        return field
+    return ConstantField(np.array([a for a, _ in ends]) * field.scale[0])
+
+
+def _select(mask: mi.Bool, a: list, b: list) -> list:
+    return [dr.select(mask, x, y) for x, y in zip(a, b, strict=True)]
+
+
 def _gather(
     gathered: list,
-    active: mi.Bool,
     transmittance: mi.Float | mi.Color3f,
     distance: mi.Float | mi.Color3f,
     weights: tuple,
@@ -196,7 +299,7 @@ def _gather(
     near, far = (luminance(mi.Spectrum(transmittance * end)) for end in light)
     errors = [near * a + far * b for a, b in zip(near_errors, far_errors, strict=True)]
     added = [colour, luminance(mi.Spectrum(transmittance * distance)), *errors]
-    return [dr.select(active, old + new, old) for old, new in zip(gathered, added, strict=True)]
+    return [old + new for old, new in zip(gathered, added, strict=True)]
 
 
 def curved(before, a, b, ratio: mi.Float) -> tuple:
@@ -247,6 +350,13 @@ def exponential_weights(tau_a, tau_b) -> tuple:
 
 
 def absorptance(tau):
-    """1 - e^-tau, by its series where the difference would cancel."""
-    series = tau * (1 - tau * (1 / 2 - tau * (1 / 6 - tau * (1 / 24 - tau / 120))))
-    return dr.select(tau < 0.1, series, 1 - dr.exp(-tau))
+    """1 - e^-tau without cancellation.
+
+    Of a 32nd of ``tau`` by its series, then five times 1 - e^-2x = a (2 - a) with a = 1 - e^-x:
+    right to 1e-6, for a third of an exponential's price.
+    """
+    x = dr.minimum(tau, 32.0) * (1 / 32)
+    a = x * (1 - x * (1 / 2 - x * (1 / 6 - x * (1 / 24 - x / 120))))
+    for _ in range(5):
+        a = a * (2 - a)
+    return a

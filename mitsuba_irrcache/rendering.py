@@ -49,7 +49,7 @@ def render_film(
     block = film.create_block()
     block.set_offset(film.crop_offset())
     block.set_coalesce(block.coalesce() and per_pass >= 4)
-    spread = PixelPositions(sampler, seed)
+    spread = PixelPositions(sampler, seed, spp)
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
         _splat(sensor, sampler, spread, block, size, border, per_pass, spp, radiance)
@@ -103,21 +103,24 @@ class PixelPositions:
     """Where in their pixels the camera samples lie.
 
     Mitsuba's ``independent`` sampler knows nothing of the other samples of a pixel. With noise-free
-    light that is most of an image's noise, so they are spread evenly here, each still uniform: by
-    the two-dimensional golden ratio, shifted at random in every pixel. Other samplers do it their
-    way.
+    light that is most of an image's noise, so they are spread evenly here: by the two-dimensional
+    golden ratio, shifted at random in every pixel, and in pairs that mirror each other at the
+    pixel's centre. Where the light changes evenly over a pixel, a pair is exact. Each sample of a
+    pair is still uniform. The last of an odd number lies in the centre: one sample per pixel shows
+    pixels as they are there, whatever the seed. Other samplers do it their way.
     """
 
     #: 2^32 over the root of x^3 = x + 1, and over its square
     STEPS = (3242174889, 2447445414)
 
-    def __init__(self, sampler: mi.Sampler, seed: int) -> None:
+    def __init__(self, sampler: mi.Sampler, seed: int, spp: int) -> None:
         self.sampler = sampler
         self.independent = sampler.class_name() == "IndependentSampler"
         # Wrappers hand on a seed that is an array.
         given = isinstance(seed, mi.UInt32)
         self.seed = seed if given else dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self.first = dr.opaque(mi.UInt32, 0)
+        self.paired = dr.opaque(mi.UInt32, spp - spp % 2)
 
     def next(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
         """The position in [0, 1)^2 of a ``sample`` of this pass."""
@@ -125,7 +128,10 @@ class PixelPositions:
             return self.sampler.next_2d()
         shifts = mi.sample_tea_32(pixel, self.seed, 8)
         number = self.first + sample
-        bits = [s + number * mi.UInt32(k) for s, k in zip(shifts, self.STEPS, strict=True)]
+        pair = number // 2
+        bits = [s + pair * mi.UInt32(k) for s, k in zip(shifts, self.STEPS, strict=True)]
+        bits = [dr.select(number % 2 == 1, ~b, b) for b in bits]
+        bits = [dr.select(number < self.paired, b, 1 << 31) for b in bits]
         return mi.Point2f([mi.Float(b >> 8) * 2.0**-24 for b in bits])
 
 

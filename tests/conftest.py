@@ -161,6 +161,8 @@ def description(integrator: dict, shape: dict | None, size: int = 24, **objects)
     sensor = {"type": "perspective", "fov": 34.0, "to_world": look, "film": film}
     emitters = {} if "emitter" in objects else {"emitter": ISOTROPIC_SKY, "sun": SUN}
     shapes = {} if shape is None else {"shape": shape}
+    if integrator.get("type") == "irrcache":
+        integrator = {"solver": "path"} | integrator  # what most tests here are about
     scene = {"type": "scene", "integrator": integrator, "sensor": sensor}
     return scene | shapes | emitters | {k: v for k, v in objects.items() if v is not None}
 

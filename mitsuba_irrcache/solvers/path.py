@@ -79,13 +79,20 @@ def _blocks(count: int, width: int) -> Iterator[mi.UInt32]:
 
 
 def _statistics(totals: list, size: int, count: int) -> tuple:
-    """From sums over batches of ``size`` samples, ``count`` batches of a voxel in a row: for every
-    layer and channel the sum of the batch means and the sum of their squares, per voxel.
+    """From sums over batches of ``size`` samples, ``count`` batches of a voxel in a row: per voxel,
+    the sums of batch means for each layer and channel; and for each channel the squared deviations
+    of both layers' sum from its mean.
     """
     means = [total / size for total in totals]
-    pairs = [(mean, dr.square(mean)) for mean in means]
-    dr.eval(pairs)  # by one kernel, also where the sum over one batch would be a part of it
-    return tuple(tuple(dr.block_sum(term, count) for term in pair) for pair in pairs)
+    channels = len(means) // 2
+    both = [means[c] + means[channels + c] for c in range(channels)]
+    squares = [dr.square(b) for b in both]
+    dr.eval(means, both, squares)  # by one kernel, also where a sum over one batch is part of it
+    spreads = [
+        dr.maximum(dr.block_sum(s, count) - dr.square(dr.block_sum(b, count)) / count, 0)
+        for s, b in zip(squares, both, strict=True)
+    ]
+    return tuple(dr.block_sum(mean, count) for mean in means), tuple(spreads)
 
 
 class Opening:
@@ -146,7 +153,7 @@ class _Estimator:
         """Estimates ``count`` batches from the batch ``first`` on.
 
         ``voxels`` are places in the list of active voxels. Returns, for every layer and channel,
-        the sum of the batch means and the sum of their squares, per voxel (float64).
+        the sum of the batch means, and for every channel their spread, per voxel (float64).
         """
         result = _statistics(self.sums(voxels, first, count, 0, BATCH), BATCH, count)
         dr.eval(result)

@@ -240,13 +240,13 @@ def damaged(content: bytes, how: str) -> bytes:
         middle = len(content) // 2
         return content[:middle] + bytes([content[middle] ^ 0xFF]) + content[middle + 1 :]
     if how == "array missing":
-        del arrays["sums"]
+        del arrays["totals"]
     if how == "pickle":
-        arrays["sums"] = np.array([{"evil": 1}], dtype=object)
+        arrays["totals"] = np.array([{"evil": 1}], dtype=object)
     if how == "not finite":
-        arrays["sums"][0, 0, 0] = np.nan
+        arrays["totals"][0, 0] = np.nan
     if how == "short":
-        arrays["sums"] = arrays["sums"][..., :-1]
+        arrays["totals"] = arrays["totals"][..., :-1]
     if how == "voxel outside":
         arrays["active"][-1] = 10**6
     if how in ("other format", "huge grid"):
@@ -277,7 +277,7 @@ def test_a_bomb_is_refused_before_it_is_read(make, tmp_path):
     """A small file whose header claims 2^40 values."""
     file = tmp_path / "light.npz"
     with zipfile.ZipFile(file, "w") as archive:
-        for name in ("description", "active", "sums"):
+        for name in ("description", "active", "totals", "spreads"):
             header = io.BytesIO()
             np.lib.format.write_array_header_1_0(
                 header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 40,)}

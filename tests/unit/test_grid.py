@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.grid import Grid, GridField
+from mitsuba_irrcache.grid import ConstantField, Grid, GridField, RootField
+from mitsuba_irrcache.packets import Lookups
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -102,3 +104,60 @@ def test_impossible_grids_are_refused(shape, to_world):
 def test_data_of_another_size_are_refused():
     with pytest.raises(IrrcacheError, match="7 values do not fill"):
         GridField(Grid((2, 2, 2), np.eye(4)), mi.Float([0.0] * 7), 1)
+
+
+# Packets
+
+
+def fields_of(grid: Grid, kinds: list[str], seed: int = 5) -> list:
+    """Fields of one grid: ``1`` and ``3`` channels of any size, ``a`` three below 1, ``r`` and
+    ``R`` roots of one and three channels, ``c`` a constant.
+    """
+    rng = np.random.default_rng(seed)
+    fields = []
+    for kind in kinds:
+        if kind == "c":
+            fields.append(ConstantField(np.array([0.25])))
+            continue
+        channels = 3 if kind in "3aR" else 1
+        values = rng.uniform(0, 1 if kind == "a" else 5, grid.voxel_count * channels)
+        data = mi.Float(np.float32(values))
+        root = kind in "rR"
+        fields.append(
+            RootField(grid, data, channels) if root else GridField(grid, data, channels, 0.7)
+        )
+    return fields
+
+
+@pytest.mark.parametrize("shape", [(4, 3, 6), (1, 5, 2), (1, 1, 1)])
+@pytest.mark.parametrize(
+    ("kinds", "groups"),
+    [("1", 1), ("1r", 1), ("1rc", 1), ("1r1", 1), ("1R", 1), ("1ra", 1), ("1Ra", 2), ("3Ra", 3)],
+)
+def test_packets_hold_what_fields_hold(scenes, shape, kinds, groups):
+    """Inside and outside the grid, for every layout: to rounding, and fractions to 16 bits."""
+    grid = Grid(shape, scenes.placement(turn=30.0, edges=(1.0, 2.0, 3.0)))
+    fields = fields_of(grid, list(kinds))
+    lookups = Lookups(fields)
+    assert len(lookups.groups) == groups
+    u = np.random.default_rng(3).uniform(-0.4, 1.4, (3, 512)) * grid.resolution[:, None]
+    p = grid.world.point(mi.Point3f(np.float32(u)))
+    for found, field in zip(lookups.at_world(p, mi.Bool(True)), fields, strict=True):
+        assert type(found) is type(field.at_world(p))
+        expected = np.array(field.at_world(p))
+        np.testing.assert_allclose(np.array(found), expected, rtol=2e-4, atol=1.5e-5)
+
+
+def test_packets_keep_other_grids_apart():
+    """Fields of different voxels are never read at each other's places."""
+    fine, coarse = (Grid((n, n, n), np.eye(4)) for n in (6, 3))
+    lookups = Lookups([*fields_of(fine, ["1"]), *fields_of(coarse, ["1"])])
+    assert [group.packets.grid for group in lookups.groups] == [fine, coarse]
+
+
+def test_a_copy_takes_four_floats_per_voxel():
+    """Whatever it holds."""
+    grid = Grid((4, 5, 6), np.eye(4))
+    for kinds in ("1", "11", "1r", "1R", "1ra"):
+        (group,) = Lookups(fields_of(grid, list(kinds))).groups
+        assert dr.width(group.packets.data) == 4 * group.packets.grid.voxel_count

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
+import mitsuba_irrcache.projection as module
 from mitsuba_irrcache.boundary import Boundary
 from mitsuba_irrcache.grid import ConstantField, Grid, GridField
 from mitsuba_irrcache.macrocells import Macrocells
@@ -17,6 +18,7 @@ from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.projection import (
     EARLY_STOP,
     QUADRATURES,
+    Clearance,
     Projection,
     exponential_weights,
     segment,
@@ -122,8 +124,12 @@ def exact() -> float:
 @pytest.mark.parametrize(
     ("quadrature", "order"), [("riemann", 1), ("trapezoid", 2), ("exponential", 3)]
 )
-def test_order_of_convergence(exact, quadrature, order):
-    """Jitter off: halving the step divides the error by 2^order, measured over 8 to 64 steps."""
+def test_order_of_convergence(exact, quadrature, order, monkeypatch):
+    """Jitter off: halving the step divides the error by 2^order, measured over 8 to 64 steps, all
+    of the same length.
+    """
+    monkeypatch.setattr(module, "COARSER", 0)
+    monkeypatch.setattr(module, "COARSEST", 0)
     errors = []
     for count in (8, 16, 32, 64):
         value = march(analytic_projection(quadrature, LENGTH / count), (-3, 0, 0), (1, 0, 0))[0][0]
@@ -131,6 +137,15 @@ def test_order_of_convergence(exact, quadrature, order):
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert orders[-1] == pytest.approx(order, abs=0.15), errors
     assert (orders > order - 0.4).all()
+
+
+@pytest.mark.parametrize("count", [16, 32, 64])
+def test_longer_steps_in_what_hardly_shows(exact, count):
+    """Twice and four times the step where less than a fifth of the light and less than 3 % is
+    still to come: as good as single steps would be everywhere, to 2e-4.
+    """
+    value = march(analytic_projection("exponential", LENGTH / count), (-3, 0, 0), (1, 0, 0))[0][0]
+    assert value == pytest.approx(exact, rel=2e-4 + 0.5 / count**2)
 
 
 @pytest.mark.parametrize("quadrature", ["trapezoid", "exponential"])
@@ -202,6 +217,17 @@ def test_skipping_empty_macrocells_changes_nothing():
         results.append([np.array(v.x) for v in (radiance, passed)])
     assert results[0][0].max() > 0.1
     np.testing.assert_allclose(results[0], results[1], rtol=1e-4, atol=1e-5)
+
+
+def test_clearance_is_the_distance_to_matter():
+    """In macrocells, in the maximum norm, up to REACH: against all pairs of cells."""
+    medium, _ = sparse_medium()
+    cells = medium.macrocells
+    place = np.argwhere(np.ones(cells.shape))
+    matter = place[np.array(cells.majorant) > 0]
+    expected = np.abs(place[:, None] - matter[None]).max(axis=2).min(axis=1)
+    found = np.array(Clearance(cells).distance)
+    np.testing.assert_array_equal(found, np.minimum(expected, module.REACH))
 
 
 def test_early_stop_with_a_bright_light_behind():

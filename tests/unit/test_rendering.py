@@ -137,3 +137,30 @@ def test_further_channels_are_reconstructed_like_the_colour(rgb, rfilter):
     assert np.abs(np.array(other) - np.array(same)).max() > 0.05
     np.testing.assert_allclose(np.array(alpha), 1, rtol=1e-5)
     np.testing.assert_allclose(np.array(colour[2]), 2, rtol=1e-5)
+
+
+def positions(spp: int, seed: int = 3, pixels: int = 4096) -> np.ndarray:
+    """Positions in their pixels, (sample, pixel, axis)."""
+    sampler = mi.load_dict({"type": "independent"})
+    spread = rendering().PixelPositions(sampler, seed, spp)
+    lane = dr.arange(mi.UInt32, pixels * spp)
+    found = np.array(spread.next(lane // spp, lane % spp)).T
+    return found.reshape(pixels, spp, 2).transpose(1, 0, 2)
+
+
+@pytest.mark.parametrize("spp", [1, 2, 5, 16])
+def test_samples_mirror_each_other(rgb, spp):
+    """In pairs, at the centre of the pixel, where the last of an odd number lies."""
+    found = positions(spp)
+    paired = spp - spp % 2
+    np.testing.assert_allclose(found[0:paired:2] + found[1:paired:2], 1, atol=2e-7)
+    np.testing.assert_array_equal(found[paired:], 0.5)
+    assert (found >= 0).all() and (found < 1).all()
+
+
+def test_each_sample_of_a_pair_is_uniform(rgb):
+    """Over pixels and seeds: moments within 4 standard errors, and other seeds lie elsewhere."""
+    for sample in positions(4):
+        assert np.abs(sample.mean(axis=0) - 1 / 2).max() < 4 * np.sqrt(1 / 12 / 4096)
+        assert np.abs((sample**2).mean(axis=0) - 1 / 3).max() < 4 * np.sqrt(4 / 45 / 4096)
+    assert np.abs(positions(2, seed=3) - positions(2, seed=4)).mean() > 0.2

@@ -28,9 +28,10 @@ def cache_of(batches: np.ndarray, shape, to_world=UNIT, active=None) -> Irradian
     index = np.arange(np.prod(shape)) if active is None else active
     cache = IrradianceCache(Grid(shape, to_world), mi.UInt32(np.uint32(index)), 3, -1)
     double = dr.float64_array_t(mi.Float)
-    pairs = [(batches[..., c].sum(axis=0), (batches[..., c] ** 2).sum(axis=0)) for c in range(3)]
-    pairs += [(np.zeros(len(index)),) * 2] * 3  # nothing scattered
-    cache.add(0, BATCH * len(batches), [[tuple(map(double, pair)) for pair in pairs]])
+    totals = [double(batches[..., c].sum(axis=0)) for c in range(3)]
+    spreads = [double(batches[..., c].var(axis=0) * len(batches)) for c in range(3)]
+    nothing = [None] * 3  # scattered
+    cache.add(0, BATCH * len(batches), [((*totals, *nothing), spreads)])
     return cache
 
 

@@ -1,0 +1,193 @@
+"""Where light comes from: sets of directions, and the emitters that are far away.
+
+A set is of pairs of opposite directions, spread evenly and turned at random, so that every
+direction alone is uniform. Its weights integrate spherical harmonics up to degree 3 exactly: inside
+dense matter radiance has no others, whatever the turn.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.medium import MediumGrid
+
+_GOLDEN = (1 + 5**0.5) / 2
+
+
+def spread(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """``count`` directions (n, 3) of one hemisphere, and the solid angle (n) that each of them
+    stands for; so does its opposite.
+    """
+    i = np.arange(count)
+    z = 1 - (i + 0.5) / count
+    radius, angle = np.sqrt(1 - z * z), 2 * np.pi * i / _GOLDEN
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    points = points @ _rotation(rng).T
+    return points, _weights(points)
+
+
+def _weights(points: np.ndarray) -> np.ndarray:
+    """The weights nearest to equal ones that integrate all products of two coordinates."""
+    count = len(points)
+    x, y, z = points.T
+    moments = np.stack([np.ones(count), x * x, y * y, x * y, y * z, z * x])
+    wanted = 2 * np.pi * np.array([1, 1 / 3, 1 / 3, 0, 0, 0])
+    equal = np.full(count, 2 * np.pi / count)
+    correction, *_ = np.linalg.lstsq(moments, wanted - moments @ equal, rcond=None)
+    weights = equal + correction
+    return weights if weights.min() > 0.25 * equal[0] else equal
+
+
+def _rotation(rng: np.random.Generator) -> np.ndarray:
+    """A uniformly random rotation matrix."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+def environment_radiance(environment: mi.Emitter, directions: np.ndarray) -> np.ndarray:
+    """Radiance (n, channels) that the environment sends along ``directions`` (n, 3)."""
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    interaction.wi = mi.Vector3f(directions.T.astype(np.float32))
+    return _values(environment.eval(interaction), len(directions))
+
+
+def _values(spectrum: mi.Spectrum, count: int) -> np.ndarray:
+    """A spectrum as an array (count, channels), float64."""
+    channels = [np.broadcast_to(np.array(v, dtype=np.float64), count) for v in spectrum]
+    return np.stack(channels, axis=1)
+
+
+class Sky:
+    """The emitters of a scene, seen from the medium: an environment, suns that are infinitely far
+    and narrow, and point-like lights nearby.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self._environment = scene.environment()
+        self._suns, self._near = [], []
+        for emitter in scene.emitters():
+            if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
+                self._suns.append(_sun(emitter))
+            elif mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+                self._near.append(emitter)
+
+    def tables(
+        self, passes: int, pairs: int, channels: int, rng: np.random.Generator
+    ) -> tuple[list[list[tuple]], np.ndarray]:
+        """Directions for a number of passes, and the light from far away along them.
+
+        Returns for each channel a list of arguments of `Lattice.table`, one for each pass, and the
+        factors (channels) of what these give. Where channels differ by a factor only, there is one
+        list for all.
+        """
+        tables = [self._rows(pairs, rng) for _ in range(passes)]
+        light = np.concatenate([table[1] for table in tables])
+        brightest = light.max(axis=(0, 1))
+        colour = brightest / brightest.max() if brightest.max() > 0 else np.ones(channels)
+        apart = np.abs(light - light.max(axis=-1, keepdims=True) * colour)
+        if not self._near and apart.max() <= 1e-6 * light.max():
+            return [[(d, light.max(axis=-1), w, o) for d, light, w, o in tables]], colour
+        by_channel = [
+            [(d, light[..., c], w, o) for d, light, w, o in tables] for c in range(channels)
+        ]
+        return by_channel, np.ones(channels)
+
+    def _rows(self, pairs: int, rng: np.random.Generator) -> tuple:
+        """Directions of a pass, irradiance along both ways (n, 2, channels), weights, offsets: an
+        even set, which light from voxels takes too, and those that only emitters need.
+        """
+        directions, weights = spread(pairs, rng)
+        colours = dr.size_v(mi.Spectrum)
+        light = np.zeros((pairs, 2, colours))
+        rows = [(directions, light, weights)]
+        if self._environment is not None:
+            if self._environment.class_name() == "ConstantBackgroundEmitter":
+                light += self._both_ways(directions) * weights[:, None, None]
+            else:
+                rows.append(self._bright_rows(pairs, rng))
+        for direction, irradiance in self._suns:
+            ways = np.stack([irradiance, np.zeros(colours)])
+            rows.append((direction[None], ways[None], np.zeros(1)))
+        joined = [np.concatenate(part) for part in zip(*rows, strict=True)]
+        return *joined, rng.random((len(joined[0]), 2))
+
+    def _bright_rows(self, pairs: int, rng: np.random.Generator) -> tuple:
+        """Directions of an environment that varies: half of them even, half by its luminance. One
+        may come from either half, and as the opposite of one: what it stands for is one over the
+        density of all ways to get it.
+        """
+        even, bright = pairs - pairs // 2, pairs // 2
+        directions = np.concatenate([spread(even, rng)[0], self._bright(bright, rng)])
+        angle = 1 / (even / (2 * np.pi) + bright * self._density(directions))
+        return directions, self._both_ways(directions) * angle[:, None, None], np.zeros(pairs)
+
+    def _both_ways(self, directions: np.ndarray) -> np.ndarray:
+        """Radiance (n, 2, channels) along directions and their opposites."""
+        both = [environment_radiance(self._environment, s * directions) for s in (1, -1)]
+        return np.stack(both, axis=1)
+
+    def _bright(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Directions (n, 3) of light from the environment, by its own density."""
+        i = np.arange(count)
+        samples = np.stack([(i + 0.5) / count, i * 0.7548776662466927 % 1])
+        samples = ((samples + rng.random((2, 1))) % 1).astype(np.float32)
+        record, _ = self._environment.sample_direction(
+            dr.zeros(mi.Interaction3f, count), mi.Point2f(samples)
+        )
+        return -np.array(record.d, dtype=np.float64).T
+
+    def _density(self, directions: np.ndarray) -> np.ndarray:
+        """Density (n) with which the environment draws directions or their opposites [1/sr]."""
+        total = np.zeros(len(directions))
+        for sign in (1, -1):
+            record = dr.zeros(mi.DirectionSample3f, len(directions))
+            record.d = mi.Vector3f((-sign * directions).T.astype(np.float32))
+            at = dr.zeros(mi.Interaction3f, len(directions))
+            total += np.array(self._environment.pdf_direction(at, record), dtype=np.float64)
+        return total
+
+    def near_light(self, medium: MediumGrid, position: mi.Point3f) -> list[mi.Spectrum]:
+        """Irradiance at ``position`` from each point-like light nearby."""
+        return [_from_point(emitter, medium, position) for emitter in self._near]
+
+
+def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -> mi.Spectrum:
+    """Irradiance from a point-like emitter, its light followed through the medium."""
+    at = dr.zeros(mi.Interaction3f, dr.width(position))
+    at.p = position
+    record, light = emitter.sample_direction(at, mi.Point2f(0.5))
+    lit = dr.max(light) > 0
+    light = light * marched(medium, mi.Ray3f(position, record.d), record.dist, lit)
+    light = dr.select(lit, light, 0)
+    dr.eval(light)
+    return light
+
+
+@dr.syntax
+def marched(medium: MediumGrid, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool):
+    """Transmittance along ``ray`` up to ``distance``, by the midpoint rule with about two steps in
+    a voxel; exact in a homogeneous medium.
+    """
+    hit, near, far = medium.intersect(ray)
+    near, far = dr.maximum(near, 0), dr.minimum(far, distance)
+    active = active & hit & (near < far)
+    length = dr.opaque(mi.Float, medium.shortest_edge / 2)
+    count = dr.clip(dr.ceil((far - near) / length), 1, 1 << 16)
+    step = (far - near) / count
+    depth = medium.sigma_t.at_world(ray.o, False) * 0
+    k = mi.Float(0)
+    while dr.hint(active, label="shadow rays"):
+        depth += medium.sigma_t.at_world(ray(dr.fma(k + 0.5, step, near)), active) * step
+        k += 1
+        active &= k < count
+    return dr.exp(-depth)
+
+
+def _sun(emitter: mi.Emitter) -> tuple[np.ndarray, np.ndarray]:
+    """Direction (3) and irradiance (channels) of a light that is infinitely far and narrow."""
+    record, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1), mi.Point2f(0.5))
+    direction = -np.array(record.d, dtype=np.float64).ravel()
+    return direction / np.linalg.norm(direction), _values(weight, 1)[0]

@@ -1,0 +1,196 @@
+"""All orders of scattering, from sweeps on a hierarchy of grids.
+
+The irradiance of scattered light solves phi = A phi + b. A takes irradiance to the light that it
+scatters, phi -> albedo phi / (4 pi), carried by one sweep over a fixed set of directions; b is the
+light that was scattered once. Iterating this (source iteration) adds an order per sweep: in dense,
+white matter thousands. What is slow to converge is smooth, and smooth light is found on coarser
+grids by the same means: errors are corrected there, grid by grid (multigrid).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grid import Grid, GridField
+from mitsuba_irrcache.solvers.lattice import Lattice, Table
+
+#: Voxels along the longest side of the coarsest grid, at most.
+COARSEST = 16
+#: Corrections on the finest grid, at most; there is one on the others.
+CORRECTIONS = 12
+#: Relative error of the finest solution that is left, and change of the coarsest one.
+TOLERANCE = 2e-3
+COARSE_TOLERANCE = 1e-4
+
+
+class Level:
+    """A grid of the hierarchy: extinction, albedo, the lines, and the next coarser level.
+
+    ``sigma_t`` and ``albedo`` hold a value for each voxel.
+    """
+
+    def __init__(self, grid: Grid, sigma_t: mi.Float, albedo: mi.Float, lattice: Lattice) -> None:
+        self.grid, self.sigma_t, self.albedo, self.lattice = grid, sigma_t, albedo, lattice
+        self._coarser: Level | None = None
+        self._children: list[tuple[mi.UInt32, mi.Float]] = []
+
+    @property
+    def coarsest(self) -> bool:
+        return max(self.grid.shape) <= COARSEST
+
+    @property
+    def coarser(self) -> Level:
+        """The level of half the resolution, made when it is first asked for."""
+        if self._coarser is None:
+            grid = _halved(self.grid)
+            self._children = _children(self.grid, grid, self.sigma_t)
+            sigma_t = sum(dr.gather(mi.Float, self.sigma_t, i) * w for i, w in self._children) / 8
+            # The weights of the means that follow are shares of the extinction.
+            total = sum(dr.gather(mi.Float, self.sigma_t, i) * w for i, w in self._children)
+            shares = [
+                (i, dr.select(total > 0, dr.gather(mi.Float, self.sigma_t, i) * w / total, 0))
+                for i, w in self._children
+            ]
+            dr.eval(sigma_t, shares)
+            self._children = shares
+            lattice = Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
+            self._coarser = Level(grid, sigma_t, self.restrict(self.albedo), lattice)
+        return self._coarser
+
+    def restrict(self, values: mi.Float) -> mi.Float:
+        """Means over the voxels of the coarser level, weighted by extinction."""
+        result = sum(dr.gather(mi.Float, values, i) * w for i, w in self._children)
+        dr.eval(result)
+        return result
+
+    def prolong(self, values: mi.Float) -> mi.Float:
+        """Values of the coarser level at the voxels of this one, trilinear."""
+        index = dr.arange(mi.UInt32, self.grid.voxel_count)
+        _, ny, nx = self.grid.shape
+        nx, ny = dr.opaque(mi.UInt32, nx), dr.opaque(mi.UInt32, ny)
+        row = index // nx
+        u = mi.Point3f(index - row * nx, row % ny, row // ny)
+        return GridField(self.coarser.grid, values, 1).at(u * 0.5 + 0.25)
+
+    def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
+        """A phi plus the light that enters along ``table``: irradiance, and the mean of it where it
+        collides, which is what is scattered again.
+
+        ``phi``, such a mean, may be None for 0.
+        """
+        count = self.grid.voxel_count
+        nothing = dr.zeros(mi.Float, count)
+        sent = nothing if phi is None else phi * self.albedo * dr.inv_four_pi
+        volume = dr.ravel(mi.Vector4f(sent, nothing, nothing, nothing))
+        dr.eval(volume)
+        self.lattice.scatter(volume, table)
+        index = dr.arange(mi.UInt32, count)
+        source, phi, lost, depth = dr.gather(mi.Vector4f, volume, index)
+        # Radiance of collisions times 4 pi, which is what 1 is, integrated over directions.
+        collided = 4 * dr.pi * (source + lost / dr.select(depth > 0, depth, 1))
+        collided = dr.select(depth > 0, collided, phi)
+        dr.eval(phi, collided)
+        return phi, collided
+
+    def solve(self, b: mi.Float, quadrature: tuple) -> mi.Float:
+        """Solves phi = A phi + b for directions, weights and offsets ``quadrature``."""
+        table = self.lattice.table(*without_light(*quadrature))
+        phi = self._guess(b, quadrature, table)
+        change, scale = np.inf, float(dr.sum(dr.abs(b))[0])
+        for _ in range(CORRECTIONS if not self.coarsest and scale > 0 else 0):
+            before, phi = phi, self.correct(phi, b, table, quadrature)
+            scale = float(dr.sum(dr.abs(phi))[0])
+            last, change = change, float(dr.sum(dr.abs(phi - before))[0])
+            # Errors fall by about the same factor each time.
+            factor = min(change / last, 0.9) if last < np.inf else 0.2
+            left = change * factor / (1 - factor) / scale
+            mi.Log(mi.LogLevel.Debug, f"irrcache: light of further orders known to {left:.1e}")
+            if left <= TOLERANCE:
+                break
+        else:
+            if not self.coarsest and scale > 0:
+                mi.Log(
+                    mi.LogLevel.Warn,
+                    f"irrcache: light of high orders of scattering is known to {left:.1e} only",
+                )
+        return phi
+
+    def correct(self, phi: mi.Float, b: mi.Float, table: Table, quadrature: tuple) -> mi.Float:
+        """A sweep, and the correction of its error on the coarser level."""
+        swept = self.scatter(phi, table)[1] + b
+        coarser = self.coarser
+        residual = self.restrict(swept - phi)
+        coarse = coarser.lattice.table(*without_light(*quadrature))
+        error = coarser._approximate(coarser.scatter(residual, coarse)[1], quadrature, coarse)
+        result = swept + self.prolong(error)
+        dr.eval(result)
+        return result
+
+    def _approximate(self, b: mi.Float, quadrature: tuple, table: Table) -> mi.Float:
+        """About the solution, by a single correction on each level."""
+        phi = self._guess(b, quadrature, table)
+        return phi if self.coarsest else self.correct(phi, b, table, quadrature)
+
+    def _guess(self, b: mi.Float, quadrature: tuple, table: Table) -> mi.Float:
+        """The solution as the coarser level sees it; on the coarsest, the solution."""
+        if self.coarsest:
+            return self._iterate(b, table)
+        coarser = self.coarser
+        coarse = coarser.lattice.table(*without_light(*quadrature))
+        return self.prolong(coarser._approximate(self.restrict(b), quadrature, coarse))
+
+    def _iterate(self, b: mi.Float, table: Table) -> mi.Float:
+        """Source iteration with Anderson's acceleration on few voxels."""
+        shape = b.shape
+        known = np.array(b, dtype=np.float64)
+        phi, history = known.copy(), []
+        scale = np.abs(known).mean()
+        for _ in range(200):
+            image = np.array(self.scatter(mi.Float(phi.astype(np.float32)), table)[1]) + known
+            history.append((phi, image))
+            history = history[-6:]
+            residual = image - phi
+            if np.abs(residual).mean() <= COARSE_TOLERANCE * scale:
+                break
+            phi = _mixed(history)
+        return dr.reshape(mi.Float, mi.Float(image.astype(np.float32)), shape)
+
+
+def without_light(directions: np.ndarray, weights: np.ndarray, offsets: np.ndarray) -> tuple:
+    """Arguments of a table of directions along which no light enters from outside."""
+    return directions, np.zeros((len(directions), 2)), weights, offsets
+
+
+def _mixed(history: list) -> np.ndarray:
+    """The combination of images that leaves the least residual (Anderson's mixing)."""
+    points, images = (np.array(x) for x in zip(*history, strict=True))
+    residuals = images - points
+    if len(history) == 1:
+        return images[0]
+    differences = (residuals[:-1] - residuals[-1]).T
+    share, *_ = np.linalg.lstsq(differences, -residuals[-1], rcond=1e-8)
+    return images[-1] + share @ (images[:-1] - images[-1])
+
+
+def _halved(grid: Grid) -> Grid:
+    """The grid of voxels twice as large; it may reach beyond the end of ``grid``."""
+    shape = tuple(-(-n // 2) for n in grid.shape)
+    scale = [2 * m / n for m, n in zip(shape[::-1], grid.resolution, strict=True)]
+    return Grid(shape, grid.to_world @ np.diag([*scale, 1.0]))
+
+
+def _children(fine: Grid, coarse: Grid, like: mi.Float) -> list[tuple[mi.UInt32, mi.Float]]:
+    """For each corner of a coarse voxel the fine one there, and 1, or 0 where there is none."""
+    index = dr.arange(mi.UInt32, coarse.voxel_count)
+    _, cy, cx = coarse.shape
+    at = (index % cx, (index // cx) % cy, index // (cx * cy))
+    nx, ny, nz = (int(n) for n in fine.resolution)
+    result = []
+    for dz, dy, dx in np.ndindex(2, 2, 2):
+        x, y, z = (2 * a + d for a, d in zip(at, (dx, dy, dz), strict=True))
+        inside = (x < nx) & (y < ny) & (z < nz)
+        place = dr.select(inside, (z * ny + y) * nx + x, 0)
+        result.append((place, dr.select(inside, mi.Float(1), 0)))
+    return result

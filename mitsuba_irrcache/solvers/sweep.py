@@ -1,0 +1,212 @@
+"""The solver ``sweep``: light is carried along lines that all voxels share, all voxels at once.
+
+See `lattice` for the lines, `directions` for where they point, `scattering` for light that is
+scattered more than once. A batch is a chain of its own, with random numbers of its own: batches are
+independent of each other, so their scatter is the error of their mean, whatever the voxels and
+orders of scattering in a batch share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache import IrradianceCache
+from mitsuba_irrcache.grid import Field, Grid
+from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.solvers.directions import Sky
+from mitsuba_irrcache.solvers.lattice import RECEIVED, Lattice, sharpened
+from mitsuba_irrcache.solvers.scattering import Level
+
+#: Directions of one pass: pairs of opposite ones.
+DIRECTIONS = 16
+#: Passes of a batch where light is scattered more than once.
+PASSES = 4
+#: Most points along each axis of a voxel over which the medium is averaged.
+FINEST = 4
+
+#: called with (samples done, samples in all), both in voxels times directions
+Progress = Callable[[int, int], None]
+
+
+def batch_size(max_depth: int) -> int:
+    """Directions per voxel of a batch."""
+    return DIRECTIONS * (1 if max_depth == 2 else PASSES)
+
+
+def takes(emitter: mi.Emitter) -> bool:
+    """Whether the light of an emitter can be swept: it comes from far away, or from a point."""
+    flags = mi.EmitterFlags.Infinite, mi.EmitterFlags.DeltaDirection, mi.EmitterFlags.DeltaPosition
+    return any(mi.has_flag(emitter.flags(), flag) for flag in flags)
+
+
+class Sweep:
+    """Fills ``cache``, which lies over ``medium``."""
+
+    def __init__(
+        self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int
+    ) -> None:
+        self.cache, self.seed = cache, seed
+        self._sky = Sky(scene)
+        if not cache.active_count:
+            return
+        grid = cache.grid
+        sigma_t = baked(medium, medium.sigma_t, grid)
+        box = _occupied_box(cache)
+        self._lattices = [Lattice(grid, s, *box) for s in sigma_t]
+        # For single scattering the albedo does not matter here.
+        self._levels: list[Level] = []
+        if cache.max_depth != 2:
+            albedo = baked(medium, medium.albedo, grid, masked=False)
+            self._levels = [
+                Level(
+                    grid,
+                    sigma_t[min(c, len(sigma_t) - 1)],
+                    albedo[min(c, len(albedo) - 1)],
+                    self._lattices[min(c, len(sigma_t) - 1)],
+                )
+                for c in range(max(len(albedo), len(sigma_t)))
+            ]
+        self._direct = self._sky.near_light(medium, grid.centers(cache.active))
+
+    def refine(self, samples: int, progress: Progress | None = None) -> None:
+        """Adds ``samples`` directions per voxel, a multiple of the cache's batch.
+
+        If ``progress`` raises, batches that are complete stay in the cache.
+        """
+        cache = self.cache
+        if not cache.active_count:
+            cache.note_samples(self.seed, samples)
+            return
+        first, count = cache.streams.get(self.seed, 0) // cache.batch, samples // cache.batch
+        for number in range(first, first + count):
+            cache.add(self.seed, cache.batch, [self._batch(number)])
+            if progress is not None:
+                dr.sync_thread()
+                done = (number - first + 1) * cache.batch
+                progress(done * cache.active_count, samples * cache.active_count)
+
+    def _batch(self, number: int) -> tuple:
+        """Irradiance of both layers in all channels at the active voxels, as `IrradianceCache.add`
+        wants it.
+        """
+        cache = self.cache
+        # Where light is scattered again, one pass more tells what is.
+        passes = cache.batch // DIRECTIONS + bool(self._levels)
+        rng = np.random.default_rng((self.seed, number))
+        tables, colour = self._sky.tables(passes, DIRECTIONS // 2, cache.channels, rng)
+        found: dict[tuple[int, int], tuple] = {}
+        layers = [], []
+        for c in range(cache.channels):
+            # Channels that differ by a factor only are computed once.
+            key = min(c, len(tables) - 1), min(c, len(self._levels or self._lattices) - 1)
+            if key not in found:
+                found[key] = self._solved(tables[key[0]], *key)
+            for layer, phi in zip(layers, found[key], strict=True):
+                layer.append(phi if phi is None else self._gathered(phi, colour[c]))
+        dr.eval(layers)
+        return (*layers[0], *layers[1]), (None,) * cache.channels
+
+    def _solved(self, rows: list, light: int, medium: int) -> tuple:
+        """Irradiance at all voxels: straight from the emitters, and scattered, if it is wanted."""
+        if not self._levels:
+            return self._uncollided(self._lattices[medium], rows, light), None
+        level, (first, *rows) = self._levels[medium], rows
+        uncollided = self._uncollided(level.lattice, rows, light)
+        total = 0 * uncollided
+        phi, known = self._collided(level, first, light), 1
+        for row in rows:
+            received, again = level.scatter(phi, level.lattice.table(*row))
+            total = total + received
+            if self.cache.max_depth < 0:
+                # Of all orders there is now another estimate: on average they have less noise.
+                weights = (dr.opaque(mi.Float, x / (known + 1)) for x in (known, 1))
+                old, new = weights
+                phi = phi * old + self._with_near_light(again, light) * new
+                known += 1
+            dr.eval(total, phi)
+        total = self._with_near_light(total * dr.opaque(mi.Float, 1 / len(rows)), light)
+        # Both layers with the same directions: under a white sky the sum has no noise.
+        scattered = dr.maximum(total - uncollided, 0)
+        dr.eval(scattered)
+        return uncollided, scattered
+
+    def _uncollided(self, lattice: Lattice, rows: list, light: int) -> mi.Float:
+        """Irradiance straight from the emitters, on average over passes."""
+        volume = dr.opaque(mi.Float, 0, self.cache.grid.voxel_count)
+        for row in rows:
+            lattice.carry(volume, lattice.table(*row))
+        volume = sharpened(volume, lattice.grid, RECEIVED) * dr.opaque(mi.Float, 1 / len(rows))
+        return self._with_near_light(volume, light)
+
+    def _collided(self, level: Level, row: tuple, light: int) -> mi.Float:
+        """Mean irradiance of collisions, of all orders but the last."""
+        table = level.lattice.table(*row)
+        _, phi = level.scatter(None, table)
+        phi = self._with_near_light(phi, light)
+        if self.cache.max_depth < 0:
+            directions, _, weights, offsets = row
+            lit_only = weights == 0
+            return level.solve(phi, tuple(x[~lit_only] for x in (directions, weights, offsets)))
+        for _ in range(self.cache.max_depth - 3):
+            phi = self._with_near_light(level.scatter(phi, table)[1], light)
+        return phi
+
+    def _with_near_light(self, volume: mi.Float, channel: int) -> mi.Float:
+        for light in self._direct:
+            dr.eval(volume)
+            dr.scatter_reduce(dr.ReduceOp.Add, volume, light[channel], self.cache.active)
+        dr.eval(volume)
+        return volume
+
+    def _gathered(self, volume: mi.Float, scale: float) -> mi.Float:
+        """A volume at the active voxels."""
+        return dr.gather(mi.Float, volume, self.cache.active) * dr.opaque(mi.Float, scale)
+
+
+def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> list[mi.Float]:
+    """Channels of ``field`` at the voxels of ``grid``: its means over voxels that are larger than
+    the field's, or that the boundary of the medium may cut. Outside of it the field counts as 0 if
+    ``masked``.
+    """
+    ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
+    cut = masked and not medium.fills(grid)
+    points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
+    index = dr.arange(mi.UInt32, grid.voxel_count)
+    values = _mean(medium, field, grid, index, dr.opaque(mi.UInt32, points), cut)
+    dr.eval(values)
+    return values
+
+
+@dr.syntax
+def _mean(medium, field, grid, index, points, cut: bool):
+    """Means over points^3 places in the voxels ``index``."""
+    _, ny, nx = grid.shape
+    corner = mi.Point3f(index % nx, (index // nx) % ny, index // (nx * ny))
+    count = points * points * points
+    sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
+    k = mi.UInt32(0)
+    while dr.hint(k < count, label="points in a voxel"):
+        place = mi.Point3f(k % points, (k // points) % points, k // (points * points)) + 0.5
+        p = grid.world.point(corner + place / mi.Float(points))
+        value = field.at_world(p)
+        if dr.hint(cut, mode="scalar"):
+            value = dr.select(medium.contains(p), value, 0)
+        for c in range(field.channels):
+            part = value if dr.hint(field.channels == 1, mode="scalar") else value[c]
+            sums[c] = sums[c] + part
+        k += 1
+    return [s / mi.Float(count) for s in sums]
+
+
+def _occupied_box(cache: IrradianceCache) -> tuple[np.ndarray, np.ndarray]:
+    """The least box of voxels (x, y, z; lower end, upper end) that holds all active ones."""
+    _, ny, nx = cache.grid.shape
+    index = cache.active
+    places = index % nx, (index // nx) % ny, index // (nx * ny)
+    ends = [(dr.min(p), dr.max(p)) for p in places]
+    dr.eval(ends)
+    return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])
