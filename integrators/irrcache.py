@@ -42,7 +42,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - rr_depth
        - |int|
-       - Depth from which paths in the cache are ended by Russian roulette. (Default: 5)
+       - Depth from which paths of the solver ``path`` are ended by Russian roulette. (Default: 5)
 
      * - hide_emitters
        - |bool|
@@ -50,19 +50,21 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - solver
        - |string|
-       - How the cache is computed: ``path`` (Monte Carlo at every voxel) or ``auto``. (Default:
-         ``auto``)
+       - How the cache is computed: ``sweep`` (light carried along lines that all voxels share),
+         ``path`` (Monte Carlo at every voxel), or ``auto``: ``sweep`` unless an emitter is neither
+         far away nor a point. The log says which, and why. (Default: ``auto``)
 
      * - resolution
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
-         0: that of the data, at most 128; two per mean free path, 32 to 96, in a
-         homogeneous medium. (Default: 0)
+         0: the voxels of the data, at most 2^25 of them, for ``path`` at most 128 along a side;
+         two per mean free path, 32 to 96, in a homogeneous medium. (Default: 0)
 
      * - cache_spp
        - |int|
-       - Samples per cache voxel, rounded up to a multiple of 8;
-         0: 16 to 256, about 2^24 for all voxels together. (Default: 0)
+       - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches:
+         8 samples, 16 directions, or 32 where light is scattered more than once;
+         0: 128 or 64 directions; 16 to 256 samples, about 2^24 for all voxels. (Default: 0)
 
      * - cache_seed
        - |int|

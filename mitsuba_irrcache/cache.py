@@ -44,9 +44,11 @@ class IrradianceCache:
         max_depth: int,
         fingerprint: dict[str, str] | None = None,
         batch: int = BATCH,
-        double: bool = True,
+        correlated: bool = False,
     ) -> None:
-        """``double``: whether sums are kept in float64, as very many batches need."""
+        """``correlated``: whether all voxels share their samples, and so their errors. Such batches
+        are few: sums are kept in float32 then, else in float64.
+        """
         self.grid = grid
         self.batch = batch  #: samples per batch
         self.active = active
@@ -56,7 +58,8 @@ class IrradianceCache:
         self.fingerprint = fingerprint or {}
         #: samples taken per voxel from each random stream
         self.streams: dict[int, int] = {}
-        self.real = dr.float64_array_t(mi.Float) if double else mi.Float
+        self.correlated = correlated
+        self.real = mi.Float if correlated else dr.float64_array_t(mi.Float)
         # Sums of batch means for each layer and channel, and for each channel the sum of squared
         # deviations of the batches' irradiance, both layers, from its mean. None stands for 0.
         self._totals: list = [None] * (len(LAYERS) * channels)
@@ -136,8 +139,10 @@ class IrradianceCache:
         return RootField(self.grid, roots, dr.width(roots) // self.grid.voxel_count, noise)
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
-        """Variance of the voxels over their squared mean, at most 1; 0 where it is not known."""
-        variance = self._variance(channel)
+        """Variance of the voxels over their squared mean, at most 1; 0 where it is not known, or
+        neighbours err alike: then it does no harm to interpolation.
+        """
+        variance = None if self.correlated else self._variance(channel)
         if variance is None:
             return dr.zeros(mi.Float, dr.width(mean))
         # Not the quotient of squares: these vanish for light of 1e-19 and less.
@@ -215,7 +220,7 @@ class IrradianceCache:
                 raise IrrcacheError(
                     f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
                 )
-        alike = ("max_depth", "channels", "batch", "real")
+        alike = ("max_depth", "channels", "batch", "correlated")
         if self.grid.shape != other.grid.shape or any(
             getattr(self, name) != getattr(other, name) for name in alike
         ):
@@ -246,6 +251,7 @@ class IrradianceCache:
             "to_world": self.grid.to_world.tolist(),
             "channels": self.channels,
             "batch": self.batch,
+            "correlated": self.correlated,
             "max_depth": self.max_depth,
             "streams": {str(seed): n for seed, n in self.streams.items()},
             "fingerprint": self.fingerprint,
@@ -308,7 +314,9 @@ class IrradianceCache:
         expected = (len(LAYERS) * channels, width), (channels, width)
         if channels not in (1, 3) or (totals.shape, spreads.shape) != expected:
             raise ValueError(f"sums of shape {totals.shape} where {expected[0]} is expected")
-        if totals.dtype not in (np.float32, np.float64) or totals.dtype != spreads.dtype:
+        correlated = bool(description["correlated"])
+        real = np.float32 if correlated else np.float64
+        if totals.dtype != real or spreads.dtype != real:
             raise ValueError(f"sums of type {totals.dtype}")
         if not (np.isfinite(totals).all() and np.isfinite(spreads).all()):
             raise ValueError("it holds values that are not finite")
@@ -319,7 +327,7 @@ class IrradianceCache:
             int(description["max_depth"]),
             dict(description["fingerprint"]),
             int(description["batch"]),
-            totals.dtype == np.float64,
+            correlated,
         )
         cache.streams = {int(seed): int(n) for seed, n in description["streams"].items()}
         cache._totals = [cache.real(t) if t.any() else None for t in totals]

@@ -5,6 +5,10 @@ those of its voxels, each times the square of the voxel's share in the pixel. Th
 known one by one; but of random errors, +- one standard error per voxel, the squared projection is
 that variance on average (Hutchinson's estimator of a trace). `PROBES` such errors are projected.
 
+Where voxels share their samples (`IrradianceCache.correlated`), their errors do not average out.
+All probes err to the same side then, and the projection is the largest deviation that the errors of
+the voxels admit.
+
 *Bias*: the field at half the resolution differs from the field by more than the field differs from
 the truth, by a known ratio where the light is smooth (Richardson).
 """
@@ -87,6 +91,8 @@ def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     # a^2 / b of two values that err alike errs as the root of 2^2 + 1 of them, mostly as a does.
     deviation = dr.gather(mi.Float, deviations, extension.inside) * growth * 5 ** (0.5 * beyond)
     random, _ = mi.sample_tea_32(extension.inside, mi.UInt32(0x5EED), ROUNDS)
+    if cache.correlated:
+        random = random & 0  # all errors to the same side
     bits = dr.reinterpret_array(mi.UInt32, deviation) & ~mi.UInt32(2**PROBES - 1)
     signed = dr.reinterpret_array(mi.Float, bits | (random >> (32 - PROBES)))
     bias = dr.gather(mi.Float, biases, extension.inside) * growth

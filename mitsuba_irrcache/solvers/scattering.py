@@ -17,12 +17,12 @@ from mitsuba_irrcache.grid import Grid, GridField
 from mitsuba_irrcache.solvers.lattice import Lattice, Table
 
 #: Voxels along the longest side of the coarsest grid, at most.
-COARSEST = 16
+COARSEST = 20
 #: Corrections on the finest grid, at most; there is one on the others.
 CORRECTIONS = 12
 #: Relative error of the finest solution that is left, and change of the coarsest one.
 TOLERANCE = 2e-3
-COARSE_TOLERANCE = 1e-4
+COARSE_TOLERANCE = 1e-3
 
 
 class Level:

@@ -24,7 +24,7 @@ from mitsuba_irrcache.solvers.scattering import Level
 #: Directions of one pass: pairs of opposite ones.
 DIRECTIONS = 16
 #: Passes of a batch where light is scattered more than once.
-PASSES = 4
+PASSES = 2
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
 
@@ -137,8 +137,8 @@ class Sweep:
     def _uncollided(self, lattice: Lattice, rows: list, light: int) -> mi.Float:
         """Irradiance straight from the emitters, on average over passes."""
         volume = dr.opaque(mi.Float, 0, self.cache.grid.voxel_count)
-        for row in rows:
-            lattice.carry(volume, lattice.table(*row))
+        joined = (np.concatenate(part) for part in zip(*rows, strict=True))
+        lattice.carry(volume, lattice.table(*joined))
         volume = sharpened(volume, lattice.grid, RECEIVED) * dr.opaque(mi.Float, 1 / len(rows))
         return self._with_near_light(volume, light)
 

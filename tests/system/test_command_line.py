@@ -268,7 +268,7 @@ def test_interrupted(folder, capsys, monkeypatch):
 
     monkeypatch.setattr(path, "refine", interrupt)
     before = set(os.listdir(folder))
-    flags = ["-i", f"irrcache{{cache_file={folder / 'light.npz'}}}"]
+    flags = ["-i", f"irrcache{{solver=path,cache_file={folder / 'light.npz'}}}"]
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 130
     assert "interrupted; no image was written" in capsys.readouterr().err
     assert set(os.listdir(folder)) == before
@@ -293,7 +293,7 @@ def interrupt(*args, **kwargs):
 
 def test_budget(folder, capsys):
     """However small it is there is an image; what it shows is in its header."""
-    flags = ["--budget", 0.01, "--spp", 2, "-i", "irrcache{resolution=8}"]
+    flags = ["--budget", 0.01, "--spp", 2, "-i", "irrcache{solver=path,resolution=8}"]
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 0
     printed = capsys.readouterr().out
     assert " 4 samples per voxel, error" in printed and "wrote" in printed and "cache" in printed
@@ -327,7 +327,8 @@ def test_a_stopped_progressive_render(folder, capsys, monkeypatch, how):
 
     monkeypatch.setattr(path, "refine", stopped)
     before = signal.getsignal(signal.SIGTERM)
-    flags = ["-i", f"irrcache{{resolution=8,cache_file={folder / 'light.npz'}}}", "--budget", 100]
+    settings = f"solver=path,resolution=8,cache_file={folder / 'light.npz'}"
+    flags = ["-i", f"irrcache{{{settings}}}", "--budget", 100]
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 130
     assert "interrupted; the image of 16 samples" in capsys.readouterr().err
     assert read(folder / "a.exr").any() and (folder / "a.png").exists()
@@ -340,7 +341,8 @@ def test_stopped_before_the_first_image(folder, capsys, monkeypatch):
 
     monkeypatch.setattr(path.Opening, "grow", interrupt)
     before = set(os.listdir(folder))
-    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", "--budget", 9) == 130
+    flags = ["-i", "irrcache{solver=path}", "--budget", 9]
+    assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 130
     assert "interrupted; no image was written" in capsys.readouterr().err
     assert set(os.listdir(folder)) == before
 

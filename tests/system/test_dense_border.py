@@ -41,7 +41,8 @@ def test_light_is_extrapolated_to_the_faces(depth, mean_error, rmse):
         np.array(mi.render(cube(sigma_t, {"type": "volpath"}), spp=256, seed=seed), dtype=float)
         for seed in (1, 2)
     )
-    ours = cube(sigma_t, {"type": "irrcache", "resolution": 32, "cache_spp": 64})
+    settings = {"solver": "path", "resolution": 32, "cache_spp": 64}
+    ours = cube(sigma_t, {"type": "irrcache"} | settings)
     image = np.array(mi.render(ours, spp=32), dtype=float)
     mean = 0.5 * (a + b).mean()
     assert abs(metrics.mean_error(image, a, b)) < mean_error * mean

@@ -143,7 +143,8 @@ def test_wrapped_like_a_stock_integrator(scenes):
     and what they hold is what they hold outside.
     """
     names, values = {}, {}
-    ours = {"type": "irrcache", "resolution": 8, "cache_spp": 16, "aovs": "far:depth,c:colour"}
+    ours = {"type": "irrcache", "solver": "path", "resolution": 8, "cache_spp": 16}
+    ours |= {"aovs": "far:depth,c:colour"}
     for kind, inner in (("volpath", {"type": "volpath"}), ("irrcache", ours)):
         inner |= {"max_depth": 2}
         scene = scenes.load({"type": "aov", "aovs": "z:depth", "inner": inner}, cloud(scenes), 8)

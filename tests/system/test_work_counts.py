@@ -227,7 +227,8 @@ def test_wrappers_use_the_cache(scenes, refine_calls):
     shape = scenes.boundary(
         scenes.medium(scenes.texture((6, 5, 7), 0.2, 2.0, 1), 0.8, to_world), to_world
     )
-    inner = {"type": "irrcache", "max_depth": 3, "resolution": 12, "cache_spp": 32}
+    inner = {"type": "irrcache", "solver": "path", "max_depth": 3, "resolution": 12}
+    inner |= {"cache_spp": 32}
     plain = scenes.image(scenes.load(inner, shape), spp=64)
     refine_calls.clear()
     wrapped = scenes.load({"type": "aov", "aovs": "depth:depth", "inner": inner}, shape)

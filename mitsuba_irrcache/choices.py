@@ -1,0 +1,89 @@
+"""What is not told is chosen: solver, voxels and samples of a cache, from the scene."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .cache import IrradianceCache
+from .grid import Grid
+from .layers import luminance
+from .medium import MediumGrid
+from .solvers import sweep
+
+#: Optical depth of a voxel at the boundary of a medium from which on the pixels there are off by
+#: more than 10 % (a homogeneous cube; at half of it, by 5 %).
+DENSE_BORDER = 1.0
+
+#: Voxels of a cache that ``resolution`` 0 leads to, at most.
+MOST_VOXELS = 1 << 25
+#: Directions per voxel of the solver ``sweep``, unless told otherwise: for single scattering, and
+#: for more, where what is left of the noise is less.
+SINGLE, MULTIPLE = 128, 64
+
+
+def choose_solver(scene: mi.Scene, solver: str) -> tuple[str, str]:
+    """The solver for a scene, and why."""
+    if solver != "auto":
+        return solver, "as told"
+    for emitter in scene.emitters():
+        if not sweep.takes(emitter):
+            return "path", f'emitter "{emitter.id()}" is neither far away nor a point'
+    return "sweep", "all light comes from far away or from points"
+
+
+def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid, str]:
+    """The voxels of the cache, and why.
+
+    With ``resolution`` 0 those of the medium: the light of coarser ones lacks its detail, and that
+    of finer ones would see it interpolated twice. ``path`` takes at most 128 along the longest
+    side, which are work enough; ``sweep`` as many as memory lets it. A homogeneous medium gets half
+    a mean free path per voxel.
+    """
+    data, frame = medium.sigma_t.grid, medium.frame
+    if resolution:
+        grid, reason = Grid.near_cubic(frame, resolution), "as told"
+    elif data is None:
+        longest = np.linalg.norm(frame[:3, :3], axis=0).max()
+        count = np.clip(np.ceil(2 * longest * medium.sigma_t.maximum), 32, 96)
+        grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"
+    elif solver == "sweep" and data.voxel_count <= MOST_VOXELS:
+        grid, reason = Grid(data.shape, frame), "those of the medium"
+    else:
+        most = 128 if solver == "path" else round(MOST_VOXELS ** (1 / 3))
+        grid = Grid.near_cubic(frame, min(max(data.shape), most))
+        reason = f"of the medium, at most {most}"
+    return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
+
+
+def choose_samples(cache: IrradianceCache, solver: str) -> int:
+    """Samples per voxel: for ``path`` about 2^24 in all, 16 to 256 each."""
+    if solver == "sweep":
+        return SINGLE if cache.max_depth == 2 else MULTIPLE
+    return int(np.clip(2**24 // max(cache.active_count, 1), 16, 256))
+
+
+def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
+    """Tells where the cache is too coarse for matter that the boundary cuts: light falls off within
+    a fraction of a mean free path there, and nothing is known of it beyond the outermost voxels.
+    """
+    depth = _border_extinction(medium) * grid.voxel_size.max()
+    if depth > DENSE_BORDER:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"irrcache: dense matter reaches the boundary of the medium (optical depth {depth:.2g} "
+            "per cache voxel), whose light is known poorly in the outermost layer. Raise "
+            "resolution, or leave two voxels of empty space around the matter.",
+        )
+
+
+def _border_extinction(medium: MediumGrid) -> float:
+    """What 95 % of the medium's faces do not exceed: sigma_t [1/scene unit]."""
+    rng = mi.PCG32(4096)
+    face = dr.arange(mi.UInt32, 4096) % 6
+    place = [rng.next_float32() for _ in range(3)]
+    side = mi.Float(face % 2)
+    u = mi.Point3f([dr.select(face // 2 == axis, side, p) for axis, p in enumerate(place)])
+    sigma_t = medium.sigma_t.at_world(Grid((1, 1, 1), medium.frame).world.point(u))
+    return float(np.quantile(np.array(luminance(mi.Spectrum(sigma_t))), 0.95))
