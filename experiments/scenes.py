@@ -66,6 +66,10 @@ SOURCES = {
         128,
         "phantom-organs",
     ),
+    "phantom-paper": Source(
+        "thorax phantom as large as the paper's chest",
+        ("phantom:thorax:512,150,350", "--preset", "ct-chest"),
+    ),
     "phantom-bones": Source("thorax phantom, bones", ("phantom", "--preset", "ct-bone"), 128),
     "phantom-organs": Source(
         "thorax phantom, organs", ("phantom", "--transfer-function", _ORGANS), 128

@@ -22,7 +22,7 @@ from mitsuba_irrcache.loading import load_scene
 from mitsuba_irrcache.render import progress_bar
 from mitsuba_irrcache.runtime import require_llvm
 
-INTEGRATOR = "irrcache{resolution=128,cache_spp=16,step=0.5}"
+INTEGRATOR = "irrcache{step=0.5}"
 SCENE = {"max_depth": "2", "hide_emitters": "true", "radiance": "2"}
 
 

@@ -60,7 +60,7 @@ def measure(path, parameters: dict, truth: Reference, resolution: int, samples: 
     images, layers = [], {}
     for seed in (1, 2):
         integrator = specify(
-            "irrcache",
+            "irrcache{solver=path}",
             resolution=resolution,
             cache_spp=samples,
             cache_seed=seed,

@@ -55,7 +55,7 @@ def _panel(ax, case: dict) -> None:
         colour = style.COLOURS[(index + len(KINDS)) % len(style.COLOURS)]
         ax.plot(ends, np.sqrt(seconds / np.array(ends)), color=colour, label=name, linewidth=1)
     for index, (kind, label) in enumerate(KINDS):
-        errors = [max(row["rmse"], row["resolved"]) for row in every]
+        errors = [max(row["rmse"], row["at_most"] / 2) for row in every]
         look = style.line(index)
         ax.plot(
             [row[kind] for row in every], errors, look["marker"], color=look["color"],

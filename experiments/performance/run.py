@@ -6,11 +6,12 @@
 White sky of radiance 1; RMSE is absolute and net of the noise of the reference, which gets
 ``--seconds``. A stock integrator's time to an error is its variance over the square of the error,
 times what a sample takes. ``irrcache`` is run at many settings; the least time of any that reaches
-the error counts: with a cold cache (kernels warm, loading excluded), with a moved camera, and in a
+the error, one standard error of its measurement added, counts: with a cold cache (kernels warm, loading excluded), with a moved camera, and in a
 new process, all counted, that finds its kernels on disk.
 
-Whatever is finished is kept: stop it, and run it again. ``--force`` forgets ``irrcache``'s rows
-(output/performance/irrcache.json); those of the stock integrators stay until stock.json is deleted.
+Whatever is finished is kept: stop it, and run it again. ``--force`` forgets ``irrcache``'s rows of
+these scenes and depths (output/performance/irrcache.json); those of the stock integrators stay
+until stock.json is deleted.
 Prints a table and writes output/performance/results.json, which plot.py draws.
 """
 
@@ -18,11 +19,13 @@ from __future__ import annotations
 
 import argparse
 import gc
+import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -38,7 +41,7 @@ from mitsuba_irrcache.compare import metrics
 from mitsuba_irrcache.compare.reference import Reference, reference
 from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.tables import Table, percent, seconds
-from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.loading import load_scene, parse_integrator
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.solvers.sweep import batch_size
 
@@ -62,12 +65,21 @@ RESOLUTIONS = (32, 48, 64, 96, 0)
 BATCHES = (1, 2, 4, 8)
 #: Resolution and samples per voxel of ``solver=path``.
 PATH = ((32, 8), (64, 8), (64, 16))
-SPP, STEPS = (1, 2, 4, 16), (1, 2, 4)
-#: Of the first product of settings: resolution and samples of the cache.
-FIRST_SPP = 4
+SPP, STEPS = (1, 2, 4, 16), (1.0, 2.0, 4.0)
+#: Of all caches, before the best of them are seen in other ways.
+FIRST_SPP, FIRST_STEP = 4, 1.0
 COLD_RUNS, MOVED_RUNS = 3, 5
 #: A setting that takes longer than so many seconds is not repeated, nor are costlier ones tried.
-PATIENCE = 20.0
+PATIENCE = 10.0
+#: A stock integrator in a process of its own: variant, scene, image, integrator, parameters.
+STOCK_PROCESS = """
+import json, sys
+import mitsuba as mi
+variant, scene, image, integrator, parameters = sys.argv[1:]
+mi.set_variant(variant)
+scene = mi.load_file(scene, integrator=integrator, **json.loads(parameters))
+mi.util.write_bitmap(image, mi.render(scene, spp=1), write_async=False)
+"""
 
 
 @dataclass(frozen=True)
@@ -123,7 +135,7 @@ def main() -> None:
     folder = args.output / "performance"
     folder.mkdir(parents=True, exist_ok=True)
     stock = Store(folder / "stock.json")
-    points = Store(folder / "irrcache.json", args.force)
+    points = Store(folder / "irrcache.json")
     results = Store(folder / "results.json")
     cases = []
     for name in args.scenes:
@@ -131,6 +143,9 @@ def main() -> None:
             mi.set_variant(SCENES[name][0])
             mi.set_log_level(mi.LogLevel.Error)
             case = Case.of(name, depth, args.pixels, args.output)
+            if args.force:
+                kept = {k: v for k, v in points.rows.items() if not k.startswith(f"{case.key} ")}
+                points.rows = kept
             results.rows[case.key] = measure(case, args, stock, points)
             write_json(results.path, results.rows)
             cases.append(results.rows[case.key])
@@ -213,7 +228,7 @@ def picture(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
     return np.nan_to_num(metrics.colours(image).astype(np.float64), posinf=0, neginf=0), took
 
 
-def explore(depth: int, args: argparse.Namespace, point) -> list[dict]:
+def explore(depth: int, args: argparse.Namespace, point: Callable) -> list[dict]:
     """Caches of all resolutions and samples first, then images from the best two of them."""
     batch = batch_size(depth)
     series = [
@@ -224,7 +239,7 @@ def explore(depth: int, args: argparse.Namespace, point) -> list[dict]:
     caches = []
     for group in series:
         for properties in group:
-            row = point(FIRST_SPP, step=1, **properties)
+            row = point(FIRST_SPP, step=FIRST_STEP, **properties)
             caches.append((row, properties))
             if row["cold"] > PATIENCE:
                 break
@@ -242,7 +257,7 @@ def finalists(caches: list[tuple[dict, dict]]) -> list[tuple[dict, dict]]:
     chosen: list[tuple[dict, dict]] = []
     for target in TARGETS:
         rest = [c for c in caches if c not in chosen]
-        reaching = [c for c in rest if c[0]["rmse"] <= target]
+        reaching = [c for c in rest if c[0]["at_most"] <= target]
         if reaching:
             chosen.append(min(reaching, key=lambda c: c[0]["cold"]))
         elif rest:
@@ -259,12 +274,12 @@ def point_row(case: Case, truth: Reference, integrator: str, spp: int) -> dict:
         scene, _, stages = cold_start(case, integrator, spp)
         times.append(stages)
     cache, image = (float(t) for t in np.median(times, axis=0))
-    mse, uncertainty = metrics.net_mse(first, truth.a, truth.b)
+    square, uncertainty = net_mse(first, truth)
     row = {
         "integrator": integrator,
         "spp": spp,
         "rmse": metrics.net_rmse(first, truth.a, truth.b),
-        "resolved": float(np.sqrt(2 * uncertainty)),
+        "at_most": float(np.sqrt(max(square, 0) + uncertainty)),
         "mean_error": metrics.mean_error(first, truth.a, truth.b),
         "cold": float(np.median(np.sum(times, axis=1))),
         "cold_cache": cache,
@@ -276,10 +291,18 @@ def point_row(case: Case, truth: Reference, integrator: str, spp: int) -> dict:
     }
     say(
         case,
-        f"{integrator} spp {spp}: RMSE {row['rmse']:.2e}, cold {row['cold']:.3f} s, moved "
+        f"{integrator} spp {spp}: RMSE {row['rmse']:.2e} (at most {row['at_most']:.2e}), cold {row['cold']:.3f} s, moved "
         f"{row['moved']:.3f} s, load {row['load']:.1f}",
     )
     return row
+
+
+def net_mse(image: np.ndarray, truth: Reference) -> tuple[float, float]:
+    """Mean square error net of the reference's noise, and its standard error, for which the
+    channels of a pixel, which share their paths, count as one.
+    """
+    products = ((image - truth.a) * (image - truth.b)).mean(axis=-1)
+    return float(products.mean()), float(products.std() / np.sqrt(products.size))
 
 
 def cold_start(
@@ -316,17 +339,19 @@ def reach(
     stock_seconds = cost(rival) / target**2
     row = {"target": target, "stock": rival["integrator"], "stock_seconds": stock_seconds}
     row |= dict.fromkeys(("cold", "moved", "process"))
-    reaching = [p for p in points if p["rmse"] <= target]
+    reaching = [p for p in points if p["at_most"] <= target]
     if not reaching:
         return row
     cold, moved = (min(reaching, key=lambda p, k=k: p[k]) for k in ("cold", "moved"))
 
-    def started(store: Store, integrator: str, spp: int) -> float:
-        key = f"{case.key} process {integrator} spp {spp}"
-        return store.row(key, partial(process_row, case, integrator, spp))["seconds"]
+    def started(store: Store, point: dict, command: Callable) -> float:
+        spp = point["spp"] if store is own else 1
+        key = f"{case.key} process {point['integrator']} spp {spp}"
+        compute = partial(process_row, key, partial(command, case, point))
+        return store.row(key, compute)["seconds"]
 
-    rival_process = started(stock, rival["integrator"], 1) + stock_seconds
-    process = started(own, cold["integrator"], cold["spp"])
+    rival_process = started(stock, rival, stock_command) + stock_seconds
+    process = started(own, cold, own_command)
     return row | {
         "cold": entry(cold, cold["cold"], stock_seconds),
         "moved": entry(moved, moved["moved"], stock_seconds),
@@ -340,17 +365,29 @@ def entry(point: dict, took: float, rival: float) -> dict:
     return {"setting": setting, "seconds": took, "ratio": rival / took}
 
 
-def process_row(case: Case, integrator: str, spp: int) -> dict:
-    """Seconds of ``irrcache render`` in a process of its own, the second time."""
+def own_command(case: Case, point: dict, image: str) -> list[str]:
+    """``irrcache render`` with a setting."""
     defined = [part for k, v in case.parameters.items() for part in ("-D", f"{k}={v}")]
     command = [sys.executable, "-m", "mitsuba_irrcache", "render", str(case.scene), *defined]
-    command += ["-m", case.variant, "-i", integrator, "--spp", str(spp), "-o"]
+    command += ["-m", case.variant, "-i", point["integrator"], "--spp", str(point["spp"])]
+    return [*command, "-o", image]
+
+
+def stock_command(case: Case, rival: dict, image: str) -> list[str]:
+    """Mitsuba alone, one sample per pixel; the default ``rr_depth``, which hardly matters then."""
+    name = parse_integrator(rival["integrator"])[0]
+    command = [sys.executable, "-c", STOCK_PROCESS, case.variant, str(case.scene), image, name]
+    return [*command, json.dumps(case.parameters)]
+
+
+def process_row(what: str, command: Callable[[str], list[str]]) -> dict:
+    """Seconds of a process from start to end, the second time: its kernels are on disk."""
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(2):
             started = time.perf_counter()
-            subprocess.run([*command, f"{folder}/x.exr"], check=True, stdout=subprocess.DEVNULL)
+            subprocess.run(command(f"{folder}/x.exr"), check=True, stdout=subprocess.DEVNULL)
             took = time.perf_counter() - started
-    say(case, f"process {integrator} spp {spp}: {took:.2f} s")
+    print(f"{what}: {took:.2f} s", flush=True)
     return {"seconds": took, "load": os.getloadavg()[0]}
 
 

@@ -1,0 +1,240 @@
+"""What the solver ``sweep`` costs as volumes and images grow, beside what memory allows.
+
+    python -m experiments.scaling.run [--full] [--force]
+
+Single scattering in grey, 32 directions, on procedural clouds up to 128^3 voxels (``--full``: up to
+256^3, and the paper's 512 x 150 x 350 thorax), each in a process of its own: seconds, voxels times
+directions per second, peak memory. The floor is a kernel y = a x in the same process: a step of a
+line would take as long if it moved 12 bytes and did nothing else. Then images of up to 512^2
+(``--full``: 1024^2) pixels, and the kernels of a pass. Writes output/scaling/results.json.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from experiments.methods import specify
+from experiments.options import FULL, Options, parse
+from experiments.scenes import scene_file
+from experiments.store import Store
+from mitsuba_irrcache.build import CacheBuilder, CacheSettings
+from mitsuba_irrcache.compare.tables import Table
+from mitsuba_irrcache.compare.worker import peak_memory
+from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.solvers.sweep import DIRECTIONS
+
+VARIANT = "llvm_ad_mono"
+#: Source and voxels along its longest side; 0: as the source has it.
+QUICK_SIZES = (("procedural", 32), ("procedural", 64), ("procedural", 128))
+FULL_SIZES = (*QUICK_SIZES, ("procedural", 192), ("procedural", 256), ("phantom-paper", 0))
+QUICK_PIXELS = (128, 256, 512)
+FULL_PIXELS = (*QUICK_PIXELS, 1024)
+#: Of which images and kernels are measured.
+MIDDLE = ("procedural", 128)
+SAMPLES = 2 * DIRECTIONS
+#: Samples per pixel of an image.
+SPP = 4
+REPEATS = 3
+#: Of the floor: numbers in an array, and bytes that a step of a line moves.
+STREAM = 64 << 20
+STEP_BYTES = 12
+
+
+def run(options: Options) -> None:
+    """Measures what is missing, and prints all."""
+    store = Store(options.folder("scaling") / "results.json", options.force)
+    full = options.size == FULL
+
+    def row(key: str, function: Callable, source: tuple[str, int], *rest: int) -> dict:
+        scene = scene_file(source[0], options.output, source[1])
+        return store.row(key, partial(alone, function, scene, *rest))
+
+    sizes = [
+        row(f"size {name} {longest}", growth, (name, longest))
+        for name, longest in (FULL_SIZES if full else QUICK_SIZES)
+    ]
+    images = [row(f"pixels {n}", image, MIDDLE, n) for n in (FULL_PIXELS if full else QUICK_PIXELS)]
+    counts = row("kernels", kernels, MIDDLE)
+    print(sizes_table(sizes).as_text(), images_table(images).as_text(), sep="\n\n")
+    print(f"\nKernels of passes of {DIRECTIONS} directions at 128^3, the first with all before it:")
+    for number, count in enumerate(counts["passes"], 1):
+        print(
+            f"  pass {number}: {count['launches']} launches, {count['compiled']} compilations, "
+            f"{count['loaded']} kernels from disk"
+        )
+
+
+def alone(function: Callable, scene: Path, *rest: int) -> dict:
+    """What ``function`` returns in a new process, and the machine's load."""
+    print(
+        f"scaling: {function.__name__} {scene.parent.name} {' '.join(map(str, rest))}", flush=True
+    )
+    with get_context("spawn").Pool(1) as pool:
+        return pool.apply(function, (scene, *rest)) | {"load": os.getloadavg()[0]}
+
+
+def growth(scene: Path) -> dict:
+    """Seconds of a whole cache and of as many directions more, peak memory, and bandwidth."""
+    set_up()
+    parameters = {"max_depth": "2"}
+    loaded = load_scene(scene, parameters)
+    before = peak_memory()
+    builder = build(loaded, SAMPLES)[0]
+    peak = peak_memory()
+    grid, sides = builder.cache.grid, swept_sides(builder.cache)
+    whole, more = [], []
+    for _ in range(REPEATS):
+        builder = None  # its memory is used again
+        builder, seconds = build(load_scene(scene, parameters), SAMPLES, also=(more,))
+        whole.append(seconds)
+    active = builder.cache.active_count
+    builder = loaded = None
+    return {
+        "voxels": grid.voxel_count,
+        "sides": grid.shape[::-1],
+        "swept": int(np.prod(sides)),
+        "active": active,
+        "directions": SAMPLES,
+        "seconds": float(np.median(whole)),
+        "seconds_more": float(np.median(more)),
+        "peak": peak,
+        "peak_loaded": before,
+        "bandwidth": bandwidth(),
+    }
+
+
+def build(scene: mi.Scene, samples: int, also: tuple[list, ...] = ()) -> tuple:
+    """A builder that has filled its cache, and the seconds that took; those of as many samples
+    more go to the lists in ``also``.
+    """
+    dr.sync_thread()
+    builder = CacheBuilder(CacheSettings(max_depth=2, solver="sweep", samples=samples))
+    started = time.perf_counter()
+    builder.update(scene)
+    dr.sync_thread()
+    seconds = time.perf_counter() - started
+    for times in also:
+        builder.samples = 2 * samples
+        started = time.perf_counter()
+        builder.update(scene)
+        dr.sync_thread()
+        times.append(time.perf_counter() - started)
+    return builder, seconds
+
+
+def image(scene: Path, pixels: int) -> dict:
+    """Seconds of an image from a cache that is there, and peak memory."""
+    set_up()
+    parameters = {"max_depth": "2", "width": str(pixels), "height": str(pixels)}
+    integrator = specify("irrcache", solver="sweep", cache_spp=SAMPLES)
+    loaded = load_scene(scene, parameters, integrator)
+    mi.render(loaded, spp=SPP)
+    times = []
+    for seed in range(1, 6):
+        started = time.perf_counter()
+        mi.render(loaded, spp=SPP, seed=seed)
+        times.append(time.perf_counter() - started)
+    seconds = float(np.median(times))
+    return {"pixels": pixels**2, "spp": SPP, "seconds": seconds, "peak": peak_memory()}
+
+
+def kernels(scene: Path) -> dict:
+    """Kernels launched and compiled in three passes, the first with what comes before it."""
+    set_up()
+    loaded = load_scene(scene, {"max_depth": "2"})
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        builder = build(loaded, DIRECTIONS)[0]
+        passes = [counted(dr.kernel_history())]
+        for number in (2, 3):
+            builder.samples = number * DIRECTIONS
+            builder.update(loaded)
+            passes.append(counted(dr.kernel_history()))
+    return {"passes": passes}
+
+
+def counted(history: list[dict]) -> dict[str, int]:
+    """Launches, kernels that were compiled, and kernels that came from disk."""
+    jit = [k for k in history if k["type"] == dr.KernelType.JIT]
+    loaded = sum(bool(k["cache_disk"]) for k in jit)
+    compiled = sum(not k["cache_hit"] for k in jit)
+    return {"launches": len(history), "compiled": compiled, "loaded": loaded}
+
+
+def bandwidth() -> float:
+    """Bytes per second, read and written, of y = a x; the best of 5."""
+    x = dr.arange(mi.Float, STREAM)
+    a = dr.opaque(mi.Float, 2)
+    dr.eval(x)
+    times = []
+    for _ in range(6):  # the first one is compiled
+        y = x * a
+        dr.sync_thread()
+        started = time.perf_counter()
+        dr.eval(y)
+        dr.sync_thread()
+        times.append(time.perf_counter() - started)
+        del y
+    return 2 * 4 * STREAM / min(times[1:])
+
+
+def swept_sides(cache) -> np.ndarray:
+    """Sides of the box of voxels that lines pass through: the least one with all active voxels."""
+    places = np.stack(np.unravel_index(np.array(cache.active), cache.grid.shape))
+    return places.max(axis=1) - places.min(axis=1) + 1
+
+
+def set_up() -> None:
+    """A new process has no variant."""
+    require_llvm()
+    mi.set_variant(VARIANT)
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+def rate(row: dict, kind: str = "seconds_more") -> float:
+    """Voxels times directions per second, of those voxels that are swept."""
+    return row["swept"] * row["directions"] / row[kind]
+
+
+def floor(row: dict) -> float:
+    """The same if each took a step's bytes at the bandwidth of the machine."""
+    return row["bandwidth"] / STEP_BYTES
+
+
+def sizes_table(rows: list[dict]) -> Table:
+    """Time, throughput and memory by size."""
+    head = ["voxels", "swept", "s", "M/s", "s, sweeps", "M/s, sweeps", "floor", "share", "peak MiB"]
+    cells = [
+        [" x ".join(map(str, r["sides"])), f"{r['swept'] / r['voxels']:.0%}",
+         f"{r['seconds']:.3f}", f"{rate(r, 'seconds') / 1e6:.0f}",
+         f"{r['seconds_more']:.3f}", f"{rate(r) / 1e6:.0f}",
+         f"{floor(r) / 1e6:.0f}", f"{rate(r) / floor(r):.0%}", f"{r['peak'] / 2**20:.0f}"]
+        for r in rows
+    ]  # fmt: skip
+    title = f"{SAMPLES} directions; M/s: million voxels times directions per second, of those swept"
+    return Table(title, head, cells)
+
+
+def images_table(rows: list[dict]) -> Table:
+    """Time by size of the image."""
+    head = ["pixels", "spp", "s", "ns per sample", "peak MiB"]
+    cells = [
+        [f"{r['pixels'] ** 0.5:.0f}^2", str(r["spp"]), f"{r['seconds']:.3f}",
+         f"{1e9 * r['seconds'] / r['pixels'] / r['spp']:.0f}", f"{r['peak'] / 2**20:.0f}"]
+        for r in rows
+    ]  # fmt: skip
+    return Table("Images of the 128^3 cloud from a cache that is there", head, cells)
+
+
+if __name__ == "__main__":
+    run(parse(__doc__))
