@@ -143,7 +143,7 @@ class CacheBuilder:
         settings = self.settings
         self.solver, reason = choose_solver(scene, settings.solver)
         grid, size_reason = choose_grid(medium, settings.resolution, self.solver)
-        _check_memory(grid, settings.with_error)
+        _check_memory(grid, self.solver, settings.max_depth, settings.with_error)
         warn_of_dense_border(medium, grid)
         active = active_voxels(medium, grid)
         if medium.albedo.maximum == 0 or not scene.emitters():
@@ -263,13 +263,18 @@ def _of_the_cache(progress: Progress | None) -> path.Progress | None:
     return None if progress is None else lambda *n: progress("cache", *n)
 
 
-def _check_memory(grid: Grid, with_error: bool) -> None:
-    """Refuses a cache that cannot be held: float64 sums and squares of two layers, and the float32
-    field with what it is made of; for the field of its errors as much again (experiments/memory).
+def _check_memory(grid: Grid, solver: str, max_depth: int, with_error: bool) -> None:
+    """Refuses a cache that cannot be held, with what it takes to make it and to look it up; for the
+    field of its errors as much again (experiments/memory).
     """
     channels = 1 if mi.is_monochromatic else 3
-    needed = grid.voxel_count * (channels * (2 * 2 * 8 + 3 * 4) + 5 * 4)
-    needed *= 2 if with_error else 1
+    if solver == "sweep":
+        # Extinction with its neighbours, the light that lines carry, sums and spreads; and where
+        # light is scattered again, the voxels' own and what is kept between sweeps.
+        numbers = 5 + 2 * channels + (0 if max_depth == 2 else 12 + 3 * channels)
+    else:
+        numbers = channels * (3 * 2 + 3) + 5  # sums in float64
+    needed = 4 * grid.voxel_count * (numbers + 8) * (2 if with_error else 1)
     available = available_memory()
     if needed > available or grid.voxel_count >= 2**32:
         sides = " x ".join(map(str, grid.shape[::-1]))

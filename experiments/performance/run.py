@@ -6,8 +6,9 @@
 White sky of radiance 1; RMSE is absolute and net of the noise of the reference, which gets
 ``--seconds``. A stock integrator's time to an error is its variance over the square of the error,
 times what a sample takes. ``irrcache`` is run at many settings; the least time of any that reaches
-the error, one standard error of its measurement added, counts: with a cold cache (kernels warm, loading excluded), with a moved camera, and in a
-new process, all counted, that finds its kernels on disk.
+the error, one standard error of its measurement added, counts: with a cold cache (kernels warm,
+loading excluded), with a moved camera, and in a new process, all counted, that finds its kernels on
+disk.
 
 Whatever is finished is kept: stop it, and run it again. ``--force`` forgets ``irrcache``'s rows of
 these scenes and depths (output/performance/irrcache.json); those of the stock integrators stay
@@ -164,6 +165,10 @@ def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -
     truth = reference(
         case.scene, case.parameters, judge, args.output / "references", seconds=args.seconds
     )
+    mean, noise = float(truth.mean.mean()), metrics.noise(truth.a, truth.b)
+    # The root of the standard error that the mean square error of a perfect image has.
+    least = float(noise / case.pixels**0.5)
+    say(case, f"errors from {least:.1e} on can be told from none; more --seconds, smaller ones")
 
     def point(spp: int, **properties: object) -> dict:
         setting = specify("irrcache", **properties)
@@ -172,10 +177,13 @@ def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -
 
     found = explore(case.depth, args, point)
     default = point(64)  # the scenes' own samples per pixel
-    mean = float(truth.mean.mean())
-    noise = metrics.noise(truth.a, truth.b) / 2**0.5
     about = asdict(case) | {"scene": str(case.scene), "mean": mean}
-    about |= {"reference": judge, "reference_seconds": truth.seconds, "reference_noise": noise}
+    about |= {
+        "reference": judge,
+        "reference_seconds": truth.seconds,
+        "reference_noise": noise / 2**0.5,
+    }
+    about["resolved"] = least
     reached = [reach(case, target, rivals, [*found, default], stock, points) for target in TARGETS]
     return about | {"stock": rivals, "points": found, "default": default, "targets": reached}
 
@@ -291,8 +299,8 @@ def point_row(case: Case, truth: Reference, integrator: str, spp: int) -> dict:
     }
     say(
         case,
-        f"{integrator} spp {spp}: RMSE {row['rmse']:.2e} (at most {row['at_most']:.2e}), cold {row['cold']:.3f} s, moved "
-        f"{row['moved']:.3f} s, load {row['load']:.1f}",
+        f"{integrator} spp {spp}: RMSE {row['rmse']:.2e} (at most {row['at_most']:.2e}), "
+        f"cold {row['cold']:.3f} s, moved {row['moved']:.3f} s, load {row['load']:.1f}",
     )
     return row
 

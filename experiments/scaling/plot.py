@@ -41,10 +41,9 @@ def plot(options: Options) -> Section:
         )
         right.set_xlabel("pixels")
         right.set_ylabel("seconds of an image")
-        right.set_yscale("log")
         for ax in (left, right):
             ax.set_xscale("log")
-        left.set_ylim(bottom=0)
+            ax.set_yscale("log")
         left.legend()
     caption = (
         "Single scattering by sweeps, grey. Left: clouds and the thorax of the paper's size; the "

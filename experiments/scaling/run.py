@@ -12,8 +12,10 @@ line would take as long if it moved 12 bytes and did nothing else. Then images o
 from __future__ import annotations
 
 import os
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -27,6 +29,7 @@ from experiments.options import FULL, Options, parse
 from experiments.scenes import scene_file
 from experiments.store import Store
 from mitsuba_irrcache.build import CacheBuilder, CacheSettings
+from mitsuba_irrcache.compare.processes import KERNEL_CACHE
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.compare.worker import peak_memory
 from mitsuba_irrcache.loading import load_scene
@@ -45,6 +48,8 @@ SAMPLES = 2 * DIRECTIONS
 #: Samples per pixel of an image.
 SPP = 4
 REPEATS = 3
+#: Of which kernels are counted.
+PASSES = 5
 #: Of the floor: numbers in an array, and bytes that a step of a line moves.
 STREAM = 64 << 20
 STEP_BYTES = 12
@@ -64,14 +69,12 @@ def run(options: Options) -> None:
         for name, longest in (FULL_SIZES if full else QUICK_SIZES)
     ]
     images = [row(f"pixels {n}", image, MIDDLE, n) for n in (FULL_PIXELS if full else QUICK_PIXELS)]
-    counts = row("kernels", kernels, MIDDLE)
+    with no_kernels_on_disk():
+        counts = row("kernels", kernels, MIDDLE)
     print(sizes_table(sizes).as_text(), images_table(images).as_text(), sep="\n\n")
     print(f"\nKernels of passes of {DIRECTIONS} directions at 128^3, the first with all before it:")
     for number, count in enumerate(counts["passes"], 1):
-        print(
-            f"  pass {number}: {count['launches']} launches, {count['compiled']} compilations, "
-            f"{count['loaded']} kernels from disk"
-        )
+        print(f"  pass {number}: {count['launches']} launches, {count['compiled']} compilations")
 
 
 def alone(function: Callable, scene: Path, *rest: int) -> dict:
@@ -81,6 +84,20 @@ def alone(function: Callable, scene: Path, *rest: int) -> dict:
     )
     with get_context("spawn").Pool(1) as pool:
         return pool.apply(function, (scene, *rest)) | {"load": os.getloadavg()[0]}
+
+
+@contextmanager
+def no_kernels_on_disk() -> Iterator[None]:
+    """New processes do not find those of earlier ones."""
+    before = os.environ.get(KERNEL_CACHE)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ[KERNEL_CACHE] = folder
+        try:
+            yield
+        finally:
+            del os.environ[KERNEL_CACHE]
+            if before is not None:
+                os.environ[KERNEL_CACHE] = before
 
 
 def growth(scene: Path) -> dict:
@@ -138,25 +155,25 @@ def image(scene: Path, pixels: int) -> dict:
     parameters = {"max_depth": "2", "width": str(pixels), "height": str(pixels)}
     integrator = specify("irrcache", solver="sweep", cache_spp=SAMPLES)
     loaded = load_scene(scene, parameters, integrator)
-    mi.render(loaded, spp=SPP)
+    np.array(mi.render(loaded, spp=SPP))
     times = []
     for seed in range(1, 6):
         started = time.perf_counter()
-        mi.render(loaded, spp=SPP, seed=seed)
+        np.array(mi.render(loaded, spp=SPP, seed=seed))
         times.append(time.perf_counter() - started)
     seconds = float(np.median(times))
     return {"pixels": pixels**2, "spp": SPP, "seconds": seconds, "peak": peak_memory()}
 
 
 def kernels(scene: Path) -> dict:
-    """Kernels launched and compiled in three passes, the first with what comes before it."""
+    """Kernels launched and compiled pass by pass, the first with what comes before it."""
     set_up()
     loaded = load_scene(scene, {"max_depth": "2"})
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         builder = build(loaded, DIRECTIONS)[0]
         passes = [counted(dr.kernel_history())]
-        for number in (2, 3):
+        for number in range(2, PASSES + 1):
             builder.samples = number * DIRECTIONS
             builder.update(loaded)
             passes.append(counted(dr.kernel_history()))
@@ -164,11 +181,9 @@ def kernels(scene: Path) -> dict:
 
 
 def counted(history: list[dict]) -> dict[str, int]:
-    """Launches, kernels that were compiled, and kernels that came from disk."""
-    jit = [k for k in history if k["type"] == dr.KernelType.JIT]
-    loaded = sum(bool(k["cache_disk"]) for k in jit)
-    compiled = sum(not k["cache_hit"] for k in jit)
-    return {"launches": len(history), "compiled": compiled, "loaded": loaded}
+    """Launches, and kernels that were compiled."""
+    compiled = sum(k["type"] == dr.KernelType.JIT and not k["cache_hit"] for k in history)
+    return {"launches": len(history), "compiled": compiled}
 
 
 def bandwidth() -> float:

@@ -137,8 +137,10 @@ class Sweep:
     def _uncollided(self, lattice: Lattice, rows: list, light: int) -> mi.Float:
         """Irradiance straight from the emitters, on average over passes."""
         volume = dr.opaque(mi.Float, 0, self.cache.grid.voxel_count)
-        joined = (np.concatenate(part) for part in zip(*rows, strict=True))
-        lattice.carry(volume, lattice.table(*joined))
+        joined = [np.concatenate(part) for part in zip(*rows, strict=True)]
+        lit = joined[1].any(axis=1)
+        if lit.any():
+            lattice.carry(volume, lattice.table(*(part[lit] for part in joined)))
         volume = sharpened(volume, lattice.grid, RECEIVED) * dr.opaque(mi.Float, 1 / len(rows))
         return self._with_near_light(volume, light)
 
