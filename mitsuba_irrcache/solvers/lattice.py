@@ -175,9 +175,11 @@ def sharpened(values: mi.Float, grid: Grid, strength: float) -> mi.Float:
     at = (index - row * nx, row % ny, row // ny)
     change = mi.Float(0)
     for i, n, stride in zip(at, (nx, ny, nz), (mi.UInt32(1), nx, nx * ny), strict=True):
-        inner = (i > 0) & (i + 1 < n)
-        for other in (index - stride, index + stride):
-            change += dr.select(inner, values - dr.gather(mi.Float, values, other, inner), 0)
+        # At a border, the second difference of the voxel next to it.
+        centre = index + dr.select(i == 0, stride, 0) - dr.select(i + 1 == n, stride, 0)
+        for other in (centre - stride, centre + stride):
+            here, there = (dr.gather(mi.Float, values, k, n > 2) for k in (centre, other))
+            change += here - there
     return dr.maximum(dr.fma(change, dr.opaque(mi.Float, strength), values), 0)
 
 
@@ -270,7 +272,7 @@ def _sweep(
     kb, kc = dr.select(kb >= nb, kb - nb, kb), dr.select(kc >= nc, kc - nc, kc)
     since_back = dr.minimum(back_b.start(kb, gb), back_c.start(kc, gc))
     L, L_back, s0, s0_back = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
-    scale = quantum * length
+    scale, area = quantum * length, dr.rcp(length)
     k = mi.Int32(0)
     while dr.hint(active, label="slices"):
         index = mi.UInt32(ib * sb + ic * sc + off)
@@ -281,7 +283,7 @@ def _sweep(
         )
         L = dr.select(since < 1, light, L)
         L_back = dr.select(since_back < 1, light_back, L_back)
-        # In the middle slice both ways are in the same voxel.
+        # In the middle slice both ways are in the same voxel: the first to write writes for both.
         middle = off == off_back
         if dr.hint(source is None, mode="scalar"):
             L *= _passed(since, s0, s, scale)
@@ -292,9 +294,8 @@ def _sweep(
             else:
                 before = dr.gather(mi.Float, volume, index, active)
                 before_back = dr.gather(mi.Float, volume, index_back, active)
-                dr.scatter(volume, before + L, index, active)
-                both = L_back + dr.select(middle, L, 0)
-                dr.scatter(volume, before_back + both, index_back, active)
+                dr.scatter(volume, before + L + dr.select(middle, L_back, 0), index, active)
+                dr.scatter(volume, before_back + L_back, index_back, active & ~middle)
         else:
             if dr.hint(together, mode="scalar"):
                 voxel, voxel_back = mi.Vector4f(0), mi.Vector4f(0)
@@ -303,9 +304,9 @@ def _sweep(
             else:
                 voxel = dr.gather(mi.Vector4f, volume, index, active)
                 voxel_back = dr.gather(mi.Vector4f, volume, index_back, active)
-            L, tally = _crossed(L, voxel.x * weight, s * scale, since, weight)
+            L, tally = _crossed(L, voxel.x * weight, s * scale, since, weight, area)
             L_back, tally_back = _crossed(
-                L_back, voxel_back.x * weight, s_back * scale, since_back, weight
+                L_back, voxel_back.x * weight, s_back * scale, since_back, weight, area
             )
             if dr.hint(together, mode="scalar"):
                 for i in range(1, 4):
@@ -314,9 +315,9 @@ def _sweep(
                         dr.ReduceOp.Add, volume, tally_back[i], index_back * 4 + i, active
                     )
             else:
-                tally_back += dr.select(middle, tally, 0)
+                tally += dr.select(middle, tally_back, 0)
                 dr.scatter(volume, voxel + tally, index, active)
-                dr.scatter(volume, voxel_back + tally_back, index_back, active)
+                dr.scatter(volume, voxel_back + tally_back, index_back, active & ~middle)
         s0, s0_back = s, s_back
         ib, fb, since = there_b.advance(ib, fb)
         ic, fc, near = there_c.advance(ic, fc)
@@ -347,11 +348,14 @@ def _passed(since, before, here, scale) -> mi.Float:
     return dr.exp(-dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
 
 
-def _crossed(L, source, depth, since, weight) -> tuple:
-    """Radiance behind a slice, and what its voxel tallies, for a source that is constant in it."""
+def _crossed(L, source, depth, since, weight, area) -> tuple:
+    """Radiance behind a slice, and what its voxel tallies, for a source that is constant in it.
+
+    A line stands for an ``area`` across it that is the less the longer it stays in a voxel.
+    """
     tau = dr.select(since < 1, since + 0.5, 1) * depth
     passed = dr.exp(-tau)
     # Thin voxels lose little, but what they scatter is known from just that.
     lost = (L - source) * dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
     middle = dr.fma(L - source, dr.sqrt(passed), source)
-    return L - lost, mi.Vector4f(0, middle, lost, weight * tau)
+    return L - lost, mi.Vector4f(0, middle, lost * area, weight * tau * area)

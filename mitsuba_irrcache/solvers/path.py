@@ -84,12 +84,12 @@ def _statistics(totals: list, size: int, count: int) -> tuple:
     of both layers' sum from its mean.
     """
     means = [total / size for total in totals]
-    channels = len(means) // 2
+    channels, n = len(means) // 2, dr.opaque(type(means[0]), count)
     both = [means[c] + means[channels + c] for c in range(channels)]
     squares = [dr.square(b) for b in both]
     dr.eval(means, both, squares)  # by one kernel, also where a sum over one batch is part of it
     spreads = [
-        dr.maximum(dr.block_sum(s, count) - dr.square(dr.block_sum(b, count)) / count, 0)
+        dr.maximum(dr.block_sum(s, count) - dr.square(dr.block_sum(b, count)) / n, 0)
         for s, b in zip(squares, both, strict=True)
     ]
     return tuple(dr.block_sum(mean, count) for mean in means), tuple(spreads)

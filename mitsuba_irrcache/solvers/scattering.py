@@ -21,8 +21,8 @@ COARSEST = 20
 #: Corrections on the finest grid, at most; there is one on the others.
 CORRECTIONS = 12
 #: Relative error of the finest solution that is left, and change of the coarsest one.
-TOLERANCE = 2e-3
-COARSE_TOLERANCE = 1e-3
+TOLERANCE = 1e-3
+COARSE_TOLERANCE = 2e-4
 
 
 class Level:
@@ -103,8 +103,9 @@ class Level:
             before, phi = phi, self.correct(phi, b, table, quadrature)
             scale = float(dr.sum(dr.abs(phi))[0])
             last, change = change, float(dr.sum(dr.abs(phi - before))[0])
-            # Errors fall by about the same factor each time.
-            factor = min(change / last, 0.9) if last < np.inf else 0.2
+            # Errors fall by about the same factor each time. It is not trusted to stay as small as
+            # it may be at first: what converges last shows last.
+            factor = np.clip(change / last, 0.5, 0.95)
             left = change * factor / (1 - factor) / scale
             mi.Log(mi.LogLevel.Debug, f"irrcache: light of further orders known to {left:.1e}")
             if left <= TOLERANCE:
