@@ -155,7 +155,7 @@ class CacheBuilder:
             f"of {grid.voxel_count} see the medium",
         )
         channels = 1 if mi.is_monochromatic else 3
-        by_sweep = {"batch": sweep.batch_size(settings.max_depth), "correlated": True}
+        by_sweep = {"batch": sweep.BATCH, "correlated": True}
         cache = IrradianceCache(
             grid,
             active,

@@ -44,7 +44,7 @@ from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.tables import Table, percent, seconds
 from mitsuba_irrcache.loading import load_scene, parse_integrator
 from mitsuba_irrcache.runtime import require_llvm
-from mitsuba_irrcache.solvers.sweep import batch_size
+from mitsuba_irrcache.solvers.sweep import BATCH
 
 #: Variant and further parameters of each scene: clouds are grey.
 SCENES = {
@@ -63,7 +63,7 @@ REFERENCES = ("volpath{rr_depth=20}", "prbvolpath{rr_depth=20}")
 STOCK_IMAGES, STOCK_SPP = 4, 128
 
 RESOLUTIONS = (32, 48, 64, 96, 0)
-BATCHES = (1, 2, 4, 8)
+BATCHES = (1, 2, 4)
 #: Resolution and samples per voxel of ``solver=path``.
 PATH = ((32, 8), (64, 8), (64, 16))
 SPP, STEPS = (1, 2, 4, 16), (1.0, 2.0, 4.0)
@@ -238,9 +238,8 @@ def picture(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
 
 def explore(depth: int, args: argparse.Namespace, point: Callable) -> list[dict]:
     """Caches of all resolutions and samples first, then images from the best two of them."""
-    batch = batch_size(depth)
     series = [
-        [{"resolution": r, "cache_spp": n * batch, "solver": "sweep"} for n in args.batches]
+        [{"resolution": r, "cache_spp": n * BATCH, "solver": "sweep"} for n in args.batches]
         for r in args.resolutions
     ]
     series.append([{"resolution": r, "cache_spp": n, "solver": "path"} for r, n in PATH])

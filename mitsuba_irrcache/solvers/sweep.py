@@ -21,20 +21,17 @@ from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.lattice import RECEIVED, Lattice, sharpened
 from mitsuba_irrcache.solvers.scattering import Level
 
-#: Directions of one pass: pairs of opposite ones.
+#: Directions per voxel of a batch, pairs of opposite ones. Spread evenly together, 32 leave half
+#: the noise of two sets of 16.
+BATCH = 32
+#: Directions of a pass, of which a batch is made where light is scattered more than once: the
+#: orders before the last are solved for with one such set.
 DIRECTIONS = 16
-#: Passes of a batch where light is scattered more than once.
-PASSES = 2
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
 
 #: called with (samples done, samples in all), both in voxels times directions
 Progress = Callable[[int, int], None]
-
-
-def batch_size(max_depth: int) -> int:
-    """Directions per voxel of a batch."""
-    return DIRECTIONS * (1 if max_depth == 2 else PASSES)
 
 
 def takes(emitter: mi.Emitter) -> bool:
@@ -94,10 +91,11 @@ class Sweep:
         wants it.
         """
         cache = self.cache
-        # Where light is scattered again, one pass more tells what is.
-        passes = cache.batch // DIRECTIONS + bool(self._levels)
+        pairs, passes = cache.batch // 2, 1
+        if self._levels:  # one pass more tells what is scattered again
+            pairs, passes = DIRECTIONS // 2, cache.batch // DIRECTIONS + 1
         rng = np.random.default_rng((self.seed, number))
-        tables, colour = self._sky.tables(passes, DIRECTIONS // 2, cache.channels, rng)
+        tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
         found: dict[tuple[int, int], tuple] = {}
         layers = [], []
         for c in range(cache.channels):

@@ -185,7 +185,7 @@ def test_half_space_by_sweeps(scenes):
     place[:3, 3] = -100, -100, -64
     grid = Grid((128, 41, 41), place)
     index = dr.arange(mi.UInt32, grid.voxel_count)
-    batch = sweep.batch_size(-1)
+    batch = sweep.BATCH
     cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True)
     sweep.Sweep(scene, medium, cache, seed=1).refine(batch)
     found = [radiance(medium, cache, cosine, 0.25) for cosine in (0.1, 0.5, 1.0)]
