@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]) -> np.ndarray:
     integrator = scene.integrator()
     try:
-        if hasattr(integrator, "prepare"):
+        if hasattr(integrator, "progressive"):
             with _stopwatch(seconds, "cache"), progress_bar(integrator):
                 integrator.prepare(scene)
         with _stopwatch(seconds, "projection" if "cache" in seconds else "render"):
