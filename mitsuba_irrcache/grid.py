@@ -77,9 +77,13 @@ class Grid:
 
     def centers(self, index: mi.UInt32) -> mi.Point3f:
         """World positions of the voxels with the flat indices ``index`` (x fastest)."""
-        _, ny, nx = self.shape
-        x, y, z = index % nx, (index // nx) % ny, index // (nx * ny)
-        return self.world.point(mi.Point3f(x, y, z) + 0.5)
+        return self.world.point(mi.Point3f(*self.places(index)) + 0.5)
+
+    def places(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """Voxels along x, y, z of the flat indices ``index`` (x fastest)."""
+        nx, ny, _ = (mi.UInt32(n) for n in self.sides)
+        row = index // nx
+        return index - row * nx, row % ny, row // ny
 
     @staticmethod
     def near_cubic(to_world: np.ndarray, resolution: int) -> Grid:

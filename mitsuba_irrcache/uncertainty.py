@@ -108,10 +108,8 @@ def _everywhere(cache: IrradianceCache, values: mi.Float) -> mi.Float:
 
 def _at_half_resolution(cache: IrradianceCache, root: mi.Float) -> mi.Float:
     """The root of the irradiance at the active voxels, from its averages over 2^3 of them."""
-    _, ny, nx = cache.grid.shape
     halves = tuple(-(-n // 2) for n in cache.grid.shape)
-    index = cache.active
-    x, y, z = index % nx, (index // nx) % ny, index // (nx * ny)
+    x, y, z = cache.grid.places(cache.active)
     parent = ((z // 2) * halves[1] + y // 2) * halves[2] + x // 2
     count = int(np.prod(halves))
     total, members = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)

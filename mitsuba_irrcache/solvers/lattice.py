@@ -47,10 +47,10 @@ class Lattice:
 
     def __init__(self, grid: Grid, sigma_t: mi.Float, lower: np.ndarray, upper: np.ndarray) -> None:
         self.grid = grid
-        self.lower, self.sides = np.array(lower), np.array(upper) - np.array(lower)
+        self.sides = np.array(upper) - np.array(lower)
         nx, ny, _ = (int(n) for n in grid.resolution)
         self._strides = (1, nx, nx * ny)
-        self._base = int(np.dot(self.lower, self._strides))
+        self._base = int(np.dot(lower, self._strides))
         self._to_voxels = grid.coordinates.matrix[:3, :3]
         self._lines = max(int(np.prod(np.delete(self.sides, axis))) for axis in range(3))
         self._lanes = dr.arange(mi.UInt32, self._lines)
@@ -64,7 +64,6 @@ class Lattice:
         dither = mi.Float(mi.sample_tea_32(place, mi.UInt32(0x5EED), 8)[0] >> 8) * 2**-24
         self._levels = mi.UInt32(dr.minimum(dr.floor(levels + dither), LEVELS))
         dr.eval(self._levels)
-        self._corners: dict[int, mi.UInt32] = {}
         if self.together:
             self._all_corners = dr.concat([self._corners_across(axis) for axis in range(3)])
             dr.eval(self._all_corners)
@@ -150,9 +149,7 @@ class Lattice:
         bits each; flat, two words per voxel.
         """
         index = dr.arange(mi.UInt32, self.grid.voxel_count)
-        nx, ny = self._strides[1], self._strides[2] // self._strides[1]
-        row = index // nx
-        at = (index - row * nx, row % ny, row // ny)
+        at = self.grid.places(index)
         steps = []
         for k in range(3):
             if k != axis:
@@ -170,11 +167,11 @@ def sharpened(values: mi.Float, grid: Grid, strength: float) -> mi.Float:
     what smoothing by a kernel of twice that variance, in voxels, has taken away. Never negative.
     """
     index = dr.arange(mi.UInt32, grid.voxel_count)
-    nz, ny, nx = (dr.opaque(mi.UInt32, n) for n in grid.shape)
-    row = index // nx
-    at = (index - row * nx, row % ny, row // ny)
+    nx, ny, nz = (mi.UInt32(n) for n in grid.sides)
     change = mi.Float(0)
-    for i, n, stride in zip(at, (nx, ny, nz), (mi.UInt32(1), nx, nx * ny), strict=True):
+    for i, n, stride in zip(
+        grid.places(index), (nx, ny, nz), (mi.UInt32(1), nx, nx * ny), strict=True
+    ):
         # At a border, the second difference of the voxel next to it.
         centre = index + dr.select(i == 0, stride, 0) - dr.select(i + 1 == n, stride, 0)
         for other in (centre - stride, centre + stride):

@@ -45,16 +45,14 @@ class Level:
         """The level of half the resolution, made when it is first asked for."""
         if self._coarser is None:
             grid = _halved(self.grid)
-            self._children = _children(self.grid, grid, self.sigma_t)
-            sigma_t = sum(dr.gather(mi.Float, self.sigma_t, i) * w for i, w in self._children) / 8
-            # The weights of the means that follow are shares of the extinction.
-            total = sum(dr.gather(mi.Float, self.sigma_t, i) * w for i, w in self._children)
-            shares = [
-                (i, dr.select(total > 0, dr.gather(mi.Float, self.sigma_t, i) * w / total, 0))
-                for i, w in self._children
+            children = [
+                (i, dr.gather(mi.Float, self.sigma_t, i) * w) for i, w in _children(self.grid, grid)
             ]
-            dr.eval(sigma_t, shares)
-            self._children = shares
+            total = sum(s for _, s in children)
+            sigma_t = total / 8
+            # The weights of the means that follow are shares of the extinction.
+            self._children = [(i, dr.select(total > 0, s / total, 0)) for i, s in children]
+            dr.eval(sigma_t, self._children)
             lattice = Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
             self._coarser = Level(grid, sigma_t, self.restrict(self.albedo), lattice)
         return self._coarser
@@ -67,11 +65,7 @@ class Level:
 
     def prolong(self, values: mi.Float) -> mi.Float:
         """Values of the coarser level at the voxels of this one, trilinear."""
-        index = dr.arange(mi.UInt32, self.grid.voxel_count)
-        _, ny, nx = self.grid.shape
-        nx, ny = dr.opaque(mi.UInt32, nx), dr.opaque(mi.UInt32, ny)
-        row = index // nx
-        u = mi.Point3f(index - row * nx, row % ny, row // ny)
+        u = mi.Point3f(*self.grid.places(dr.arange(mi.UInt32, self.grid.voxel_count)))
         return GridField(self.coarser.grid, values, 1).at(u * 0.5 + 0.25)
 
     def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
@@ -94,13 +88,21 @@ class Level:
         dr.eval(phi, collided)
         return phi, collided
 
-    def solve(self, b: mi.Float, quadrature: tuple) -> mi.Float:
-        """Solves phi = A phi + b for directions, weights and offsets ``quadrature``."""
-        table = self.lattice.table(*without_light(*quadrature))
-        phi = self._guess(b, quadrature, table)
+    def solve(
+        self, b: mi.Float, directions: np.ndarray, weights: np.ndarray, offsets: np.ndarray
+    ) -> mi.Float:
+        """Solves phi = A phi + b for directions as in `Lattice.table`."""
+        dark = np.zeros((len(directions), 2))  # no light enters from outside
+        tables, level = [], self
+        while True:
+            tables.append(level.lattice.table(directions, dark, weights, offsets))
+            if level.coarsest:
+                break
+            level = level.coarser
+        phi = self._guess(b, tables)
         change, scale = np.inf, float(dr.sum(dr.abs(b))[0])
         for _ in range(CORRECTIONS if not self.coarsest and scale > 0 else 0):
-            before, phi = phi, self.correct(phi, b, table, quadrature)
+            before, phi = phi, self.correct(phi, b, tables)
             scale = float(dr.sum(dr.abs(phi))[0])
             last, change = change, float(dr.sum(dr.abs(phi - before))[0])
             # Errors fall by about the same factor each time. It is not trusted to stay as small as
@@ -118,33 +120,31 @@ class Level:
                 )
         return phi
 
-    def correct(self, phi: mi.Float, b: mi.Float, table: Table, quadrature: tuple) -> mi.Float:
-        """A sweep, and the correction of its error on the coarser level."""
+    def correct(self, phi: mi.Float, b: mi.Float, tables: list[Table]) -> mi.Float:
+        """A sweep, and the correction of its error on the coarser level; ``tables`` are those of
+        this level and of all coarser ones.
+        """
+        table, *coarse = tables
         swept = self.scatter(phi, table)[1] + b
-        coarser = self.coarser
-        residual = self.restrict(swept - phi)
-        coarse = coarser.lattice.table(*without_light(*quadrature))
-        error = coarser._approximate(coarser.scatter(residual, coarse)[1], quadrature, coarse)
-        result = swept + self.prolong(error)
+        _, again = self.coarser.scatter(self.restrict(swept - phi), coarse[0])
+        result = swept + self.prolong(self.coarser._approximate(again, coarse))
         dr.eval(result)
         return result
 
-    def _approximate(self, b: mi.Float, quadrature: tuple, table: Table) -> mi.Float:
+    def _approximate(self, b: mi.Float, tables: list[Table]) -> mi.Float:
         """About the solution, by a single correction on each level."""
-        phi = self._guess(b, quadrature, table)
-        return phi if self.coarsest else self.correct(phi, b, table, quadrature)
+        phi = self._guess(b, tables)
+        return phi if self.coarsest else self.correct(phi, b, tables)
 
-    def _guess(self, b: mi.Float, quadrature: tuple, table: Table) -> mi.Float:
+    def _guess(self, b: mi.Float, tables: list[Table]) -> mi.Float:
         """The solution as the coarser level sees it; on the coarsest, the solution."""
         if self.coarsest:
-            return self._iterate(b, table)
-        coarser = self.coarser
-        coarse = coarser.lattice.table(*without_light(*quadrature))
-        return self.prolong(coarser._approximate(self.restrict(b), quadrature, coarse))
+            return self._iterate(b, tables[0])
+        coarser = self.coarser  # made before anything is restricted to it
+        return self.prolong(coarser._approximate(self.restrict(b), tables[1:]))
 
     def _iterate(self, b: mi.Float, table: Table) -> mi.Float:
         """Source iteration with Anderson's acceleration on few voxels."""
-        shape = b.shape
         known = np.array(b, dtype=np.float64)
         phi, history = known.copy(), []
         scale = np.abs(known).mean()
@@ -156,12 +156,7 @@ class Level:
             if np.abs(residual).mean() <= COARSE_TOLERANCE * scale:
                 break
             phi = _mixed(history)
-        return dr.reshape(mi.Float, mi.Float(image.astype(np.float32)), shape)
-
-
-def without_light(directions: np.ndarray, weights: np.ndarray, offsets: np.ndarray) -> tuple:
-    """Arguments of a table of directions along which no light enters from outside."""
-    return directions, np.zeros((len(directions), 2)), weights, offsets
+        return mi.Float(image.astype(np.float32))
 
 
 def _mixed(history: list) -> np.ndarray:
@@ -182,11 +177,9 @@ def _halved(grid: Grid) -> Grid:
     return Grid(shape, grid.to_world @ np.diag([*scale, 1.0]))
 
 
-def _children(fine: Grid, coarse: Grid, like: mi.Float) -> list[tuple[mi.UInt32, mi.Float]]:
+def _children(fine: Grid, coarse: Grid) -> list[tuple[mi.UInt32, mi.Float]]:
     """For each corner of a coarse voxel the fine one there, and 1, or 0 where there is none."""
-    index = dr.arange(mi.UInt32, coarse.voxel_count)
-    _, cy, cx = coarse.shape
-    at = (index % cx, (index // cx) % cy, index // (cx * cy))
+    at = coarse.places(dr.arange(mi.UInt32, coarse.voxel_count))
     nx, ny, nz = (int(n) for n in fine.resolution)
     result = []
     for dz, dy, dx in np.ndindex(2, 2, 2):

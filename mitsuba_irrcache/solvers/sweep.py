@@ -115,16 +115,14 @@ class Sweep:
         level, (first, *rows) = self._levels[medium], rows
         uncollided = self._uncollided(level.lattice, rows, light)
         total = 0 * uncollided
-        phi, known = self._collided(level, first, light), 1
-        for row in rows:
+        phi = self._collided(level, first, light)
+        for known, row in enumerate(rows, 1):
             received, again = level.scatter(phi, level.lattice.table(*row))
             total = total + received
             if self.cache.max_depth < 0:
                 # Of all orders there is now another estimate: on average they have less noise.
-                weights = (dr.opaque(mi.Float, x / (known + 1)) for x in (known, 1))
-                old, new = weights
+                old, new = (dr.opaque(mi.Float, n / (known + 1)) for n in (known, 1))
                 phi = phi * old + self._with_near_light(again, light) * new
-                known += 1
             dr.eval(total, phi)
         total = self._with_near_light(total * dr.opaque(mi.Float, 1 / len(rows)), light)
         # Both layers with the same directions: under a white sky the sum has no noise.
@@ -149,8 +147,8 @@ class Sweep:
         phi = self._with_near_light(phi, light)
         if self.cache.max_depth < 0:
             directions, _, weights, offsets = row
-            lit_only = weights == 0
-            return level.solve(phi, tuple(x[~lit_only] for x in (directions, weights, offsets)))
+            even = weights != 0  # the others carry light of emitters only
+            return level.solve(phi, directions[even], weights[even], offsets[even])
         for _ in range(self.cache.max_depth - 3):
             phi = self._with_near_light(level.scatter(phi, table)[1], light)
         return phi
@@ -184,8 +182,7 @@ def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> 
 @dr.syntax
 def _mean(medium, field, grid, index, points, cut: bool):
     """Means over points^3 places in the voxels ``index``."""
-    _, ny, nx = grid.shape
-    corner = mi.Point3f(index % nx, (index // nx) % ny, index // (nx * ny))
+    corner = mi.Point3f(*grid.places(index))
     count = points * points * points
     sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
     k = mi.UInt32(0)
@@ -204,9 +201,6 @@ def _mean(medium, field, grid, index, points, cut: bool):
 
 def _occupied_box(cache: IrradianceCache) -> tuple[np.ndarray, np.ndarray]:
     """The least box of voxels (x, y, z; lower end, upper end) that holds all active ones."""
-    _, ny, nx = cache.grid.shape
-    index = cache.active
-    places = index % nx, (index // nx) % ny, index // (nx * ny)
-    ends = [(dr.min(p), dr.max(p)) for p in places]
+    ends = [(dr.min(p), dr.max(p)) for p in cache.grid.places(cache.active)]
     dr.eval(ends)
     return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])
