@@ -11,7 +11,7 @@ from time import perf_counter
 import drjit as dr
 import mitsuba as mi
 
-from .cache import IrradianceCache, active_voxels
+from .cache import BATCH, IrradianceCache, active_voxels
 from .choices import choose_grid, choose_samples, choose_solver, warn_of_dense_border
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import Snapshot, digests
@@ -155,13 +155,14 @@ class CacheBuilder:
             f"of {grid.voxel_count} see the medium",
         )
         channels = 1 if mi.is_monochromatic else 3
-        by_sweep = {"batch": sweep.BATCH, "correlated": True}
+        swept = self.solver == "sweep"
         cache = IrradianceCache(
             grid,
             active,
             channels,
             settings.max_depth,
-            **by_sweep if self.solver == "sweep" else {},
+            batch=sweep.BATCH if swept else BATCH,
+            correlated=swept,
         )
         self.saved_samples = 0
         if not settings.file:

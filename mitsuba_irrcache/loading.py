@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -167,3 +168,10 @@ class _search_path:  # noqa: N801 (a context manager)
 
     def __exit__(self, *_: object) -> None:
         mi.set_file_resolver(self.saved)
+
+
+def has_cache(scene: mi.Scene) -> bool:
+    """Whether the integrator builds a cache before it renders."""
+    method = getattr(scene.integrator(), "prepare", None)
+    # Mitsuba's differentiable integrators have another method of this name.
+    return callable(method) and "scene" in inspect.signature(method).parameters

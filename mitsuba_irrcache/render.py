@@ -18,7 +18,7 @@ from tqdm import tqdm
 from . import __version__
 from .errors import IrrcacheError, origin
 from .images import check_output, write_image
-from .loading import integrator_of, load_scene, parse_parameters
+from .loading import has_cache, integrator_of, load_scene, parse_parameters
 from .progressive import Frame, render_progressive
 from .runtime import require_llvm
 from .variants import SUPPORTED
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]) -> np.ndarray:
     integrator = scene.integrator()
     try:
-        if hasattr(integrator, "progressive"):
+        if has_cache(scene):
             with _stopwatch(seconds, "cache"), progress_bar(integrator):
                 integrator.prepare(scene)
         with _stopwatch(seconds, "projection" if "cache" in seconds else "render"):

@@ -13,7 +13,6 @@ An integrator is told apart by what it offers, never by its name:
 
 from __future__ import annotations
 
-import inspect
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -26,6 +25,7 @@ import numpy as np
 
 from mitsuba_irrcache.loading import (
     describe_integrator,
+    has_cache,
     load_scene,
     parse_integrator,
     unknown_properties,
@@ -147,13 +147,6 @@ def prepare(scene: mi.Scene) -> float:
     scene.integrator().prepare(scene)
     dr.sync_thread()
     return time.perf_counter() - started
-
-
-def has_cache(scene: mi.Scene) -> bool:
-    """Whether the integrator builds a cache before it renders."""
-    method = getattr(scene.integrator(), "prepare", None)
-    # Mitsuba's differentiable integrators have another method of this name.
-    return callable(method) and "scene" in inspect.signature(method).parameters
 
 
 def is_progressive(scene: mi.Scene) -> bool:

@@ -303,6 +303,11 @@ def test_budget(folder, capsys):
     assert header.getattribute("irrcache:seconds_image") > 0
 
 
+def test_an_integrator_with_another_prepare(folder):
+    """Mitsuba's differentiable ones have a method of this name that builds no cache."""
+    assert run("render", folder / "scene.xml", "-i", "prbvolpath", "--spp", 1) == 0
+
+
 def test_wanted_error(folder, capsys):
     flags = ["--error", 0.05, "--spp", 2, "-i", "irrcache{resolution=8}"]
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 0
