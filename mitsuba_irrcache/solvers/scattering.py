@@ -149,14 +149,15 @@ class Level:
         phi, history = known.copy(), []
         scale = np.abs(known).mean()
         for _ in range(200):
-            image = np.array(self.scatter(mi.Float(phi.astype(np.float32)), table)[1]) + known
+            # As lists: NumPy's memory would be borrowed, and kernels differ with its alignment.
+            image = np.array(self.scatter(mi.Float(phi.tolist()), table)[1]) + known
             history.append((phi, image))
             history = history[-6:]
             residual = image - phi
             if np.abs(residual).mean() <= COARSE_TOLERANCE * scale:
                 break
             phi = _mixed(history)
-        return mi.Float(image.astype(np.float32))
+        return mi.Float(image.tolist())
 
 
 def _mixed(history: list) -> np.ndarray:
