@@ -157,7 +157,8 @@ class Lattice:
             lanes = dr.arange(mi.UInt32, self._lines * len(pairs))
             lines = dr.opaque(mi.UInt32, self._lines)
             row = lanes // lines
-            which = dr.gather(mi.UInt32, mi.UInt32(pairs), row)
+            first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
+            which = dr.gather(mi.UInt32, table.ordered, first + row)
             lane = lanes - row * lines
             _sweep(self._all_corners[axis], self._own, volume, source, table, which, lane, True)
             dr.eval(volume)
@@ -208,11 +209,11 @@ def _strides(sides: np.ndarray) -> tuple[int, int, int]:
     return 1, nx, nx * ny
 
 
-def _rounded(values: mi.Float) -> mi.UInt32:
-    """Integers, up or down at random: right on average."""
+def _rounded(values: mi.Float, shift: float = 0.0) -> mi.UInt32:
+    """Integers, up or down by the golden ratio: right on average over any few neighbours."""
     place = dr.arange(mi.UInt32, dr.width(values))
-    dither = mi.Float(mi.sample_tea_32(place, mi.UInt32(0x5EED), 8)[0] >> 8) * 2**-24
-    return mi.UInt32(dr.minimum(dr.floor(values + dither), LEVELS))
+    dither = mi.Float((place * 2654435769 + int(shift * 2**32)) >> 8) * 2**-24
+    return mi.UInt32(dr.minimum(values + dither, LEVELS))
 
 
 def _halved(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
@@ -238,7 +239,7 @@ def _halved(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
             place = rest + lower * strides[axis]
             low, high = (dr.gather(mi.UInt32, levels, i) for i in (place, place + step))
             total += dr.lerp(mi.Float(low), mi.Float(high), u - mi.Float(lower))
-        halves.append(_rounded(0.5 * total))
+        halves.append(_rounded(0.5 * total, 0.5 * half))
     result = halves[0] | halves[1] << 16
     dr.eval(result)
     return result
@@ -276,6 +277,9 @@ class Table:
         self.numbers = mi.Float(numbers.astype(np.float32).ravel())
         self.axes = [int(axis) for axis in axes]
         self.places = [dr.opaque(mi.UInt32, i) for i in range(len(integers))]
+        self.order = [i for _, pairs in self.by_axis() for i in pairs]
+        # One more, since kernels that read an array of a single value are different ones.
+        self.ordered = mi.UInt32([*self.order, 0, 1])
 
     def by_axis(self) -> list[tuple[int, list[int]]]:
         """The pairs of each dominant axis, which have their corners in common."""

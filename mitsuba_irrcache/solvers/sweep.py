@@ -30,7 +30,7 @@ DIRECTIONS = 16
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
 #: Most values of the extinction along each axis of a voxel that lines see.
-DETAIL = 2
+DETAIL = 4
 
 #: called with (samples done, samples in all), both in voxels times directions
 Progress = Callable[[int, int], None]
@@ -189,6 +189,11 @@ def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> 
     cut = masked and not medium.fills(grid)
     points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
     index = dr.arange(mi.UInt32, grid.voxel_count)
+    if field.grid is grid and not cut:
+        n = field.channels
+        values = [dr.gather(mi.Float, field.data, index * n + c) * field.scale for c in range(n)]
+        dr.eval(values)
+        return values
     values = _mean(medium, field, grid, index, dr.opaque(mi.UInt32, points), cut)
     dr.eval(values)
     return values
