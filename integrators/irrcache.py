@@ -64,7 +64,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - cache_spp
        - |int|
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
-         of 8 samples or 32 directions;
+         of 8 samples or 32 directions (64, if so many are wanted of single scattering);
          0: 128 or 64 directions; 16 to 256 samples, about 2^24 for all voxels. (Default: 0)
 
      * - cache_seed

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .cache import BATCH, IrradianceCache, active_voxels
-from .choices import choose_grid, choose_samples, choose_solver, warn_of_dense_border
+from .choices import SINGLE, choose_grid, choose_samples, choose_solver, warn_of_dense_border
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import Snapshot, digests
 from .grid import Grid
@@ -155,15 +155,9 @@ class CacheBuilder:
             f"of {grid.voxel_count} see the medium",
         )
         channels = 1 if mi.is_monochromatic else 3
-        swept = self.solver == "sweep"
-        cache = IrradianceCache(
-            grid,
-            active,
-            channels,
-            settings.max_depth,
-            batch=sweep.BATCH if swept else BATCH,
-            correlated=swept,
-        )
+        swept, depth = self.solver == "sweep", settings.max_depth
+        batch = sweep.batch_of(self.samples or SINGLE, depth) if swept else BATCH
+        cache = IrradianceCache(grid, active, channels, depth, batch=batch, correlated=swept)
         self.saved_samples = 0
         if not settings.file:
             return cache

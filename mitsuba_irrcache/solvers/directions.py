@@ -60,6 +60,10 @@ def _values(spectrum: mi.Spectrum, count: int) -> np.ndarray:
     return np.stack(channels, axis=1)
 
 
+#: Pairs of directions of a pass for each line of light from a sun.
+SUN_SHARE = 8
+
+
 class Sky:
     """The emitters of a scene, seen from the medium: an environment, suns that are infinitely far
     and narrow, and point-like lights nearby.
@@ -108,11 +112,17 @@ class Sky:
                 light += self._both_ways(directions) * weights[:, None, None]
             else:
                 rows.append(self._bright_rows(pairs, rng))
+        lines = max(1, pairs // SUN_SHARE)
         for direction, irradiance in self._suns:
-            ways = np.stack([irradiance, np.zeros(colours)])
-            rows.append((direction[None], ways[None], np.zeros(1)))
+            ways = np.stack([irradiance / lines, np.zeros(colours)])
+            rows.append((np.tile(direction, (lines, 1)), np.tile(ways, (lines, 1, 1)), lines * [0]))
         joined = [np.concatenate(part) for part in zip(*rows, strict=True)]
-        return *joined, rng.random((len(joined[0]), 2))
+        offsets = rng.random((len(joined[0]), 2))
+        for k in range(len(self._suns)):
+            # The last rows: lines of one direction lie evenly in the voxels.
+            end = len(offsets) - k * lines
+            offsets[end - lines : end] = (offsets[end - 1] + _even(lines)) % 1
+        return *joined, offsets
 
     def _bright_rows(self, pairs: int, rng: np.random.Generator) -> tuple:
         """Directions of an environment that varies: half of them even, half by its luminance. One
@@ -131,9 +141,7 @@ class Sky:
 
     def _bright(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Directions (n, 3) of light from the environment, by its own density."""
-        i = np.arange(count)
-        samples = np.stack([(i + 0.5) / count, i * 0.7548776662466927 % 1])
-        samples = ((samples + rng.random((2, 1))) % 1).astype(np.float32)
+        samples = ((_even(count).T + rng.random((2, 1))) % 1).astype(np.float32)
         record, _ = self._environment.sample_direction(
             dr.zeros(mi.Interaction3f, count), mi.Point2f(samples)
         )
@@ -152,6 +160,12 @@ class Sky:
     def near_light(self, medium: MediumGrid, position: mi.Point3f) -> list[mi.Spectrum]:
         """Irradiance at ``position`` from each point-like light nearby."""
         return [_from_point(emitter, medium, position) for emitter in self._near]
+
+
+def _even(count: int) -> np.ndarray:
+    """Points (n, 2) that lie evenly in the unit square."""
+    i = np.arange(count)
+    return np.stack([(i + 0.5) / count, i * 0.7548776662466927 % 1], axis=1)
 
 
 def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -> mi.Spectrum:

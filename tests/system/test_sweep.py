@@ -116,9 +116,9 @@ def test_sunlight_along_an_axis(scenes):
 
 def test_sunlight_across_is_of_order_two(scenes):
     """A homogeneous cube of optical depth 10, not empty at its borders, in an oblique sun: at voxel
-    centres the mean error falls as the square of the voxels' size (19, 4.9, 1.2 and 0.3 %, most of
-    it in the outermost voxels, whose means are not sharpened). Lines that enter at slices, not
-    between them, are of order 1.5.
+    centres the mean error falls at least as the square of the voxels' size (15, 2.7, 0.2 and 0.1 %,
+    the last two of them noise; without sharpening 19, 4.9, 1.2 and 0.3 %). Lines that enter at
+    slices, not between them, are of order 1.5.
     """
     direction = np.array([0.5, -0.3, 0.8]) / np.linalg.norm([0.5, -0.3, 0.8])
     errors = []
@@ -130,9 +130,8 @@ def test_sunlight_across_is_of_order_two(scenes):
         ways = np.where(direction > 0, at, 2 - at) / np.abs(direction)
         expected = 4 * np.exp(-5 * ways.min(axis=-1))
         errors.append(values(cache.uncollided)[..., 0].mean() / expected.mean() - 1)
-    assert abs(errors[2]) < 0.015
-    orders = np.log2(np.abs(errors[:-1]) / np.abs(errors[1:]))
-    assert orders.min() > 1.6, errors
+    bound = 0.17 * (8 / np.array([8, 16, 32, 64])) ** 2
+    assert (np.abs(errors) < bound).all(), errors
 
 
 def test_a_cube_in_the_sky(scenes):
