@@ -246,3 +246,85 @@ def test_gradients_do_not_leak_into_the_cache(scenes, scene):
     dr.enable_grad(params[key])
     params.update()
     np.testing.assert_allclose(scenes.image(scene, spp=4), expected, rtol=1e-4, atol=1e-5)
+
+
+# What a picture reads, and how often it is launched
+
+
+def reads(kernels, scene) -> tuple[int, int]:
+    """Loads from arrays and ray intersections in the kernel that makes most of a second picture."""
+    mi.render(scene, spp=4)
+    history = kernels(lambda: mi.render(scene, spp=4, seed=1))
+    largest = max(history, key=lambda k: k["operation_count"])["ir"].getvalue()
+    return largest.count("gather"), largest.count("rtcIntersect") + largest.count("embree")
+
+
+def plain_scene(scenes, sigma_t, albedo, **more) -> mi.Scene:
+    to_world = scenes.placement()
+    shape = scenes.boundary(scenes.medium(sigma_t, albedo, to_world), to_world)
+    integrator = {"type": "irrcache", "max_depth": 2, "resolution": 8, "cache_spp": 8}
+    return scenes.load(integrator | more, shape, emitter={"type": "constant"}, sun=None)
+
+
+def test_constants_are_not_looked_up(scenes, kernels):
+    """By loads in the march: fewer where the albedo is constant, fewest where the extinction is,
+    and no ray is intersected with the scene.
+    """
+    values = scenes.texture((8, 8, 8), 0.2, 2.0, 1)
+    albedos = scenes.texture((8, 8, 8, 3), 0.2, 0.9, 2)
+    varied, constant, homogeneous = (
+        reads(kernels, plain_scene(scenes, *parts))
+        for parts in ((values, albedos), (values, 0.8), (1.5, 0.8))
+    )
+    assert varied[0] > constant[0] > homogeneous[0] > 0
+    assert varied[1] == constant[1] == homogeneous[1] == 0
+
+
+def test_grey_light_is_swept_once(scenes, kernels):
+    """In RGB a grey medium under a coloured sky takes the launches of a grey one: its channels
+    differ by a factor. A coloured medium takes three times as many lines.
+    """
+
+    def launches(sigma_t, radiance) -> int:
+        to_world = scenes.placement()
+        shape = scenes.boundary(scenes.medium(sigma_t, 0.8, to_world), to_world)
+        integrator = {"type": "irrcache", "solver": "sweep", "max_depth": 2}
+        integrator |= {"resolution": 44, "cache_spp": 32}
+        sky = {"type": "constant", "radiance": radiance}
+        scene = scenes.load(integrator, shape, size=4, emitter=sky, sun=None)
+        history = kernels(lambda: scene.integrator().prepare(scene))
+        return sum(k["size"] == 44 * 44 for k in history)
+
+    grey = scenes.texture((6, 6, 6), 0.2, 2.0, 1)
+    coloured = scenes.texture((6, 6, 6, 3), 0.2, 2.0, 1)
+    blue = {"type": "rgb", "value": [0.2, 0.4, 0.9]}
+    assert launches(grey, 1.0) == launches(grey, blue) == 16
+    assert launches(coloured, blue) == 48
+
+
+def test_no_filter_no_layers(scenes, kernels):
+    """Without a filter and further images nothing but the picture is projected: fewer channels on
+    the film, and fewer launches.
+    """
+    values = scenes.texture((8, 8, 8), 0.2, 2.0, 1)
+    counts = []
+    for settings in ({}, {"filter": "fixed"}):
+        scene = plain_scene(scenes, values, 0.8, **settings)
+        mi.render(scene, spp=4)
+        history = kernels(lambda scene=scene: mi.render(scene, spp=4, seed=1))
+        counts.append((len(history), max(k["operation_count"] for k in history)))
+    assert counts[0][0] < counts[1][0] and counts[0][1] < counts[1][1]
+
+
+def test_only_single_scattering_keeps_one_number_per_voxel(scenes, kernels):
+    """max_depth 2 by sweeps: launches for 16 pairs of directions and nothing solved; max_depth 3
+    solves, and sweeps again.
+    """
+    launches = []
+    for max_depth in (2, 3):
+        values = scenes.texture((6, 6, 6), 0.2, 2.0, 1)
+        settings = {"solver": "sweep", "resolution": 44, "cache_spp": 32}
+        scene = plain_scene(scenes, values, 0.8, max_depth=max_depth, **settings)
+        history = kernels(lambda scene=scene: scene.integrator().prepare(scene))
+        launches.append(sum(k["size"] == 44 * 44 for k in history))
+    assert launches[0] == 16 < launches[1]
