@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from .cache import IrradianceCache
+from .errors import IrrcacheError
 from .grid import Grid
 from .layers import luminance
 from .medium import MediumGrid
@@ -16,6 +17,9 @@ from .solvers import sweep
 #: more than 10 % (a homogeneous cube; at half of it, by 5 %).
 DENSE_BORDER = 1.0
 
+#: Voxels along the longest side of a cache among surfaces, unless told otherwise.
+AMONG_SURFACES = 64
+
 #: Voxels of a cache that ``resolution`` 0 leads to, at most.
 MOST_VOXELS = 1 << 25
 #: Directions per voxel of the solver ``sweep``, unless told otherwise: for single scattering, and
@@ -23,8 +27,16 @@ MOST_VOXELS = 1 << 25
 SINGLE, MULTIPLE = 128, 64
 
 
-def choose_solver(scene: mi.Scene, solver: str) -> tuple[str, str]:
+def choose_solver(scene: mi.Scene, solver: str, medium: MediumGrid) -> tuple[str, str]:
     """The solver for a scene, and why."""
+    if medium.surroundings is not None:
+        if solver == "sweep":
+            raise IrrcacheError(
+                'irrcache: solver "sweep" carries light through one medium in a box or sphere '
+                "only, and this scene has surfaces, area emitters, other boundaries or several "
+                'media; set solver to "path" or "auto".'
+            )
+        return "path", "there are surfaces or several media"
     if solver != "auto":
         return solver, "as told"
     for emitter in scene.emitters():
@@ -42,7 +54,11 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     a mean free path per voxel.
     """
     data, frame = medium.sigma_t.grid, medium.frame
-    if resolution:
+    if not resolution and medium.surroundings is not None:
+        sizes = [max(f.grid.shape) for f in (medium.sigma_t, medium.albedo) if f.grid]
+        most = min(max(sizes, default=AMONG_SURFACES), AMONG_SURFACES)
+        grid, reason = Grid.near_cubic(frame, most), f"of the medium, at most {AMONG_SURFACES}"
+    elif resolution:
         grid, reason = Grid.near_cubic(frame, resolution), "as told"
     elif data is None:
         longest = np.linalg.norm(frame[:3, :3], axis=0).max()

@@ -110,7 +110,7 @@ class Projection:
         grey = self.medium.sigma_t.channels == 1
         transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
         radiance = mi.Spectrum(0)
-        gathered = self._nothing()
+        gathered = self.nothing()
         brightest = dr.maximum(self.brightest, dr.max(background))
         # A float counts steps exactly up to 2^24; longer lattices are coarser, not endless.
         limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
@@ -188,7 +188,7 @@ class Projection:
         errors = self.uncertainty.count if self.uncertainty is not None else 1
         return 4 * dr.size_v(mi.Spectrum) + 1 + errors if self.layered else 0
 
-    def _nothing(self) -> list:
+    def nothing(self) -> list:
         """What has been gathered at the start of a ray: colour, depth, errors."""
         if not self.layered:
             return []

@@ -1,0 +1,126 @@
+"""What is around the voxels of a cache where a scene has surfaces or several media."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .grid import Grid
+from .medium import MediumGrid
+from .survey import Survey
+from .transport import MOST_CROSSINGS, Media, is_null
+
+#: Rays from each voxel that look for its medium and for surfaces seen from behind.
+RAYS = 16
+#: A voxel is behind a surface if more than this share of its rays meet the dark back of a surface
+#: first, or all of them any back.
+DARK_SHARE = 0.35
+
+
+class Surroundings:
+    """All media of a scene, and what light does between them. The scene itself is not held."""
+
+    def __init__(self, scene: mi.Scene, grids: list[MediumGrid]) -> None:
+        self.media = Media(grids)
+        #: whether emitters can only be sampled, never met
+        self.only_points = all(
+            int(e.flags()) & int(mi.EmitterFlags.Delta) for e in scene.emitters()
+        )
+        self.brightest = dr.opaque(mi.Float, _brightest(scene))
+        for grid in grids:
+            grid.surroundings = self
+
+    def survey(self, scene: mi.Scene, grid: Grid, medium: MediumGrid) -> Survey:
+        """Of all voxels of the cache's ``grid`` in ``medium``."""
+        index = dr.arange(mi.UInt32, grid.voxel_count)
+        *votes, within, dark, back = _survey(scene, self.media, medium, grid, index)
+        dr.eval(votes, within, dark, back)
+        best, place = mi.UInt32(0), mi.UInt32(0)
+        for i, count in enumerate(votes):
+            place = dr.select(count > best, i, place)
+            best = dr.maximum(best, count)
+        hidden = (mi.Float(dark) > DARK_SHARE * RAYS) | (back == RAYS)
+        dr.eval(place, hidden)
+        return Survey(grid, place, within > 0, hidden)
+
+    def pointer(self, place: mi.UInt32) -> mi.MediumPtr:
+        """The medium of a number from `Survey.place`."""
+        pointer = dr.zeros(mi.MediumPtr, dr.width(place))
+        for i, grid in enumerate(self.media.grids):
+            pointer = dr.select(place == i + 1, grid.pointer, pointer)
+        return pointer
+
+
+@dr.syntax
+def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index: mi.UInt32):
+    """Per voxel, of its rays: how many found each medium (none first), how many found ``medium``
+    from some place in the voxel, how many met a surface's dark back first, how many any back.
+    """
+    corner = mi.Point3f(*grid.places(index))
+    votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
+    within, dark, back = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+    k, count = mi.UInt32(0), dr.opaque(mi.UInt32, RAYS)
+    always = mi.Bool(True)
+    while dr.hint(k < count, label="survey"):
+        # Points of the generalised golden ratio: directions, and places in the voxel.
+        u = [mi.Float(k) * g for g in (0.8191725134, 0.6710436067, 0.5497004779)]
+        u = [v - dr.floor(v) for v in u]
+        z = (mi.Float(k) + 0.5) * (2 / RAYS) - 1
+        around = dr.sqrt(1 - z * z)
+        sine, cosine = dr.sincos(2.3999632297 * mi.Float(k) + 0.4)
+        direction = mi.Vector3f(around * cosine, around * sine, z)
+        pointer, seen_back, seen_dark = probe(scene, grid.world.point(corner + 0.5), direction)
+        votes[0] += dr.select(pointer == None, mi.UInt32(1), 0)  # noqa: E711
+        for i in range(len(media.grids)):
+            votes[i + 1] += dr.select(pointer == media.grids[i].pointer, mi.UInt32(1), 0)
+        back += dr.select(seen_back, mi.UInt32(1), 0)
+        dark += dr.select(seen_dark, mi.UInt32(1), 0)
+        pointer, seen_back, _ = probe(scene, grid.world.point(corner + mi.Point3f(u)), direction)
+        here = (pointer == medium.pointer) & always
+        within += dr.select(here, mi.UInt32(1), 0)
+        k += 1
+    return [*votes, within, dark, back]
+
+
+@dr.syntax
+def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
+    """The medium at ``p``, as the first shape along ``direction`` tells that has a medium (none
+    where there is no such shape); whether the first surface is met from behind; and whether that
+    side of it is dark.
+    """
+    ray = mi.Ray3f(p, direction)
+    pointer = dr.zeros(mi.MediumPtr, dr.width(p))
+    found, solid, back, dark = (mi.Bool(False) for _ in range(4))
+    crossings, active = mi.UInt32(0), mi.Bool(True)
+    while dr.hint(active, label="probe"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        tells = active & si.is_medium_transition() & ~found
+        pointer = dr.select(tells, si.target_medium(-direction), pointer)
+        found |= tells
+        flags = si.bsdf().flags()
+        first = active & ~is_null(flags) & ~solid
+        from_behind = first & (si.wi.z < 0)
+        back |= from_behind
+        dark |= from_behind & ~mi.has_flag(flags, mi.BSDFFlags.BackSide)
+        solid |= first
+        ray = si.spawn_ray(direction)
+        crossings += 1
+        active &= ~(found & solid) & (crossings < MOST_CROSSINGS)
+    return pointer, back, dark
+
+
+def _brightest(scene: mi.Scene) -> float:
+    """The largest radiance found on emitters that can be seen."""
+    rng = mi.PCG32(1024)
+    si = dr.zeros(mi.SurfaceInteraction3f, 1024)
+    si.uv = mi.Point2f(rng.next_float32(), rng.next_float32())
+    found = [0.0]
+    for emitter in scene.emitters():
+        environment = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+        sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+        si.wi = mi.warp.square_to_uniform_sphere(sample) if environment else mi.Vector3f(0, 0, 1)
+        value = mi.Spectrum(emitter.eval(si))
+        found.append(float(np.nanmax(np.array(value))))
+    return max(f for f in found if np.isfinite(f))
