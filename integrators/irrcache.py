@@ -212,6 +212,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return Projection(medium, field, self._quadrature, self._step, self._layered, uncertainty)
 
     @property
+    def _projection(self) -> Projection:
+        """The one that tells of layers what all do."""
+        return self._sight.projection
+
+    @property
     def _layered(self) -> bool:
         """Whether anything is asked for that the radiance alone cannot tell."""
         return bool(self._aovs) or self._filter != "none"
@@ -301,7 +306,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             found = self._radiance(scene, sampler, ray, medium, weight, active)
             return *found[:2], found[2].channels() if found[2] else []
 
-        count = self._sight.projection.channel_count
+        count = self._projection.channel_count
         names = [f"layer.{i}" for i in range(count)]
         film = render_film(sensor, radiance, seed, spp, self.should_stop, names)
         if not count:
@@ -352,7 +357,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         view = self._sight.look(scene, sampler, mi.Ray3f(ray), medium, active)
         layers = None
         if self._layered:
-            layers = self._sight.projection.layers(
+            layers = self._projection.layers(
                 view.scattered, view.transmittance, view.gathered, view.background, weight
             )
         return (view.scattered + view.background) * weight, view.alpha, layers
