@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .cache import IrradianceCache
+from .choices import choose_solver
 from .fingerprint import Snapshot
 from .lit import CacheSettings, LitMedium
 from .medium import MediumGrid
@@ -71,8 +72,10 @@ class CacheBuilder:
             self.parts, self._snapshot = [], None
             self.revision += 1
             media = bake_media(scene)
+            if media:
+                solver = choose_solver(scene, self.settings.solver, media[0])
             self.parts = [
-                LitMedium(scene, m, self.settings, m.name if len(media) > 1 else "", edited)
+                LitMedium(scene, m, self.settings, solver, m.name if len(media) > 1 else "", edited)
                 for m in media
             ]
             self._scene_id, self._snapshot = id(scene), snapshot

@@ -143,7 +143,9 @@ class IrradianceCache:
         if self.survey is not None:
             roots = self.survey.filled(roots, self.active, channels)
             dr.eval(roots)
-        return RootField(self.grid, roots, channels, noise)
+        field = RootField(self.grid, roots, channels, noise)
+        field.edges = self.survey and self.survey.edges
+        return field
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Variance of the voxels over their squared mean, at most 1; 0 where it is not known, or

@@ -27,9 +27,11 @@ MOST_VOXELS = 1 << 25
 SINGLE, MULTIPLE = 128, 64
 
 
-def choose_solver(scene: mi.Scene, solver: str, medium: MediumGrid) -> tuple[str, str]:
-    """The solver for a scene, and why."""
-    if medium.surroundings is not None:
+def choose_solver(
+    scene: mi.Scene, solver: str, medium: MediumGrid | None = None
+) -> tuple[str, str]:
+    """The solver for a scene, one of whose media is ``medium``, and why."""
+    if medium is not None and medium.surroundings is not None:
         if solver == "sweep":
             raise IrrcacheError(
                 'irrcache: solver "sweep" carries light through one medium in a box or sphere '

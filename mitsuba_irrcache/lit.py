@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .cache import BATCH, IrradianceCache, active_voxels
-from .choices import choose_grid, choose_samples, choose_solver, warn_of_dense_border
+from .choices import choose_grid, choose_samples, warn_of_dense_border
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import digests
 from .grid import Grid
@@ -36,17 +36,24 @@ class LitMedium:
     """A medium with its cache, which is None where no light needs caching (``max_depth`` below
     2).
 
-    ``name`` tells it from the scene's other media, "" where there are none.
+    ``solver`` is what `choices.choose_solver` says; ``name`` tells the medium from the
+    scene's others, "" where there are none.
     """
 
     def __init__(
-        self, scene: mi.Scene, medium: MediumGrid, settings: CacheSettings, name: str, edited: bool
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        settings: CacheSettings,
+        solver: tuple[str, str],
+        name: str,
+        edited: bool,
     ) -> None:
         self.settings, self.medium, self.name = settings, medium, name
         #: samples per voxel in the file
         self.saved_samples = 0
-        #: path or sweep
-        self.solver = ""
+        #: path or sweep, and why
+        self.solver, self._reason = solver
         self._opening: path.Opening | None = None
         self._preview: IrradianceCache | None = None
         self._sweep: sweep.Sweep | None = None
@@ -105,7 +112,6 @@ class LitMedium:
 
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
         settings, medium = self.settings, self.medium
-        self.solver, reason = choose_solver(scene, settings.solver, medium)
         grid, size_reason = choose_grid(medium, settings.resolution, self.solver)
         _check_memory(grid, self.solver, settings.max_depth, settings.with_error)
         warn_of_dense_border(medium, grid)
@@ -117,7 +123,7 @@ class LitMedium:
             active = mi.UInt32()
         mi.Log(
             mi.LogLevel.Info,
-            f"irrcache: {self.label}solver {self.solver} ({reason}); cache of "
+            f"irrcache: {self.label}solver {self.solver} ({self._reason}); cache of "
             f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {dr.width(active)} "
             f"of {grid.voxel_count} see the medium",
         )

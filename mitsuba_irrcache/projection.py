@@ -79,6 +79,8 @@ class Projection:
         if self.irradiance is None:
             return sigma_t, mi.Float(0), known
         phi, albedo = rest
+        if self.irradiance.edges is not None:
+            phi = self.irradiance.edges.corrected(self.irradiance, p, phi, active)
         if self.uncertainty is not None:
             known += self.uncertainty.at_world(p, phi, active)
         return sigma_t, albedo * phi * dr.inv_four_pi, known

@@ -30,9 +30,8 @@ def bake_media(scene: mi.Scene) -> list[MediumGrid]:
     """
     if not media_of(scene):
         return []
-    if is_simple(scene):
-        return [bake_scene(scene)]
-    return bake_general(scene)
+    boundary = simple_boundary(scene)
+    return bake_general(scene) if boundary is None else [_bake_simple(scene, boundary)]
 
 
 def media_of(scene: mi.Scene) -> dict[mi.Medium, list[mi.Shape]]:
@@ -55,38 +54,38 @@ def _flags(shape: mi.Shape) -> int:
     return int(bsdf.flags()) if bsdf is not None else 0
 
 
-def is_simple(scene: mi.Scene) -> bool:
-    """Whether there is one medium, in a null boundary of known form, and no surface besides."""
+def simple_boundary(scene: mi.Scene) -> Boundary | None:
+    """The boundary of the one medium in a scene that has no surface besides; None for others."""
     media = media_of(scene)
     bounded = [s for s in scene.shapes() if s.interior_medium() is not None]
     if len(media) != 1 or len(bounded) != 1:
-        return False
+        return None
     for shape in scene.shapes():
         surface = not is_null(_flags(shape)) or shape.is_emitter() or shape.is_sensor()
         if surface or shape.exterior_medium() is not None:
-            return False
-    return _recognised(scene, bounded[0]) is not None
-
-
-def _recognised(scene: mi.Scene, shape: mi.Shape) -> Boundary | None:
+            return None
     try:
-        return boundary_of(scene, shape)
+        return boundary_of(scene, bounded[0])
     except UnsupportedSceneError:
         return None
 
 
 def bake_scene(scene: mi.Scene) -> MediumGrid | None:
     """The medium of a simple scene on its grids, or None where there is none."""
-    for medium, (shape, *_) in media_of(scene).items():
-        boundary = boundary_of(scene, shape)
-        for emitter in _point_lights(scene):
-            position = _position(emitter)
-            if boundary.contains(position):
-                _refuse_inside(emitter, position)
-        grid = bake(medium, boundary)
-        grid.name = medium.id()
-        return grid
+    for shapes in media_of(scene).values():
+        return _bake_simple(scene, boundary_of(scene, shapes[0]))
     return None
+
+
+def _bake_simple(scene: mi.Scene, boundary: Boundary) -> MediumGrid:
+    for emitter in _point_lights(scene):
+        position = _position(emitter)
+        if boundary.contains(position):
+            _refuse_inside(emitter, position)
+    (medium,) = media_of(scene)
+    grid = bake(medium, boundary)
+    grid.name = medium.id()
+    return grid
 
 
 def bake_general(scene: mi.Scene) -> list[MediumGrid]:

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .edges import Edges
 from .grid import Grid
 from .medium import MediumGrid
 from .survey import Survey
@@ -13,9 +14,6 @@ from .transport import MOST_CROSSINGS, Media, is_null
 
 #: Rays from each voxel that look for its medium and for surfaces seen from behind.
 RAYS = 16
-#: A voxel is behind a surface if more than this share of its rays meet the dark back of a surface
-#: first, or all of them any back.
-DARK_SHARE = 0.35
 
 
 class Surroundings:
@@ -34,15 +32,16 @@ class Surroundings:
     def survey(self, scene: mi.Scene, grid: Grid, medium: MediumGrid) -> Survey:
         """Of all voxels of the cache's ``grid`` in ``medium``."""
         index = dr.arange(mi.UInt32, grid.voxel_count)
-        *votes, within, dark, back = _survey(scene, self.media, medium, grid, index)
-        dr.eval(votes, within, dark, back)
+        *votes, within, back = _survey(scene, self.media, medium, grid, index)
+        dr.eval(votes, within, back)
         best, place = mi.UInt32(0), mi.UInt32(0)
         for i, count in enumerate(votes):
             place = dr.select(count > best, i, place)
             best = dr.maximum(best, count)
-        hidden = (mi.Float(dark) > DARK_SHARE * RAYS) | (back == RAYS)
+        hidden = back == RAYS
         dr.eval(place, hidden)
-        return Survey(grid, place, within > 0, hidden)
+        edges = Edges(scene, grid)
+        return Survey(grid, place, within > 0, hidden, edges if edges.count else None)
 
     def pointer(self, place: mi.UInt32) -> mi.MediumPtr:
         """The medium of a number from `Survey.place`."""
@@ -55,11 +54,11 @@ class Surroundings:
 @dr.syntax
 def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index: mi.UInt32):
     """Per voxel, of its rays: how many found each medium (none first), how many found ``medium``
-    from some place in the voxel, how many met a surface's dark back first, how many any back.
+    from some place in the voxel, how many met the back of a surface first.
     """
     corner = mi.Point3f(*grid.places(index))
     votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
-    within, dark, back = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+    within, back = mi.UInt32(0), mi.UInt32(0)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, RAYS)
     always = mi.Bool(True)
     while dr.hint(k < count, label="survey"):
@@ -70,28 +69,26 @@ def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
         around = dr.sqrt(1 - z * z)
         sine, cosine = dr.sincos(2.3999632297 * mi.Float(k) + 0.4)
         direction = mi.Vector3f(around * cosine, around * sine, z)
-        pointer, seen_back, seen_dark = probe(scene, grid.world.point(corner + 0.5), direction)
+        pointer, seen_back = probe(scene, grid.world.point(corner + 0.5), direction)
         votes[0] += dr.select(pointer == None, mi.UInt32(1), 0)  # noqa: E711
         for i in range(len(media.grids)):
             votes[i + 1] += dr.select(pointer == media.grids[i].pointer, mi.UInt32(1), 0)
         back += dr.select(seen_back, mi.UInt32(1), 0)
-        dark += dr.select(seen_dark, mi.UInt32(1), 0)
-        pointer, seen_back, _ = probe(scene, grid.world.point(corner + mi.Point3f(u)), direction)
+        pointer, seen_back = probe(scene, grid.world.point(corner + mi.Point3f(u)), direction)
         here = (pointer == medium.pointer) & always
         within += dr.select(here, mi.UInt32(1), 0)
         k += 1
-    return [*votes, within, dark, back]
+    return [*votes, within, back]
 
 
 @dr.syntax
 def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
     """The medium at ``p``, as the first shape along ``direction`` tells that has a medium (none
-    where there is no such shape); whether the first surface is met from behind; and whether that
-    side of it is dark.
+    where there is no such shape); whether the first surface is met from behind.
     """
     ray = mi.Ray3f(p, direction)
     pointer = dr.zeros(mi.MediumPtr, dr.width(p))
-    found, solid, back, dark = (mi.Bool(False) for _ in range(4))
+    found, solid, back = (mi.Bool(False) for _ in range(3))
     crossings, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="probe"):
         si = scene.ray_intersect(ray, active)
@@ -101,14 +98,12 @@ def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
         found |= tells
         flags = si.bsdf().flags()
         first = active & ~is_null(flags) & ~solid
-        from_behind = first & (si.wi.z < 0)
-        back |= from_behind
-        dark |= from_behind & ~mi.has_flag(flags, mi.BSDFFlags.BackSide)
+        back |= first & (dr.dot(si.n, direction) > 0)
         solid |= first
         ray = si.spawn_ray(direction)
         crossings += 1
         active &= ~(found & solid) & (crossings < MOST_CROSSINGS)
-    return pointer, back, dark
+    return pointer, back
 
 
 def _brightest(scene: mi.Scene) -> float:

@@ -13,13 +13,21 @@ class Survey:
     """Where the voxels of ``grid`` are.
 
     ``place`` is 0 for a voxel whose centre is in no medium, else 1 for the first of the scene's,
-    and so on. ``hidden`` are voxels behind surfaces, such as inside of opaque things: what is known
-    there must not be looked up from the other side. ``reach`` are those that a lookup in the
-    cache's medium can read: some of it lies in them (``within``) or in a neighbour.
+    and so on. ``hidden`` are voxels inside of closed surfaces: what is known there must not be
+    looked up from the other side. ``reach`` are those that a lookup in the cache's medium can read:
+    some of it lies in them (``within``) or in a neighbour. ``edges`` are the surfaces between
+    voxels.
     """
 
-    def __init__(self, grid: Grid, place: mi.UInt32, within: mi.Bool, hidden: mi.Bool) -> None:
-        self.grid, self.place, self.hidden = grid, place, hidden
+    def __init__(
+        self,
+        grid: Grid,
+        place: mi.UInt32,
+        within: mi.Bool,
+        hidden: mi.Bool,
+        edges: object | None = None,
+    ) -> None:
+        self.grid, self.place, self.hidden, self.edges = grid, place, hidden, edges
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.reach = within | (total > 0)
         dr.eval(self.reach)
