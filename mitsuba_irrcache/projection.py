@@ -79,11 +79,21 @@ class Projection:
         if self.irradiance is None:
             return sigma_t, mi.Float(0), known
         phi, albedo = rest
-        if self.irradiance.edges is not None:
-            phi = self.irradiance.edges.corrected(self.irradiance, p, phi, active)
+        phi = self._within_edges(p, phi, active)
         if self.uncertainty is not None:
             known += self.uncertainty.at_world(p, phi, active)
         return sigma_t, albedo * phi * dr.inv_four_pi, known
+
+    def irradiance_at(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
+        """The cached irradiance alone."""
+        return self._within_edges(p, self.irradiance.at_world(p, active), active)
+
+    def _within_edges(
+        self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
+    ) -> mi.Float | mi.Color3f:
+        """Irradiance that was looked up, without what is on the other side of surfaces."""
+        edges = self.irradiance.edges
+        return phi if edges is None else edges.corrected(self.irradiance, p, phi, active)
 
     @dr.syntax
     def march(

@@ -3,7 +3,8 @@
 In a simple scene (see `scene`) its way is known in closed form. In all others the ray goes straight
 on through null surfaces, from one medium into the next, and is marched through each with that
 medium's cache. Where it meets a surface, or nothing any more, its straight way ends: what a surface
-sends back is path traced, by one path per camera sample.
+sends back is path traced, by one path per camera sample, which ends where it meets a medium with a
+cache.
 """
 
 from __future__ import annotations
@@ -93,6 +94,8 @@ class Sight:
         #: the one that gathers most: a dark medium has no errors to tell
         self.projection = max(projections, key=lambda p: p.channel_count)
         self.hide_emitters = hide_emitters
+        #: the caches hold what paths of any length find; for shorter ones they hold too much
+        self.cached = self._irradiance if max_depth < 0 else None
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
 
@@ -125,6 +128,7 @@ class Sight:
             self.hide_emitters,
             rng,
             traced,
+            self.cached,
         )
         background += dr.select(traced, weight * (straight + reflected), 0)
         alpha = mi.Float(1)
@@ -188,6 +192,19 @@ class Sight:
             crossings += 1
             active &= crosses & (dr.max(passed) > 0) & (crossings < MOST_CROSSINGS)
         return scattered, background, passed, gathered, segment, pointer, stopped, escaped
+
+    def _irradiance(
+        self, pointer: mi.MediumPtr, p: mi.Point3f, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Bool]:
+        """The cached irradiance, and whether there is a cache."""
+        result, known = mi.Spectrum(0), mi.Bool(False)
+        for projection in self.projections:
+            here = active & (pointer == projection.medium.pointer)
+            known |= here
+            if projection.irradiance is not None:
+                phi = mi.Spectrum(projection.irradiance_at(p, here))
+                result = dr.select(here, phi, result)
+        return result, known
 
     def _nothing(self) -> list:
         """Gathered sums at the start of a ray."""

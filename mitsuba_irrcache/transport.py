@@ -12,7 +12,7 @@ than ``max_depth`` vertices.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -168,9 +168,14 @@ def trace(
     hide_emitters: bool,
     rng: mi.PCG32,
     active: mi.Bool,
+    cached: Callable | None = None,
 ):
     """One path per lane: radiance that came straight from emitters, radiance that was scattered,
     whether anything was scattered, and the random generator.
+
+    ``cached``, if given, maps a medium, a position in it and a mask to the irradiance there, and
+    whether it is known; where it is, paths end with their first collision. It has to hold all that
+    the path could still find.
     """
     straight, scattered = mi.Spectrum(0), mi.Spectrum(0)
     weight, eta = mi.Spectrum(1), mi.Float(1)
@@ -193,6 +198,12 @@ def trace(
         collided, t, weight, rng = media.fly(pointer, ray, si.t, weight, rng, active & ~clear)
         clear = mi.Bool(False)
         surface = active & ~collided
+        met |= collided
+        if dr.hint(cached is not None, mode="scalar"):
+            irradiance, known = cached(pointer, ray(t), collided)
+            light = weight * irradiance * dr.inv_four_pi
+            scattered += dr.select(collided & known, light, 0)
+            collided &= ~known
 
         # Emitters that are met by chance, weighted against sampling them from the last vertex.
         emitter = si.emitter(scene, surface)
