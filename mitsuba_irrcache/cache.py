@@ -141,8 +141,7 @@ class IrradianceCache:
         channels = len(roots)
         roots, noise = (self._tensor(x).array for x in (roots, noise[:channels]))
         if self.survey is not None:
-            roots = self.survey.filled(roots, self.active, channels)
-            dr.eval(roots)
+            roots = self.survey.filled(roots, channels)
         field = RootField(self.grid, roots, channels, noise)
         field.edges = self.survey and self.survey.edges
         return field

@@ -106,7 +106,7 @@ def bake_general(scene: mi.Scene) -> list[MediumGrid]:
     Surroundings(scene, grids)
     for emitter in _point_lights(scene):
         position = _position(emitter)
-        pointer, *_ = probe(scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
+        pointer = probe(scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
         if dr.any(pointer != None):  # noqa: E711
             _refuse_inside(emitter, position)
     return seen

@@ -12,7 +12,7 @@ from .medium import MediumGrid
 from .survey import Survey
 from .transport import MOST_CROSSINGS, Media, is_null
 
-#: Rays from each voxel that look for its medium and for surfaces seen from behind.
+#: Rays from each voxel that look for its medium.
 RAYS = 16
 
 
@@ -32,16 +32,16 @@ class Surroundings:
     def survey(self, scene: mi.Scene, grid: Grid, medium: MediumGrid) -> Survey:
         """Of all voxels of the cache's ``grid`` in ``medium``."""
         index = dr.arange(mi.UInt32, grid.voxel_count)
-        *votes, within, back = _survey(scene, self.media, medium, grid, index)
-        dr.eval(votes, within, back)
+        *votes, within, backs = _survey(scene, self.media, medium, grid, index)
+        within, enclosed = within > 0, backs == RAYS
+        dr.eval(votes, within, enclosed)
         best, place = mi.UInt32(0), mi.UInt32(0)
         for i, count in enumerate(votes):
             place = dr.select(count > best, i, place)
             best = dr.maximum(best, count)
-        hidden = back == RAYS
-        dr.eval(place, hidden)
+        dr.eval(place)
         edges = Edges(scene, grid)
-        return Survey(grid, place, within > 0, hidden, edges if edges.count else None)
+        return Survey(grid, place, within, enclosed, edges if edges.count else None)
 
     def pointer(self, place: mi.UInt32) -> mi.MediumPtr:
         """The medium of a number from `Survey.place`."""
@@ -58,7 +58,7 @@ def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
     """
     corner = mi.Point3f(*grid.places(index))
     votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
-    within, back = mi.UInt32(0), mi.UInt32(0)
+    within, backs = mi.UInt32(0), mi.UInt32(0)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, RAYS)
     always = mi.Bool(True)
     while dr.hint(k < count, label="survey"):
@@ -69,41 +69,51 @@ def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
         around = dr.sqrt(1 - z * z)
         sine, cosine = dr.sincos(2.3999632297 * mi.Float(k) + 0.4)
         direction = mi.Vector3f(around * cosine, around * sine, z)
-        pointer, seen_back = probe(scene, grid.world.point(corner + 0.5), direction)
+        pointer = probe(scene, grid.world.point(corner + 0.5), direction)
+        meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction)
+        backs += dr.select(meets_back, mi.UInt32(1), 0)
         votes[0] += dr.select(pointer == None, mi.UInt32(1), 0)  # noqa: E711
         for i in range(len(media.grids)):
             votes[i + 1] += dr.select(pointer == media.grids[i].pointer, mi.UInt32(1), 0)
-        back += dr.select(seen_back, mi.UInt32(1), 0)
-        pointer, seen_back = probe(scene, grid.world.point(corner + mi.Point3f(u)), direction)
+        pointer = probe(scene, grid.world.point(corner + mi.Point3f(u)), direction)
         here = (pointer == medium.pointer) & always
         within += dr.select(here, mi.UInt32(1), 0)
         k += 1
-    return [*votes, within, back]
+    return [*votes, within, backs]
 
 
 @dr.syntax
 def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
-    """The medium at ``p``, as the first shape along ``direction`` tells that has a medium (none
-    where there is no such shape); whether the first surface is met from behind.
+    """The medium at ``p``, as the first shape along ``direction`` tells that has a medium; none
+    where there is no such shape.
     """
-    ray = mi.Ray3f(p, direction)
-    pointer = dr.zeros(mi.MediumPtr, dr.width(p))
-    found, solid, back = (mi.Bool(False) for _ in range(3))
+    ray, pointer = mi.Ray3f(p, direction), dr.zeros(mi.MediumPtr, dr.width(p))
     crossings, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="probe"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        tells = active & si.is_medium_transition() & ~found
+        tells = active & si.is_medium_transition()
         pointer = dr.select(tells, si.target_medium(-direction), pointer)
-        found |= tells
-        flags = si.bsdf().flags()
-        first = active & ~is_null(flags) & ~solid
-        back |= first & (dr.dot(si.n, direction) > 0)
-        solid |= first
         ray = si.spawn_ray(direction)
         crossings += 1
-        active &= ~(found & solid) & (crossings < MOST_CROSSINGS)
-    return pointer, back
+        active &= ~tells & (crossings < MOST_CROSSINGS)
+    return pointer
+
+
+@dr.syntax
+def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
+    """Whether the first surface that is not null is met from behind."""
+    ray, back = mi.Ray3f(p, direction), mi.Bool(False)
+    crossings, active = mi.UInt32(0), mi.Bool(True)
+    while dr.hint(active, label="backs"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        solid = active & ~is_null(si.bsdf().flags())
+        back |= solid & (dr.dot(si.n, direction) > 0)
+        ray = si.spawn_ray(direction)
+        crossings += 1
+        active &= ~solid & (crossings < MOST_CROSSINGS)
+    return back
 
 
 def _brightest(scene: mi.Scene) -> float:

@@ -1,4 +1,4 @@
-"""Where the voxels of a cache lie among surfaces and media, and what is done about those behind."""
+"""Where the voxels of a cache lie among surfaces and media."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ class Survey:
     """Where the voxels of ``grid`` are.
 
     ``place`` is 0 for a voxel whose centre is in no medium, else 1 for the first of the scene's,
-    and so on. ``hidden`` are voxels inside of closed surfaces: what is known there must not be
-    looked up from the other side. ``reach`` are those that a lookup in the cache's medium can read:
-    some of it lies in them (``within``) or in a neighbour. ``edges`` are the surfaces between
-    voxels.
+    and so on. ``reach`` are those that a lookup in the cache's medium can read: some of it lies in
+    them (``within``) or in a neighbour. ``enclosed`` are those that see nothing but the backs of
+    surfaces. ``edges`` are the surfaces between voxels, None where there are none.
     """
 
     def __init__(
@@ -24,26 +23,30 @@ class Survey:
         grid: Grid,
         place: mi.UInt32,
         within: mi.Bool,
-        hidden: mi.Bool,
+        enclosed: mi.Bool,
         edges: object | None = None,
     ) -> None:
-        self.grid, self.place, self.hidden, self.edges = grid, place, hidden, edges
+        self.grid, self.place, self.enclosed, self.edges = grid, place, enclosed, edges
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.reach = within | (total > 0)
         dr.eval(self.reach)
 
-    def filled(self, values: mi.Float, active: mi.UInt32, channels: int) -> mi.Float:
-        """Values of all voxels, the hidden ones' replaced by means of those of their ``active``
-        neighbours that are not, where there are any.
+    def filled(self, values: mi.Float, channels: int) -> mi.Float:
+        """Values of all voxels, the means of their neighbours' for those inside of opaque things:
+        of a curved surface, `edges` leave a little to be read there.
         """
-        known = dr.zeros(mi.Bool, self.grid.voxel_count)
-        dr.scatter(known, mi.Bool(True), active)
-        known &= ~self.hidden
+        voxel = dr.arange(mi.UInt32, self.grid.voxel_count)
+        lit = mi.Bool(False)
+        for c in range(channels):
+            lit |= dr.gather(mi.Float, values, voxel * channels + c) > 0
+        known = lit | ~self.enclosed
         dr.eval(known)
         total, weights = neighbourhood(self.grid, values, known, channels)
-        voxel = dr.arange(mi.UInt32, self.grid.voxel_count * channels) // channels
-        own = ~dr.gather(mi.Bool, self.hidden, voxel) | (weights == 0)
-        return dr.select(own, values, total / dr.select(own, 1, weights))
+        own = dr.gather(mi.Bool, known, dr.arange(mi.UInt32, dr.width(values)) // channels)
+        own |= weights == 0
+        result = dr.select(own, values, total / dr.select(own, 1, weights))
+        dr.eval(result)
+        return result
 
 
 def neighbourhood(
@@ -63,11 +66,11 @@ def neighbourhood(
         squared = sum(o * o for o in offset)
         if not squared:
             continue
-        x, y, z = (p + o for p, o in zip(places, offset, strict=True))
-        inside = (x >= 0) & (y >= 0) & (z >= 0)
-        for at, side in zip((x, y, z), grid.sides, strict=True):
-            inside &= at < side
-        there = mi.UInt32((z * ny + y) * nx + x)
+        at = [p + o for p, o in zip(places, offset, strict=True)]
+        inside = mi.Bool(True)
+        for a, side in zip(at, grid.sides, strict=True):
+            inside &= (a >= 0) & (a < side)
+        there = mi.UInt32((at[2] * ny + at[1]) * nx + at[0])
         inside &= dr.gather(mi.Bool, valid, there, inside)
         value = dr.gather(mi.Float, values, there * channels + channel, inside)
         total += dr.select(inside, value / squared, 0)
