@@ -53,14 +53,15 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - solver
        - |string|
        - How the cache is computed: ``sweep`` (light carried along lines that all voxels share),
-         ``path`` (Monte Carlo at every voxel), or ``auto``: ``sweep`` unless an emitter is neither
-         far away nor a point. The log says which, and why. (Default: ``auto``)
+         ``path`` (Monte Carlo at every voxel), or ``auto``: ``sweep`` unless there are surfaces,
+         area emitters or several media. The log says which, and why. (Default: ``auto``)
 
      * - resolution
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
          0: the voxels of the data, at most 2^25 of them, for ``path`` at most 128 along a side;
-         two per mean free path, 32 to 96, in a homogeneous medium. (Default: 0)
+         two per mean free path, 32 to 96, in a homogeneous medium; 32 to 64 along a side where
+         there are surfaces or several media. (Default: 0)
 
      * - cache_spp
        - |int|
@@ -99,7 +100,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - cache_file
        - |string|
        - Load the cache from this file if it is there, write it when it was computed. A file
-         of another scene is refused. (Default: none)
+         of another scene is refused. Of several media, each has a file with its id in the name.
+         (Default: none)
 
     Computes the irradiance (fluence rate) that reaches every point of an isotropically scattering
     medium once, independently of the camera, and integrates the radiative transfer equation along
@@ -107,10 +109,14 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     medium or emitter renews it. The image is consistent, not unbiased: it converges to
     ``volpath``'s as ``resolution`` and ``cache_spp`` grow and ``step`` falls.
 
-    One medium (``heterogeneous`` or ``homogeneous``, isotropic phase function) in a box or sphere
-    with a null BSDF, and emitters that are not surfaces (point-like ones outside of the medium),
-    are supported; whatever else is refused by name. A scene without media is rendered by
-    ``volpath``.
+    Media (``heterogeneous`` or ``homogeneous``, isotropic phase function) may be several, in any
+    closed shapes with a null BSDF, apart, touching or nested; each has a cache of its own. Surfaces
+    and area emitters may be anywhere. What is seen on them is path traced, by as many paths as
+    there are samples per pixel, and is ``background``. Where there is no more than one medium in a
+    box or sphere, and light from far away or from points outside of it, nothing has to be ray
+    traced, and the solver ``sweep`` can be used. Point-like emitters in a medium, media without
+    bounds and other phase functions are refused by name. What glass encloses is rendered as
+    ``volpath`` does, and so is a scene without media.
 
     .. tabs::
         .. code-tab:: xml

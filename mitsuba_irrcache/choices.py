@@ -17,8 +17,9 @@ from .solvers import sweep
 #: more than 10 % (a homogeneous cube; at half of it, by 5 %).
 DENSE_BORDER = 1.0
 
-#: Voxels along the longest side of a cache among surfaces, unless told otherwise.
-AMONG_SURFACES = 64
+#: Voxels along the longest side of a cache among surfaces, unless told otherwise: shadows have more
+#: detail than coarse data.
+AMONG_SURFACES = (32, 64)
 
 #: Voxels of a cache that ``resolution`` 0 leads to, at most.
 MOST_VOXELS = 1 << 25
@@ -58,8 +59,9 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     data, frame = medium.sigma_t.grid, medium.frame
     if not resolution and medium.surroundings is not None:
         sizes = [max(f.grid.shape) for f in (medium.sigma_t, medium.albedo) if f.grid]
-        most = min(max(sizes, default=AMONG_SURFACES), AMONG_SURFACES)
-        grid, reason = Grid.near_cubic(frame, most), f"of the medium, at most {AMONG_SURFACES}"
+        least, most = AMONG_SURFACES
+        count = int(np.clip(max(sizes, default=most), least, most))
+        grid, reason = Grid.near_cubic(frame, count), f"of the medium, {least} to {most}"
     elif resolution:
         grid, reason = Grid.near_cubic(frame, resolution), "as told"
     elif data is None:

@@ -20,6 +20,10 @@ from .transport import MOST_CROSSINGS, is_null
 #: Rays that find out whether a shape is closed, and the share of them that may say it is not:
 #: edges are hit twice, or not at all.
 CLOSED_RAYS, CLOSED_TOLERANCE = 1024, 0.05
+#: Mitsuba's rays leave a surface at (1 + largest coordinate) times this, ...
+RAY_OFFSET = 9e-5
+#: ... which should not exceed this part of the shortest side of a medium.
+LARGEST_OFFSET = 0.002
 
 
 def bake_media(scene: mi.Scene) -> list[MediumGrid]:
@@ -104,6 +108,13 @@ def bake_general(scene: mi.Scene) -> list[MediumGrid]:
         ):
             seen.append(grid)
     Surroundings(scene, grids)
+    if not seen:
+        mi.Log(
+            mi.LogLevel.Warn,
+            "irrcache: all media are behind surfaces, so this scene is rendered as volpath does. A "
+            'shape that only bounds a medium needs <bsdf type="null"/>.',
+        )
+    _warn_of_scale(scene, grids)
     for emitter in _point_lights(scene):
         position = _position(emitter)
         pointer = probe(scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
@@ -165,9 +176,9 @@ def _check_shape(scene: mi.Scene, shape: mi.Shape) -> None:
         )
     if inwards + open_ > CLOSED_TOLERANCE * hit:
         _refuse(
-            f"{name} is not closed ({inwards + open_} of {hit} rays leave it otherwise than they "
-            "entered), so its interior medium has no bounds",
-            " Close it, or use another shape.",
+            f"{name} is not closed, or has a face in common with another shape: {inwards + open_} "
+            f"of {hit} rays do not leave it as they entered, so its interior medium has no bounds",
+            " Close it, or move the shapes apart by a thousandth of their size.",
         )
 
 
@@ -205,6 +216,21 @@ def _count_crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
         crossings += 1
         active &= crossings < MOST_CROSSINGS
     return first, depth
+
+
+def _warn_of_scale(scene: mi.Scene, grids: list[MediumGrid]) -> None:
+    """Tells where Mitsuba's rays, which leave a surface at some distance from it, lose light."""
+    corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
+    offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
+    for grid in grids:
+        size = np.linalg.norm(grid.frame[:3, :3], axis=0).min()
+        if offset > LARGEST_OFFSET * size:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'irrcache: medium "{grid.name}" is {size:.2g} thin, and rays that leave surfaces '
+                f"in this scene skip up to {offset:.1g}, as in volpath: light is lost. Scale the "
+                "scene up, or move it to the origin.",
+            )
 
 
 def _point_lights(scene: mi.Scene) -> list[mi.Emitter]:
