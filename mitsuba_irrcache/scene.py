@@ -132,8 +132,8 @@ def _name(medium: mi.Medium, taken: list[str]) -> str:
 
 
 def _extent(medium: mi.Medium, filled: list[mi.Shape]) -> np.ndarray:
-    """``to_world`` of the unit cube over the world box of ``medium``: of the shapes that it fills,
-    and of its own grid.
+    """``to_world`` of the cube [-1, 1]^3 over the world box of ``medium``: of the shapes that it
+    fills, and of its own grid.
     """
     boxes = []
     if filled:
@@ -156,8 +156,8 @@ def _extent(medium: mi.Medium, filled: list[mi.Shape]) -> np.ndarray:
     upper = np.min([b[1] for b in boxes], axis=0).astype(np.float64)
     if not (lower < upper).all():
         _refuse(f"the grid of {name} lies outside of the shapes that it fills, or these are flat")
-    frame = np.diag([*(upper - lower), 1.0])
-    frame[:3, 3] = lower
+    frame = np.diag([*(0.5 * (upper - lower)), 1.0])
+    frame[:3, 3] = 0.5 * (lower + upper)
     return frame
 
 
