@@ -67,7 +67,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - |int|
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
          of 8 samples or 32 directions;
-         0: 128 or 64 directions; 16 to 256 samples, about 2^24 for all voxels. (Default: 0)
+         0: 128 or 64 directions; 16 to 256 samples, about 2^24 for all voxels, 2^22 among
+         surfaces. (Default: 0)
 
      * - cache_seed
        - |int|

@@ -57,16 +57,17 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     a mean free path per voxel.
     """
     data, frame = medium.sigma_t.grid, medium.frame
+    longest = np.linalg.norm(frame[:3, :3], axis=0).max()
+    per_path = 2 * longest * medium.sigma_t.maximum
     if not resolution and medium.surroundings is not None:
-        sizes = [max(f.grid.shape) for f in (medium.sigma_t, medium.albedo) if f.grid]
         least, most = AMONG_SURFACES
-        count = int(np.clip(max(sizes, default=most), least, most))
-        grid, reason = Grid.near_cubic(frame, count), f"of the medium, {least} to {most}"
+        count = np.ceil(per_path) if data is None else max(data.shape)
+        grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
+        reason = f"of the medium, {least} to {most} among surfaces"
     elif resolution:
         grid, reason = Grid.near_cubic(frame, resolution), "as told"
     elif data is None:
-        longest = np.linalg.norm(frame[:3, :3], axis=0).max()
-        count = np.clip(np.ceil(2 * longest * medium.sigma_t.maximum), 32, 96)
+        count = np.clip(np.ceil(per_path), 32, 96)
         grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"
     elif solver == "sweep" and data.voxel_count <= MOST_VOXELS:
         grid, reason = Grid(data.shape, frame), "those of the medium"
@@ -78,10 +79,13 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
 
 
 def choose_samples(cache: IrradianceCache, solver: str) -> int:
-    """Samples per voxel: for ``path`` about 2^24 in all, 16 to 256 each."""
+    """Samples per voxel: for ``path`` about 2^24 in all, 2^22 among surfaces, where each is more
+    work; 16 to 256 each.
+    """
     if solver == "sweep":
         return SINGLE if cache.max_depth == 2 else MULTIPLE
-    return int(np.clip(2**24 // max(cache.active_count, 1), 16, 256))
+    paths = 2**24 if cache.survey is None else 2**22
+    return int(np.clip(paths // max(cache.active_count, 1), 16, 256))
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:

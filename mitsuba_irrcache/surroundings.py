@@ -21,10 +21,7 @@ class Surroundings:
 
     def __init__(self, scene: mi.Scene, grids: list[MediumGrid]) -> None:
         self.media = Media(grids)
-        #: whether emitters can only be sampled, never met
-        self.only_points = all(
-            int(e.flags()) & int(mi.EmitterFlags.Delta) for e in scene.emitters()
-        )
+        #: radiance that no emitter exceeds
         self.brightest = dr.opaque(mi.Float, _brightest(scene))
         for grid in grids:
             grid.surroundings = self
