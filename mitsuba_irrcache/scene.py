@@ -163,8 +163,12 @@ def _extent(medium: mi.Medium, filled: list[mi.Shape]) -> np.ndarray:
 
 def _check_shape(scene: mi.Scene, shape: mi.Shape) -> None:
     name = f'shape "{shape.id()}" ({shape.class_name()})'
-    if shape.class_name() == "Instance" and "medium" in str(shape):
-        _refuse(f"{name} is an instance of shapes with media")
+    if shape.class_name() == "Instance" and _has_media(scene, shape):
+        _refuse(
+            f"{name} is an instance of shapes with media, of which there is no telling where they "
+            "are",
+            " Place these shapes in the scene themselves.",
+        )
     if shape.interior_medium() is None:
         return
     hit, inwards, open_ = _crossings(scene, shape)
@@ -186,28 +190,41 @@ def _crossings(scene: mi.Scene, shape: mi.Shape) -> tuple[int, int, int]:
     """Of rays from outside through ``shape``: those that meet it, those that meet its inside first,
     and other ones that do not leave it as often as they enter.
     """
+    first, depth, _ = _count_crossings(scene, mi.ShapePtr(shape), _rays_through(shape))
+    inwards = first < 0
+    open_ = (first > 0) & (depth != 0)
+    return tuple(int(dr.count(c)[0]) for c in (first != 0, inwards, open_))
+
+
+def _has_media(scene: mi.Scene, instance: mi.Shape) -> bool:
+    """Whether rays through an instance come into a medium there."""
+    *_, inside = _count_crossings(scene, mi.ShapePtr(instance), _rays_through(instance))
+    return bool(dr.any(inside))
+
+
+def _rays_through(shape: mi.Shape) -> mi.Ray3f:
+    """From outside through the bounding box of a shape."""
     rng = mi.PCG32(CLOSED_RAYS)
     lower, upper = mi.Point3f(shape.bbox().min), mi.Point3f(shape.bbox().max)
     u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
     target = lower + u * (upper - lower)
     sample = mi.Point2f(rng.next_float32(), rng.next_float32())
     direction = mi.warp.square_to_uniform_sphere(sample)
-    ray = mi.Ray3f(target - 1.1 * dr.norm(upper - lower) * direction, direction)
-    first, depth = _count_crossings(scene, mi.ShapePtr(shape), ray)
-    inwards = first < 0
-    open_ = (first > 0) & (depth != 0)
-    return tuple(int(dr.count(c)[0]) for c in (first != 0, inwards, open_))
+    return mi.Ray3f(target - 1.1 * dr.norm(upper - lower) * direction, direction)
 
 
 @dr.syntax
 def _count_crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
-    """How rays cross a shape first (1: inwards, -1: outwards, 0: never), and all of these added."""
-    ray = mi.Ray3f(ray)
+    """How rays cross a shape first (1: inwards, -1: outwards, 0: never), and all of these added;
+    whether a medium begins or ends at an instance of this shape.
+    """
+    ray, inside = mi.Ray3f(ray), mi.Bool(False)
     first, depth = mi.Int32(0), mi.Int32(0)
     crossings, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="crossings"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
+        inside |= active & (si.instance == shape) & si.is_medium_transition()
         step = dr.select(dr.dot(si.n, ray.d) < 0, mi.Int32(1), -1)
         step = dr.select(active & (si.shape == shape), step, 0)
         first = dr.select(first == 0, step, first)
@@ -215,7 +232,7 @@ def _count_crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
         ray = si.spawn_ray(ray.d)
         crossings += 1
         active &= crossings < MOST_CROSSINGS
-    return first, depth
+    return first, depth, inside
 
 
 def _warn_of_scale(scene: mi.Scene, grids: list[MediumGrid]) -> None:

@@ -207,6 +207,12 @@ EXTRAS = {
         '<medium name="interior" type="homogeneous"/> </shape>',
         "normals.*hole.*inwards",
     ),
+    "instance of a medium": (
+        f'<shape type="shapegroup" id="group"> <shape type="sphere"> {NULL} '
+        '<medium name="interior" type="homogeneous"/> </shape> </shape>'
+        '<shape type="instance" id="copy"> <ref id="group"/> </shape>',
+        "copy.*instance",
+    ),
     "phase function": (
         f'<shape type="sphere" id="other"> {NULL} <medium name="interior" type="homogeneous" '
         'id="haze"> <phase type="hg"/> </medium> </shape>',
