@@ -59,9 +59,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - resolution
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
-         0: the voxels of the data, at most 2^25 of them, for ``path`` at most 128 along a side;
-         two per mean free path, 32 to 96, in a homogeneous medium; 32 to 64 along a side where
-         there are surfaces or several media. (Default: 0)
+         0: the voxels of the data, up to twice as many along each axis where they are dense, at
+         most 2^25 of them, for ``path`` at most 128 along a side; two per mean free path, 32 to 96,
+         in a homogeneous medium; 32 to 64 along a side where there are surfaces or several media.
+         (Default: 0)
 
      * - cache_spp
        - |int|

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from .errors import IrrcacheError, essence, origin
 
@@ -13,7 +14,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit status (1: an error was printed, 130:
     interrupted).
     """
-    args = _parser().parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    args = _parser(arguments).parse_args(arguments)
     try:
         return args.run(args)
     except (IrrcacheError, OSError) as error:
@@ -28,22 +30,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1
 
 
-def _parser() -> argparse.ArgumentParser:
-    from . import doctor, render
-    from .compare import command as compare
-    from .volumes import importer
+#: Name, module and description of each command.
+COMMANDS = (
+    ("render", "render", "render a scene with irrcache"),
+    ("compare", "compare.command", "measure error against time of any integrators"),
+    ("import", "volumes.importer", "make a scene of a CT, MR or other volume"),
+    ("doctor", "doctor", "check this machine and say what to install"),
+)
 
+
+def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser of these arguments: it imports no command but the one they name, since what each
+    needs takes a while.
+    """
     parser = argparse.ArgumentParser(
         prog="irrcache", description="Irradiance caching for participating media in Mitsuba 3."
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for name, module, text in (
-        ("render", render, "render a scene with irrcache"),
-        ("compare", compare, "measure error against time of any integrators"),
-        ("import", importer, "make a scene of a CT, MR or other volume"),
-        ("doctor", doctor, "check this machine and say what to install"),
-    ):
-        command = commands.add_parser(name, help=text, description=module.__doc__)
-        module.add_arguments(command)
-        command.set_defaults(run=module.run)
+    for name, path, text in COMMANDS:
+        command = commands.add_parser(name, help=text)
+        if arguments and arguments[0] == name:
+            module = import_module(f".{path}", __package__)
+            command.description = module.__doc__
+            module.add_arguments(command)
+            command.set_defaults(run=module.run)
     return parser

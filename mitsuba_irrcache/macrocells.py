@@ -4,6 +4,8 @@ them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -103,31 +105,50 @@ class Walk:
         return dr.maximum(nearest, t), following
 
 
-@dr.syntax
 def _block_bounds(
     sigma_t: GridField, size: int, shape: tuple[int, int, int]
 ) -> tuple[mi.Float, mi.Float]:
     """Least and largest value in each block grown by the one voxel that trilinear stencils reach
     beyond it.
     """
-    nz, ny, nx = shape
-    index = dr.arange(mi.UInt32, nx * ny * nz)
-    first = mi.Vector3i(mi.Vector3u(index % nx, (index // nx) % ny, index // (nx * ny)) * size) - 1
-    fx, fy, fz = sigma_t.grid.sides
-    width = dr.opaque(mi.UInt32, size + 2)
-    count = width * width * width
-    k, least, largest = mi.UInt32(0), mi.Float(dr.inf), mi.Float(0)
-    while dr.hint(k < count, label="macrocell bounds"):
-        x = dr.clip(first.x + mi.Int32(k % width), 0, fx - 1)
-        y = dr.clip(first.y + mi.Int32((k // width) % width), 0, fy - 1)
-        z = dr.clip(first.z + mi.Int32(k // (width * width)), 0, fz - 1)
-        voxel = mi.UInt32((z * fy + y) * fx + x) * sigma_t.channels
-        for c in range(sigma_t.channels):
-            value = dr.gather(mi.Float, sigma_t.data, voxel + c)
-            least = dr.minimum(least, value)
-            largest = dr.maximum(largest, value)
-        k += 1
+    channels = sigma_t.channels
+    bounds = []
+    for reduce in (dr.minimum, dr.maximum):
+        values, sides = sigma_t.data, list(sigma_t.grid.shape[::-1])
+        # Channels first, then axis by axis: windows overlap, so this reads less than blocks would.
+        if channels > 1:
+            index = dr.arange(mi.UInt32, sigma_t.grid.voxel_count) * channels
+            values = dr.gather(mi.Float, values, index)
+            for c in range(1, channels):
+                values = reduce(values, dr.gather(mi.Float, sigma_t.data, index + c))
+        for axis in range(3):
+            values = _reduced(values, sides, axis, size, shape[2 - axis], reduce)
+            sides[axis] = shape[2 - axis]
+        bounds.append(values)
+    least, largest = bounds
     # A little slack, since interpolation may round beyond its eight values.
     least, largest = least * sigma_t.scale * (1 - 1e-6), largest * sigma_t.scale * (1 + 1e-6)
     dr.eval(least, largest)
     return least, largest
+
+
+def _reduced(
+    values: mi.Float, sides: list[int], axis: int, size: int, count: int, reduce: Callable
+) -> mi.Float:
+    """Bounds of ``count`` windows along one axis, each of ``size`` values and one more at both
+    ends.
+    """
+    stride, side = int(np.prod(sides[:axis])), sides[axis]
+    index = dr.arange(mi.UInt32, int(np.prod(sides)) // side * count)
+    before, sides_here, count = (dr.opaque(mi.UInt32, n) for n in (stride, side, count))
+    row = index // before
+    window = row % count
+    start = index - row * before + row // count * (before * sides_here)
+    first = mi.Int32(window * size) - 1
+    result = None
+    for k in range(size + 2):
+        place = mi.UInt32(dr.clip(first + k, 0, mi.Int32(sides_here) - 1))
+        value = dr.gather(mi.Float, values, start + place * before)
+        result = value if result is None else reduce(result, value)
+    dr.eval(result)
+    return result

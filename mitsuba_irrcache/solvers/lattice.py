@@ -7,8 +7,12 @@ So a voxel and direction cost one step, whatever the size of the grid, and no tw
 to the same voxel. A line that leaves through a side goes on as a new one that enters through the
 opposite side; it begins at the very point of entry, between two slices.
 
-Along a line the extinction is interpolated between the four voxels around it in every slice, and
-linear from slice to slice; a source is that of the line's voxel in every slice.
+Along a line the extinction is interpolated between the four values around it in every slice, and
+linear from slice to slice; a source is that of the line's voxel in every slice. On a grid that is
+coarser or finer than the medium's, the values across the lines are still those of the medium, and
+each half of a slice has its own mean. Were they interpolated to the grid, and between its voxels
+again, matter would be wider than it is, and shade more: on a CT head at twice its resolution, 1 %
+of the light in the air and 5 % in the skin.
 
 Each launch takes a direction and its opposite along the same lines: two independent chains of
 arithmetic, and the odd part of what is integrated over directions cancels.
@@ -28,29 +32,36 @@ ONE = 1 << 24
 #: this optical depth of a voxel.
 OPAQUE = 16.0
 LEVELS = (1 << 16) - 1
-#: What `carry` gives a voxel is a mean over its cross section: smoothing of variance 1/12 along two
-#: of three axes, half of which is to be taken back (`sharpened`).
-RECEIVED = 1 / 36
+#: What lines leave in a voxel is a mean over its cross section: smoothing of variance 1/12 along
+#: both axes across, half of which is to be taken back (`sharpened`).
+RECEIVED = 1 / 24
 #: Below so many voxels one launch takes all directions and adds atomically.
 SMALL = 40**3
 
-_INTEGERS = 16
-_NUMBERS = 5
+_INTEGERS = 19
+_NUMBERS = 11
 
 
 class Lattice:
     """The lines through the voxels of ``grid`` between ``lower`` and ``upper`` (x, y, z; voxels
     outside of this box are empty and get no light).
 
-    ``sigma_t`` holds the extinction [1/scene unit] of all voxels of the grid.
+    ``sigma_t`` holds the extinction [1/scene unit] at all voxels of ``detail``, a grid over the
+    same box (None: the same grid).
     """
 
-    def __init__(self, grid: Grid, sigma_t: mi.Float, lower: np.ndarray, upper: np.ndarray) -> None:
-        self.grid = grid
-        self.sides = np.array(upper) - np.array(lower)
-        nx, ny, _ = (int(n) for n in grid.resolution)
-        self._strides = (1, nx, nx * ny)
-        self._base = int(np.dot(lower, self._strides))
+    def __init__(
+        self,
+        grid: Grid,
+        sigma_t: mi.Float,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        detail: Grid | None = None,
+    ) -> None:
+        self.grid, self.detail = grid, detail or grid
+        self._own = self.detail.shape == grid.shape  # each voxel has its own extinction
+        self.lower, self.sides = np.array(lower), np.array(upper) - np.array(lower)
+        self._strides = _strides(grid.resolution)
         self._to_voxels = grid.coordinates.matrix[:3, :3]
         self._lines = max(int(np.prod(np.delete(self.sides, axis))) for axis in range(3))
         self._lanes = dr.arange(mi.UInt32, self._lines)
@@ -60,12 +71,11 @@ class Lattice:
         top = float(min(dr.max(sigma_t)[0], opaque))
         self._quantum = top / LEVELS
         levels = sigma_t * dr.opaque(mi.Float, LEVELS / top if top else 0)
-        place = dr.arange(mi.UInt32, grid.voxel_count)
-        dither = mi.Float(mi.sample_tea_32(place, mi.UInt32(0x5EED), 8)[0] >> 8) * 2**-24
-        self._levels = mi.UInt32(dr.minimum(dr.floor(levels + dither), LEVELS))
+        self._levels = _rounded(dr.minimum(levels, LEVELS))
         dr.eval(self._levels)
+        self._halves: dict[int, mi.UInt32] = {}  # of slices along axes
         if self.together:
-            self._all_corners = dr.concat([self._corners_across(axis) for axis in range(3)])
+            self._all_corners = [self._corners_across(axis) for axis in range(3)]
             dr.eval(self._all_corners)
 
     def table(
@@ -89,8 +99,11 @@ class Lattice:
             ways = light[i] if velocity[axis] > 0 else light[i][::-1]
             across = [k for k in range(3) if k != axis]
             order = (*across, axis)
+            places = _strides(self._slices(axis))
             row = [*(int(self.sides[k]) for k in order), *(self._strides[k] for k in order)]
-            row += [self._base, int(axis) * self.grid.voxel_count if self.together else 0]
+            base = int(np.dot(self.lower, self._strides))
+            row += [base, *(places[k] for k in order)]
+            row += [base if self._own else int(self.lower[axis]) * places[axis]]
             for k, offset in zip(across, offsets[i], strict=True):
                 slope = round(velocity[k] / velocity[axis] * ONE)
                 slope = slope or 1  # lines never stay in a face
@@ -98,15 +111,26 @@ class Lattice:
                 end = start + (int(self.sides[axis]) - 1) * slope
                 row += [slope, start, (end >> 24) % int(self.sides[k]), end & (ONE - 1)]
             integers[i] = row
-            length = 1 / abs(velocity[axis])
-            numbers[i] = [length, *ways, weights[i], self._quantum]
+            numbers[i, :5] = [1 / abs(velocity[axis]), *ways, weights[i], self._quantum]
+            ratio = self.detail.resolution / self.grid.resolution
+            numbers[i, 5:] = [
+                x
+                for k in across
+                for x in (ratio[k], self.lower[k] * ratio[k] - 0.5, self.detail.resolution[k] - 1)
+            ]
         return Table(integers, numbers, axes)
 
-    def carry(self, volume: mi.Float, table: Table) -> None:
-        """Adds to ``volume``, one value for each voxel of the grid, the light that enters along all
-        pairs of ``table``: irradiance.
+    def carry(self, table: Table) -> mi.Float:
+        """Irradiance at the centres of all voxels of the grid: the light that enters along all
+        pairs of ``table``.
         """
-        self._launch(volume, None, table)
+        total = dr.opaque(mi.Float, 0, self.grid.voxel_count)
+        for axis, pairs in table.by_axis():
+            volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
+            self._launch(volume, None, table, axis, pairs)
+            total += sharpened(volume, self.grid, self.lower, self.lower + self.sides, axis)
+            dr.eval(total)
+        return total
 
     def scatter(self, volume: mi.Float, table: Table) -> None:
         """Follows the light that comes from the voxels themselves, and that enters from outside.
@@ -117,67 +141,132 @@ class Lattice:
         loss / W, is the mean radiance *of collisions*: what is scattered from it is neither more
         nor less than what has collided.
         """
-        if not self.together:
-            self._launch(volume, volume, table)
-            return
-        index = dr.arange(mi.UInt32, self.grid.voxel_count) * 4
-        source = dr.gather(mi.Float, volume, index)
-        dr.eval(source)
-        self._launch(volume, source, table)
-
-    def _launch(self, volume: mi.Float, source: mi.Float | None, table: Table) -> None:
+        source = volume
         if self.together:
-            count = len(table.places)
-            lanes = dr.arange(mi.UInt32, self._lines * count)
+            index = dr.arange(mi.UInt32, self.grid.voxel_count) * 4
+            source = dr.gather(mi.Float, volume, index)
+            dr.eval(source)
+        for axis, pairs in table.by_axis():
+            self._launch(volume, source, table, axis, pairs)
+
+    def _launch(
+        self, volume: mi.Float, source: mi.Float | None, table: Table, axis: int, pairs: list[int]
+    ) -> None:
+        """Follows the ``pairs`` of ``table``, all of which have the dominant ``axis``."""
+        if self.together:
+            lanes = dr.arange(mi.UInt32, self._lines * len(pairs))
             lines = dr.opaque(mi.UInt32, self._lines)
-            which = lanes // lines
-            _sweep(self._all_corners, volume, source, table, which, lanes - which * lines, True)
+            row = lanes // lines
+            first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
+            which = dr.gather(mi.UInt32, table.ordered, first + row)
+            lane = lanes - row * lines
+            _sweep(self._all_corners[axis], self._own, volume, source, table, which, lane, True)
             dr.eval(volume)
             return
-        # By dominant axis, since each has its own corners: they are made when they are needed.
-        corners, last = None, -1
-        for axis, i in sorted(zip(table.axes, range(len(table.places)), strict=True)):
-            if axis != last:
-                corners, last = None, axis  # one set at a time is kept
-                corners = self._corners_across(axis)
-                dr.eval(corners)
-            _sweep(corners, volume, source, table, table.places[i], self._lanes, False)
+        corners = self._corners_across(axis)  # one set at a time is kept
+        dr.eval(corners)
+        for i in pairs:
+            _sweep(corners, self._own, volume, source, table, table.places[i], self._lanes, False)
             dr.eval(volume)
+
+    def _slices(self, axis: int) -> np.ndarray:
+        """Values of the extinction along x, y, z: a slice for each of the grid's along ``axis``."""
+        sides = self.detail.resolution.copy()
+        sides[axis] = self.grid.resolution[axis]
+        return sides
 
     def _corners_across(self, axis: int) -> mi.UInt32:
-        """For each voxel the extinction of the four voxels from it on along both other axes, 16
-        bits each; flat, two words per voxel.
+        """For each value of the extinction in all slices along ``axis`` those of four, from it on
+        along both other axes: flat, two words of two values each, or four words of the means over
+        both halves of a slice, unless voxels have their own values.
         """
-        index = dr.arange(mi.UInt32, self.grid.voxel_count)
-        at = self.grid.places(index)
+        sides = self._slices(axis)
+        if self._own:
+            values = self._levels
+        elif axis in self._halves:
+            values = self._halves[axis]
+        else:
+            count = int(sides[axis])
+            values = self._halves[axis] = _halved(self._levels, self.detail, count, axis)
+        grid = Grid(tuple(int(n) for n in sides[::-1]), self.grid.to_world)
+        index = dr.arange(mi.UInt32, grid.voxel_count)
+        at, strides = grid.places(index), _strides(sides)
         steps = []
         for k in range(3):
             if k != axis:
-                last = dr.opaque(mi.UInt32, int(self.grid.resolution[k]) - 1)
-                steps.append(dr.select(at[k] < last, dr.opaque(mi.UInt32, self._strides[k]), 0))
-        words = []
-        for start in (index, index + steps[1]):
-            low, high = (dr.gather(mi.UInt32, self._levels, i) for i in (start, start + steps[0]))
-            words.append(low | high << 16)
-        return dr.ravel(mi.Vector2u(words))
+                last = dr.opaque(mi.UInt32, int(sides[k]) - 1)
+                steps.append(dr.select(at[k] < last, dr.opaque(mi.UInt32, strides[k]), 0))
+        places = [row + step for row in (index, index + steps[1]) for step in (0, steps[0])]
+        words = [dr.gather(mi.UInt32, values, place) for place in places]
+        if not self._own:
+            return dr.ravel(mi.Array4u(words))
+        return dr.ravel(mi.Vector2u(words[0] | words[1] << 16, words[2] | words[3] << 16))
 
 
-def sharpened(values: mi.Float, grid: Grid, strength: float) -> mi.Float:
-    """``values`` of all voxels less ``strength`` times their second differences along all axes:
-    what smoothing by a kernel of twice that variance, in voxels, has taken away. Never negative.
+def _strides(sides: np.ndarray) -> tuple[int, int, int]:
+    """Steps of the flat index along x, y, z."""
+    nx, ny, _ = (int(n) for n in sides)
+    return 1, nx, nx * ny
+
+
+def _rounded(values: mi.Float, shift: float = 0.0) -> mi.UInt32:
+    """Integers, up or down by the golden ratio: right on average over any few neighbours."""
+    place = dr.arange(mi.UInt32, dr.width(values))
+    dither = mi.Float((place * 2654435769 + int(shift * 2**32)) >> 8) * 2**-24
+    return mi.UInt32(dr.minimum(values + dither, LEVELS))
+
+
+def _halved(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
+    """``levels`` of the voxels of ``grid`` in ``count`` slices along ``axis`` instead: means over
+    the first half of their thickness, and over the second one in the upper 16 bits.
+    """
+    sides = grid.resolution.copy()
+    before, sides[axis] = int(sides[axis]), count
+    slices = Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
+    at = list(slices.places(dr.arange(mi.UInt32, slices.voxel_count)))
+    begin, at[axis] = mi.Float(at[axis]), mi.UInt32(0)
+    strides = [dr.opaque(mi.UInt32, n) for n in _strides(grid.resolution)]
+    rest = at[0] * strides[0] + at[1] * strides[1] + at[2] * strides[2]
+    ratio, last = dr.opaque(mi.Float, before / count), dr.opaque(mi.Float, before - 1)
+    step = dr.select(last > 0, strides[axis], 0)
+    halves = []
+    for half in range(2):
+        total = 0.0
+        # Two points: exact where kinks, the centres of voxels, lie between them or at the ends.
+        for point in (0.125, 0.375):
+            u = dr.clip((begin + (0.5 * half + point)) * ratio - 0.5, 0, last)
+            lower = mi.UInt32(dr.minimum(u, dr.maximum(last - 1, 0)))
+            place = rest + lower * strides[axis]
+            low, high = (dr.gather(mi.UInt32, levels, i) for i in (place, place + step))
+            total += dr.lerp(mi.Float(low), mi.Float(high), u - mi.Float(lower))
+        halves.append(_rounded(0.5 * total, 0.5 * half))
+    result = halves[0] | halves[1] << 16
+    dr.eval(result)
+    return result
+
+
+def sharpened(
+    values: mi.Float, grid: Grid, lower: np.ndarray, upper: np.ndarray, axis: int
+) -> mi.Float:
+    """``values`` of the voxels between ``lower`` and ``upper`` (x, y, z) at their centres, given
+    means over their cross sections across ``axis``: second differences along both other axes take
+    back what the mean has smoothed. Never negative.
     """
     index = dr.arange(mi.UInt32, grid.voxel_count)
-    nx, ny, nz = (mi.UInt32(n) for n in grid.sides)
     change = mi.Float(0)
-    for i, n, stride in zip(
-        grid.places(index), (nx, ny, nz), (mi.UInt32(1), nx, nx * ny), strict=True
+    for k, (at, stride) in enumerate(
+        zip(grid.places(index), _strides(grid.resolution), strict=True)
     ):
+        if k == axis or upper[k] - lower[k] < 3:
+            continue
+        stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))
+        inside = (at >= first) & (at <= last)
         # At a border, the second difference of the voxel next to it.
-        centre = index + dr.select(i == 0, stride, 0) - dr.select(i + 1 == n, stride, 0)
+        centre = index + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
         for other in (centre - stride, centre + stride):
-            here, there = (dr.gather(mi.Float, values, k, n > 2) for k in (centre, other))
+            here, there = (dr.gather(mi.Float, values, i, inside) for i in (centre, other))
             change += here - there
-    return dr.maximum(dr.fma(change, dr.opaque(mi.Float, strength), values), 0)
+    return dr.maximum(dr.fma(change, dr.opaque(mi.Float, RECEIVED), values), 0)
 
 
 class Table:
@@ -188,13 +277,22 @@ class Table:
         self.numbers = mi.Float(numbers.astype(np.float32).ravel())
         self.axes = [int(axis) for axis in axes]
         self.places = [dr.opaque(mi.UInt32, i) for i in range(len(integers))]
+        self.order = [i for _, pairs in self.by_axis() for i in pairs]
+        # One more, since kernels that read an array of a single value are different ones.
+        self.ordered = mi.UInt32([*self.order, 0, 1])
+
+    def by_axis(self) -> list[tuple[int, list[int]]]:
+        """The pairs of each dominant axis, which have their corners in common."""
+        pairs = [[i for i, a in enumerate(self.axes) if a == axis] for axis in range(3)]
+        return [(axis, found) for axis, found in enumerate(pairs) if found]
 
 
 class _Across:
     """One way along the lines, and one of the axes across: its constants."""
 
-    def __init__(self, sides: mi.Int32, stride: mi.Int32, slope: mi.Int32) -> None:
-        self.sides, self.stride, self.slope = sides, stride, slope
+    def __init__(self, sides: mi.Int32, slope: mi.Int32, detail: tuple) -> None:
+        self.sides, self.slope = sides, slope
+        self.stride, self.ratio, self.origin, self.last = detail
         forward = slope > 0
         self.entry = dr.select(forward, 0, sides - 1)
         # Distance to the side of entry, in slices: (zero + sign * position) * scale.
@@ -220,19 +318,25 @@ class _Across:
         voxel = dr.select(outside, self.entry, voxel)
         return voxel, position, dr.select(outside, self.since(position), 1.0)
 
-    def lower(self, voxel: mi.Int32, position: mi.Int32) -> tuple:
-        """Of the two voxels around the line, how far back the lower one is, and the weight of the
-        upper one.
+    def lower(self, voxel: mi.Int32, position: mi.Int32, own: bool) -> tuple:
+        """Of the two values of the extinction around the line, where the lower one is, and the
+        weight of the upper one. ``own``: each voxel has its own value.
         """
-        before, first = position < ONE // 2, voxel == 0
-        weight = dr.fma(mi.Float(position), 1 / ONE, dr.select(before, 0.5, -0.5))
-        back = dr.select(before & ~first, self.stride, 0)
-        return back, dr.select(before & first, 0, weight)
+        if own:
+            before = position < ONE // 2
+            weight = dr.fma(mi.Float(position), 1 / ONE, dr.select(before, 0.5, -0.5))
+            lower = dr.maximum(voxel - dr.select(before, 1, 0), 0)
+            return lower * self.stride, dr.select(before & (voxel == 0), 0, weight)
+        place = dr.fma(mi.Float(position), 1 / ONE, mi.Float(voxel))
+        u = dr.clip(dr.fma(place, self.ratio, self.origin), 0, self.last)
+        lower = mi.Int32(u)
+        return lower * self.stride, u - mi.Float(lower)
 
 
 @dr.syntax
 def _sweep(
     corners: mi.UInt32,
+    own: bool,
     volume: mi.Float,
     source: mi.Float | None,
     table: Table,
@@ -244,16 +348,17 @@ def _sweep(
     its own.
     """
     row = [dr.gather(mi.Int32, table.integers, which * _INTEGERS + i) for i in range(_INTEGERS)]
-    nb, nc, na, sb, sc, sa, base, shift, mb, fb, eb, gb, mc, fc, ec, gc = row
-    length, light, light_back, weight, quantum = (
+    nb, nc, na, sb, sc, sa, base, tb, tc, ta, shift, mb, fb, eb, gb, mc, fc, ec, gc = row
+    length, light, light_back, weight, quantum, *detail = (
         dr.gather(mi.Float, table.numbers, which * _NUMBERS + i) for i in range(_NUMBERS)
     )
+    detail_b, detail_c = (tb, *detail[:3]), (tc, *detail[3:])
     lane = mi.Int32(lanes)
     jc = lane // dr.maximum(nb, 1)  # 0 where a vector of lanes is not filled
     jb = lane - jc * nb
     active = (jc < nc) & (na > 0)
-    there_b, there_c = _Across(nb, sb, mb), _Across(nc, sc, mc)
-    back_b, back_c = _Across(nb, sb, -mb), _Across(nc, sc, -mc)
+    there_b, there_c = _Across(nb, mb, detail_b), _Across(nc, mc, detail_c)
+    back_b, back_c = _Across(nb, -mb, detail_b), _Across(nc, -mc, detail_c)
     # The state of both ways: voxel and position along both axes across, offset of the slice, slices
     # since entry (1: not new), radiance, and depth and source in the slice before.
     width = 0 * lane
@@ -268,15 +373,17 @@ def _sweep(
     )
     kb, kc = dr.select(kb >= nb, kb - nb, kb), dr.select(kc >= nc, kc - nc, kc)
     since_back = dr.minimum(back_b.start(kb, gb), back_c.start(kc, gc))
+    slice_, slice_back = shift + width, shift + ta * (na - 1) + width
     L, L_back, s0, s0_back = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
     scale, area = quantum * length, dr.rcp(length)
     k = mi.Int32(0)
     while dr.hint(active, label="slices"):
         index = mi.UInt32(ib * sb + ic * sc + off)
         index_back = mi.UInt32(kb * sb + kc * sc + off_back)
-        s = _level(corners, index + mi.UInt32(shift), there_b, there_c, ib, fb, ic, fc, active)
-        s_back = _level(
-            corners, index_back + mi.UInt32(shift), back_b, back_c, kb, gb, kc, gc, active
+        # Of the half before the middle of the slice, and of the half behind it.
+        s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, active)
+        s_next_back, s_back = _levels(
+            corners, own, slice_back, back_b, back_c, kb, gb, kc, gc, active
         )
         L = dr.select(since < 1, light, L)
         L_back = dr.select(since_back < 1, light_back, L_back)
@@ -301,9 +408,15 @@ def _sweep(
             else:
                 voxel = dr.gather(mi.Vector4f, volume, index, active)
                 voxel_back = dr.gather(mi.Vector4f, volume, index_back, active)
-            L, tally = _crossed(L, voxel.x * weight, s * scale, since, weight, area)
+            L, tally = _crossed(L, voxel.x * weight, s * scale, s_next * scale, since, weight, area)
             L_back, tally_back = _crossed(
-                L_back, voxel_back.x * weight, s_back * scale, since_back, weight, area
+                L_back,
+                voxel_back.x * weight,
+                s_back * scale,
+                s_next_back * scale,
+                since_back,
+                weight,
+                area,
             )
             if dr.hint(together, mode="scalar"):
                 for i in range(1, 4):
@@ -315,7 +428,7 @@ def _sweep(
                 tally += dr.select(middle, tally_back, 0)
                 dr.scatter(volume, voxel + tally, index, active)
                 dr.scatter(volume, voxel_back + tally_back, index_back, active & ~middle)
-        s0, s0_back = s, s_back
+        s0, s0_back = s_next, s_next_back
         ib, fb, since = there_b.advance(ib, fb)
         ic, fc, near = there_c.advance(ic, fc)
         since = dr.minimum(near, since)
@@ -324,35 +437,49 @@ def _sweep(
         since_back = dr.minimum(near_back, since_back)
         off += sa
         off_back -= sa
+        slice_ += ta
+        slice_back -= ta
         k += 1
         active &= k < na
 
 
-def _level(corners, index, across_b, across_c, ib, fb, ic, fc, active) -> mi.Float:
-    """Extinction of a line in a slice, bilinear, in units of the quantum."""
-    below_b, weight_b = across_b.lower(ib, fb)
-    below_c, weight_c = across_c.lower(ic, fc)
-    words = dr.gather(mi.Vector2u, corners, index - mi.UInt32(below_b + below_c), active)
-    low, high = mi.Vector2f(words & 0xFFFF), mi.Vector2f(words >> 16)
-    rows = dr.fma(high - low, weight_b, low)
-    return dr.fma(rows.y - rows.x, weight_c, rows.x)
+def _levels(corners, own, slice_, across_b, across_c, ib, fb, ic, fc, active) -> tuple:
+    """Extinction of a line in both halves of a slice, bilinear, in units of the quantum."""
+    place_b, weight_b = across_b.lower(ib, fb, own)
+    place_c, weight_c = across_c.lower(ic, fc, own)
+
+    def bilinear(v00, v10, v01, v11):
+        rows = [dr.fma(high - low, weight_b, low) for low, high in ((v00, v10), (v01, v11))]
+        return dr.fma(rows[1] - rows[0], weight_c, rows[0])
+
+    place = mi.UInt32(slice_ + place_b + place_c)
+    if own:
+        words = dr.gather(mi.Vector2u, corners, place, active)
+        value = bilinear(*(mi.Float(v) for w in words for v in (w & 0xFFFF, w >> 16)))
+        return value, value
+    words = dr.gather(mi.Array4u, corners, place, active)
+    first, second = ([mi.Float(w & 0xFFFF) for w in words], [mi.Float(w >> 16) for w in words])
+    return bilinear(*first), bilinear(*second)
 
 
 def _passed(since, before, here, scale) -> mi.Float:
-    """Transmittance from the slice before: half of both slices' extinction, or what of this one's
+    """Transmittance from the slice before: half of it and half of this one, or what of this one
     lies behind the entry.
     """
     return dr.exp(-dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
 
 
-def _crossed(L, source, depth, since, weight, area) -> tuple:
+def _crossed(L, source, first, second, since, weight, area) -> tuple:
     """Radiance behind a slice, and what its voxel tallies, for a source that is constant in it.
+    ``first`` and ``second`` are the slice's optical depths, were it all like that half.
 
     A line stands for an ``area`` across it that is the less the longer it stays in a voxel.
     """
-    tau = dr.select(since < 1, since + 0.5, 1) * depth
+    to_middle = dr.select(since < 1, since, 0.5) * first
+    tau = dr.fma(second, 0.5, to_middle)
     passed = dr.exp(-tau)
     # Thin voxels lose little, but what they scatter is known from just that.
     lost = (L - source) * dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
-    middle = dr.fma(L - source, dr.sqrt(passed), source)
+    half = dr.sqrt(passed) if first is second else dr.exp(-to_middle)
+    middle = dr.fma(L - source, half, source)
     return L - lost, mi.Vector4f(0, middle, lost * area, weight * tau * area)

@@ -18,7 +18,7 @@ from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.grid import Field, Grid
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.directions import Sky
-from mitsuba_irrcache.solvers.lattice import RECEIVED, Lattice, sharpened
+from mitsuba_irrcache.solvers.lattice import Lattice
 from mitsuba_irrcache.solvers.scattering import Level
 
 #: Directions per voxel of a batch, pairs of opposite ones. Spread evenly together, 32 leave half
@@ -29,6 +29,8 @@ BATCH = 32
 DIRECTIONS = 16
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
+#: Most values of the extinction along each axis of a voxel that lines see.
+DETAIL = 4
 
 #: called with (samples done, samples in all), both in voxels times directions
 Progress = Callable[[int, int], None]
@@ -51,12 +53,14 @@ class Sweep:
         if not cache.active_count:
             return
         grid = cache.grid
-        sigma_t = baked(medium, medium.sigma_t, grid)
+        detail = _detail(medium, grid)
+        extinction = baked(medium, medium.sigma_t, detail)
         box = _occupied_box(cache)
-        self._lattices = [Lattice(grid, s, *box) for s in sigma_t]
+        self._lattices = [Lattice(grid, s, *box, detail) for s in extinction]
         # For single scattering the albedo does not matter here.
         self._levels: list[Level] = []
         if cache.max_depth != 2:
+            sigma_t = extinction if detail is grid else baked(medium, medium.sigma_t, grid)
             albedo = baked(medium, medium.albedo, grid, masked=False)
             self._levels = [
                 Level(
@@ -132,13 +136,10 @@ class Sweep:
 
     def _uncollided(self, lattice: Lattice, rows: list, light: int) -> mi.Float:
         """Irradiance straight from the emitters, on average over passes."""
-        volume = dr.opaque(mi.Float, 0, self.cache.grid.voxel_count)
         joined = [np.concatenate(part) for part in zip(*rows, strict=True)]
         lit = joined[1].any(axis=1)
-        if lit.any():
-            lattice.carry(volume, lattice.table(*(part[lit] for part in joined)))
-        volume = sharpened(volume, lattice.grid, RECEIVED) * dr.opaque(mi.Float, 1 / len(rows))
-        return self._with_near_light(volume, light)
+        volume = lattice.carry(lattice.table(*(part[lit] for part in joined)))
+        return self._with_near_light(volume * dr.opaque(mi.Float, 1 / len(rows)), light)
 
     def _collided(self, level: Level, row: tuple, light: int) -> mi.Float:
         """Mean irradiance of collisions, of all orders but the last."""
@@ -165,6 +166,20 @@ class Sweep:
         return dr.gather(mi.Float, volume, self.cache.active) * dr.opaque(mi.Float, scale)
 
 
+def _detail(medium: MediumGrid, grid: Grid) -> Grid:
+    """The voxels in which lines see the extinction: those of the medium, where ``grid`` lies over
+    the same box, but at most `DETAIL` in one of ``grid`` along each axis.
+    """
+    data = medium.sigma_t.grid
+    if data is None or not medium.fills(grid) or not medium.fills(data):
+        return grid
+    sides = np.minimum(data.resolution, DETAIL * grid.resolution)
+    if (sides == grid.resolution).all():
+        return grid
+    shape = tuple(int(n) for n in sides[::-1])
+    return data if shape == data.shape else Grid(shape, grid.to_world)
+
+
 def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> list[mi.Float]:
     """Channels of ``field`` at the voxels of ``grid``: its means over voxels that are larger than
     the field's, or that the boundary of the medium may cut. Outside of it the field counts as 0 if
@@ -174,6 +189,11 @@ def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> 
     cut = masked and not medium.fills(grid)
     points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
     index = dr.arange(mi.UInt32, grid.voxel_count)
+    if field.grid is grid and not cut:
+        n = field.channels
+        values = [dr.gather(mi.Float, field.data, index * n + c) * field.scale for c in range(n)]
+        dr.eval(values)
+        return values
     values = _mean(medium, field, grid, index, dr.opaque(mi.UInt32, points), cut)
     dr.eval(values)
     return values

@@ -237,6 +237,24 @@ def test_voxel_by_voxel(scenes, name):
     assert np.quantile(off, 0.99) < 3 and (off**2).mean() < 1
 
 
+@pytest.mark.parametrize(("resolution", "tolerance"), [(12, 0.02), (24, 0.01), (32, 0.008)])
+def test_caches_coarser_and_finer_than_the_data(scenes, resolution, tolerance):
+    """A dense ball in 16 voxels along each axis: light where it collides, on average over the
+    voxels, is what ``path`` finds at the same places. With extinction that is interpolated to the
+    cache first, 6.7, 2.3 and 1.3 % are missing.
+    """
+    to_world = scenes.placement()
+    z, y, x = np.indices((16, 16, 16)) - 7.5
+    density = np.where(x**2 + y**2 + z**2 < 5.5**2, 8.0, 0.0).astype(np.float32)
+    shape = scenes.boundary(scenes.medium(density, 0.8, to_world), to_world)
+    settings = {"resolution": resolution, "max_depth": 2}
+    ours = values(filled(scenes, shape, **settings, cache_spp=8 * sweep.BATCH).irradiance)
+    theirs = values(filled(scenes, shape, "path", **settings, cache_spp=128).irradiance)
+    voxel = ((np.arange(resolution) + 0.5) / resolution * 16).astype(int)
+    weights = density[np.ix_(voxel, voxel, voxel)][..., None]
+    assert (weights * ours).sum() == pytest.approx((weights * theirs).sum(), rel=tolerance)
+
+
 # The light itself
 
 
@@ -359,8 +377,8 @@ def test_more_batches_compile_nothing(scenes, kernels, monkeypatch, max_depth, s
 
 
 def test_launches_of_a_batch(scenes, kernels, monkeypatch):
-    """Single scattering of a large grid: for each batch a launch for each of 16 pairs, and at most
-    one per axis for what they read; the rest is done once per batch.
+    """Single scattering of a large grid: for each batch a launch for each of 16 pairs, and three
+    per axis: what they read, a volume for what they leave, and its sharpening.
     """
     monkeypatch.setattr(lattice, "SMALL", 0)
     counts = []
@@ -371,4 +389,4 @@ def test_launches_of_a_batch(scenes, kernels, monkeypatch):
             )
         )
         counts.append(len(history))
-    assert 16 * 4 <= counts[1] - counts[0] <= (16 + 3 + 3) * 4
+    assert 16 * 4 <= counts[1] - counts[0] <= (16 + 3 * 3) * 4
