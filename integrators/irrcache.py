@@ -217,7 +217,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         lit = cache is not None and cache.active_count
         field = cache.field() if lit else None
         uncertainty = uncertainty_of(cache) if lit and self._with_error else None
-        return Projection(medium, field, self._quadrature, self._step, self._layered, uncertainty)
+        projection = Projection(
+            medium, field, self._quadrature, self._step, self._layered, uncertainty
+        )
+        if lit and cache.survey is not None:
+            projection.edges = cache.survey.edges
+        return projection
 
     @property
     def _projection(self) -> Projection:

@@ -142,9 +142,7 @@ class IrradianceCache:
         roots, noise = (self._tensor(x).array for x in (roots, noise[:channels]))
         if self.survey is not None:
             roots = self.survey.filled(roots, channels)
-        field = RootField(self.grid, roots, channels, noise)
-        field.edges = self.survey and self.survey.edges
-        return field
+        return RootField(self.grid, roots, channels, noise)
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Variance of the voxels over their squared mean, at most 1; 0 where it is not known, or

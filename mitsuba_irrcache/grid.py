@@ -204,8 +204,6 @@ class RootField(GridField):
     ) -> None:
         """``variance`` is that of the values, relative, where they are noisy."""
         self.inner, extension = grid, Extension(grid)
-        #: surfaces that end the light, where there are any; see `edges`
-        self.edges: object | None = None
         roots = extrapolated(extension, roots, channels, variance)
         super().__init__(extension.grid, roots, channels)
         self.maximum = self.maximum**2

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .edges import Edges
 from .grid import ConstantField, Field, GridField
 from .layers import Layers, luminance
 from .macrocells import Macrocells, Walk
@@ -57,6 +58,8 @@ class Projection:
         self.quadrature = quadrature
         self.layered = layered
         self.uncertainty = uncertainty
+        #: surfaces that end the light, where there are any
+        self.edges: Edges | None = None
         albedo = _constant_if_it_is(medium.albedo)
         grids = [f.grid for f in (medium.sigma_t, medium.albedo, irradiance) if f and f.grid]
         # Where nothing varies, one step is exact.
@@ -92,8 +95,9 @@ class Projection:
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
     ) -> mi.Float | mi.Color3f:
         """Irradiance that was looked up, without what is on the other side of surfaces."""
-        edges = self.irradiance.edges
-        return phi if edges is None else edges.corrected(self.irradiance, p, phi, active)
+        if self.edges is None:
+            return phi
+        return self.edges.corrected(self.irradiance, p, phi, active)
 
     @dr.syntax
     def march(
