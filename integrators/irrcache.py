@@ -15,10 +15,12 @@ from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.filtering import FILTERS, filter_illumination
 from mitsuba_irrcache.layers import AOVS, Layers, parse_aovs
+from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.progressive import Frame, Targets, frames
 from mitsuba_irrcache.projection import QUADRATURES, Projection
 from mitsuba_irrcache.rendering import fill_film, planes, render_film
 from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.sight import Sight, SimpleSight
 from mitsuba_irrcache.uncertainty import uncertainty_of
 from mitsuba_irrcache.variants import require_variant
 from mitsuba_irrcache.versions import check_versions
@@ -51,21 +53,23 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - solver
        - |string|
        - How the cache is computed: ``sweep`` (light carried along lines that all voxels share),
-         ``path`` (Monte Carlo at every voxel), or ``auto``: ``sweep`` unless an emitter is neither
-         far away nor a point. The log says which, and why. (Default: ``auto``)
+         ``path`` (Monte Carlo at every voxel), or ``auto``: ``sweep`` unless there are surfaces,
+         area emitters or several media. The log says which, and why. (Default: ``auto``)
 
      * - resolution
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
          0: the voxels of the data, up to twice as many along each axis where they are dense, at
          most 2^25 of them, for ``path`` at most 128 along a side; two per mean free path, 32 to 96,
-         in a homogeneous medium. (Default: 0)
+         in a homogeneous medium; 32 to 64 along a side where there are surfaces or several media.
+         (Default: 0)
 
      * - cache_spp
        - |int|
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
          of 8 samples or 32 directions (64, if so many are wanted of single scattering);
-         0: 128 or 64 directions; 16 to 256 samples, about 2^24 for all voxels. (Default: 0)
+         0: 128 or 64 directions; 16 to 256 samples, about 2^24 for all voxels, 2^22 among
+         surfaces. (Default: 0)
 
      * - cache_seed
        - |int|
@@ -98,7 +102,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - cache_file
        - |string|
        - Load the cache from this file if it is there, write it when it was computed. A file
-         of another scene is refused. (Default: none)
+         of another scene is refused. Of several media, each has a file with its id in the name.
+         (Default: none)
 
     Computes the irradiance (fluence rate) that reaches every point of an isotropically scattering
     medium once, independently of the camera, and integrates the radiative transfer equation along
@@ -106,10 +111,14 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     medium or emitter renews it. The image is consistent, not unbiased: it converges to
     ``volpath``'s as ``resolution`` and ``cache_spp`` grow and ``step`` falls.
 
-    One medium (``heterogeneous`` or ``homogeneous``, isotropic phase function) in a box or sphere
-    with a null BSDF, and emitters that are not surfaces (point-like ones outside of the medium),
-    are supported; whatever else is refused by name. A scene without media is rendered by
-    ``volpath``.
+    Media (``heterogeneous`` or ``homogeneous``, isotropic phase function) may be several, in any
+    closed shapes with a null BSDF, apart, touching or nested; each has a cache of its own. Surfaces
+    and area emitters may be anywhere. What is seen on them is path traced, by as many paths as
+    there are samples per pixel, and is ``background``. Where there is no more than one medium in a
+    box or sphere, and light from far away or from points outside of it, nothing has to be ray
+    traced, and the solver ``sweep`` can be used. Point-like emitters in a medium, media without
+    bounds and other phase functions are refused by name. What glass encloses is rendered as
+    ``volpath`` does, and so is a scene without media.
 
     .. tabs::
         .. code-tab:: xml
@@ -149,8 +158,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                 f"irrcache: step is {self._step:g}; it must lie between 0.001 and 1000 voxel edges."
             )
         self._builder = CacheBuilder(self._settings)
-        self._projection: Projection | None = None
-        self._revision = 0  # of the builder, when the projection was made
+        self._sight: SimpleSight | Sight | None = None
+        self._revision = 0  # of the builder, when the sight was made
         self._volpath: mi.Integrator | None = None
         #: seconds that stages of the last image took, of those that can be told apart
         self.seconds: dict[str, float] = {}
@@ -160,9 +169,19 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     @property
     def cache(self) -> IrradianceCache | None:
         """The irradiance cache of the last scene rendered; None before, and where none is
-        needed.
+        needed. Of a scene with several media there are as many: see ``caches``.
         """
+        if len(self._builder.parts) > 1:
+            names = ", ".join(f'"{name}"' for name in self.caches)
+            raise IrrcacheError(
+                f"irrcache: the scene has several media, each with a cache: caches[...] of {names}."
+            )
         return self._builder.cache
+
+    @property
+    def caches(self) -> dict[str, IrradianceCache | None]:
+        """The irradiance caches of the last scene rendered, by the ids of their media."""
+        return {part.medium.name: part.cache for part in self._builder.parts}
 
     @property
     def cache_spp(self) -> int:
@@ -178,17 +197,37 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def prepare(self, scene: mi.Scene) -> None:
         """Builds or completes the cache for ``scene``, unless it is up to date."""
         self._builder.update(scene, self.progress)
-        medium, cache = self._builder.medium, self._builder.shown
-        if medium is None:
-            self._projection = None
-        elif self._projection is None or self._revision != self._builder.revision:
-            lit = cache is not None and cache.active_count
-            field = cache.field() if lit else None
-            uncertainty = uncertainty_of(cache) if lit and self._with_error else None
-            self._projection = Projection(
-                medium, field, self._quadrature, self._step, self._layered, uncertainty
-            )
+        if self._revision != self._builder.revision:
+            self._sight = self._make_sight()
             self._revision = self._builder.revision
+
+    def _make_sight(self) -> SimpleSight | Sight | None:
+        """What sees the caches as they are; None where there is no medium to be seen."""
+        settings, parts = self._settings, self._builder.parts
+        if not parts:
+            return None
+        projections = [self._project(part.medium, part.shown) for part in parts]
+        surroundings = parts[0].medium.surroundings
+        if surroundings is None:
+            return SimpleSight(projections[0], settings.max_depth, self._hide_emitters)
+        depths = settings.max_depth, settings.rr_depth
+        return Sight(surroundings, projections, *depths, self._hide_emitters)
+
+    def _project(self, medium: MediumGrid, cache: IrradianceCache | None) -> Projection:
+        lit = cache is not None and cache.active_count
+        field = cache.field() if lit else None
+        uncertainty = uncertainty_of(cache) if lit and self._with_error else None
+        projection = Projection(
+            medium, field, self._quadrature, self._step, self._layered, uncertainty
+        )
+        if lit and cache.survey is not None:
+            projection.edges = cache.survey.edges
+        return projection
+
+    @property
+    def _projection(self) -> Projection:
+        """The one that tells of layers what all do."""
+        return self._sight.projection
 
     @property
     def _layered(self) -> bool:
@@ -216,11 +255,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         mask.
         """
         self.prepare(scene)
-        if self._projection is None:
+        if self._sight is None:
             radiance, valid, _ = self._fallback().sample(scene, sampler, ray, medium, active)
             return radiance, valid, self._aov_values(Layers.background_only(radiance))
         radiance, alpha, layers = self._radiance(
-            scene, sampler, ray, medium is not None, mi.Spectrum(1), mi.Bool(active)
+            scene, sampler, ray, medium, mi.Spectrum(1), mi.Bool(active)
         )
         return radiance, sampler.next_1d(active) < alpha, self._aov_values(layers)
 
@@ -237,7 +276,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             sensor = scene.sensors()[sensor]
         with dr.suspend_grad():
             self.prepare(scene)
-            if self._projection is None:
+            if self._sight is None:
                 film = self._render_empty(scene, sensor, seed, spp)
             else:
                 film = self._render(scene, sensor, seed, spp)
@@ -274,10 +313,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         raise NotImplementedError(_NO_GRADIENTS)
 
     def _render(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
-        inside = sensor.get_medium() is not None
+        medium = sensor.get_medium()
 
         def radiance(sampler, ray, weight, active) -> tuple:
-            found = self._radiance(scene, sampler, ray, inside, weight, active)
+            found = self._radiance(scene, sampler, ray, medium, weight, active)
             return *found[:2], found[2].channels() if found[2] else []
 
         count = self._projection.channel_count
@@ -321,42 +360,20 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         scene: mi.Scene,
         sampler: mi.Sampler,
         ray: mi.Ray3f,
-        inside: bool,
+        medium: mi.Medium | None,
         weight: mi.Spectrum,
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, mi.Float, Layers | None]:
         """Radiance times ``weight``, alpha, and the layers of the radiance if they are asked
         for.
         """
-        ray = mi.Ray3f(ray)
-        background = mi.Spectrum(0)
-        environment = scene.environment()
-        visible = (
-            environment is not None and not self._hide_emitters and self._settings.max_depth != 0
-        )
-        if visible:
-            escaped = dr.zeros(mi.SurfaceInteraction3f)
-            escaped.wi = -ray.d
-            escaped.wavelengths = ray.wavelengths
-            background = environment.eval(escaped, active)
-        hit, near, far = self._builder.medium.intersect(ray)
-        # As in volpath, a sensor is in the medium only if the scene says so, and the way in leads
-        # through the boundary, wherever inside of it the medium's grid begins.
-        _, entry, leave = self._builder.medium.boundary.intersect(ray)
-        entered = entry > -1e-5 * (leave - entry)
-        hit &= (far > 0) if inside else entered
-        near = dr.maximum(near, 0)
-        scattered, transmittance, gathered = self._projection.march(
-            ray, near, far, background, 1 - sampler.next_1d(active), active & hit
-        )
-        alpha = mi.Float(1)
-        if not visible:  # dr.mean would write the number of samples into the kernel
-            alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
-        background = transmittance * background
+        view = self._sight.look(scene, sampler, mi.Ray3f(ray), medium, active)
         layers = None
         if self._layered:
-            layers = self._projection.layers(scattered, transmittance, gathered, background, weight)
-        return (scattered + background) * weight, alpha, layers
+            layers = self._projection.layers(
+                view.scattered, view.transmittance, view.gathered, view.background, weight
+            )
+        return (view.scattered + view.background) * weight, view.alpha, layers
 
     def _fallback(self) -> mi.Integrator:
         if self._volpath is None:

@@ -15,6 +15,7 @@ import numpy as np
 from .errors import CacheFileError, IrrcacheError
 from .files import atomic_write
 from .grid import Affine, Grid, RootField
+from .survey import Survey
 
 #: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
 #: independent of each other, the batches are: means and errors are statistics of batch means.
@@ -56,6 +57,8 @@ class IrradianceCache:
         self.channels = channels
         self.max_depth = max_depth
         self.fingerprint = fingerprint or {}
+        #: where voxels lie among surfaces; None where there are none
+        self.survey: Survey | None = None
         #: samples taken per voxel from each random stream
         self.streams: dict[int, int] = {}
         self.correlated = correlated
@@ -135,8 +138,11 @@ class IrradianceCache:
         roots = [dr.sqrt(m) * _root_correction(v) for m, v in zip(means, noise, strict=True)]
         if all(dr.all(r == roots[0])[0] for r in roots[1:]):
             roots = roots[:1]
-        roots, noise = (self._tensor(x).array for x in (roots, noise[: len(roots)]))
-        return RootField(self.grid, roots, dr.width(roots) // self.grid.voxel_count, noise)
+        channels = len(roots)
+        roots, noise = (self._tensor(x).array for x in (roots, noise[:channels]))
+        if self.survey is not None:
+            roots = self.survey.filled(roots, channels)
+        return RootField(self.grid, roots, channels, noise)
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Variance of the voxels over their squared mean, at most 1; 0 where it is not known, or

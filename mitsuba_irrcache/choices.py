@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from .cache import IrradianceCache
+from .errors import IrrcacheError
 from .grid import Grid, GridField
 from .layers import luminance
 from .medium import MediumGrid
@@ -15,6 +16,10 @@ from .solvers import sweep
 #: Optical depth of a voxel at the boundary of a medium from which on the pixels there are off by
 #: more than 10 % (a homogeneous cube; at half of it, by 5 %).
 DENSE_BORDER = 1.0
+
+#: Voxels along the longest side of a cache among surfaces, unless told otherwise: shadows have more
+#: detail than coarse data.
+AMONG_SURFACES = (32, 64)
 
 #: Voxels of a cache that ``resolution`` 0 leads to, at most.
 MOST_VOXELS = 1 << 25
@@ -27,8 +32,18 @@ DENSE_VOXEL, FINEST = 0.8, 2.0
 SINGLE, MULTIPLE = 128, 64
 
 
-def choose_solver(scene: mi.Scene, solver: str) -> tuple[str, str]:
-    """The solver for a scene, and why."""
+def choose_solver(
+    scene: mi.Scene, solver: str, medium: MediumGrid | None = None
+) -> tuple[str, str]:
+    """The solver for a scene, one of whose media is ``medium``, and why."""
+    if medium is not None and medium.surroundings is not None:
+        if solver == "sweep":
+            raise IrrcacheError(
+                'irrcache: solver "sweep" carries light through one medium in a box or sphere '
+                "only, and this scene has surfaces, area emitters, other boundaries or several "
+                'media; set solver to "path" or "auto".'
+            )
+        return "path", "there are surfaces or several media"
     if solver != "auto":
         return solver, "as told"
     for emitter in scene.emitters():
@@ -46,11 +61,17 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     path per voxel.
     """
     data, frame = medium.sigma_t.grid, medium.frame
-    if resolution:
+    longest = np.linalg.norm(frame[:3, :3], axis=0).max()
+    per_path = 2 * longest * medium.sigma_t.maximum
+    if not resolution and medium.surroundings is not None:
+        least, most = AMONG_SURFACES
+        count = np.ceil(per_path) if data is None else max(data.shape)
+        grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
+        reason = f"of the medium, {least} to {most} among surfaces"
+    elif resolution:
         grid, reason = Grid.near_cubic(frame, resolution), "as told"
     elif data is None:
-        longest = np.linalg.norm(frame[:3, :3], axis=0).max()
-        count = np.clip(np.ceil(2 * longest * medium.sigma_t.maximum), 32, 96)
+        count = np.clip(np.ceil(per_path), 32, 96)
         grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"
     elif solver == "sweep" and data.voxel_count <= MOST_VOXELS:
         sides = _finer(medium.sigma_t)
@@ -80,10 +101,13 @@ def _finer(sigma_t: GridField) -> np.ndarray:
 
 
 def choose_samples(cache: IrradianceCache, solver: str) -> int:
-    """Samples per voxel: for ``path`` about 2^24 in all, 16 to 256 each."""
+    """Samples per voxel: for ``path`` about 2^24 in all, 2^22 among surfaces, where each is more
+    work; 16 to 256 each.
+    """
     if solver == "sweep":
         return SINGLE if cache.max_depth == 2 else MULTIPLE
-    return int(np.clip(2**24 // max(cache.active_count, 1), 16, 256))
+    paths = 2**24 if cache.survey is None else 2**22
+    return int(np.clip(paths // max(cache.active_count, 1), 16, 256))
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:

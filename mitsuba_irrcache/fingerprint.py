@@ -53,14 +53,32 @@ def _identity(value: Any) -> Any:
 def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
     """SHA-256 of the contents of each ingredient of the light in ``medium``."""
     boundary = medium.boundary
-    return {
-        "medium": _digest(
-            *_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()
-        ),
+    found = {
+        "medium": _medium_digest(medium),
         "boundary": _digest(boundary.kind, boundary.to_world),
         "emitters": _digest(*sorted(_emitter_digest(e) for e in scene.emitters())),
         "variant": "grey" if mi.is_monochromatic else "rgb",
     }
+    if medium.surroundings is not None:
+        media = medium.surroundings.media.grids
+        found["media"] = _digest(*sorted(_medium_digest(grid) for grid in media))
+        found["surfaces"] = _digest(*sorted(_shape_digest(s) for s in scene.shapes()))
+    return found
+
+
+def _medium_digest(medium: MediumGrid) -> str:
+    return _digest(*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ())
+
+
+def _shape_digest(shape: mi.Shape) -> str:
+    """Of a shape with its BSDF, and of which media are on its sides."""
+    params = mi.traverse(shape)
+    media = ("interior_medium", "exterior_medium")
+    keys = [k for k in sorted(params.keys()) if not k.startswith(media)]
+    values = [(key, np.array(_plain(params[key]))) for key in keys]
+    sides = [m.id() if m else "" for m in (shape.interior_medium(), shape.exterior_medium())]
+    bsdf = str(shape.bsdf())  # names all that is nested in it; its textures are in the values
+    return _digest(shape.class_name(), bsdf, *sides, *(part for pair in values for part in pair))
 
 
 def _field_parts(field: Field) -> tuple:

@@ -32,6 +32,12 @@ class MediumGrid:
         self.albedo = albedo
         self.boundary = boundary
         self.bbox = bbox
+        #: what it is called among others
+        self.name = ""
+        #: Mitsuba's medium, as rays carry it, and what else there is in the scene; None where
+        #: this medium in its boundary is all
+        self.pointer: mi.MediumPtr | None = None
+        self.surroundings: object | None = None
         self.macrocells = Macrocells.build(sigma_t, boundary)
         if bbox is not None:
             corners = [mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in p)) for p in bbox]

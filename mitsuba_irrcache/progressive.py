@@ -224,7 +224,7 @@ class _Run:
 
     @property
     def _samples(self) -> int:
-        return 0 if self.builder.shown is None else self.builder.shown.samples
+        return self.builder.done
 
     @property
     def _has_arrived(self) -> bool:
@@ -240,7 +240,7 @@ class _Run:
         cache = self.builder.cache
         if cache is not old:
             before = self.builder.saved_samples  # what a new one has, it has from its file
-        self.error = 0.0 if self.builder.is_dark else self.builder.shown.relative_error
+        self.error = self.builder.relative_error
         checkpoint()
         self.schedule.note_pass(max(self._samples - before, 0), perf_counter() - started)
 

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .edges import Edges
 from .grid import ConstantField, Field, GridField
 from .layers import Layers, luminance
 from .macrocells import Macrocells, Walk
@@ -57,6 +58,8 @@ class Projection:
         self.quadrature = quadrature
         self.layered = layered
         self.uncertainty = uncertainty
+        #: surfaces that end the light, where there are any
+        self.edges: Edges | None = None
         albedo = _constant_if_it_is(medium.albedo)
         grids = [f.grid for f in (medium.sigma_t, medium.albedo, irradiance) if f and f.grid]
         # Where nothing varies, one step is exact.
@@ -79,9 +82,22 @@ class Projection:
         if self.irradiance is None:
             return sigma_t, mi.Float(0), known
         phi, albedo = rest
+        phi = self._within_edges(p, phi, active)
         if self.uncertainty is not None:
             known += self.uncertainty.at_world(p, phi, active)
         return sigma_t, albedo * phi * dr.inv_four_pi, known
+
+    def irradiance_at(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
+        """The cached irradiance alone."""
+        return self._within_edges(p, self.irradiance.at_world(p, active), active)
+
+    def _within_edges(
+        self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
+    ) -> mi.Float | mi.Color3f:
+        """Irradiance that was looked up, without what is on the other side of surfaces."""
+        if self.edges is None:
+            return phi
+        return self.edges.corrected(self.irradiance, p, phi, active)
 
     @dr.syntax
     def march(
@@ -110,7 +126,7 @@ class Projection:
         grey = self.medium.sigma_t.channels == 1
         transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
         radiance = mi.Spectrum(0)
-        gathered = self._nothing()
+        gathered = self.nothing()
         brightest = dr.maximum(self.brightest, dr.max(background))
         # A float counts steps exactly up to 2^24; longer lattices are coarser, not endless.
         limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
@@ -188,7 +204,7 @@ class Projection:
         errors = self.uncertainty.count if self.uncertainty is not None else 1
         return 4 * dr.size_v(mi.Spectrum) + 1 + errors if self.layered else 0
 
-    def _nothing(self) -> list:
+    def nothing(self) -> list:
         """What has been gathered at the start of a ray: colour, depth, errors."""
         if not self.layered:
             return []

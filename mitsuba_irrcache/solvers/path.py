@@ -19,6 +19,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache import BATCH, IrradianceCache
 from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.solvers import volume_path
 from mitsuba_irrcache.tracking import free_flight, transmittance
 
 #: Paths in one kernel launch: enough to fill any machine, few enough to bound memory (about 100
@@ -175,24 +176,38 @@ class _Estimator:
         within = lane - row * per_batch + dr.opaque(mi.UInt32, start)
         place = dr.gather(mi.UInt32, voxels, lane // per_voxel)
         voxel = dr.gather(mi.UInt32, cache.active, place)
-        layers = _estimate(
-            self.scene,
-            self.medium,
-            cache.grid.centers(voxel),
-            batch,
-            within,
-            voxel,
-            self.seed,
-            self.orders,
-            self.rr_depth,
-            self.multiple,
-        )
+        layers = self._layers(cache.grid.centers(voxel), batch, within, voxel)
         double = dr.float64_array_t(mi.Float)
         # A layer that is zero throughout comes as a literal without a width.
         none = dr.zeros(mi.Float, dr.width(lane))
         values = [double(v[c] + none) for v in layers for c in range(cache.channels)]
         dr.eval(values)
         return [dr.block_sum(value, size) for value in values]
+
+    def _layers(
+        self, position: mi.Point3f, batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """One sample of both layers per lane."""
+        around = self.medium.surroundings
+        if around is None:
+            return _estimate(
+                self.scene,
+                self.medium,
+                position,
+                batch,
+                within,
+                voxel,
+                self.seed,
+                self.orders,
+                self.rr_depth,
+                self.multiple,
+            )
+        rng, spread = _random_numbers(batch, within, voxel, self.seed)
+        pointer = around.pointer(dr.gather(mi.UInt32, self.cache.survey.place, voxel))
+        max_depth = dr.select(self.orders < 0xFFFFFFFF, self.orders + 1, self.orders)
+        return volume_path.estimate(
+            self.scene, around.media, position, pointer, spread, rng, max_depth, self.rr_depth
+        )
 
     def seconds(self, samples: int) -> float:
         """Predicts the time for ``samples`` from one batch at voxels all over the medium."""
@@ -222,13 +237,7 @@ def _estimate(
     """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over
     directions.
     """
-    shift_a, shift_b = mi.sample_tea_32(voxel, mi.sample_tea_32(seed, batch)[0])
-    rng = mi.PCG32(
-        initstate=mi.UInt64(shift_a) << 32 | mi.UInt64(shift_b), initseq=mi.UInt64(within) + 1
-    )
-    # A batch shares one random shift of a low-discrepancy set; each point alone is uniform.
-    shifts = mi.PCG32(initstate=mi.UInt64(shift_b) << 32 | mi.UInt64(shift_a), initseq=mi.UInt64(0))
-    spread = [_fraction(shifts.next_float32() + _kronecker(within, axis)) for axis in range(4)]
+    rng, spread = _random_numbers(batch, within, voxel, seed)
     always = mi.Bool(True)
     uncollided, rng = direct_light(
         scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always
@@ -262,6 +271,19 @@ def _estimate(
             order += 1
             active &= order < orders
     return uncollided, scattered
+
+
+def _random_numbers(
+    batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32, seed: mi.UInt32
+) -> tuple[mi.PCG32, list[mi.Float]]:
+    """The random stream of a sample, and four numbers that the samples of a batch spread evenly."""
+    shift_a, shift_b = mi.sample_tea_32(voxel, mi.sample_tea_32(seed, batch)[0])
+    rng = mi.PCG32(
+        initstate=mi.UInt64(shift_a) << 32 | mi.UInt64(shift_b), initseq=mi.UInt64(within) + 1
+    )
+    # A batch shares one random shift of a low-discrepancy set; each point alone is uniform.
+    shifts = mi.PCG32(initstate=mi.UInt64(shift_b) << 32 | mi.UInt64(shift_a), initseq=mi.UInt64(0))
+    return rng, [_fraction(shifts.next_float32() + _kronecker(within, axis)) for axis in range(4)]
 
 
 def direct_light(

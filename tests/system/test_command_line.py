@@ -188,26 +188,35 @@ def _matches(pattern: str, text: str) -> bool:
 
 NULL = '<bsdf type="null"/>'
 EXTRAS = {
-    "opaque surface": (
-        '<shape type="sphere" id="ball"> <bsdf type="diffuse"/> </shape>',
-        "ball.*diffuse",
-    ),
     "point light in the medium": (
         '<emitter type="point" id="bulb"> <point name="position" value="0, 0, 0"/> </emitter>',
         "bulb.*inside the medium",
     ),
-    "area light": (
-        f'<shape type="rectangle" id="lamp"> {NULL} <emitter type="area"/> </shape>',
-        "lamp.*area emitter",
+    "medium without bounds": (
+        f'<shape type="sphere" id="hole"> {NULL} <medium name="exterior" type="homogeneous" '
+        'id="haze"/> </shape>',
+        "haze.*infinity",
     ),
-    "second medium": (
-        f'<shape type="cube" id="other"> {NULL} <medium name="interior" type="homogeneous"/>'
+    "open boundary": (
+        f'<shape type="rectangle" id="pane"> {NULL} <medium name="interior" type="homogeneous"/>'
         "</shape>",
-        "2 shapes bound media.*box.*other",
+        "pane.*not closed",
     ),
-    "exterior medium": (
-        f'<shape type="sphere" id="hole"> {NULL} <ref name="exterior" id="fog"/> </shape>',
-        "hole.*exterior",
+    "inward boundary": (
+        f'<shape type="sphere" id="hole"> {NULL} <boolean name="flip_normals" value="true"/>'
+        '<medium name="interior" type="homogeneous"/> </shape>',
+        "normals.*hole.*inwards",
+    ),
+    "instance of a medium": (
+        f'<shape type="shapegroup" id="group"> <shape type="sphere"> {NULL} '
+        '<medium name="interior" type="homogeneous"/> </shape> </shape>'
+        '<shape type="instance" id="copy"> <ref id="group"/> </shape>',
+        "copy.*instance",
+    ),
+    "phase function": (
+        f'<shape type="sphere" id="other"> {NULL} <medium name="interior" type="homogeneous" '
+        'id="haze"> <phase type="hg"/> </medium> </shape>',
+        "haze.*HGPhaseFunction",
     ),
 }
 
@@ -356,11 +365,11 @@ def test_errors_reach_a_script_too(folder, scenes):
     """mi.render wraps what an integrator raises in a RuntimeError; its cause is ours, with the
     remedy.
     """
-    (folder / "odd.xml").write_text(SCENE.replace("EXTRA", EXTRAS["area light"][0]))
+    (folder / "odd.xml").write_text(SCENE.replace("EXTRA", EXTRAS["medium without bounds"][0]))
     scene = mi.load_file(str(folder / "odd.xml"), integrator="irrcache")
     with pytest.raises((RuntimeError, ValueError)) as caught:
         mi.render(scene, spp=1)
     chain = [caught.value]
     while chain[-1].__cause__ is not None:
         chain.append(chain[-1].__cause__)
-    assert type(chain[-1]).__name__ == "UnsupportedSceneError" and "lamp" in str(chain[-1])
+    assert type(chain[-1]).__name__ == "UnsupportedSceneError" and "haze" in str(chain[-1])

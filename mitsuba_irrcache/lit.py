@@ -1,0 +1,251 @@
+"""One medium of a scene, and the cache of the light in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+
+from .cache import BATCH, IrradianceCache, active_voxels
+from .choices import SINGLE, choose_grid, choose_samples, warn_of_dense_border
+from .errors import CacheFileError, IrrcacheError
+from .fingerprint import digests
+from .grid import Grid
+from .medium import MediumGrid
+from .memory import available_memory
+from .solvers import path, sweep
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """What a cache is asked to be; see the plugin's documentation."""
+
+    max_depth: int = -1
+    rr_depth: int = 5
+    solver: str = "auto"
+    resolution: int = 0
+    samples: int = 0
+    seed: int = 0
+    file: str = ""
+    with_error: bool = False  # enough samples for a standard error: two batches at least
+
+
+class LitMedium:
+    """A medium with its cache, which is None where no light needs caching (``max_depth`` below
+    2).
+
+    ``solver`` is what `choices.choose_solver` says; ``name`` tells the medium from the
+    scene's others, "" where there are none.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        settings: CacheSettings,
+        solver: tuple[str, str],
+        name: str,
+        edited: bool,
+    ) -> None:
+        self.settings, self.medium, self.name = settings, medium, name
+        #: samples per voxel in the file
+        self.saved_samples = 0
+        #: path or sweep, and why
+        self.solver, self._reason = solver
+        self._opening: path.Opening | None = None
+        self._preview: IrradianceCache | None = None
+        self._sweep: sweep.Sweep | None = None
+        self.cache: IrradianceCache | None = None
+        if settings.max_depth not in (0, 1):
+            self.cache = self._start_cache(scene, edited)
+
+    @property
+    def label(self) -> str:
+        """Before a message about it."""
+        return f'medium "{self.name}": ' if self.name else ""
+
+    @property
+    def file(self) -> str:
+        """Its own where there are several media, with the medium's name in it."""
+        if not self.settings.file or not self.name:
+            return self.settings.file
+        file = Path(self.settings.file)
+        return str(file.with_name(f"{file.stem}.{self.name}{file.suffix}"))
+
+    @property
+    def shown(self) -> IrradianceCache | None:
+        """The cache, or the incomplete batches that stand for it so far."""
+        return self._preview or self.cache
+
+    def target(self, samples: int) -> int:
+        """Samples per voxel to build up to where ``samples`` (0: chosen) are wanted, a multiple of
+        the cache's batch.
+        """
+        samples, batch = samples or choose_samples(self.cache, self.solver), self.cache.batch
+        return max(-(-samples // batch), 2 if self.settings.with_error else 1) * batch
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether the cache is zero, or there is none: samples change nothing."""
+        return self.cache is None or not self.cache.active_count
+
+    def refine(
+        self, scene: mi.Scene, samples: int, early: bool, progress: path.Progress | None
+    ) -> bool:
+        """Fills the cache up to ``samples`` (0: chosen), the first two batches in pieces if
+        ``early``; whether anything may have changed.
+        """
+        if early and self.solver == "path" and not self.is_dark and not self.cache.samples:
+            return self._open(scene, samples, progress)
+        if self.cache is None or self.cache.samples >= self.target(samples):
+            return False
+        self._fill(scene, self.target(samples) - self.cache.samples, progress)
+        return True
+
+    def close(self) -> bool:
+        """Drops incomplete batches; whether there were any."""
+        dropped = self._preview is not None
+        self._opening = self._preview = None
+        return dropped
+
+    def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
+        settings, medium = self.settings, self.medium
+        grid, size_reason = choose_grid(medium, settings.resolution, self.solver)
+        _check_memory(grid, self.solver, settings.max_depth, settings.with_error)
+        warn_of_dense_border(medium, grid)
+        active, survey = active_voxels(medium, grid), None
+        if medium.surroundings is not None:
+            survey = medium.surroundings.survey(scene, grid, medium)
+            active = dr.compress(survey.reach & _marked(grid, active))
+        if medium.albedo.maximum == 0 or not scene.emitters():
+            active = mi.UInt32()
+        mi.Log(
+            mi.LogLevel.Info,
+            f"irrcache: {self.label}solver {self.solver} ({self._reason}); cache of "
+            f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {dr.width(active)} "
+            f"of {grid.voxel_count} see the medium",
+        )
+        channels = 1 if mi.is_monochromatic else 3
+        swept, depth = self.solver == "sweep", settings.max_depth
+        batch = sweep.batch_of(settings.samples or SINGLE, depth) if swept else BATCH
+        cache = IrradianceCache(grid, active, channels, depth, batch=batch, correlated=swept)
+        cache.survey = survey
+        self.saved_samples = 0
+        if not self.file:
+            return cache
+        cache.fingerprint = digests(scene, medium) | {
+            "settings": f"solver {self.solver}, max_depth {settings.max_depth}, "
+            f"grid {grid.shape[::-1]}"
+        }
+        return self._resume(cache, edited)
+
+    def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache:
+        """The cache on disk where it is of the same light; a foreign file is refused, never
+        overwritten.
+        """
+        file = Path(self.file)
+        if not file.exists():
+            if not file.parent.is_dir():
+                raise IrrcacheError(
+                    f'irrcache: cache_file "{file}": the folder "{file.parent}" does not exist.'
+                )
+            return cache
+        stored = IrradianceCache.load(file)
+        differing = [
+            k for k in cache.fingerprint if stored.fingerprint.get(k) != cache.fingerprint[k]
+        ]
+        if not differing:
+            mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
+            self.saved_samples = stored.samples
+            stored.survey = cache.survey
+            return stored
+        if edited:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'irrcache: the scene was edited ({", ".join(differing)}): "{file}" keeps the '
+                "light of before.",
+            )
+            cache.fingerprint = {}
+            return cache
+        detail = (
+            f" ({stored.fingerprint.get('settings')} in the file, {cache.fingerprint['settings']} "
+            "here)"
+            if differing == ["settings"]
+            else ""
+        )
+        raise CacheFileError(
+            f'irrcache: cache_file "{file}" belongs to another scene: {", ".join(differing)} '
+            f"differ{detail}. "
+            "Delete the file, or give this scene a cache_file of its own."
+        )
+
+    def _open(self, scene: mi.Scene, samples: int, progress: path.Progress | None) -> bool:
+        """Adds to the first two batches up to ``samples`` in all; whether anything was added."""
+        cache, settings = self.cache, self.settings
+        if self._opening is None:
+            self._opening = path.Opening(
+                scene, self.medium, cache, settings.seed, settings.rr_depth
+            )
+        size = min(samples // 2, cache.batch)
+        if size <= self._opening.size:
+            return False
+        self._opening.grow(size, progress)
+        if size == cache.batch:
+            self._opening.fill(cache)
+            self._opening = self._preview = None
+        else:
+            self._preview = IrradianceCache(
+                cache.grid, cache.active, cache.channels, cache.max_depth, batch=size
+            )
+            self._preview.survey = cache.survey
+            self._opening.fill(self._preview)
+        return True
+
+    def _fill(self, scene: mi.Scene, missing: int, progress: path.Progress | None) -> None:
+        settings, cache = self.settings, self.cache
+        if self.solver == "sweep":
+            if self._sweep is None:
+                self._sweep = sweep.Sweep(scene, self.medium, cache, settings.seed)
+            self._sweep.refine(missing, progress)
+        else:
+            path.refine(
+                scene, self.medium, cache, missing, settings.seed, settings.rr_depth, progress
+            )
+
+    def save(self) -> None:
+        """Writes the cache to its file, where it has one that has fewer samples."""
+        file, cache = self.file, self.cache
+        if file and cache is not None and cache.fingerprint and cache.samples > self.saved_samples:
+            cache.save(file)
+            self.saved_samples = cache.samples
+
+
+def _marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
+    """Of all voxels of ``grid``, whether they are among ``voxels``."""
+    marks = dr.zeros(mi.Bool, grid.voxel_count)
+    dr.scatter(marks, mi.Bool(True), voxels)
+    return marks
+
+
+def _check_memory(grid: Grid, solver: str, max_depth: int, with_error: bool) -> None:
+    """Refuses a cache that cannot be held, with what it takes to make it and to look it up; for the
+    field of its errors as much again (experiments/memory).
+    """
+    channels = 1 if mi.is_monochromatic else 3
+    if solver == "sweep":
+        # Extinction with its neighbours, the light that lines carry, sums and spreads; and where
+        # light is scattered again, the voxels' own and what is kept between sweeps.
+        numbers = 5 + 2 * channels + (0 if max_depth == 2 else 12 + 3 * channels)
+    else:
+        numbers = channels * (3 * 2 + 3) + 5  # sums in float64
+    needed = 4 * grid.voxel_count * (numbers + 8) * (2 if with_error else 1)
+    available = available_memory()
+    if needed > available or grid.voxel_count >= 2**32:
+        sides = " x ".join(map(str, grid.shape[::-1]))
+        raise IrrcacheError(
+            f"irrcache: a cache of {sides} voxels needs {needed / 2**30:.1f} GiB, and "
+            f"{available / 2**30:.1f} GiB are "
+            "free; lower resolution."
+        )

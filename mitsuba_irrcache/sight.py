@@ -1,0 +1,229 @@
+"""What a camera ray sees: light scattered in media, from their caches, and what is behind them.
+
+In a simple scene (see `scene`) its way is known in closed form. In all others the ray goes straight
+on through null surfaces, from one medium into the next, and is marched through each with that
+medium's cache. Where it meets a surface, or nothing any more, its straight way ends: what a surface
+sends back is path traced, by one path per camera sample, which ends where it meets a medium with a
+cache.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .layers import luminance
+from .projection import Projection
+from .surroundings import Surroundings
+from .transport import MOST_CROSSINGS, Start, behind, is_null, trace
+
+#: Surfaces seen through less than this transmittance are traced by roulette.
+FAINT = 0.1
+
+
+class View:
+    """What rays have found: ``scattered`` light of the media, ``background`` (emitters and
+    surfaces, seen through the media), the ``transmittance`` of the way, ``alpha``, and the sums
+    that `Projection.layers` makes layers of.
+    """
+
+    def __init__(
+        self,
+        scattered: mi.Spectrum,
+        background: mi.Spectrum,
+        transmittance: mi.Spectrum,
+        alpha: mi.Float,
+        gathered: list,
+    ) -> None:
+        self.scattered, self.background = scattered, background
+        self.transmittance, self.alpha, self.gathered = transmittance, alpha, gathered
+
+
+class SimpleSight:
+    """Camera rays through the one medium of a simple scene."""
+
+    def __init__(self, projection: Projection, max_depth: int, hide_emitters: bool) -> None:
+        self.projection, self.medium = projection, projection.medium
+        self.hide_emitters, self.lit = hide_emitters, max_depth != 0
+
+    def look(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        medium: mi.Medium | None,
+        active: mi.Bool,
+    ) -> View:
+        """Along ``ray``, which starts in ``medium``."""
+        background = mi.Spectrum(0)
+        environment = scene.environment()
+        visible = environment is not None and not self.hide_emitters and self.lit
+        if visible:
+            escaped = dr.zeros(mi.SurfaceInteraction3f)
+            escaped.wi = -ray.d
+            escaped.wavelengths = ray.wavelengths
+            background = environment.eval(escaped, active)
+        hit, near, far = self.medium.intersect(ray)
+        # As in volpath, a sensor is in the medium only if the scene says so, and the way in leads
+        # through the boundary, wherever inside of it the medium's grid begins.
+        _, entry, leave = self.medium.boundary.intersect(ray)
+        entered = entry > -1e-5 * (leave - entry)
+        hit &= (far > 0) if medium is not None else entered
+        near = dr.maximum(near, 0)
+        scattered, transmittance, gathered = self.projection.march(
+            ray, near, far, background, 1 - sampler.next_1d(active), active & hit
+        )
+        alpha = mi.Float(1)
+        if not visible:  # dr.mean would write the number of samples into the kernel
+            alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
+        return View(scattered, transmittance * background, transmittance, alpha, gathered)
+
+
+class Sight:
+    """Camera rays through several ``projections``, one for each medium that can be seen."""
+
+    def __init__(
+        self,
+        surroundings: Surroundings,
+        projections: list[Projection],
+        max_depth: int,
+        rr_depth: int,
+        hide_emitters: bool,
+    ) -> None:
+        self.surroundings, self.projections = surroundings, projections
+        #: the one that gathers most: a dark medium has no errors to tell
+        self.projection = max(projections, key=lambda p: p.channel_count)
+        self.hide_emitters = hide_emitters
+        #: the caches hold what paths of any length find; for shorter ones they hold too much
+        self.cached = self._irradiance if max_depth < 0 else None
+        self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
+        self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+
+    def look(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        medium: mi.Medium | None,
+        active: mi.Bool,
+    ) -> View:
+        """Along ``ray``, which starts in ``medium``."""
+        pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
+        offset = 1 - sampler.next_1d(active)
+        rng = _stream(sampler, active)
+        scattered, background, passed, gathered, end, pointer, stopped, escaped = self._straight(
+            scene, ray, pointer, offset, active
+        )
+        # What is hardly seen is traced rarely.
+        chance = dr.minimum(dr.max(passed) * (1 / FAINT), 1)
+        traced = stopped & (rng.next_float32(stopped) < chance)
+        weight = dr.select(traced, passed / chance, 0)
+        start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
+        straight, reflected, met, _ = trace(
+            scene,
+            self.surroundings.media,
+            start,
+            self.max_depth,
+            self.rr_depth,
+            self.hide_emitters,
+            rng,
+            traced,
+            self.cached,
+        )
+        background += dr.select(traced, weight * (straight + reflected), 0)
+        alpha = mi.Float(1)
+        if self.hide_emitters or scene.environment() is None:
+            clear = dr.select(traced & ~met, weight, 0)
+            clear = dr.select(escaped, passed, clear)
+            alpha = 1 - dr.sum(clear) / dr.size_v(mi.Spectrum)
+        return View(scattered, background, passed, alpha, gathered)
+
+    @dr.syntax
+    def _straight(
+        self,
+        scene: mi.Scene,
+        ray: mi.Ray3f,
+        pointer: mi.MediumPtr,
+        offset: mi.Float,
+        active: mi.Bool,
+    ):
+        """Up to the first surface that is not null: scattered light, emitters seen, transmittance
+        and gathered sums; then the ray that ends there, its medium, and whether it stopped at a
+        surface, or escaped.
+        """
+        scattered, background, passed = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(1)
+        gathered = self._nothing()
+        # Distances are those from the camera all along, so that depths are too.
+        segment, pointer, near = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Float(0)
+        stopped, escaped, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
+        bright = mi.Spectrum(self.surroundings.brightest)
+        crossings = mi.UInt32(0)
+        lit = self.max_depth > 0
+        while dr.hint(active, label="straight on"):
+            si = scene.ray_intersect(segment, active)
+            valid = active & si.is_valid()
+            far = dr.select(valid, dr.dot(si.p - ray.o, ray.d), dr.inf)
+            for projection in self.projections:
+                hit, entry, leave = projection.medium.intersect(ray)
+                entry, leave = dr.maximum(entry, near), dr.minimum(leave, far)
+                hit &= active & (pointer == projection.medium.pointer)
+                found, through, sums = projection.march(ray, entry, leave, bright, offset, hit)
+                scale = luminance(passed)
+                scattered += passed * found
+                gathered = _added(gathered, sums, passed, scale)
+                passed *= through
+            # Emitters, and what lies behind them if they are hidden.
+            emitter = si.emitter(scene, active)
+            shines = active & (emitter != None)  # noqa: E711
+            null = is_null(si.bsdf().flags())
+            crosses = valid & null
+            if dr.hint(self.hide_emitters, mode="scalar"):
+                crosses |= shines & valid & (pointer == None)  # noqa: E711
+                shines = mi.Bool(False)
+            shines &= crosses | ~valid
+            light = emitter.eval(si, shines & lit)
+            background += dr.select(shines & lit, passed * light, 0)
+            stopped |= valid & ~crosses
+            escaped |= active & ~valid
+            pointer = dr.select(crosses & null, behind(si, ray.d, pointer), pointer)
+            onwards = si.spawn_ray(ray.d)
+            segment = dr.select(crosses, onwards, segment)
+            near = dr.select(crosses, far, near)
+            crossings += 1
+            active &= crosses & (dr.max(passed) > 0) & (crossings < MOST_CROSSINGS)
+        return scattered, background, passed, gathered, segment, pointer, stopped, escaped
+
+    def _irradiance(
+        self, pointer: mi.MediumPtr, p: mi.Point3f, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Bool]:
+        """The cached irradiance, and whether there is a cache."""
+        result, known = mi.Spectrum(0), mi.Bool(False)
+        for projection in self.projections:
+            here = active & (pointer == projection.medium.pointer)
+            known |= here
+            if projection.irradiance is not None:
+                phi = mi.Spectrum(projection.irradiance_at(p, here))
+                result = dr.select(here, phi, result)
+        return result, known
+
+    def _nothing(self) -> list:
+        """Gathered sums at the start of a ray."""
+        return self.projection.nothing()
+
+
+def _added(gathered: list, sums: list, passed: mi.Spectrum, scale: mi.Float) -> list:
+    """Sums of a medium that is seen through ``passed`` added to those before it."""
+    if not sums:
+        return gathered
+    colour, *rest = gathered
+    rest = [old + scale * new for old, new in zip(rest, sums[1:], strict=False)] + rest[
+        len(sums) - 1 :
+    ]
+    return [colour + passed * sums[0], *rest]
+
+
+def _stream(sampler: mi.Sampler, active: mi.Bool) -> mi.PCG32:
+    """A random stream per lane, from two numbers of the sampler's."""
+    a, b = (dr.reinterpret_array(mi.UInt32, sampler.next_1d(active)) for _ in range(2))
+    state, sequence = mi.sample_tea_32(a, b, 8)
+    return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))

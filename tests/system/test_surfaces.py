@@ -1,0 +1,315 @@
+"""Scenes with surfaces, area emitters and several media against ``volpath``.
+
+Block means of two images by each integrator, within what coarse caches may err plus the statistical
+error that the two images of each tell; see `check`.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SIZE, BLOCK = 24, 6
+#: Error allowed in the mean of a block, relative to the mean radiance, beside 4.5 standard errors,
+#: which must not be larger than a few times that: what coarse caches leave.
+TOLERANCE, NOISE = 0.02, 0.02
+
+
+def colour(*rgb: float) -> dict:
+    return {"type": "rgb", "value": [float(v) for v in rgb]}
+
+
+def fog(extinction=(1.0, 1.0, 1.0), albedo=(0.9, 0.9, 0.9)) -> dict:
+    scale = max(extinction)
+    sigma_t = colour(*(v / scale for v in extinction))
+    return {
+        "type": "homogeneous", "sigma_t": sigma_t, "albedo": colour(*albedo), "scale": scale,
+    }  # fmt: skip
+
+
+def ref(name: str) -> dict:
+    return {"type": "ref", "id": name}
+
+
+def placed(center=(0, 0, 0), scale=(1, 1, 1), towards=None):
+    transform = mi.ScalarTransform4f
+    if towards is not None:
+        return transform().look_at(list(center), list(towards), [0.1, 1, 0.2]).scale(list(scale))
+    return transform().translate(list(center)).scale(list(scale))
+
+
+def bound(kind="cube", interior=None, center=(0, 0, 0), scale=(1, 1, 1), **more) -> dict:
+    """A null boundary."""
+    place = placed(center, scale)
+    return {"type": kind, "to_world": place, "bsdf": {"type": "null"}, "interior": interior} | more
+
+
+def ball(center=(0, 0, 0), radius=0.4, **more) -> dict:
+    return {"type": "sphere", "center": list(center), "radius": radius} | more
+
+
+def lamp(center, towards, size=0.5, radiance=(12, 10, 8)) -> dict:
+    emitter = {"type": "area", "radiance": colour(*radiance)}
+    place = placed(center, (size, size, 1), towards)
+    return {"type": "rectangle", "to_world": place, "emitter": emitter}
+
+
+def diffuse(*rgb: float) -> dict:
+    return {"type": "diffuse", "reflectance": colour(*rgb)}
+
+
+def ground(height=-1.1, bsdf=None) -> dict:
+    place = placed((0, height, 0), (5, 5, 1), (0, height + 1, 0.001))
+    return {"type": "rectangle", "to_world": place, "bsdf": bsdf or diffuse(0.6, 0.5, 0.4)}
+
+
+def tetrahedron(folder, interior: dict) -> dict:
+    """A closed mesh, from a file."""
+    corners = [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]]
+    faces = [[1, 3, 2], [1, 2, 4], [1, 4, 3], [2, 3, 4]]
+    rows = [("v", *c) for c in corners] + [("f", *f) for f in faces]
+    (folder / "mesh.obj").write_text("".join(" ".join(map(str, row)) + "\n" for row in rows))
+    mesh = {"type": "obj", "filename": str(folder / "mesh.obj"), "bsdf": {"type": "null"}}
+    return mesh | {"interior": interior}
+
+
+def images(scenes, objects: dict, settings: dict, depth: dict, spp: tuple) -> list[np.ndarray]:
+    """Two by irrcache, two by volpath."""
+    objects = {"emitter": scenes.sky, "sun": scenes.sun} | objects
+    found = []
+    for name, samples in zip(("irrcache", "volpath"), spp, strict=True):
+        own = {"resolution": 20, "cache_spp": 64} | settings if name == "irrcache" else {}
+        scene = scenes.load({"type": name, **depth, **own}, None, SIZE, **objects)
+        found += [scenes.image(scene, spp=samples, seed=seed) for seed in (1, 2)]
+    return found
+
+
+def blocks(image: np.ndarray) -> np.ndarray:
+    n = SIZE // BLOCK
+    return image.reshape(n, BLOCK, n, BLOCK, -1).mean(axis=(1, 3))
+
+
+def check(x, y, p, q, tolerance=TOLERANCE, noise=NOISE) -> None:
+    scale = 0.5 * (p + q)[..., :3].mean()
+    assert scale > 0
+    difference = blocks(0.5 * (x + y - p - q)) / scale
+    errors = [np.sqrt(blocks((0.5 * (a - b)) ** 2) / BLOCK**2) / scale for a, b in ((x, y), (p, q))]
+    error = np.hypot(*errors)
+    assert np.median(error) < noise, "too noisy to say"
+    excess = np.abs(difference) - 4.5 * error
+    assert excess.max() < tolerance, (difference, error)
+
+
+def scene_ground(scenes, folder) -> dict:
+    """A cloud over the ground, which it shades, and which lights it, before a mirror."""
+    to_world = scenes.placement(turn=20)
+    cloud = scenes.medium(scenes.texture((5, 6, 7), 0, 3, 4), 0.9, to_world)
+    mirror = {"type": "rectangle", "to_world": placed((-0.5, 0, 2.0), (2, 2, 1), (0, 0.2, 0))}
+    mirror["bsdf"] = {"type": "conductor"}
+    return {"cloud": scenes.boundary(cloud, to_world), "ground": ground(), "mirror": mirror}
+
+
+def scene_ball(scenes, folder) -> dict:
+    """An opaque ball in fog: its shadow, and the light it reflects."""
+    red = diffuse(0.9, 0.2, 0.1)
+    return {"fog": fog(), "box": bound(interior=ref("fog")), "ball": ball(bsdf=red)}
+
+
+def scene_glass(scenes, folder) -> dict:
+    """Glass behind a medium, and glass in it, which the medium fills too."""
+    glass = {"bsdf": {"type": "dielectric"}}
+    return {
+        "box": bound(interior=fog((0.7, 0.7, 0.7))),
+        "behind": ball((-0.6, 0, 2.0), 0.7, **glass),
+        "inside": ball((0.2, 0, 0), 0.4, **glass),
+        "sun": None,
+    }
+
+
+def scene_lamp_outside(scenes, folder) -> dict:
+    """A mesh lit by a lamp, over the ground."""
+    return {
+        "mesh": tetrahedron(folder, fog((2, 2, 2))), "ground": ground(),
+        "lamp": lamp((0.5, 2.2, -0.5), (0, 0, 0)), "emitter": None, "sun": None,
+    }  # fmt: skip
+
+
+def scene_lamp_inside(scenes, folder) -> dict:
+    """A lamp in the medium: bright on one side, dark on the other, the one that is seen."""
+    return {
+        "box": bound(interior=fog()), "lamp": lamp((0, 0.2, 0), (0, -1, 0.3), 0.4),
+        "emitter": {"type": "constant", "radiance": 0.1}, "sun": None,
+    }  # fmt: skip
+
+
+def scene_two(scenes, folder) -> dict:
+    """A medium beside another, whose extinction is coloured, and a third in that."""
+    inner = bound("sphere", fog((1, 2, 4)), (0.55, 0, 0), (0.3, 0.3, 0.3), exterior=ref("right"))
+    return {
+        "right": fog((3, 1, 0.5)),
+        "box": bound(interior=fog(), center=(-0.5, 0, 0), scale=(0.5, 0.8, 0.8)),
+        "other": bound(interior=ref("right"), center=(0.502, 0, 0), scale=(0.5, 0.8, 0.8)),
+        "inner": inner,
+    }
+
+
+def scene_camera_inside(scenes, folder) -> dict:
+    """Between the camera and a ball, all in one medium."""
+    sensor = scenes.description({}, None, SIZE)["sensor"]
+    look = mi.ScalarTransform4f().look_at([0.3, 0.4, -1.5], [0, 0, 0], [0, 1, 0])
+    return {
+        "fog": fog((0.5, 0.6, 0.8)), "box": bound(interior=ref("fog"), scale=(2, 2, 2)),
+        "ball": ball(bsdf=diffuse(0.8, 0.8, 0.8), exterior=ref("fog")), "sun": None,
+        "sensor": sensor | {"to_world": look, "fov": 60.0, "medium": ref("fog")},
+    }  # fmt: skip
+
+
+def scene_glass_boundary(scenes, folder) -> dict:
+    """A medium in glass has no cache, and is lit and seen by paths; one behind a veil has one."""
+    glass = {"bsdf": {"type": "dielectric"}, "interior": fog((1, 1, 1))}
+    half = {"type": "mask", "opacity": 0.5}
+    half["nested"] = {"type": "twosided", "nested": diffuse(0.7, 0.5, 0.3)}
+    veil = {"type": "rectangle", "to_world": placed((0, 0, -1.4), (0.5, 0.5, 1), (0, 0, -3))}
+    return {
+        "jar": ball((-0.8, 0, 0), 0.7, **glass), "veil": veil | {"bsdf": half},
+        "box": bound(interior=fog(), center=(0.8, 0, 0), scale=(0.6, 0.6, 0.6)), "sun": None,
+    }  # fmt: skip
+
+
+SCENES = {
+    "ground and mirror": (scene_ground, {}, {}),
+    "opaque ball in fog": (scene_ball, {}, {"tolerance": 0.03}),
+    "glass": (scene_glass, {}, {}),
+    "mesh under a lamp": (scene_lamp_outside, {}, {"tolerance": 0.03}),
+    "lamp inside": (scene_lamp_inside, {"resolution": 32}, {"tolerance": 0.04, "noise": 0.04}),
+    "three media": (scene_two, {}, {}),
+    "camera inside": (scene_camera_inside, {"cache_spp": 512}, {}),
+    "glass boundary": (scene_glass_boundary, {}, {}),
+}
+
+
+@pytest.mark.parametrize(("build", "settings", "bounds"), SCENES.values(), ids=SCENES)
+def test_scenes(scenes, tmp_path, build, settings, bounds):
+    depth = {"max_depth": -1, "rr_depth": 50}
+    check(*images(scenes, build(scenes, tmp_path), settings, depth, (64, 256)), **bounds)
+
+
+def everything(scenes) -> dict:
+    """Surfaces, an area light and two media, one of them with coloured extinction."""
+    return {
+        "fog": fog((0.5, 0.5, 0.5)), "box": bound(interior=ref("fog")),
+        "inner": bound("sphere", fog((1, 2, 3)), (-0.4, 0, 0), [0.4] * 3, exterior=ref("fog")),
+        "ball": ball((0.5, 0, 0), 0.3, bsdf=diffuse(0.8, 0.8, 0.8)), "ground": ground(),
+        "lamp": lamp((1, 2.0, -1), (0, 0, 0)), "emitter": None, "sun": None,
+    }  # fmt: skip
+
+
+def test_every_order_of_scattering_is_counted_once(scenes):
+    """What each further vertex of paths adds, on average over the image, is what it adds in
+    volpath: within 3 % and four standard errors.
+    """
+    means, variances = [], []
+    for max_depth in (1, 2, 3):
+        depth = {"max_depth": max_depth, "rr_depth": 1000}
+        found = images(scenes, everything(scenes), {}, depth, (128, 512))
+        pairs = [found[:2], found[2:]]
+        means.append([0.5 * (a + b).mean() for a, b in pairs])
+        variances.append(sum(((a - b) ** 2).mean() / 4 / a.size for a, b in pairs))
+    ours, theirs = np.diff(means, axis=0, prepend=0).T
+    errors = np.sqrt(np.convolve(variances, [1, 1])[: len(means)])
+    assert (theirs[1:] > 10 * errors[1:]).all(), "too noisy to say"
+    assert (np.abs(ours - theirs) <= 0.03 * theirs + 4 * errors).all(), (ours, theirs, errors)
+
+
+@pytest.mark.parametrize("hide", [False, True])
+def test_hidden_emitters_and_alpha(scenes, hide):
+    """A lamp in view, before and in the fog, with the sky behind: what is seen, and alpha."""
+    sensor = scenes.description({}, None, SIZE)["sensor"]
+    sensor["film"] = sensor["film"] | {"pixel_format": "rgba"}
+    objects = {
+        "box": bound(interior=fog((0.7, 0.7, 0.7))), "sensor": sensor, "sun": None,
+        "near": lamp((0.4, 0.8, -2.0), (1.0, 1.5, -5.0), 0.3, (1, 2, 3)),
+        "within": lamp((-0.3, -0.3, -0.3), (1.0, 1.5, -5.0), 0.2, (3, 2, 1)),
+    }  # fmt: skip
+    depth = {"max_depth": 3, "rr_depth": 1000, "hide_emitters": hide}
+    found = images(scenes, objects, {"resolution": 32}, depth, (64, 256))
+    check(*(i[..., :3] for i in found), tolerance=0.03)
+    check(*(i[..., 3:] for i in found))
+    assert (found[0][..., 3].mean() < 0.9) == hide
+
+
+def test_mono(mono, scenes):
+    objects = scene_ball(scenes, None) | {"ground": ground()}
+    depth = {"max_depth": 4, "rr_depth": 50}
+    check(*images(scenes, objects, {}, depth, (64, 256)), tolerance=0.03)
+
+
+def loaded(scenes, objects: dict, **settings) -> mi.Scene:
+    integrator = {"type": "irrcache", "max_depth": 3, "resolution": 8, "cache_spp": 16} | settings
+    return scenes.load(integrator, None, 8, **objects)
+
+
+def test_each_medium_has_a_cache(scenes, tmp_path):
+    """By the medium's id, in a file of its own, which another scene is refused."""
+    file = str(tmp_path / "light.npz")
+    scene = loaded(scenes, everything(scenes), cache_file=file)
+    scenes.image(scene, spp=1)
+    caches = scene.integrator().caches
+    assert len(caches) == 2 and "fog" in caches
+    assert all(cache.samples == 16 for cache in caches.values())
+    with pytest.raises(IrrcacheError, match=r'several media.*"fog"'):
+        scene.integrator().cache  # noqa: B018
+    assert {p.name for p in tmp_path.iterdir()} == {f"light.{name}.npz" for name in caches}
+    again = loaded(scenes, everything(scenes), cache_file=file)
+    again.integrator().prepare(again)
+    np.testing.assert_array_equal(
+        np.array(again.integrator().caches["fog"].irradiance), np.array(caches["fog"].irradiance)
+    )
+    other = everything(scenes) | {"ground": ground(bsdf=diffuse(0.1, 0.1, 0.1))}
+    other = loaded(scenes, other, cache_file=file)
+    with pytest.raises(CacheFileError, match="surfaces"):
+        other.integrator().prepare(other)
+
+
+def test_edits_of_surfaces_renew_the_caches(scenes):
+    scene = loaded(scenes, scene_ball(scenes, None))
+    scenes.image(scene, spp=1)
+    before = scene.integrator().cache
+    scenes.image(scene, spp=1, seed=3)
+    assert scene.integrator().cache is before
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.startswith("ball") and "reflectance" in k]
+    params[key] = mi.Color3f(0.2, 0.9, 0.1)
+    params.update()
+    scenes.image(scene, spp=1)
+    assert scene.integrator().cache is not before
+
+
+def test_layers_add_up(scenes):
+    """Surfaces and emitters are background: colour times illumination plus that is the image."""
+    scene = loaded(scenes, everything(scenes), aovs="colour,illumination,background,noise")
+    values = scenes.image(scene, spp=8)
+    image, colours, illumination, background = (values[..., i : i + 3] for i in (0, 3, 6, 9))
+    np.testing.assert_allclose(colours * illumination + background, image, rtol=1e-4, atol=1e-5)
+    assert background.mean() > 0.1 * image.mean() and values[..., 12].mean() > 0
+
+
+def test_media_that_only_glass_shows_are_volpaths(scenes):
+    glass = {"bsdf": {"type": "dielectric"}, "interior": fog()}
+    pictures = []
+    for name in ("irrcache", "volpath"):
+        jar = {"jar": ball(radius=1.0, **glass)}
+        scene = scenes.load({"type": name, "max_depth": 4, "rr_depth": 5}, None, 8, **jar)
+        pictures.append(scenes.image(scene, spp=4, seed=5))
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_sweep_is_refused_among_surfaces(scenes):
+    scene = loaded(scenes, scene_ball(scenes, None), solver="sweep")
+    with pytest.raises(IrrcacheError, match=r"sweep.*path.*auto"):
+        scene.integrator().prepare(scene)

@@ -1,0 +1,119 @@
+"""Lookups beside surfaces, and where voxels are."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.edges import Edges
+from mitsuba_irrcache.grid import Grid, RootField
+from mitsuba_irrcache.scene import bake_media
+from mitsuba_irrcache.survey import neighbourhood
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+NORMAL, DISTANCE = np.array([0.6, 0.64, 0.48]), 0.9
+
+
+@pytest.fixture
+def unit(rgb) -> Grid:
+    return Grid((8, 8, 8), np.eye(4))
+
+
+def wall() -> mi.Scene:
+    """A plane through the unit cube, at ``DISTANCE`` along ``NORMAL``."""
+    center = DISTANCE * NORMAL
+    place = mi.ScalarTransform4f().look_at(list(center), list(center + NORMAL), [0, 0, 1])
+    shape = {"type": "rectangle", "to_world": place.scale(3)}
+    return mi.load_dict({"type": "scene", "wall": shape})
+
+
+def points(count: int = 4096) -> tuple[mi.Point3f, np.ndarray]:
+    """Places in the unit cube, and their distances from the wall."""
+    p = np.random.default_rng(1).uniform(0.07, 0.93, (3, count)).astype(np.float32)
+    return mi.Point3f(p), NORMAL @ p - DISTANCE
+
+
+def test_light_does_not_pass_a_wall(unit):
+    """1 on one side, 4 on the other: exactly that everywhere, but for what borders take from
+    beyond; without edges, lookups near the wall mix the two.
+    """
+    centers = np.array(unit.centers(dr.arange(mi.UInt32, unit.voxel_count)))
+    roots = np.where(NORMAL @ centers > DISTANCE, 2.0, 1.0).astype(np.float32)
+    field = RootField(unit, mi.Float(roots), 1)
+    p, distance = points()
+    plain = field.at_world(p)
+    edges = Edges(wall(), unit)
+    sided = np.array(edges.corrected(field, p, plain, mi.Bool(True)))
+    expected = np.where(distance > 0, 4.0, 1.0)
+    far = np.abs(distance) > 1e-4
+    inner = np.all((np.array(p) > 1 / 16) & (np.array(p) < 15 / 16), axis=0)
+    np.testing.assert_allclose(sided[far & inner], expected[far & inner], rtol=1e-5)
+    assert np.abs(np.array(plain) - expected)[inner].max() > 0.5
+
+
+def test_colours_and_uncut_cells(unit):
+    """Far from the wall nothing changes, to the bit, in any channel."""
+    rng = np.random.default_rng(2)
+    roots = rng.uniform(0.5, 1.5, unit.voxel_count * 3).astype(np.float32)
+    field = RootField(unit, mi.Float(roots), 3)
+    p, distance = points()
+    plain = field.at_world(p)
+    sided = np.array(Edges(wall(), unit).corrected(field, p, plain, mi.Bool(True)))
+    far = np.abs(distance) > 3**0.5 / 8
+    np.testing.assert_array_equal(sided[:, far], np.array(plain)[:, far])
+    assert (sided != np.array(plain)).any()
+
+
+def test_empty_space_has_no_edges(unit):
+    ball = {"type": "sphere", "center": [3, 3, 3]}
+    null = {"type": "sphere", "bsdf": {"type": "null"}}
+    assert Edges(mi.load_dict({"type": "scene", "a": ball, "b": null}), unit).count == 0
+
+
+def test_neighbourhood():
+    """Means over valid neighbours, weighted by their distance squared."""
+    rng = np.random.default_rng(3)
+    values, valid = rng.uniform(0, 1, (4, 5, 6)).astype(np.float32), rng.random((4, 5, 6)) < 0.5
+    grid = Grid((4, 5, 6), np.eye(4))
+    total, weights = neighbourhood(grid, mi.Float(values.ravel()), mi.Bool(valid.ravel()))
+    expected = np.zeros((2, 4, 5, 6))
+    for z, y, x in np.ndindex(4, 5, 6):
+        for k, j, i in np.ndindex(3, 3, 3):
+            place = (z + k - 1, y + j - 1, x + i - 1)
+            squared = (k - 1) ** 2 + (j - 1) ** 2 + (i - 1) ** 2
+            if squared and all(0 <= a < n for a, n in zip(place, (4, 5, 6), strict=True)):
+                expected[:, z, y, x] += valid[place] / squared * np.array([values[place], 1])
+    np.testing.assert_allclose(np.array(total).reshape(4, 5, 6), expected[0], rtol=1e-5)
+    np.testing.assert_allclose(np.array(weights).reshape(4, 5, 6), expected[1], rtol=1e-5)
+
+
+def test_survey(scenes):
+    """Of a cube with a null sphere of another medium on one side, and an opaque ball on the
+    other.
+    """
+    fog = scenes.medium(0.5, 0.9) | {"id": "fog"}
+    inner = {
+        "type": "sphere", "center": [-0.5, 0, 0], "radius": 0.4, "bsdf": {"type": "null"},
+        "interior": scenes.medium(1.0, 0.9), "exterior": {"type": "ref", "id": "fog"},
+    }  # fmt: skip
+    ball = {"type": "sphere", "center": [0.5, 0, 0], "radius": 0.4}
+    outer = scenes.boundary({"type": "ref", "id": "fog"})
+    scene = scenes.load({"type": "volpath"}, outer, fog=fog, inner=inner, ball=ball)
+    grids = {grid.name: grid for grid in bake_media(scene)}
+    assert len(grids) == 2
+    medium = grids["fog"]
+    grid = Grid.near_cubic(medium.frame, 16)
+    survey = medium.surroundings.survey(scene, grid, medium)
+    centers = np.array(grid.centers(dr.arange(mi.UInt32, grid.voxel_count)))
+    in_sphere = np.linalg.norm(centers - [[-0.5], [0], [0]], axis=0) < 0.4
+    in_ball = np.linalg.norm(centers - [[0.5], [0], [0]], axis=0) < 0.4
+    order = [g.name for g in medium.surroundings.media.grids]
+    expected = np.where(in_sphere, 2 - order.index("fog"), order.index("fog") + 1)
+    np.testing.assert_array_equal(np.array(survey.place), expected)
+    np.testing.assert_array_equal(np.array(survey.enclosed), in_ball)
+    deep = np.linalg.norm(centers - [[-0.5], [0], [0]], axis=0) < 0.4 - 2 * 3**0.5 * 0.125
+    assert not np.array(survey.reach)[deep].any()
+    assert np.array(survey.reach)[~in_sphere].all()

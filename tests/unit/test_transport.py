@@ -1,0 +1,114 @@
+"""Light transport among surfaces and media, where the answer is known."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.scene import bake_media
+from mitsuba_irrcache.solvers.volume_path import contributions
+from mitsuba_irrcache.transport import power_heuristic, visibility
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+COUNT = 1 << 16
+INFINITE = 0xFFFFFFFF
+
+
+def irradiance(scene, position, max_depth=INFINITE, count=COUNT) -> tuple[np.ndarray, ...]:
+    """Mean irradiance at a position in the first medium, uncollided and scattered, and the standard
+    error of their sum.
+    """
+    medium = bake_media(scene)[0]
+    rng = mi.PCG32(count)
+    spread = [rng.next_float32() for _ in range(4)]
+    found = contributions(
+        scene,
+        medium.surroundings.media,
+        mi.Point3f(position),
+        medium.pointer,
+        spread,
+        rng,
+        dr.opaque(mi.UInt32, max_depth),
+        dr.opaque(mi.UInt32, 1000),
+    )
+    layers = [np.array(sum(f[i] for f in found)) for i in (1, 2)]
+    assert all(np.allclose(np.linalg.norm(np.array(f[0]), axis=0), 1, atol=1e-4) for f in found)
+    error = (layers[0] + layers[1]).std(axis=1) / count**0.5
+    return layers[0].mean(axis=1), layers[1].mean(axis=1), error
+
+
+def room(scenes, extinction, albedo, radiance=1.0, reflectance=0.0, radius=1.5) -> mi.Scene:
+    """A medium in a box in a closed room whose walls glow."""
+    walls = {
+        "type": "sphere", "radius": radius, "flip_normals": True,
+        "bsdf": {"type": "diffuse", "reflectance": reflectance},
+        "emitter": {"type": "area", "radiance": radiance},
+    }  # fmt: skip
+    box = scenes.boundary(scenes.medium(extinction, albedo), scenes.placement((1.4, 1.2, 1.0)))
+    return scenes.load({"type": "volpath"}, box, walls=walls, emitter=None, sun=None)
+
+
+@pytest.mark.parametrize("extinction", [0.0, 3.0, (0.9, 0.4, 0.1)])
+def test_furnace(scenes, extinction):
+    """Nothing absorbs: the radiance is that of the walls everywhere, in all directions."""
+    straight, scattered, error = irradiance(room(scenes, extinction, 1.0), (0.2, -0.1, 0.3))
+    assert (np.abs(straight + scattered - 4 * np.pi) < 4 * error + 1e-3).all()
+    assert ((scattered > 0.1) == (np.array(extinction) > 0)).all()
+
+
+def test_walls_that_reflect(scenes):
+    """Without a medium to speak of each reflection is weaker by the reflectance: a geometric
+    series, which max_depth cuts off. Emission is order 0, of depth 1 at the voxel.
+    """
+    scene = room(scenes, 0.0, 1.0, reflectance=0.5)
+    for max_depth, total in ((2, 1.0), (3, 1.5), (4, 1.75), (INFINITE, 2.0)):
+        straight, scattered, error = irradiance(scene, (0.1, 0, 0), max_depth)
+        assert (np.abs(straight - 4 * np.pi) < 4 * error + 1e-3).all()
+        assert (np.abs(straight + scattered - 4 * np.pi * total) < 4 * error + 2e-3).all()
+
+
+def test_a_disc_overhead(scenes):
+    """Of solid angle 2 pi (1 - cos), sampled by both strategies."""
+    place = mi.ScalarTransform4f().translate([0, 2, 0]).rotate([1, 0, 0], 90)
+    disc = {"type": "disk", "to_world": place, "emitter": {"type": "area", "radiance": 3.0}}
+    box = scenes.boundary(scenes.medium(0.0, 0.5))
+    scene = scenes.load({"type": "volpath"}, box, disc=disc, emitter=None, sun=None)
+    straight, scattered, error = irradiance(scene, (0, 0, 0), 2)
+    assert (np.abs(straight - 3 * 2 * np.pi * (1 - 2 / 5**0.5)) < 4 * error + 1e-3).all()
+    assert (scattered == 0).all() and (error < 0.1).all()
+
+
+def test_visibility(scenes):
+    """Through a medium, another beside it, and a veil of opacity 1/4; not through a wall."""
+    to_world = scenes.placement((1, 1, 1), center=(0, 0, 0))
+    objects = {
+        "next": scenes.boundary(scenes.medium(0.8, 0.5), scenes.placement(center=(3, 0, 0))),
+        "veil": {
+            "type": "sphere", "center": [6, 0, 0],
+            "bsdf": {"type": "mask", "opacity": 0.25, "nested": {"type": "diffuse"}},
+        },
+        "wall": {"type": "sphere", "center": [0, 5, 0]},
+    }  # fmt: skip
+    shape = scenes.boundary(scenes.medium((0.2, 0.4, 0.6), 0.5), to_world)
+    scene = scenes.load({"type": "volpath"}, shape, **objects)
+    medium = next(m for m in bake_media(scene) if m.sigma_t.channels == 3)
+    vertex = dr.zeros(mi.Interaction3f, 2)
+    target = mi.Point3f([9.0, 0.0], [0.0, 9.0], [0.0, 0.0])
+    media = medium.surroundings.media
+    through, _ = visibility(
+        scene, media, vertex, target, mi.MediumPtr(medium.pointer), mi.PCG32(2), mi.Bool(True)
+    )
+    expected = np.exp(-np.array([0.1, 0.2, 0.3]) - 1.6) * 0.75**2
+    np.testing.assert_allclose(np.array(through)[:, 0], expected, rtol=1e-3)
+    assert not np.array(through)[:, 1].any()
+
+
+def test_power_heuristic():
+    """Weights of two strategies add up to one; what cannot be sampled weighs nothing."""
+    a, b = mi.Float([1.0, 2.0, 0.0, 3.0]), mi.Float([3.0, 2.0, 1.0, 0.0])
+    both = power_heuristic(a, b) + power_heuristic(b, a)
+    np.testing.assert_allclose(np.array(both), 1)
+    np.testing.assert_allclose(np.array(power_heuristic(a, b)), [0.1, 0.5, 0, 1])
