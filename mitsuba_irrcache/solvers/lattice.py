@@ -20,6 +20,8 @@ arithmetic, and the odd part of what is integrated over directions cancels.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -61,7 +63,6 @@ class Lattice:
         self.grid, self.detail = grid, detail or grid
         self._own = self.detail.shape == grid.shape  # each voxel has its own extinction
         self.lower, self.sides = np.array(lower), np.array(upper) - np.array(lower)
-        self._strides = _strides(grid.resolution)
         self._to_voxels = grid.coordinates.matrix[:3, :3]
         self._lines = max(int(np.prod(np.delete(self.sides, axis))) for axis in range(3))
         self._lanes = dr.arange(mi.UInt32, self._lines)
@@ -79,7 +80,12 @@ class Lattice:
             dr.eval(self._all_corners)
 
     def table(
-        self, directions: np.ndarray, light: np.ndarray, weights: np.ndarray, offsets: np.ndarray
+        self,
+        directions: np.ndarray,
+        light: np.ndarray,
+        weights: np.ndarray,
+        offsets: np.ndarray,
+        by_slice: bool = False,
     ) -> Table:
         """What kernels need to know of pairs of opposite directions.
 
@@ -89,6 +95,7 @@ class Lattice:
                 times solid angle.
             weights: (n), solid angles that each of a pair stands for, for light from the voxels.
             offsets: (n, 2), in [0, 1), random.
+            by_slice: whether the volume that lines leave light in is laid out by their slices.
         """
         count = len(directions)
         integers = np.zeros((count, _INTEGERS), np.int64)
@@ -99,11 +106,14 @@ class Lattice:
             ways = light[i] if velocity[axis] > 0 else light[i][::-1]
             across = [k for k in range(3) if k != axis]
             order = (*across, axis)
-            places = _strides(self._slices(axis))
-            row = [*(int(self.sides[k]) for k in order), *(self._strides[k] for k in order)]
-            base = int(np.dot(self.lower, self._strides))
-            row += [base, *(places[k] for k in order)]
-            row += [base if self._own else int(self.lower[axis]) * places[axis]]
+            layout = _by_slice(axis)
+            strides = _strides(self.grid.resolution, layout if by_slice else (0, 1, 2))
+            places = _strides(self._slices(axis), layout)
+            row = [*(int(self.sides[k]) for k in order), *(strides[k] for k in order)]
+            row += [int(np.dot(self.lower, strides)), *(places[k] for k in order)]
+            row += [
+                int(np.dot(self.lower, places) if self._own else self.lower[axis] * places[axis])
+            ]
             for k, offset in zip(across, offsets[i], strict=True):
                 slope = round(velocity[k] / velocity[axis] * ONE)
                 slope = slope or 1  # lines never stay in a face
@@ -120,15 +130,23 @@ class Lattice:
             ]
         return Table(integers, numbers, axes)
 
-    def carry(self, table: Table) -> mi.Float:
-        """Irradiance at the centres of all voxels of the grid: the light that enters along all
-        pairs of ``table``.
+    def carry(self, directions: np.ndarray, light: np.ndarray, offsets: np.ndarray) -> mi.Float:
+        """Irradiance at the centres of all voxels of the grid: the light that enters along pairs of
+        directions, told as in `table`.
         """
+        table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
         total = dr.opaque(mi.Float, 0, self.grid.voxel_count)
         for axis, pairs in table.by_axis():
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
             self._launch(volume, None, table, axis, pairs)
-            total += sharpened(volume, self.grid, self.lower, self.lower + self.sides, axis)
+            volume = sharpened(volume, self.grid, self.lower, self.lower + self.sides, axis)
+            layout = _by_slice(axis)
+            if layout != (0, 1, 2):
+                dr.eval(volume)
+                strides = _strides(self.grid.resolution, layout)
+                at = self.grid.places(dr.arange(mi.UInt32, self.grid.voxel_count))
+                volume = dr.gather(mi.Float, volume, _flat(at, strides))
+            total += volume
             dr.eval(total)
         return total
 
@@ -188,9 +206,8 @@ class Lattice:
         else:
             count = int(sides[axis])
             values = self._halves[axis] = _halved(self._levels, self.detail, count, axis)
-        grid = Grid(tuple(int(n) for n in sides[::-1]), self.grid.to_world)
-        index = dr.arange(mi.UInt32, grid.voxel_count)
-        at, strides = grid.places(index), _strides(sides)
+        at = _places(sides, _by_slice(axis))
+        index, strides = _flat(at, _strides(sides)), _strides(sides)
         steps = []
         for k in range(3):
             if k != axis:
@@ -203,10 +220,35 @@ class Lattice:
         return dr.ravel(mi.Vector2u(words[0] | words[1] << 16, words[2] | words[3] << 16))
 
 
-def _strides(sides: np.ndarray) -> tuple[int, int, int]:
+def _by_slice(axis: int) -> tuple[int, int, int]:
+    """The axes from the fastest to the slowest, such that neighbours across ``axis`` are near each
+    other in memory. Slices along y and z are so as they are.
+    """
+    return (1, 2, 0) if axis == 0 else (0, 1, 2)
+
+
+def _strides(sides: np.ndarray, layout: tuple[int, ...] = (0, 1, 2)) -> tuple[int, int, int]:
     """Steps of the flat index along x, y, z."""
-    nx, ny, _ = (int(n) for n in sides)
-    return 1, nx, nx * ny
+    steps, step = [0, 0, 0], 1
+    for axis in layout:
+        steps[axis] = step
+        step *= int(sides[axis])
+    return tuple(steps)
+
+
+def _places(sides: np.ndarray, layout: tuple[int, ...]) -> list[mi.UInt32]:
+    """Places along x, y, z of all values in the order of their memory."""
+    index = dr.arange(mi.UInt32, int(np.prod(sides)))
+    first, second = (dr.opaque(mi.UInt32, int(sides[axis])) for axis in layout[:2])
+    row = index // first
+    places = index - row * first, row % second, row // second
+    return [place for _, place in sorted(zip(layout, places, strict=True), key=lambda p: p[0])]
+
+
+def _flat(places: Sequence[mi.UInt32], strides: tuple[int, ...]) -> mi.UInt32:
+    """Flat indices of places along x, y, z."""
+    x, y, z = (p * dr.opaque(mi.UInt32, n) for p, n in zip(places, strides, strict=True))
+    return x + y + z
 
 
 def _rounded(values: mi.Float, shift: float = 0.0) -> mi.UInt32:
@@ -250,13 +292,12 @@ def sharpened(
 ) -> mi.Float:
     """``values`` of the voxels between ``lower`` and ``upper`` (x, y, z) at their centres, given
     means over their cross sections across ``axis``: second differences along both other axes take
-    back what the mean has smoothed. Never negative.
+    back what the mean has smoothed. Never negative. Laid out by slices across ``axis``.
     """
-    index = dr.arange(mi.UInt32, grid.voxel_count)
-    change = mi.Float(0)
-    for k, (at, stride) in enumerate(
-        zip(grid.places(index), _strides(grid.resolution), strict=True)
-    ):
+    layout = _by_slice(axis)
+    index, change = dr.arange(mi.UInt32, grid.voxel_count), mi.Float(0)
+    places, strides = _places(grid.resolution, layout), _strides(grid.resolution, layout)
+    for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
         if k == axis or upper[k] - lower[k] < 3:
             continue
         stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))

@@ -141,9 +141,9 @@ class Sweep:
 
     def _uncollided(self, lattice: Lattice, rows: list, light: int) -> mi.Float:
         """Irradiance straight from the emitters, on average over passes."""
-        joined = [np.concatenate(part) for part in zip(*rows, strict=True)]
-        lit = joined[1].any(axis=1)
-        volume = lattice.carry(lattice.table(*(part[lit] for part in joined)))
+        directions, entering, _, offsets = (np.concatenate(p) for p in zip(*rows, strict=True))
+        lit = entering.any(axis=1)
+        volume = lattice.carry(directions[lit], entering[lit], offsets[lit])
         return self._with_near_light(volume * dr.opaque(mi.Float, 1 / len(rows)), light)
 
     def _collided(self, level: Level, row: tuple, light: int) -> mi.Float:
