@@ -34,7 +34,7 @@ from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.compare.worker import peak_memory
 from mitsuba_irrcache.loading import load_scene
 from mitsuba_irrcache.runtime import require_llvm
-from mitsuba_irrcache.solvers.sweep import DIRECTIONS
+from mitsuba_irrcache.solvers.sweep import BATCH
 
 VARIANT = "llvm_ad_mono"
 #: Source and voxels along its longest side; 0: as the source has it.
@@ -44,7 +44,7 @@ QUICK_PIXELS = (128, 256, 512)
 FULL_PIXELS = (*QUICK_PIXELS, 1024)
 #: Of which images and kernels are measured.
 MIDDLE = ("procedural", 128)
-SAMPLES = 2 * DIRECTIONS
+SAMPLES = BATCH
 #: Samples per pixel of an image.
 SPP = 4
 REPEATS = 3
@@ -72,9 +72,9 @@ def run(options: Options) -> None:
     with no_kernels_on_disk():
         counts = row("kernels", kernels, MIDDLE)
     print(sizes_table(sizes).as_text(), images_table(images).as_text(), sep="\n\n")
-    print(f"\nKernels of passes of {DIRECTIONS} directions at 128^3, the first with all before it:")
+    print(f"\nKernels of batches of {BATCH} directions at 128^3, the first with all before it:")
     for number, count in enumerate(counts["passes"], 1):
-        print(f"  pass {number}: {count['launches']} launches, {count['compiled']} compilations")
+        print(f"  batch {number}: {count['launches']} launches, {count['compiled']} compilations")
 
 
 def alone(function: Callable, scene: Path, *rest: int) -> dict:
@@ -171,10 +171,10 @@ def kernels(scene: Path) -> dict:
     loaded = load_scene(scene, {"max_depth": "2"})
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
-        builder = build(loaded, DIRECTIONS)[0]
+        builder = build(loaded, BATCH)[0]
         passes = [counted(dr.kernel_history())]
         for number in range(2, PASSES + 1):
-            builder.samples = number * DIRECTIONS
+            builder.samples = number * BATCH
             builder.update(loaded)
             passes.append(counted(dr.kernel_history()))
     return {"passes": passes}

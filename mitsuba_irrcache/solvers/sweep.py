@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache import IrradianceCache
-from mitsuba_irrcache.grid import Field, Grid
+from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.lattice import Lattice
@@ -29,8 +29,8 @@ BATCH, LARGE_BATCH = 32, 64
 DIRECTIONS = 16
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
-#: Most values of the extinction along each axis of a voxel that lines see.
-DETAIL = 4
+#: Values of the extinction along each axis of a voxel that lines see, about.
+DETAIL = 2
 
 #: called with (samples done, samples in all), both in voxels times directions
 Progress = Callable[[int, int], None]
@@ -172,17 +172,19 @@ class Sweep:
 
 
 def _detail(medium: MediumGrid, grid: Grid) -> Grid:
-    """The voxels in which lines see the extinction: those of the medium, where ``grid`` lies over
-    the same box, but at most `DETAIL` in one of ``grid`` along each axis.
+    """The voxels in which lines see the extinction, where ``grid`` lies over the same box as those
+    of the medium: these, or where ``grid`` is much coarser, blocks of them, about `DETAIL` in a
+    voxel along each axis.
     """
     data = medium.sigma_t.grid
     if data is None or not medium.fills(grid) or not medium.fills(data):
         return grid
-    sides = np.minimum(data.resolution, DETAIL * grid.resolution)
+    block = np.maximum(np.rint(data.resolution / (DETAIL * grid.resolution)), 1).astype(int)
+    block = np.where(data.resolution % block == 0, block, 1)
+    sides = data.resolution // block
     if (sides == grid.resolution).all():
         return grid
-    shape = tuple(int(n) for n in sides[::-1])
-    return data if shape == data.shape else Grid(shape, grid.to_world)
+    return data if (block == 1).all() else Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
 
 
 def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> list[mi.Float]:
@@ -190,16 +192,30 @@ def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> 
     the field's, or that the boundary of the medium may cut. Outside of it the field counts as 0 if
     ``masked``.
     """
-    ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
     cut = masked and not medium.fills(grid)
+    if field.grid is not None and not cut:
+        block, rest = np.divmod(field.grid.resolution, grid.resolution)
+        if not rest.any() and np.prod(block) <= FINEST**3 and medium.fills(field.grid):
+            return _blocks(field, grid, block)
+    ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
     points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
     index = dr.arange(mi.UInt32, grid.voxel_count)
-    if field.grid is grid and not cut:
-        n = field.channels
-        values = [dr.gather(mi.Float, field.data, index * n + c) * field.scale for c in range(n)]
-        dr.eval(values)
-        return values
     values = _mean(medium, field, grid, index, dr.opaque(mi.UInt32, points), cut)
+    dr.eval(values)
+    return values
+
+
+def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
+    """Means over blocks of so many voxels (x, y, z), which are the voxels of ``grid``."""
+    sums: list = [0.0] * field.channels
+    nx, ny, _ = (int(n) for n in field.grid.resolution)
+    at = grid.places(dr.arange(mi.UInt32, grid.voxel_count))
+    for dz, dy, dx in np.ndindex(*block[::-1]):
+        x, y, z = (a * int(n) + d for a, n, d in zip(at, block, (dx, dy, dz), strict=True))
+        place = ((z * ny + y) * nx + x) * field.channels
+        for c in range(field.channels):
+            sums[c] = sums[c] + dr.gather(mi.Float, field.data, place + c)
+    values = [total * (field.scale / int(np.prod(block))) for total in sums]
     dr.eval(values)
     return values
 
