@@ -16,6 +16,9 @@ import numpy as np
 from .errors import UnsupportedSceneError
 from .grid import Affine
 
+#: Vertices of a mesh that may still be a box: corners that are almost the same are one.
+MOST_VERTICES = 256
+
 
 class Boundary:
     """The image of the cube [-1, 1]^3 (``kind="box"``) or of the unit sphere (``"sphere"``) under
@@ -129,21 +132,21 @@ def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
     """
     size = np.ptp(vertices, axis=0).max()
     tolerance = 1e-5 * size + 4 * np.finfo(np.float32).eps * np.abs(vertices).max()
-    corners: list[np.ndarray] = []
-    for v in vertices:
-        if all(np.abs(v - c).max() > tolerance for c in corners):
-            corners.append(v)
-        if len(corners) > 8:
-            return None
+    vertices = np.unique(vertices, axis=0)
+    if len(vertices) > MOST_VERTICES:
+        return None
+    same = _distances(vertices, vertices) <= tolerance
+    corners = vertices[np.unique(same.argmax(axis=1))]
     if len(corners) != 8:
         return None
-    origin, *others = corners
-    for edges in itertools.combinations([c - origin for c in others], 3):
+    origin, others = corners[0], corners[1:] - corners[0]
+    bits = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+    for edges in itertools.combinations(others, 3):
         linear = np.stack(edges, axis=1)
-        if abs(np.linalg.det(linear)) < 1e-12 * size**3:
+        if abs(np.dot(edges[0], np.cross(edges[1], edges[2]))) < 1e-12 * size**3:
             continue
-        built = [origin + linear @ bits for bits in itertools.product((0.0, 1.0), repeat=3)]
-        if all(min(np.abs(b - c).max() for c in corners) <= tolerance for b in built):
+        built = origin + bits @ linear.T
+        if _distances(built, corners).min(axis=1).max() <= tolerance:
             frame = np.eye(4)
             frame[:3, :3] = 0.5 * _conventional(linear)
             frame[:3, 3] = np.mean(corners, axis=0)
@@ -151,15 +154,19 @@ def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
     return None
 
 
+def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Largest differences of a coordinate between points (n, 3) and (m, 3): (n, m)."""
+    return np.abs(a[:, None] - b[None]).max(axis=-1)
+
+
 def _conventional(edges: np.ndarray) -> np.ndarray:
     """The same edges (columns) ordered and signed so that each points along its world axis where it
     can.
     """
+    along = np.abs(edges) / np.linalg.norm(edges, axis=0)
     best = max(
         itertools.permutations(range(3)),
-        key=lambda p: np.prod(
-            [abs(edges[i, p[i]]) / np.linalg.norm(edges[:, p[i]]) for i in range(3)]
-        ),
+        key=lambda p: along[0, p[0]] * along[1, p[1]] * along[2, p[2]],
     )
     ordered = edges[:, list(best)]
     return ordered * np.where(np.diag(ordered) < 0, -1.0, 1.0)
