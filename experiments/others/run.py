@@ -194,8 +194,8 @@ EDITS = (
 
 
 def modernised(name: str, repaired: bool, folder: Path) -> Path:
-    """The scene ``name`` for Mitsuba 3, its files named in full; ``repaired``: with another extinction
-    that has no negative voxels.
+    """The scene ``name`` for Mitsuba 3, its files named in full; ``repaired``: with an extinction
+    whose negative voxels are 0.
     """
     text = (LAJOLLA / f"{name}.xml").read_text()
     for pattern, replacement in EDITS:

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache import render_progressive
-from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.variants import require_variant
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -307,16 +305,3 @@ def test_gradients_are_refused(scenes, wrapped):
         dr.backward(dr.mean(mi.render(scene, params, spp=2)))
     with pytest.raises(NotImplementedError, match="prbvolpath"):
         dr.forward_to(mi.render(scene, params, spp=2))
-
-
-VARIANTS = {
-    "llvm_ad_spectral": "wavelengths",
-    "llvm_mono_polarized": "polarisation",
-    "scalar_rgb": "interpreted",
-}
-
-
-@pytest.mark.parametrize(("variant", "reason"), VARIANTS.items(), ids=VARIANTS)
-def test_variants_are_refused_by_name(variant, reason):
-    with pytest.raises(IrrcacheError, match=rf'"{variant}".*{reason}.*llvm_ad_rgb'):
-        require_variant(variant)
