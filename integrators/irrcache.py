@@ -21,6 +21,7 @@ from mitsuba_irrcache.projection import QUADRATURES, Projection
 from mitsuba_irrcache.rendering import fill_film, planes, render_film
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.sight import Sight, SimpleSight
+from mitsuba_irrcache.stopping import Stopped, Stopping
 from mitsuba_irrcache.uncertainty import uncertainty_of
 from mitsuba_irrcache.variants import require_variant
 from mitsuba_irrcache.versions import check_versions
@@ -105,6 +106,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
          of another scene is refused. Of several media, each has a file with its id in the name.
          (Default: none)
 
+     * - timeout
+       - |float|
+       - Seconds after which rendering ends with what there is: neither another batch of the cache
+         nor another pass of camera samples is begun. (Default: -1, never)
+
     Computes the irradiance (fluence rate) that reaches every point of an isotropically scattering
     medium once, independently of the camera, and integrates the radiative transfer equation along
     camera rays from it. A moved camera, another film or another seed reuse the cache; an edited
@@ -158,6 +164,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                 f"irrcache: step is {self._step:g}; it must lie between 0.001 and 1000 voxel edges."
             )
         self._builder = CacheBuilder(self._settings)
+        self._timeout = float(props.get("timeout", -1.0))
+        self._stopping = Stopping()
         self._sight: SimpleSight | Sight | None = None
         self._revision = 0  # of the builder, when the sight was made
         self._volpath: mi.Integrator | None = None
@@ -196,10 +204,34 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def prepare(self, scene: mi.Scene) -> None:
         """Builds or completes the cache for ``scene``, unless it is up to date."""
-        self._builder.update(scene, self.progress)
+        self._stopping.begin(self._timeout)
+        try:
+            with dr.suspend_grad():
+                self._builder.update(scene, self._stopping.checked(self.progress))
+        except Stopped:
+            self._log_what_is_missing()
         if self._revision != self._builder.revision:
             self._sight = self._make_sight()
             self._revision = self._builder.revision
+
+    def _log_what_is_missing(self) -> None:
+        done, target = self._builder.done, self._builder.target
+        if done < target:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"irrcache: stopped with {done} of {target} samples per voxel in the cache. The "
+                "next rendering completes them.",
+            )
+
+    def cancel(self) -> None:
+        """Ends the rendering that is in progress, in whatever thread, with what there is."""
+        self._stopping.cancel()
+        if self._volpath is not None:
+            self._volpath.cancel()
+
+    def should_stop(self) -> bool:
+        """Whether rendering was cancelled, or reached its ``timeout``."""
+        return self._stopping.is_due
 
     def _make_sight(self) -> SimpleSight | Sight | None:
         """What sees the caches as they are; None where there is no medium to be seen."""
@@ -214,7 +246,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return Sight(surroundings, projections, *depths, self._hide_emitters)
 
     def _project(self, medium: MediumGrid, cache: IrradianceCache | None) -> Projection:
-        lit = cache is not None and cache.active_count
+        lit = cache is not None and cache.active_count and cache.samples
         field = cache.field() if lit else None
         uncertainty = uncertainty_of(cache) if lit and self._with_error else None
         projection = Projection(
@@ -302,9 +334,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         def image() -> tuple[mi.TensorXf, float]:
             tensor = self.render(scene, sensor, seed, spp)
+            self._stopping.end()
             return tensor, self.seconds.get("filter", 0.0)
 
-        return frames(self._builder, scene, image, Targets(**targets), self.progress)
+        self._stopping.begin()
+        progress = self._stopping.checked(self.progress)
+        return frames(self._builder, scene, image, Targets(**targets), progress)
 
     def render_forward(self, *args: object, **kwargs: object) -> mi.TensorXf:
         raise NotImplementedError(_NO_GRADIENTS)
@@ -383,6 +418,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                     "max_depth": self._settings.max_depth,
                     "rr_depth": self._settings.rr_depth,
                     "hide_emitters": self._hide_emitters,
+                    "timeout": self._timeout,
                 }
             )
         return self._volpath
@@ -396,7 +432,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             f"  resolution = {s.resolution},\n  cache_spp = {self.cache_spp},\n  cache_seed = "
             f"{s.seed},\n"
             f"  quadrature = {self._quadrature},\n  step = {self._step:g},\n  filter = "
-            f"{self._filter},\n  aovs = {self._aovs},\n"
+            f"{self._filter},\n  aovs = {', '.join(f'{n}:{k}' for n, k in self._aovs.items())},\n"
             f'  cache_file = "{s.file}"\n]'
         )
 

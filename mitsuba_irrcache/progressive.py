@@ -20,6 +20,7 @@ import mitsuba as mi
 from .build import CacheBuilder, Progress
 from .cache import BATCH
 from .errors import IrrcacheError
+from .stopping import Stopped
 
 #: Samples per voxel of the first pass: two for each of two batches, for a standard error.
 FIRST = 4
@@ -118,8 +119,9 @@ def render_progressive(
 
     Every frame is rendered afresh with ``spp`` samples per pixel and ``seed``; the last one shows
     the final cache. A ``cache_file`` is written now and then, and at the end, however that comes;
-    the cache stays with the integrator, and another run goes on with it. Raises IrrcacheError for
-    another integrator, and for targets that make no sense.
+    the cache stays with the integrator, and another run goes on with it. ``cancel()`` of the
+    integrator ends it without another frame. Raises IrrcacheError for another integrator, and for
+    targets that make no sense.
     """
     integrator = scene.integrator()
     if not hasattr(integrator, "progressive"):
@@ -157,6 +159,8 @@ def frames(
                 yield run.frame(image)
                 if run.is_over:
                     return
+        except Stopped:
+            return
         finally:
             builder.samples = own
             builder.close()

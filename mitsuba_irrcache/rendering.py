@@ -57,6 +57,7 @@ def render_film(
             sampler.advance()
             sampler.schedule_state()
             dr.eval(block.tensor())
+            dr.sync_thread()  # else all passes are queued before anybody can stop them
         if should_stop():
             break
     film.put_block(block)

@@ -60,11 +60,13 @@ def refine(
         first = cache.streams.get(seed, 0) // BATCH
         layers = []
         for voxels in _blocks(cache.active_count, block):
+            if layers and progress is not None:
+                progress(done, total)
             layers.append(estimator.batches(voxels, first, count))
             done += dr.width(voxels) * BATCH * count
-            if progress is not None:
-                progress(done, total)
         cache.add(seed, BATCH * count, layers)
+        if progress is not None:
+            progress(done, total)
         remaining -= count
 
 

@@ -11,6 +11,7 @@ from experiments import analysis, methods, scenes
 from experiments.figure2 import plot as figure2_plot
 from experiments.figure2 import run as figure2_run
 from experiments.options import FULL, QUICK, Options, Size
+from experiments.others import run as others_run
 from experiments.recording import LATE, STRIP, Recording, times
 from experiments.store import Store, read_json
 from experiments.table1 import plot as table1_plot
@@ -177,3 +178,19 @@ def test_from_nothing_to_a_figure(rgb, monkeypatch, tmp_path):
     monkeypatch.setattr("experiments.recording.run_job", None)
     figure2_run.run(options)
     assert read_json(tmp_path / "figure2" / "results.json")["path tracing"] == errors
+
+
+def test_the_z_test_of_others_references():
+    """Noise of the variance that is stated passes, an error of a few standard errors does not."""
+    target, variance = np.ones((48, 48, 3)), np.full((48, 48, 3), 0.25)
+    image = target + RNG.normal(0, 0.5 / others_run.SUITE_SPP**0.5, target.shape)
+    found = others_run.z_test(image, target, variance)
+    assert found["z"] == pytest.approx(1, abs=0.05) and found["passed"] > 0.9975
+    assert others_run.z_test(image + 0.4, target, variance)["passed"] < 0.5
+
+
+def test_scenes_of_others_are_skipped_without_data(tmp_path, monkeypatch, capsys):
+    absent = {name: others_run.of_the_suite(name, 6) for name in ("hetero", "homo")}
+    monkeypatch.setattr(others_run, "SCENES", absent)
+    others_run.run(Options(output=tmp_path))
+    assert capsys.readouterr().out.count("skipped") == 2
