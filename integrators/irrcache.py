@@ -217,8 +217,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         lit = cache is not None and cache.active_count
         field = cache.field() if lit else None
         uncertainty = uncertainty_of(cache) if lit and self._with_error else None
+        directional = cache.directional_field(field.channels) if lit else None
         projection = Projection(
-            medium, field, self._quadrature, self._step, self._layered, uncertainty
+            medium, field, self._quadrature, self._step, self._layered, uncertainty, directional
         )
         if lit and cache.survey is not None:
             projection.edges = cache.survey.edges
