@@ -171,8 +171,9 @@ def sources_of(scene: mi.Scene) -> list[Source]:
             found.append(Source(_sampled(emitter).p.numpy().ravel(), 0.0, far=False))
         elif emitter.is_environment():
             found += _spots(emitter)
-        elif emitter.shape() is not None:
-            box = emitter.shape().bbox()
+    for shape in scene.shapes():
+        if shape.is_emitter():
+            box = shape.bbox()
             radius = 0.5 * float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
             lamps.append(Source(np.array(box.center()).ravel(), radius, far=False))
     return found + lamps[:MOST_LAMPS]
