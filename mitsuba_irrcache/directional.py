@@ -7,7 +7,8 @@ tell. What is scattered into the direction of a ray is
 
     J = Phi / (4 pi) f,   Phi f = Phi + sum_lm 4 pi g_l Y_lm L_lm + sum_k (4 pi p_k - 1) E_k
 
-where L_lm leaves out the light E_k of narrow lights. Phi is what it is in isotropic media; the
+where L_lm leaves out the light E_k of narrow lights. (Of lamps, which have a size, it does not, and
+p_k is without the degrees that L_lm has: only what these lack is taken from one direction.) Phi is what it is in isotropic media; the
 *factor* f is that of values interpolated alike, so that what is noisy or dark weighs little.
 """
 
@@ -22,7 +23,7 @@ from .layers import interleaved
 from .phase import Phase
 
 #: Half the angle that a lamp may take up to be narrow; larger ones are smooth enough.
-WIDEST = float(np.deg2rad(12))
+WIDEST = float(np.deg2rad(35))
 #: Half the angle within which light from something without a size is its own.
 NARROWEST = 0.005
 #: Half the angle of a bright spot of the sky; the share of the sky's light that makes it one
@@ -43,6 +44,8 @@ class Source:
 
     def __init__(self, place: np.ndarray, size: float, far: bool) -> None:
         self.far = far
+        #: whether it is so narrow that nothing of its light has to be in the moments
+        self.sharp = far or not size
         self.place = mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in place))
         self._size = dr.opaque(mi.Float, float(np.cos(size) if far else size))
 
@@ -73,6 +76,11 @@ class Directional:
             for _ in range(2 * degree + 1)
         ]
 
+        self._degrees = [
+            dr.opaque(mi.Float, float((2 * degree + 1) * phase.moments[degree]))
+            for degree in range(1, self.order + 1)
+        ]
+
     @property
     def count(self) -> int:
         """Moments per channel."""
@@ -89,7 +97,8 @@ class Directional:
             for k, (towards, cosine) in enumerate(seen):
                 own = dr.dot(direction, towards) >= cosine
                 narrow[k] = narrow[k] + dr.select(own, uncollided, 0)
-                uncollided = dr.select(own, 0, uncollided)
+                if self.sources[k].sharp:
+                    uncollided = dr.select(own, 0, uncollided)
             basis = dr.sh_eval(direction, self.order)[1:]
             light = uncollided + scattered
             smooth = [m + y * light for m, y in zip(smooth, basis, strict=True)]
@@ -102,10 +111,23 @@ class Directional:
 
     def gains(self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
         """What the narrow lights count for a ray along ``direction`` at ``p``."""
-        return [
-            self.phase.gain(p, direction, source.seen_from(p)[0], active) - 1
-            for source in self.sources
-        ]
+        found = []
+        for source in self.sources:
+            towards, _ = source.seen_from(p)
+            gain = self.phase.gain(p, direction, towards, active) - 1
+            if not source.sharp:
+                gain -= self._smooth(dr.dot(direction, towards))
+            found.append(gain)
+        return found
+
+    def _smooth(self, cosine: mi.Float) -> mi.Float:
+        """4 pi p - 1, as far as the moments tell."""
+        before, legendre, result = mi.Float(1), cosine, mi.Float(0)
+        for degree, moment in enumerate(self._degrees, 1):
+            result += moment * legendre
+            following = ((2 * degree + 1) * cosine * legendre - degree * before) / (degree + 1)
+            before, legendre = legendre, following
+        return result
 
 
 class DirectionalField:
