@@ -8,8 +8,9 @@ tell. What is scattered into the direction of a ray is
     J = Phi / (4 pi) f,   Phi f = Phi + sum_lm 4 pi g_l Y_lm L_lm + sum_k (4 pi p_k - 1) E_k
 
 where L_lm leaves out the light E_k of narrow lights. (Of lamps, which have a size, it does not, and
-p_k is without the degrees that L_lm has: only what these lack is taken from one direction.) Phi is what it is in isotropic media; the
-*factor* f is that of values interpolated alike, so that what is noisy or dark weighs little.
+p_k is without the degrees that L_lm has: only what these lack is taken from one direction.) Phi is
+what it is in isotropic media; the *factor* f is that of values interpolated alike, so that what is
+noisy or dark weighs little.
 """
 
 from __future__ import annotations
