@@ -111,20 +111,25 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - Seconds after which rendering ends with what there is: neither another batch of the cache
          nor another pass of camera samples is begun. (Default: -1, never)
 
-    Computes the irradiance (fluence rate) that reaches every point of an isotropically scattering
+    Computes the irradiance (fluence rate) that reaches every point of a
     medium once, independently of the camera, and integrates the radiative transfer equation along
     camera rays from it. A moved camera, another film or another seed reuse the cache; an edited
     medium or emitter renews it. The image is consistent, not unbiased: it converges to
     ``volpath``'s as ``resolution`` and ``cache_spp`` grow and ``step`` falls.
 
-    Media (``heterogeneous`` or ``homogeneous``, isotropic phase function) may be several, in any
+    Media (``heterogeneous`` or ``homogeneous``) may be several, in any
     closed shapes with a null BSDF, apart, touching or nested; each has a cache of its own. Surfaces
     and area emitters may be anywhere. What is seen on them is path traced, by as many paths as
     there are samples per pixel, and is ``background``. Where there is no more than one medium in a
     box or sphere, and light from far away or from points outside of it, nothing has to be ray
     traced, and the solver ``sweep`` can be used. Point-like emitters in a medium, media without
-    bounds and other phase functions are refused by name. What glass encloses is rendered as
+    bounds and sharp phase functions are refused by name. What glass encloses is rendered as
     ``volpath`` does, and so is a scene without media.
+
+    Phase functions may be ``isotropic``, ``hg`` with |g| up to 0.58, ``rayleigh``, or others that
+    depend on the scattering angle alone and are as broad. Where one is not isotropic, the cache
+    holds spherical harmonics of the radiance up to degree 4 beside the irradiance, and the light
+    of suns, points and lamps apart, whose direction is known; the solver is ``path``.
 
     .. tabs::
         .. code-tab:: xml
@@ -249,8 +254,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         lit = cache is not None and cache.active_count and cache.samples
         field = cache.field() if lit else None
         uncertainty = uncertainty_of(cache) if lit and self._with_error else None
+        directional = cache.directional_field(field.channels) if lit else None
         projection = Projection(
-            medium, field, self._quadrature, self._step, self._layered, uncertainty
+            medium, field, self._quadrature, self._step, self._layered, uncertainty, directional
         )
         if lit and cache.survey is not None:
             projection.edges = cache.survey.edges

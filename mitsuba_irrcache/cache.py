@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .directional import Directional, DirectionalField
 from .errors import CacheFileError, IrrcacheError
 from .files import atomic_write
 from .grid import Affine, Grid, RootField
@@ -23,6 +24,7 @@ BATCH = 8
 
 LAYERS = ("uncollided", "scattered")
 FORMAT = "mitsuba_irrcache 2"
+WITH_MOMENTS = "mitsuba_irrcache 3"  # of light by its direction
 ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description
 
 
@@ -46,9 +48,11 @@ class IrradianceCache:
         fingerprint: dict[str, str] | None = None,
         batch: int = BATCH,
         correlated: bool = False,
+        moments: int = 0,
     ) -> None:
-        """``correlated``: whether all voxels share their samples, and so their errors. Such batches
-        are few: sums are kept in float32 then, else in float64.
+        """``moments`` of the radiance are kept for each channel, where a medium is not isotropic;
+        see `directional`. ``correlated``: whether all voxels share their samples, and so their
+        errors. Such batches are few: sums are kept in float32 then, else in float64.
         """
         self.grid = grid
         self.batch = batch  #: samples per batch
@@ -57,6 +61,9 @@ class IrradianceCache:
         self.channels = channels
         self.max_depth = max_depth
         self.fingerprint = fingerprint or {}
+        self.moments = moments
+        #: what the moments are of
+        self.directional: Directional | None = None
         #: where voxels lie among surfaces; None where there are none
         self.survey: Survey | None = None
         #: samples taken per voxel from each random stream
@@ -67,6 +74,8 @@ class IrradianceCache:
         # deviations of the batches' irradiance, both layers, from its mean. None stands for 0.
         self._totals: list = [None] * (len(LAYERS) * channels)
         self._spreads: list = [None] * channels
+        # Sums of batch means for each moment and channel, in float32.
+        self._moments: list = [None] * (moments * channels)
 
     # ------------------------------------------------------------------ statistics
 
@@ -144,6 +153,19 @@ class IrradianceCache:
             roots = self.survey.filled(roots, channels)
         return RootField(self.grid, roots, channels, noise)
 
+    def directional_field(self, channels: int) -> DirectionalField | None:
+        """The moments for lookups, where there are any."""
+        if not self.moments:
+            return None
+        n = mi.Float(self._batch_count)
+        phi = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        means = [mi.Float(0) if m is None else m / n for m in self._moments]
+        scattered = []
+        for values in (phi, means):
+            chosen = [v for i, v in enumerate(values) if i % self.channels < channels]
+            scattered.append([self._tensor([v]).array for v in chosen])
+        return DirectionalField(self.directional, self.grid, *scattered)
+
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Variance of the voxels over their squared mean, at most 1; 0 where it is not known, or
         neighbours err alike: then it does no harm to interpolation.
@@ -185,16 +207,21 @@ class IrradianceCache:
 
         For each block of voxels: the sums of batch means for each layer and channel, and for each
         channel the squared deviations of the batches' irradiance from their mean. None stands for 0
-        in all blocks.
+        in all blocks. Then the sums of batch means for each moment and channel, if there are any.
         """
-        totals, spreads = (
+        totals, spreads, *moments = (
             [_joined(part) for part in zip(*parts, strict=True)]
             for parts in zip(*blocks, strict=True)
         )
         merged = self._merged(totals, spreads, samples // self.batch)
-        dr.eval(merged)
+        moments = _sums(self._moments, *moments) if moments else self._moments
+        dr.eval(merged, moments)
         # An interrupt comes before or after this line, never between the two.
-        self._totals, self._spreads, self.streams = *merged, self._streams_with(seed, samples)
+        self._totals, self._spreads, self._moments, self.streams = (
+            *merged,
+            moments,
+            self._streams_with(seed, samples),
+        )
 
     def _merged(self, totals: list, spreads: list, count: int) -> tuple[list, list]:
         """Sums and spreads with those of ``count`` more batches (Chan et al.)."""
@@ -207,7 +234,7 @@ class IrradianceCache:
                 apart = (0 if old is None else old / n) - (0 if new is None else new / more)
                 spread = _sum([spread, dr.square(apart) * (n * more / (n + more))])
             result.append(_sum([self._spreads[c], spread]))
-        return [_sum(pair) for pair in zip(self._totals, totals, strict=True)], result
+        return _sums(self._totals, totals), result
 
     def note_samples(self, seed: int, samples: int) -> None:
         """Counts samples whose contribution is already in (or exactly zero)."""
@@ -226,7 +253,7 @@ class IrradianceCache:
                 raise IrrcacheError(
                     f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
                 )
-        alike = ("max_depth", "channels", "batch", "correlated")
+        alike = ("max_depth", "channels", "batch", "correlated", "moments")
         if self.grid.shape != other.grid.shape or any(
             getattr(self, name) != getattr(other, name) for name in alike
         ):
@@ -245,6 +272,7 @@ class IrradianceCache:
         self._totals, self._spreads = self._merged(
             other._totals, other._spreads, other.samples // other.batch
         )
+        self._moments = _sums(self._moments, other._moments)
         self.streams |= other.streams
 
     # ------------------------------------------------------------------ files
@@ -252,12 +280,13 @@ class IrradianceCache:
     def save(self, path: str | Path) -> None:
         """Writes the cache with all its statistics; the file appears whole or not at all."""
         description = {
-            "format": FORMAT,
+            "format": WITH_MOMENTS if self.moments else FORMAT,
             "shape": self.grid.shape,
             "to_world": self.grid.to_world.tolist(),
             "channels": self.channels,
             "batch": self.batch,
             "correlated": self.correlated,
+            **({"moments": self.moments} if self.moments else {}),
             "max_depth": self.max_depth,
             "streams": {str(seed): n for seed, n in self.streams.items()},
             "fingerprint": self.fingerprint,
@@ -269,10 +298,11 @@ class IrradianceCache:
                 active=np.array(self.active),
                 totals=self._plain(self._totals),
                 spreads=self._plain(self._spreads),
+                **({"moments": self._plain(self._moments, np.float32)} if self.moments else {}),
             )
 
-    def _plain(self, values: list) -> np.ndarray:
-        return np.array([np.array(self._zeros if v is None else v) for v in values])
+    def _plain(self, values: list, kind: type | None = None) -> np.ndarray:
+        return np.array([np.array(self._zeros if v is None else v, kind) for v in values])
 
     @classmethod
     def load(cls, path: str | Path) -> IrradianceCache:
@@ -283,10 +313,10 @@ class IrradianceCache:
         try:
             arrays = _read_arrays(path)
             description = json.loads(arrays["description"].tobytes())
-            if description["format"] != FORMAT:
+            if description["format"] not in (FORMAT, WITH_MOMENTS):
                 raise CacheFileError(
                     f'"{path}" has the format {description["format"]!r}, this version reads '
-                    f"{FORMAT!r}."
+                    f"{FORMAT!r} and {WITH_MOMENTS!r}."
                 )
             return cls._restore(description, arrays)
         except CacheFileError:
@@ -324,7 +354,11 @@ class IrradianceCache:
         real = np.float32 if correlated else np.float64
         if totals.dtype != real or spreads.dtype != real:
             raise ValueError(f"sums of type {totals.dtype}")
-        if not (np.isfinite(totals).all() and np.isfinite(spreads).all()):
+        count = int(description.get("moments", 0))
+        moments = arrays["moments"] if count else np.zeros((0, width), np.float32)
+        if (moments.shape, moments.dtype) != ((count * channels, width), np.float32):
+            raise ValueError(f"moments of shape {moments.shape} and type {moments.dtype}")
+        if not all(np.isfinite(values).all() for values in (totals, spreads, moments)):
             raise ValueError("it holds values that are not finite")
         cache = cls(
             grid,
@@ -334,7 +368,9 @@ class IrradianceCache:
             dict(description["fingerprint"]),
             int(description["batch"]),
             correlated,
+            count,
         )
+        cache._moments = [mi.Float(t) if t.any() else None for t in moments]
         cache.streams = {int(seed): int(n) for seed, n in description["streams"].items()}
         cache._totals = [cache.real(t) if t.any() else None for t in totals]
         cache._spreads = [cache.real(t) if t.any() else None for t in spreads]
@@ -370,6 +406,11 @@ def _sum(terms):
     return sum(known[1:], known[0]) if known else None
 
 
+def _sums(first: list, second: list) -> list:
+    """Term by term."""
+    return [_sum(pair) for pair in zip(first, second, strict=True)]
+
+
 def _root_correction(variance: mi.Float) -> mi.Float:
     """Makes interpolated roots of noisy values right on average.
 
@@ -386,7 +427,8 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
         if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
             raise ValueError("it is compressed")
     with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in ("description", *ARRAYS)}
+        names = ("description", *ARRAYS, *({"moments"} & set(archive.files)))
+        return {name: archive[name] for name in names}
 
 
 def active_voxels(medium, grid: Grid) -> mi.UInt32:

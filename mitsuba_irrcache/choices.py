@@ -37,12 +37,20 @@ def choose_solver(
 ) -> tuple[str, str]:
     """The solver for a scene, one of whose media is ``medium``, and why."""
     if medium is not None and medium.surroundings is not None:
+        media = medium.surroundings.media
+        if solver == "sweep" and not media.isotropic:
+            raise IrrcacheError(
+                'irrcache: solver "sweep" knows isotropic scattering only, and this scene has a '
+                'medium with another phase function; set solver to "path" or "auto".'
+            )
         if solver == "sweep":
             raise IrrcacheError(
                 'irrcache: solver "sweep" carries light through one medium in a box or sphere '
                 "only, and this scene has surfaces, area emitters, other boundaries or several "
                 'media; set solver to "path" or "auto".'
             )
+        if not media.isotropic:
+            return "path", "a phase function is not isotropic"
         return "path", "there are surfaces or several media"
     if solver != "auto":
         return solver, "as told"

@@ -67,7 +67,10 @@ def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
 
 
 def _medium_digest(medium: MediumGrid) -> str:
-    return _digest(*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ())
+    parts = [*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()]
+    if medium.phase is not None:
+        parts.append(np.float32(medium.phase.moments))
+    return _digest(*parts)
 
 
 def _shape_digest(shape: mi.Shape) -> str:

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from .cache import BATCH, IrradianceCache, active_voxels
 from .choices import SINGLE, choose_grid, choose_samples, warn_of_dense_border
+from .directional import Directional, sources_of
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import digests
 from .grid import Grid
@@ -113,7 +114,11 @@ class LitMedium:
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
         settings, medium = self.settings, self.medium
         grid, size_reason = choose_grid(medium, settings.resolution, self.solver)
-        _check_memory(grid, self.solver, settings.max_depth, settings.with_error)
+        directional = None
+        if medium.phase is not None:
+            directional = Directional(medium.phase, sources_of(scene))
+        moments = directional.count if directional is not None else 0
+        _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments)
         warn_of_dense_border(medium, grid)
         active, survey = active_voxels(medium, grid), None
         if medium.surroundings is not None:
@@ -130,14 +135,16 @@ class LitMedium:
         channels = 1 if mi.is_monochromatic else 3
         swept, depth = self.solver == "sweep", settings.max_depth
         batch = sweep.batch_of(settings.samples or SINGLE, depth) if swept else BATCH
-        cache = IrradianceCache(grid, active, channels, depth, batch=batch, correlated=swept)
-        cache.survey = survey
+        cache = IrradianceCache(
+            grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
+        )
+        cache.survey, cache.directional = survey, directional
         self.saved_samples = 0
         if not self.file:
             return cache
         cache.fingerprint = digests(scene, medium) | {
             "settings": f"solver {self.solver}, max_depth {settings.max_depth}, "
-            f"grid {grid.shape[::-1]}"
+            f"grid {grid.shape[::-1]}" + (f", moments {moments}" if moments else "")
         }
         return self._resume(cache, edited)
 
@@ -159,7 +166,7 @@ class LitMedium:
         if not differing:
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
-            stored.survey = cache.survey
+            stored.survey, stored.directional = cache.survey, cache.directional
             return stored
         if edited:
             mi.Log(
@@ -197,9 +204,14 @@ class LitMedium:
             self._opening = self._preview = None
         else:
             self._preview = IrradianceCache(
-                cache.grid, cache.active, cache.channels, cache.max_depth, batch=size
+                cache.grid,
+                cache.active,
+                cache.channels,
+                cache.max_depth,
+                batch=size,
+                moments=cache.moments,
             )
-            self._preview.survey = cache.survey
+            self._preview.survey, self._preview.directional = cache.survey, cache.directional
             self._opening.fill(self._preview)
         return True
 
@@ -229,7 +241,9 @@ def _marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
     return marks
 
 
-def _check_memory(grid: Grid, solver: str, max_depth: int, with_error: bool) -> None:
+def _check_memory(
+    grid: Grid, solver: str, max_depth: int, with_error: bool, moments: int = 0
+) -> None:
     """Refuses a cache that cannot be held, with what it takes to make it and to look it up; for the
     field of its errors as much again (experiments/memory).
     """
@@ -240,6 +254,7 @@ def _check_memory(grid: Grid, solver: str, max_depth: int, with_error: bool) -> 
         numbers = 5 + 2 * channels + (0 if max_depth == 2 else 12 + 3 * channels)
     else:
         numbers = channels * (3 * 2 + 3) + 5  # sums in float64
+        numbers += channels * moments * 3
     needed = 4 * grid.voxel_count * (numbers + 8) * (2 if with_error else 1)
     available = available_memory()
     if needed > available or grid.voxel_count >= 2**32:

@@ -12,6 +12,7 @@ from .boundary import Boundary
 from .errors import IrrcacheError, UnsupportedSceneError
 from .grid import ConstantField, Field, Grid, GridField
 from .macrocells import Macrocells
+from .phase import Phase, phase_of
 
 MEDIA = ("HeterogeneousMedium", "HomogeneousMedium")
 
@@ -32,6 +33,8 @@ class MediumGrid:
         self.albedo = albedo
         self.boundary = boundary
         self.bbox = bbox
+        #: None where it is isotropic
+        self.phase: Phase | None = None
         #: what it is called among others
         self.name = ""
         #: Mitsuba's medium, as rays carry it, and what else there is in the scene; None where
@@ -99,13 +102,7 @@ def bake(medium: mi.Medium, boundary: Boundary) -> MediumGrid:
             f'irrcache: {name} is not supported, only "heterogeneous" and "homogeneous" are; use '
             '"volpath".'
         )
-    phase = medium.phase_function()
-    if phase.class_name() != "IsotropicPhaseFunction":
-        raise UnsupportedSceneError(
-            f"irrcache: {name} has the phase function {phase.class_name()}, but an irradiance "
-            "cache is exact for "
-            'isotropic scattering only; make it <phase type="isotropic"/> or use "volpath".'
-        )
+    phase = phase_of(medium, boundary, name)
     volumes = children(medium)
     scale = float(mi.traverse(medium)["scale"])
     if not np.isfinite(scale) or scale < 0:
@@ -125,6 +122,7 @@ def bake(medium: mi.Medium, boundary: Boundary) -> MediumGrid:
     bounded = medium.class_name() == "HeterogeneousMedium"
     bbox = _clipping_box(volumes["sigma_t"], boundary) if bounded else None
     grid = MediumGrid(sigma_t, albedo, boundary, bbox)
+    grid.phase = phase
     _verify(medium, grid, name)
     return grid
 

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .directional import DirectionalField
 from .edges import Edges
 from .grid import ConstantField, Field, GridField
 from .layers import Layers, luminance
@@ -52,12 +53,14 @@ class Projection:
         step: float,
         layered: bool = False,
         uncertainty: UncertaintyField | None = None,
+        directional: DirectionalField | None = None,
     ) -> None:
         self.medium = medium
         self.irradiance = irradiance
         self.quadrature = quadrature
         self.layered = layered
         self.uncertainty = uncertainty
+        self.directional = directional
         #: surfaces that end the light, where there are any
         self.edges: Edges | None = None
         albedo = _constant_if_it_is(medium.albedo)
@@ -66,6 +69,8 @@ class Projection:
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
         self.step = dr.opaque(mi.Float, float(length))
         brightest = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
+        if directional is not None:
+            brightest *= directional.directional.phase.peak
         self.brightest = dr.opaque(mi.Float, brightest)
         self.clearance = Clearance(medium.macrocells)
         needed = [medium.sigma_t]
@@ -73,9 +78,10 @@ class Projection:
         needed += [albedo] if irradiance or layered else []
         self.lookups = Lookups(needed)
 
-    def fetch(self, p: mi.Point3f, active: mi.Bool) -> tuple:
+    def fetch(self, p: mi.Point3f, active: mi.Bool, view: tuple = ()) -> tuple:
         """Extinction; albedo Phi / (4 pi), in-scattered radiance per unit of optical depth; and
-        what layers need to know of the point: the albedo, and the relative errors of Phi.
+        what layers need to know of the point: the albedo, and the relative errors of Phi. ``view``
+        is what `seen_along` says of the ray.
         """
         sigma_t, *rest = self.lookups.at_world(p, active)
         known = [rest[-1]] if self.layered else []
@@ -85,11 +91,24 @@ class Projection:
         phi = self._within_edges(p, phi, active)
         if self.uncertainty is not None:
             known += self.uncertainty.at_world(p, phi, active)
+        if self.directional is not None:
+            phi = phi * self.directional.factor(p, *view, active)
         return sigma_t, albedo * phi * dr.inv_four_pi, known
 
-    def irradiance_at(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
-        """The cached irradiance alone."""
-        return self._within_edges(p, self.irradiance.at_world(p, active), active)
+    def seen_along(self, direction: mi.Vector3f) -> tuple:
+        """What `fetch` has to know of a ray: nothing where the medium is isotropic."""
+        if self.directional is None:
+            return ()
+        return direction, self.directional.directional.basis(direction)
+
+    def irradiance_at(
+        self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
+    ) -> mi.Float | mi.Color3f:
+        """The cached irradiance alone, as much as is seen along ``direction``."""
+        phi = self._within_edges(p, self.irradiance.at_world(p, active), active)
+        if self.directional is None:
+            return phi
+        return phi * self.directional.factor(p, *self.seen_along(direction), active)
 
     def _within_edges(
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
@@ -124,6 +143,7 @@ class Projection:
         extinction, source, known = self._nowhere()
         before, before_source, before_length = extinction, source, mi.Float(dr.inf)
         grey = self.medium.sigma_t.channels == 1
+        view = self.seen_along(ray.d)
         transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
         radiance = mi.Spectrum(0)
         gathered = self.nothing()
@@ -140,7 +160,7 @@ class Projection:
             end = dr.select(k == 0, near, end)
             end = dr.select((mi.Float(k) >= limit) | (empty & (wall >= far)), far, end)
             if active & ~skip:
-                next_extinction, next_source, next_known = self.fetch(ray(end), True)
+                next_extinction, next_source, next_known = self.fetch(ray(end), True, view)
                 # The light of a segment that enters matter comes from its far end.
                 enters = dr.max(mi.Spectrum(extinction)) == 0
                 source = dr.select(enters, next_source, source)

@@ -14,6 +14,7 @@ import numpy as np
 from .boundary import Boundary, boundary_of
 from .errors import UnsupportedSceneError
 from .medium import MediumGrid, bake, children
+from .phase import refuse_sharp
 from .surroundings import Surroundings, probe
 from .transport import MOST_CROSSINGS, is_null
 
@@ -62,7 +63,7 @@ def simple_boundary(scene: mi.Scene) -> Boundary | None:
     """The boundary of the one medium in a scene that has no surface besides; None for others."""
     media = media_of(scene)
     bounded = [s for s in scene.shapes() if s.interior_medium() is not None]
-    if len(media) != 1 or len(bounded) != 1:
+    if len(media) != 1 or len(bounded) != 1 or not _is_isotropic(*media):
         return None
     for shape in scene.shapes():
         surface = not is_null(_flags(shape)) or shape.is_emitter() or shape.is_sensor()
@@ -72,6 +73,10 @@ def simple_boundary(scene: mi.Scene) -> Boundary | None:
         return boundary_of(scene, bounded[0])
     except UnsupportedSceneError:
         return None
+
+
+def _is_isotropic(medium: mi.Medium) -> bool:
+    return medium.phase_function().class_name() == "IsotropicPhaseFunction"
 
 
 def bake_scene(scene: mi.Scene) -> MediumGrid | None:
@@ -107,6 +112,8 @@ def bake_general(scene: mi.Scene) -> list[MediumGrid]:
             sensor.get_medium() == medium for sensor in scene.sensors()
         ):
             seen.append(grid)
+            if grid.phase is not None:
+                refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
     Surroundings(scene, grids)
     if not seen:
         mi.Log(

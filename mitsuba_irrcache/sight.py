@@ -194,15 +194,15 @@ class Sight:
         return scattered, background, passed, gathered, segment, pointer, stopped, escaped
 
     def _irradiance(
-        self, pointer: mi.MediumPtr, p: mi.Point3f, active: mi.Bool
+        self, pointer: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Bool]:
-        """The cached irradiance, and whether there is a cache."""
+        """The cached irradiance, as much as ``ray`` sees of it, and whether there is a cache."""
         result, known = mi.Spectrum(0), mi.Bool(False)
         for projection in self.projections:
             here = active & (pointer == projection.medium.pointer)
             known |= here
             if projection.irradiance is not None:
-                phi = mi.Spectrum(projection.irradiance_at(p, here))
+                phi = mi.Spectrum(projection.irradiance_at(ray(t), ray.d, here))
                 result = dr.select(here, phi, result)
         return result, known
 

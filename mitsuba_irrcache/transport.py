@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .medium import MediumGrid
+from .phase import interaction
 from .tracking import free_flight, transmittance
 
 #: Surfaces that a straight line may cross; two that coincide could otherwise hold it for ever.
@@ -31,6 +32,7 @@ class Media:
 
     def __init__(self, grids: Sequence[MediumGrid]) -> None:
         self.grids = list(grids)
+        self.isotropic = all(grid.phase is None for grid in self.grids)
 
     def fly(
         self,
@@ -173,9 +175,9 @@ def trace(
     """One path per lane: radiance that came straight from emitters, radiance that was scattered,
     whether anything was scattered, and the random generator.
 
-    ``cached``, if given, maps a medium, a position in it and a mask to the irradiance there, and
-    whether it is known; where it is, paths end with their first collision. It has to hold all that
-    the path could still find.
+    ``cached``, if given, maps a medium, a ray and a distance to a position in it and a mask to the
+    irradiance there (as much as the ray sees of it), and whether it is known; where it is, paths
+    end with their first collision. It has to hold all that the path could still find.
     """
     straight, scattered = mi.Spectrum(0), mi.Spectrum(0)
     weight, eta = mi.Spectrum(1), mi.Float(1)
@@ -200,7 +202,7 @@ def trace(
         surface = active & ~collided
         met |= collided
         if dr.hint(cached is not None, mode="scalar"):
-            irradiance, known = cached(pointer, ray(t), collided)
+            irradiance, known = cached(pointer, ray, t, collided)
             light = weight * irradiance * dr.inv_four_pi
             scattered += dr.select(collided & known, light, 0)
             collided &= ~known
@@ -239,6 +241,11 @@ def trace(
         value, density = bsdf.eval_pdf(context, si, si.to_local(record.d), lit & smooth)
         value = dr.select(collided, mi.Spectrum(dr.inv_four_pi), value)
         density = dr.select(collided, dr.inv_four_pi, density)
+        if dr.hint(not media.isotropic, mode="scalar"):
+            collision, phase = interaction(ray(t), ray.d), pointer.phase_function()
+            value, density = _phase_value(
+                phase, collision, record.d, lit & collided, value, density
+            )
         lit &= dr.max(value) > 0
         beyond = dr.select(surface, behind(si, record.d, pointer), pointer)
         passed, rng = visibility(scene, media, vertex, record.p, beyond, rng, lit)
@@ -255,9 +262,15 @@ def trace(
         delta = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
         pdf = dr.select(turned, dr.select(delta, 0, bounce.pdf), pdf)
         pdf = dr.select(collided, dr.inv_four_pi, pdf)
+        direction = mi.warp.square_to_uniform_sphere(sample)
+        if dr.hint(not media.isotropic, mode="scalar"):
+            direction, value, density = phase.sample(
+                mi.PhaseFunctionContext(), collision, choice, sample, collided
+            )
+            weight = dr.select(collided, weight * value, weight)
+            pdf = dr.select(collided, density, pdf)
         outwards = dr.select(skipped, ray.d, si.to_world(bounce.wo))
         onwards = si.spawn_ray(outwards)
-        direction = mi.warp.square_to_uniform_sphere(sample)
         pointer = dr.select(scatters, behind(si, outwards, pointer), pointer)
         ray.o = dr.select(collided, vertex.p, onwards.o)
         ray.d = dr.select(collided, direction, onwards.d)
@@ -268,3 +281,16 @@ def trace(
         crossings += 1
         active &= (collided | surface) & (depth < max_depth) & (crossings < MOST_CROSSINGS)
     return straight, scattered, met, rng
+
+
+def _phase_value(
+    phase: mi.PhaseFunctionPtr,
+    collision: mi.MediumInteraction3f,
+    towards: mi.Vector3f,
+    active: mi.Bool,
+    value: mi.Spectrum,
+    density: mi.Float,
+) -> tuple[mi.Spectrum, mi.Float]:
+    """Value and density of scattering ``towards`` a direction; those given where not ``active``."""
+    own, pdf = phase.eval_pdf(mi.PhaseFunctionContext(), collision, towards, active)
+    return dr.select(active, own, value), dr.select(active, pdf, density)

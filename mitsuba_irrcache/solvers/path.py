@@ -11,13 +11,13 @@ cache, the others the *scattered* one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache import BATCH, IrradianceCache
+from mitsuba_irrcache.cache import BATCH, LAYERS, IrradianceCache
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers import volume_path
 from mitsuba_irrcache.tracking import free_flight, transmittance
@@ -52,8 +52,9 @@ def refine(
     if total > 16 * LANES:
         seconds = estimator.seconds(total)
         mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
-    block = min(cache.active_count, LANES // BATCH)
-    batches_at_once = max(1, LANES // (BATCH * block))
+    lanes = _lanes(cache)
+    block = min(cache.active_count, lanes // BATCH)
+    batches_at_once = max(1, lanes // (BATCH * block))
     remaining = samples // BATCH
     while remaining:
         count = min(batches_at_once, remaining)
@@ -81,13 +82,18 @@ def _blocks(count: int, width: int) -> Iterator[mi.UInt32]:
         yield dr.arange(mi.UInt32, min(width, count - start)) + dr.opaque(mi.UInt32, start)
 
 
-def _statistics(totals: list, size: int, count: int) -> tuple:
+def _lanes(cache: IrradianceCache) -> int:
+    """Paths in one kernel launch: each moment of the radiance takes as much again."""
+    return LANES // 8 if cache.moments else LANES
+
+
+def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
     """From sums over batches of ``size`` samples, ``count`` batches of a voxel in a row: per voxel,
     the sums of batch means for each layer and channel; and for each channel the squared deviations
-    of both layers' sum from its mean.
+    of both layers' sum from its mean; then sums of batch means of the moments, if there are any.
     """
     means = [total / size for total in totals]
-    channels, n = len(means) // 2, dr.opaque(type(means[0]), count)
+    n = dr.opaque(type(means[0]), count)
     both = [means[c] + means[channels + c] for c in range(channels)]
     squares = [dr.square(b) for b in both]
     dr.eval(means, both, squares)  # by one kernel, also where a sum over one batch is part of it
@@ -95,7 +101,9 @@ def _statistics(totals: list, size: int, count: int) -> tuple:
         dr.maximum(dr.block_sum(s, count) - dr.square(dr.block_sum(b, count)) / n, 0)
         for s, b in zip(squares, both, strict=True)
     ]
-    return tuple(dr.block_sum(mean, count) for mean in means), tuple(spreads)
+    sums = [dr.block_sum(mean, count) for mean in means]
+    layers, moments = tuple(sums[: 2 * channels]), tuple(sums[2 * channels :])
+    return (layers, tuple(spreads), *([moments] if moments else []))
 
 
 class Opening:
@@ -116,7 +124,7 @@ class Opening:
         """Adds samples until there are ``size`` in each batch, at most `BATCH`."""
         more, active = size - self.size, self.cache.active_count
         totals, done = [], 0
-        for i, voxels in enumerate(_blocks(active, min(active, LANES // (2 * BATCH)))):
+        for i, voxels in enumerate(_blocks(active, min(active, _lanes(self.cache) // (2 * BATCH)))):
             sums = self._estimator.sums(voxels, 0, 2, self.size, more)
             if self._totals:
                 sums = [old + new for old, new in zip(self._totals[i], sums, strict=True)]
@@ -130,7 +138,7 @@ class Opening:
 
     def fill(self, cache: IrradianceCache) -> None:
         """Puts both batches into an empty ``cache`` for batches of this size."""
-        blocks = [_statistics(sums, self.size, 2) for sums in self._totals]
+        blocks = [_statistics(sums, self.size, 2, cache.channels) for sums in self._totals]
         cache.add(self.seed, 2 * self.size, blocks)
 
 
@@ -156,9 +164,12 @@ class _Estimator:
         """Estimates ``count`` batches from the batch ``first`` on.
 
         ``voxels`` are places in the list of active voxels. Returns, for every layer and channel,
-        the sum of the batch means, and for every channel their spread, per voxel (float64).
+        the sum of the batch means, and for every channel their spread, per voxel (float64); then
+        the sums for every moment and channel (float32).
         """
-        result = _statistics(self.sums(voxels, first, count, 0, BATCH), BATCH, count)
+        result = _statistics(
+            self.sums(voxels, first, count, 0, BATCH), BATCH, count, self.cache.channels
+        )
         dr.eval(result)
         dr.sync_thread()
         return result
@@ -182,14 +193,19 @@ class _Estimator:
         double = dr.float64_array_t(mi.Float)
         # A layer that is zero throughout comes as a literal without a width.
         none = dr.zeros(mi.Float, dr.width(lane))
-        values = [double(v[c] + none) for v in layers for c in range(cache.channels)]
+        kinds = [double] * len(LAYERS) + [mi.Float] * cache.moments
+        values = [
+            kind(v[c] + none)
+            for kind, v in zip(kinds, layers, strict=True)
+            for c in range(cache.channels)
+        ]
         dr.eval(values)
         return [dr.block_sum(value, size) for value in values]
 
     def _layers(
         self, position: mi.Point3f, batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32
-    ) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """One sample of both layers per lane."""
+    ) -> Sequence[mi.Spectrum]:
+        """One sample of both layers per lane, and of the moments."""
         around = self.medium.surroundings
         if around is None:
             return _estimate(
@@ -208,13 +224,21 @@ class _Estimator:
         pointer = around.pointer(dr.gather(mi.UInt32, self.cache.survey.place, voxel))
         max_depth = dr.select(self.orders < 0xFFFFFFFF, self.orders + 1, self.orders)
         return volume_path.estimate(
-            self.scene, around.media, position, pointer, spread, rng, max_depth, self.rr_depth
+            self.cache.directional,
+            self.scene,
+            around.media,
+            position,
+            pointer,
+            spread,
+            rng,
+            max_depth,
+            self.rr_depth,
         )
 
     def seconds(self, samples: int) -> float:
         """Predicts the time for ``samples`` from one batch at voxels all over the medium."""
         count = self.cache.active_count
-        voxels = dr.arange(mi.UInt32, min(count, LANES // 256))
+        voxels = dr.arange(mi.UInt32, min(count, _lanes(self.cache) // 256))
         voxels = voxels * dr.opaque(mi.UInt32, max(1, count // dr.width(voxels)))
         dr.eval(voxels)
         self.batches(voxels, 0, 1)  # compiles the kernel

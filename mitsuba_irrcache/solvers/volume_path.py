@@ -11,6 +11,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.directional import Directional
 from mitsuba_irrcache.transport import Media, Start, emitted_to, power_heuristic, trace
 
 
@@ -48,9 +49,10 @@ def contributions(
     ]
 
 
-def estimate(*args: object) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """One sample of the irradiance, uncollided and scattered, with the arguments of
-    `contributions`.
+def estimate(directional: Directional | None, *args: object) -> list[mi.Spectrum]:
+    """One sample of the irradiance, uncollided and scattered, and of the moments of the radiance if
+    the medium is ``directional``; the others are the arguments of `contributions`.
     """
     found = contributions(*args)
-    return sum(f[1] for f in found), sum(f[2] for f in found)
+    layers = [sum(f[1] for f in found), sum(f[2] for f in found)]
+    return layers + (directional.moments(args[2], found) if directional is not None else [])

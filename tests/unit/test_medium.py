@@ -100,7 +100,6 @@ def other_media(scenes) -> dict[str, dict]:
     grid = scenes.texture((5, 6, 7), 0, 1, 1)
     box = scenes.placement()
     return {
-        "HG": scenes.medium(1.0, 0.5) | {"phase": {"type": "hg", "g": 0.5}},
         "nearest": scenes.medium(grid, 0.5, box)
         | {"sigma_t": scenes.volume(grid, box, filter_type="nearest")},
         "repeat": scenes.medium(grid, 0.5, scenes.placement((1.0, 1.0, 1.0)))
@@ -110,7 +109,7 @@ def other_media(scenes) -> dict[str, dict]:
 
 @pytest.mark.parametrize(
     ("kind", "message"),
-    [("HG", "phase function HG"), ("nearest", "trilinear"), ("repeat", "clamp")],
+    [("nearest", "trilinear"), ("repeat", "clamp")],
 )
 def test_other_media_are_refused(scenes, kind, message):
     with pytest.raises(UnsupportedSceneError, match=message):

@@ -1,0 +1,122 @@
+"""Media that do not scatter alike to all sides, against ``volpath`` and closed forms."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
+from tests.system.test_surfaces import check, fog, images
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+POINT = {"type": "point", "position": [1.5, 2.0, -1.0], "intensity": 20.0}
+RAYLEIGH = {"type": "rayleigh"}
+
+
+def hg(g: float) -> dict:
+    return {"type": "hg", "g": g}
+
+
+def envmap(sun: float) -> dict:
+    """A sky brighter above, with a bright texel."""
+    texels = np.float32(np.ones((32, 64, 3)) * [0.5, 0.6, 0.8])
+    texels[:16] *= 3
+    texels[10, 52] = sun
+    return {"emitter": {"type": "envmap", "bitmap": mi.Bitmap(texels)}, "sun": None}
+
+
+SCENES = {
+    "hg 0.3, single": (hg(0.3), 2, {}, {}),
+    "hg 0.5": (hg(0.5), -1, {}, {}),
+    "hg -0.3, two orders": (hg(-0.3), 3, {}, {}),
+    "rayleigh": (RAYLEIGH, -1, {}, {}),
+    "rayleigh, point": (RAYLEIGH, 3, {"emitter": POINT, "sun": None}, {"tolerance": 0.04}),
+    "hg 0.5, sun of an envmap": (hg(0.5), -1, "envmap", {"tolerance": 0.03}),
+}
+
+
+@pytest.mark.parametrize(("phase", "depth", "lights", "bounds"), SCENES.values(), ids=SCENES)
+def test_phase_functions(scenes, phase, depth, lights, bounds):
+    lights = envmap(800.0) if lights == "envmap" else lights
+    medium = scenes.medium((1.0, 1.2, 1.4), (0.9, 0.8, 0.95)) | {"phase": phase}
+    objects = {"cloud": scenes.boundary(medium)} | lights
+    depths = {"max_depth": depth, "rr_depth": 1000}
+    check(*images(scenes, objects, {"cache_spp": 128}, depths, (64, 512)), **bounds)
+
+
+def test_two_media_of_two_kinds(scenes):
+    objects = {
+        "a": scenes.boundary(fog(), scenes.placement((0.9, 1.6, 1.6), center=(-0.5, 0, 0))),
+        "b": scenes.boundary(
+            fog() | {"phase": hg(0.5)}, scenes.placement((0.9, 1.6, 1.6), center=(0.5, 0, 0))
+        ),
+    }
+    check(*images(scenes, objects, {}, {"max_depth": -1, "rr_depth": 50}, (64, 256)))
+
+
+@pytest.mark.parametrize("g", [0.5, -0.4])
+def test_thin_slab(scenes, g):
+    """Of so little matter every path is single: sigma_s p(cos) E t, to 1 %."""
+    sun = scenes.sun | {"irradiance": 2.0, "direction": [1.0, 0.0, 1.0]}
+    medium = scenes.medium(1e-3, 0.8) | {"phase": hg(g)}
+    shape = scenes.boundary(medium, scenes.placement((4.0, 4.0, 0.5)))
+    sensor = scenes.description({}, None, 4)["sensor"]
+    look = mi.ScalarTransform4f().look_at([0, 0, -50], [0, 0, 0], [0, 1, 0])
+    sensor = sensor | {"to_world": look, "fov": 0.5}
+    scene = scenes.load(
+        {"type": "irrcache", "resolution": 8, "cache_spp": 16}, shape, 4,
+        emitter=sun, sun=None, sensor=sensor,
+    )  # fmt: skip
+    cosine = -(0.5**0.5)  # of the light's way and the way to the camera
+    p = (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cosine) ** 1.5)
+    expected = 0.8e-3 * p * 2.0 * 0.5
+    np.testing.assert_allclose(scenes.image(scene, spp=16), expected, rtol=0.01)
+
+
+def test_furnace(scenes):
+    """Nothing absorbs under a white sky: all pixels are 1."""
+    medium = scenes.medium(1.0, 1.0) | {"phase": hg(0.5)}
+    sky = {"type": "constant", "radiance": 1.0}
+    integrator = {"type": "irrcache", "resolution": 10, "cache_spp": 512, "rr_depth": 100000}
+    scene = scenes.load(integrator, scenes.boundary(medium), 16, emitter=sky, sun=None)
+    image = scenes.image(scene, spp=16)
+    assert image.mean() == pytest.approx(1, abs=3e-3) and np.abs(image - 1).max() < 0.05
+
+
+def loaded(scenes, phase: dict, **settings) -> mi.Scene:
+    integrator = {"type": "irrcache", "max_depth": 3, "resolution": 6, "cache_spp": 16} | settings
+    shape = scenes.boundary(scenes.medium(1.0, 0.9) | {"phase": phase})
+    return scenes.load(integrator, shape, 8)
+
+
+def test_files(scenes, tmp_path):
+    """Moments are saved, loaded and merged; another phase function has other light."""
+    file = str(tmp_path / "light.npz")
+    first = loaded(scenes, hg(0.4), cache_file=file)
+    before = scenes.image(first, spp=2)
+    again = loaded(scenes, hg(0.4), cache_file=file)
+    np.testing.assert_array_equal(scenes.image(again, spp=2), before)
+    other = loaded(scenes, hg(0.4), cache_seed=1, cache_file=str(tmp_path / "other.npz"))
+    other.integrator().prepare(other)
+    cache, more = first.integrator().cache, other.integrator().cache
+    means = [np.array(m) for m in (cache._moments[3], more._moments[3])]
+    cache.merge(more)
+    np.testing.assert_allclose(np.array(cache._moments[3]), sum(means), rtol=1e-5)
+    foreign = loaded(scenes, hg(0.3), cache_file=file)
+    with pytest.raises(CacheFileError, match="medium"):
+        foreign.integrator().prepare(foreign)
+
+
+def test_sweep_is_refused(scenes):
+    scene = loaded(scenes, hg(0.4), solver="sweep")
+    with pytest.raises(IrrcacheError, match=r"isotropic.*path.*auto"):
+        scene.integrator().prepare(scene)
+
+
+def test_layers_add_up(scenes):
+    scene = loaded(scenes, hg(0.4), aovs="colour,illumination,background,noise")
+    values = scenes.image(scene, spp=8)
+    image, colours, illumination, background = (values[..., i : i + 3] for i in (0, 3, 6, 9))
+    np.testing.assert_allclose(colours * illumination + background, image, rtol=1e-4, atol=1e-5)

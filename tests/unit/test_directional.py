@@ -1,0 +1,111 @@
+"""Phase functions by their moments, and light by its direction."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.directional import Directional, sources_of
+from mitsuba_irrcache.errors import UnsupportedSceneError
+from mitsuba_irrcache.scene import bake_media
+from mitsuba_irrcache.solvers.volume_path import contributions
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+def scene_of(scenes, phase: dict, **objects) -> mi.Scene:
+    medium = scenes.medium(1.0, 0.9) | {"phase": phase}
+    return scenes.load({"type": "volpath"}, scenes.boundary(medium), 8, **objects)
+
+
+def hg(g: float) -> dict:
+    return {"type": "hg", "g": g}
+
+
+MOMENTS = {
+    "hg": (hg(0.4), [1, 0.4, 0.16, 0.064], 2),
+    "hg backwards": (hg(-0.25), [1, -0.25, 0.0625, -0.015625], 1),
+    "rayleigh": ({"type": "rayleigh"}, [1, 0, 0.1, 0], 2),
+    "blend": (
+        {"type": "blendphase", "weight": 0.25, "a": hg(0.4), "b": {"type": "isotropic"}},
+        [1, 0.3, 0.12, 0.048], 2,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("phase", "moments", "order"), MOMENTS.values(), ids=MOMENTS)
+def test_moments(scenes, phase, moments, order):
+    found = bake_media(scene_of(scenes, phase))[0].phase
+    np.testing.assert_allclose(found.moments[:4], moments, atol=2e-4)
+    assert found.order == order
+
+
+@pytest.mark.parametrize("phase", [{"type": "isotropic"}, hg(0.0)])
+def test_isotropic_ones_have_none(scenes, phase):
+    assert bake_media(scene_of(scenes, phase))[0].phase is None
+
+
+REFUSED = {
+    "sharp": (hg(0.8), "HGPhaseFunction.*0.80.*0.59.*volpath"),
+    "oriented": (
+        {"type": "sggx", "S": {"type": "gridvolume", "grid": "S"}}, "angle of scattering.*volpath",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("phase", "message"), REFUSED.values(), ids=REFUSED)
+def test_others_are_refused(scenes, phase, message):
+    if "S" in phase:
+        values = np.tile(np.float32([0.1, 0.1, 1, 0, 0, 0]), (2, 2, 2, 1))
+        phase["S"] = {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True}
+    with pytest.raises(UnsupportedSceneError, match=message):
+        bake_media(scene_of(scenes, phase))
+
+
+def lamp(size: float) -> dict:
+    place = mi.ScalarTransform4f().look_at([0.6, 2.2, 1.5], [0, 0, 0], [0.1, 1, 0.2]).scale(size)
+    emitter = {"type": "area", "radiance": 10.0}
+    return {"type": "rectangle", "to_world": place, "emitter": emitter}
+
+
+POINT = {"type": "point", "position": [1.5, 2.0, -1.0], "intensity": 20.0}
+LIGHTS = {
+    "sky and sun": ({}, 0.02),
+    "point": ({"emitter": POINT, "sun": None}, 0.02),
+    "small lamp": ({"emitter": 0.1, "sun": None}, 0.02),
+    "large lamp": ({"emitter": 0.5, "sun": None}, 0.03),
+}
+
+
+@pytest.mark.parametrize(("objects", "tolerance"), LIGHTS.values(), ids=LIGHTS)
+@pytest.mark.parametrize("g", [0.5, -0.3])
+def test_scattered_light_of_one_place(scenes, objects, tolerance, g):
+    """From the moments, and from all directions one by one: relative to the mean, 4 pi p weighted
+    with the same samples.
+    """
+    if isinstance(objects.get("emitter"), float):
+        objects = objects | {"emitter": lamp(objects["emitter"])}
+    scene = scene_of(scenes, hg(g), **objects)
+    medium, count = bake_media(scene)[0], 1 << 16
+    directional = Directional(medium.phase, sources_of(scene))
+    rng, p = mi.PCG32(count), mi.Point3f(0.2, 0.5, -0.3)
+    spread = [rng.next_float32() for _ in range(4)]
+    limits = [dr.opaque(mi.UInt32, n) for n in (3, 100)]
+    media = medium.surroundings.media
+    found = contributions(scene, media, p, medium.pointer, spread, rng, *limits)
+    dr.eval(found)
+
+    def mean(value) -> float:
+        return float(np.mean(np.array(mi.Spectrum(value)[1])))
+
+    phi = mean(sum(u + s for _, u, s in found))
+    moments = [mean(m) for m in directional.moments(p, found)]
+    for way in ((0, 1, 0), (0.6, 0, 0.8), (-0.4, 0.8, -0.44721), (0, -1, 0)):
+        way = dr.normalize(mi.Vector3f(*way))
+        phase = medium.phase
+        exact = mean(sum((u + s) * phase.gain(p, way, d) for d, u, s in found)) / phi
+        weights = directional.basis(way) + directional.gains(p, way, mi.Bool(True))
+        extra = sum(float(w[0]) * m for w, m in zip(weights, moments, strict=True)) / phi
+        assert 1 + extra == pytest.approx(exact, abs=tolerance * phase.peak / 2)
