@@ -152,7 +152,7 @@ class Sight:
         surface, or escaped.
         """
         scattered, background, passed = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(1)
-        gathered = self._nothing()
+        gathered = self.projection.nothing()
         # Distances are those from the camera all along, so that depths are too.
         segment, pointer, near = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Float(0)
         stopped, escaped, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
@@ -205,10 +205,6 @@ class Sight:
                 phi = mi.Spectrum(projection.irradiance_at(ray(t), ray.d, here))
                 result = dr.select(here, phi, result)
         return result, known
-
-    def _nothing(self) -> list:
-        """Gathered sums at the start of a ray."""
-        return self.projection.nothing()
 
 
 def _added(gathered: list, sums: list, passed: mi.Spectrum, scale: mi.Float) -> list:

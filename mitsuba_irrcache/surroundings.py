@@ -57,7 +57,6 @@ def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
     votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
     within, backs = mi.UInt32(0), mi.UInt32(0)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, RAYS)
-    always = mi.Bool(True)
     while dr.hint(k < count, label="survey"):
         # Points of the generalised golden ratio: directions, and places in the voxel.
         u = [mi.Float(k) * g for g in (0.8191725134, 0.6710436067, 0.5497004779)]
@@ -73,8 +72,7 @@ def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
         for i in range(len(media.grids)):
             votes[i + 1] += dr.select(pointer == media.grids[i].pointer, mi.UInt32(1), 0)
         pointer = probe(scene, grid.world.point(corner + mi.Point3f(u)), direction)
-        here = (pointer == medium.pointer) & always
-        within += dr.select(here, mi.UInt32(1), 0)
+        within += dr.select(pointer == medium.pointer, mi.UInt32(1), 0)
         k += 1
     return [*votes, within, backs]
 

@@ -40,6 +40,9 @@ RECEIVED = 1 / 24
 #: Below so many voxels one launch takes all directions and adds atomically.
 SMALL = 40**3
 
+#: Axes of an array from the fastest to the slowest, unless they are laid out by slices.
+STANDARD = (0, 1, 2)
+
 _INTEGERS = 19
 _NUMBERS = 11
 
@@ -102,12 +105,13 @@ class Lattice:
         numbers = np.zeros((count, _NUMBERS), np.float64)
         velocities = directions @ self._to_voxels.T
         axes = np.abs(velocities).argmax(axis=1)
+        ratio = self.detail.resolution / self.grid.resolution
         for i, (velocity, axis) in enumerate(zip(velocities, axes, strict=True)):
             ways = light[i] if velocity[axis] > 0 else light[i][::-1]
             across = [k for k in range(3) if k != axis]
             order = (*across, axis)
             layout = _by_slice(axis)
-            strides = _strides(self.grid.resolution, layout if by_slice else (0, 1, 2))
+            strides = _strides(self.grid.resolution, layout if by_slice else STANDARD)
             places = _strides(self._slices(axis), layout)
             row = [*(int(self.sides[k]) for k in order), *(strides[k] for k in order)]
             row += [int(np.dot(self.lower, strides)), *(places[k] for k in order)]
@@ -122,7 +126,6 @@ class Lattice:
                 row += [slope, start, (end >> 24) % int(self.sides[k]), end & (ONE - 1)]
             integers[i] = row
             numbers[i, :5] = [1 / abs(velocity[axis]), *ways, weights[i], self._quantum]
-            ratio = self.detail.resolution / self.grid.resolution
             numbers[i, 5:] = [
                 x
                 for k in across
@@ -136,16 +139,16 @@ class Lattice:
         """
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
         total = dr.opaque(mi.Float, 0, self.grid.voxel_count)
-        for axis, pairs in table.by_axis():
+        for axis, pairs in table.by_axis:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
             self._launch(volume, None, table, axis, pairs)
             volume = sharpened(volume, self.grid, self.lower, self.lower + self.sides, axis)
             layout = _by_slice(axis)
-            if layout != (0, 1, 2):
+            if layout != STANDARD:
                 dr.eval(volume)
-                strides = _strides(self.grid.resolution, layout)
-                at = self.grid.places(dr.arange(mi.UInt32, self.grid.voxel_count))
-                volume = dr.gather(mi.Float, volume, _flat(at, strides))
+                sides = self.grid.resolution
+                place = _flat(_places(sides), _strides(sides, layout))
+                volume = dr.gather(mi.Float, volume, place)
             total += volume
             dr.eval(total)
         return total
@@ -164,7 +167,7 @@ class Lattice:
             index = dr.arange(mi.UInt32, self.grid.voxel_count) * 4
             source = dr.gather(mi.Float, volume, index)
             dr.eval(source)
-        for axis, pairs in table.by_axis():
+        for axis, pairs in table.by_axis:
             self._launch(volume, source, table, axis, pairs)
 
     def _launch(
@@ -224,10 +227,10 @@ def _by_slice(axis: int) -> tuple[int, int, int]:
     """The axes from the fastest to the slowest, such that neighbours across ``axis`` are near each
     other in memory. Slices along y and z are so as they are.
     """
-    return (1, 2, 0) if axis == 0 else (0, 1, 2)
+    return (1, 2, 0) if axis == 0 else STANDARD
 
 
-def _strides(sides: np.ndarray, layout: tuple[int, ...] = (0, 1, 2)) -> tuple[int, int, int]:
+def _strides(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> tuple[int, int, int]:
     """Steps of the flat index along x, y, z."""
     steps, step = [0, 0, 0], 1
     for axis in layout:
@@ -236,7 +239,7 @@ def _strides(sides: np.ndarray, layout: tuple[int, ...] = (0, 1, 2)) -> tuple[in
     return tuple(steps)
 
 
-def _places(sides: np.ndarray, layout: tuple[int, ...]) -> list[mi.UInt32]:
+def _places(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> list[mi.UInt32]:
     """Places along x, y, z of all values in the order of their memory."""
     index = dr.arange(mi.UInt32, int(np.prod(sides)))
     first, second = (dr.opaque(mi.UInt32, int(sides[axis])) for axis in layout[:2])
@@ -262,15 +265,13 @@ def _halved(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
     """``levels`` of the voxels of ``grid`` in ``count`` slices along ``axis`` instead: means over
     the first half of their thickness, and over the second one in the upper 16 bits.
     """
-    sides = grid.resolution.copy()
+    sides, strides = grid.resolution.copy(), _strides(grid.resolution)
     before, sides[axis] = int(sides[axis]), count
-    slices = Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
-    at = list(slices.places(dr.arange(mi.UInt32, slices.voxel_count)))
+    at = _places(sides)
     begin, at[axis] = mi.Float(at[axis]), mi.UInt32(0)
-    strides = [dr.opaque(mi.UInt32, n) for n in _strides(grid.resolution)]
-    rest = at[0] * strides[0] + at[1] * strides[1] + at[2] * strides[2]
+    rest, stride = _flat(at, strides), dr.opaque(mi.UInt32, strides[axis])
     ratio, last = dr.opaque(mi.Float, before / count), dr.opaque(mi.Float, before - 1)
-    step = dr.select(last > 0, strides[axis], 0)
+    step = dr.select(last > 0, stride, 0)
     halves = []
     for half in range(2):
         total = 0.0
@@ -278,7 +279,7 @@ def _halved(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
         for point in (0.125, 0.375):
             u = dr.clip((begin + (0.5 * half + point)) * ratio - 0.5, 0, last)
             lower = mi.UInt32(dr.minimum(u, dr.maximum(last - 1, 0)))
-            place = rest + lower * strides[axis]
+            place = rest + lower * stride
             low, high = (dr.gather(mi.UInt32, levels, i) for i in (place, place + step))
             total += dr.lerp(mi.Float(low), mi.Float(high), u - mi.Float(lower))
         halves.append(_rounded(0.5 * total, 0.5 * half))
@@ -316,16 +317,13 @@ class Table:
     def __init__(self, integers: np.ndarray, numbers: np.ndarray, axes: np.ndarray) -> None:
         self.integers = mi.Int32(integers.astype(np.int32).ravel())
         self.numbers = mi.Float(numbers.astype(np.float32).ravel())
-        self.axes = [int(axis) for axis in axes]
+        found = [(axis, np.flatnonzero(axes == axis).tolist()) for axis in range(3)]
+        #: the pairs of each dominant axis, which have their corners in common
+        self.by_axis = [(axis, pairs) for axis, pairs in found if pairs]
         self.places = [dr.opaque(mi.UInt32, i) for i in range(len(integers))]
-        self.order = [i for _, pairs in self.by_axis() for i in pairs]
+        self.order = [i for _, pairs in self.by_axis for i in pairs]
         # One more, since kernels that read an array of a single value are different ones.
         self.ordered = mi.UInt32([*self.order, 0, 1])
-
-    def by_axis(self) -> list[tuple[int, list[int]]]:
-        """The pairs of each dominant axis, which have their corners in common."""
-        pairs = [[i for i, a in enumerate(self.axes) if a == axis] for axis in range(3)]
-        return [(axis, found) for axis, found in enumerate(pairs) if found]
 
 
 class _Across:
