@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from types import SimpleNamespace
 
 import drjit as dr
@@ -74,14 +75,23 @@ def refine_calls(monkeypatch) -> list[int]:
 
 @pytest.fixture
 def kernels():
-    """A function: the kernels that Dr.Jit launched while ``action`` ran."""
+    """A function: the kernels that Dr.Jit launched while ``action`` ran.
+
+    Without garbage collection: one in the middle of a trace moves the slots of Dr.Jit's tables of
+    calls, which are written into kernels, so that by accident there is one with another hash.
+    """
 
     def record(action) -> list[dict]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            action()
-            dr.sync_thread()
-            return [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+            gc.collect()
+            gc.disable()
+            try:
+                dr.kernel_history_clear()
+                action()
+                dr.sync_thread()
+                return [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+            finally:
+                gc.enable()
 
     return record
 

@@ -358,10 +358,7 @@ def test_seeds_and_batches_differ(scenes):
 @pytest.mark.parametrize("max_depth", [2, -1])
 @pytest.mark.parametrize("small", [0, 40**3])
 def test_more_batches_compile_nothing(scenes, kernels, monkeypatch, max_depth, small):
-    """More batches, another seed, other densities of one shape: the kernels of other ones before.
-    What is written into a kernel would be new every time; here at most one of three fillings needs
-    a kernel that none before did (arrays may lie in memory in another way).
-    """
+    """More batches, another seed, other densities of one shape: the kernels of another one."""
     monkeypatch.setattr(lattice, "SMALL", small)
     to_world = scenes.placement()
 
@@ -371,13 +368,10 @@ def test_more_batches_compile_nothing(scenes, kernels, monkeypatch, max_depth, s
         settings = {"resolution": 22, "cache_seed": seed, "light": SKY}
         filled(scenes, shape, **settings, **batches(count, max_depth))
 
-    known = {k["hash"] for seed in (1, 3) for k in kernels(lambda s=seed: fill(s, 3))}
-    compiled = []
+    known = {k["hash"] for k in kernels(lambda: fill(1, 3))}
     for seed in (2, 4, 5):
         found = {k["hash"] for k in kernels(lambda s=seed: fill(s, 4))}
-        compiled.append(len(found - known))
-        known |= found
-    assert found and sorted(compiled)[:2] == [0, 0]
+        assert found and found <= known
 
 
 def test_launches_of_a_batch(scenes, kernels, monkeypatch):
