@@ -16,11 +16,16 @@ from .directional import Directional, DirectionalField
 from .errors import CacheFileError, IrrcacheError
 from .files import atomic_write
 from .grid import Affine, Grid, RootField
+from .macrocells import Macrocells
 from .survey import Survey
 
 #: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
 #: independent of each other, the batches are: means and errors are statistics of batch means.
 BATCH = 8
+
+#: Share of active voxels below which they are told apart more closely, by cells of so many voxels
+#: of the medium along an edge.
+SPARSE, FINE = 0.3, 2
 
 LAYERS = ("uncollided", "scattered")
 FORMAT = "mitsuba_irrcache 2"
@@ -435,7 +440,8 @@ def active_voxels(medium, grid: Grid) -> mi.UInt32:
     """Flat indices, ascending, of the voxels of ``grid`` that a lookup where ``sigma_t > 0`` can
     read.
 
-    Every macrocell that is not empty marks the voxels whose trilinear support its box may overlap.
+    Every macrocell that is not empty marks the voxels whose trilinear support its box may overlap;
+    where these are few, smaller cells mark still fewer.
     """
     cells = medium.macrocells
     occupied = dr.compress(cells.majorant > 0)
@@ -443,7 +449,11 @@ def active_voxels(medium, grid: Grid) -> mi.UInt32:
         return mi.UInt32()
     if cells.count == 1:
         return dr.arange(mi.UInt32, grid.voxel_count)
-    return _mark(cells, occupied, grid)
+    marked = _mark(cells, occupied, grid)
+    if dr.width(marked) < SPARSE * grid.voxel_count:
+        cells = Macrocells.build(medium.sigma_t, medium.boundary, FINE)
+        marked = _mark(cells, dr.compress(cells.majorant > 0), grid)
+    return marked
 
 
 def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], list[mi.Int32]]:
@@ -476,7 +486,8 @@ def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], l
 
 
 @dr.syntax
-def _mark(cells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
+def _mark(cells: Macrocells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
+    """The voxels that a lookup in the ``occupied`` cells can read."""
     (x0, y0, z0), (x1, y1, z1) = _supports(cells, occupied, grid)
     marks = dr.zeros(mi.UInt32, grid.voxel_count)
     x, y, z = mi.Int32(x0), mi.Int32(y0), mi.Int32(z0)

@@ -34,13 +34,14 @@ class Macrocells:
         self.sides = tuple(dr.opaque(mi.Int32, n) for n in shape[::-1])
 
     @staticmethod
-    def build(sigma_t: Field, boundary: Boundary) -> Macrocells:
+    def build(sigma_t: Field, boundary: Boundary, size: int = 0) -> Macrocells:
+        """Blocks of ``size`` voxels along each edge; 0: at least 4, at most 64 blocks."""
         if isinstance(sigma_t, ConstantField):
             majorant = dr.opaque(mi.Float, sigma_t.maximum)
             minorant = dr.opaque(mi.Float, sigma_t.minimum)
             return Macrocells(majorant, minorant, (1, 1, 1), Affine(np.linalg.inv(boundary.frame)))
         grid = sigma_t.grid
-        size = max(4, -(-max(grid.shape) // 64))
+        size = size or max(4, -(-max(grid.shape) // 64))
         shape = tuple(-(-n // size) for n in grid.shape)
         minorant, majorant = _block_bounds(sigma_t, size, shape)
         shrink = np.diag([1 / size] * 3 + [1.0])

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from .directional import DirectionalField
+from .distance import chebyshev
 from .edges import Edges
 from .grid import ConstantField, Field, GridField
 from .layers import Layers, luminance
@@ -161,11 +162,15 @@ class Projection:
             end = dr.select((mi.Float(k) >= limit) | (empty & (wall >= far)), far, end)
             if active & ~skip:
                 next_extinction, next_source, next_known = self.fetch(ray(end), True, view)
-                # The light of a segment that enters matter comes from its far end.
+                # The light of a segment that enters or leaves matter comes from its end inside:
+                # where there is none the cache may know nothing.
                 enters = dr.max(mi.Spectrum(extinction)) == 0
                 source = dr.select(enters, next_source, source)
                 before_source = dr.select(enters, next_source, before_source)
                 known = _select(enters, next_known, known)
+                leaves = dr.max(mi.Spectrum(next_extinction)) == 0
+                next_source = dr.select(leaves, source, next_source)
+                next_known = _select(leaves, known, next_known)
                 length = end - t
                 ratio = length / before_length
                 ratio = dr.select(ratio < 2, ratio, 0)  # a short first step tells no curvature
@@ -260,12 +265,7 @@ class Clearance:
 
     def __init__(self, cells: Macrocells) -> None:
         self.cells = cells
-        nz, ny, nx = cells.shape
-        distance = dr.select(cells.majorant > 0, mi.UInt32(0), mi.UInt32(REACH))
-        dr.eval(distance)
-        for side, stride in ((nx, 1), (ny, nx), (nz, nx * ny)):
-            distance = _spread(distance, *(dr.opaque(mi.Int32, n) for n in (side, stride)))
-        self.distance = distance
+        self.distance = chebyshev(cells.majorant > 0, cells.shape, REACH)
 
     def exit(self, walk: Walk, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Float]:
         """Whether the place at ``t`` is empty, and the distance along the ray, at least ``t``, up
@@ -281,23 +281,6 @@ class Clearance:
         last = dr.select(forward, cell + reach >= limits, cell - reach <= 0)
         distance = dr.select(last, dr.inf, (wall - walk.origin) * walk.rcp)
         return clearance > 0, dr.maximum(dr.min(distance), t)
-
-
-@dr.syntax
-def _spread(distance: mi.UInt32, side: mi.Int32, stride: mi.Int32) -> mi.UInt32:
-    """One axis of the distance transform: the least of max(|k|, distance of the cell k further)."""
-    index = dr.arange(mi.Int32, dr.width(distance))
-    place = index // stride % side
-    k, nearest = mi.Int32(1 - REACH), mi.UInt32(distance)
-    while dr.hint(k < REACH, label="clearance"):
-        inside = (place + k >= 0) & (place + k < side)
-        there = dr.gather(mi.UInt32, distance, mi.UInt32(index + k * stride), inside)
-        nearest = dr.select(
-            inside, dr.minimum(nearest, dr.maximum(mi.UInt32(dr.abs(k)), there)), nearest
-        )
-        k += 1
-    dr.eval(nearest)
-    return nearest
 
 
 def _constant_if_it_is(field: Field) -> Field:

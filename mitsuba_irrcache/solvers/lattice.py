@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.solvers.empty import CELL, Emptiness
 
 #: Positions within a voxel are integers below this: lines can be followed back without rounding.
 ONE = 1 << 24
@@ -43,7 +44,7 @@ SMALL = 40**3
 #: Axes of an array from the fastest to the slowest, unless they are laid out by slices.
 STANDARD = (0, 1, 2)
 
-_INTEGERS = 19
+_INTEGERS = 22
 _NUMBERS = 11
 
 
@@ -52,7 +53,9 @@ class Lattice:
     outside of this box are empty and get no light).
 
     ``sigma_t`` holds the extinction [1/scene unit] at all voxels of ``detail``, a grid over the
-    same box (None: the same grid).
+    same box (None: the same grid). `carry` finds the light at the voxels ``wanted`` (flat indices;
+    None: all). Where these hold all extinction, ``sparse`` lets it skip what is empty between them,
+    if that gains time.
     """
 
     def __init__(
@@ -62,6 +65,8 @@ class Lattice:
         lower: np.ndarray,
         upper: np.ndarray,
         detail: Grid | None = None,
+        wanted: mi.UInt32 | None = None,
+        sparse: bool = False,
     ) -> None:
         self.grid, self.detail = grid, detail or grid
         self._own = self.detail.shape == grid.shape  # each voxel has its own extinction
@@ -78,6 +83,10 @@ class Lattice:
         self._levels = _rounded(dr.minimum(levels, LEVELS))
         dr.eval(self._levels)
         self._halves: dict[int, mi.UInt32] = {}  # of slices along axes
+        self._wanted = dr.arange(mi.UInt32, grid.voxel_count) if wanted is None else wanted
+        self._empty: Emptiness | None = None
+        if sparse and not self.together:
+            self._empty = Emptiness.find(grid, self._wanted, lower, upper)
         if self.together:
             self._all_corners = [self._corners_across(axis) for axis in range(3)]
             dr.eval(self._all_corners)
@@ -124,6 +133,7 @@ class Lattice:
                 start = min(int(offset * ONE), ONE - 1)
                 end = start + (int(self.sides[axis]) - 1) * slope
                 row += [slope, start, (end >> 24) % int(self.sides[k]), end & (ONE - 1)]
+            row += [self._empty.strides[k] for k in order] if self._empty else [0, 0, 0]
             integers[i] = row
             numbers[i, :5] = [1 / abs(velocity[axis]), *ways, weights[i], self._quantum]
             numbers[i, 5:] = [
@@ -134,22 +144,16 @@ class Lattice:
         return Table(integers, numbers, axes)
 
     def carry(self, directions: np.ndarray, light: np.ndarray, offsets: np.ndarray) -> mi.Float:
-        """Irradiance at the centres of all voxels of the grid: the light that enters along pairs of
+        """Irradiance at the centres of the wanted voxels: the light that enters along pairs of
         directions, told as in `table`.
         """
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
-        total = dr.opaque(mi.Float, 0, self.grid.voxel_count)
+        box = self.lower, self.lower + self.sides
+        total = dr.opaque(mi.Float, 0, dr.width(self._wanted))
         for axis, pairs in table.by_axis:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
             self._launch(volume, None, table, axis, pairs)
-            volume = sharpened(volume, self.grid, self.lower, self.lower + self.sides, axis)
-            layout = _by_slice(axis)
-            if layout != STANDARD:
-                dr.eval(volume)
-                sides = self.grid.resolution
-                place = _flat(_places(sides), _strides(sides, layout))
-                volume = dr.gather(mi.Float, volume, place)
-            total += volume
+            total += sharpened(volume, self.grid, *box, axis, self._wanted)
             dr.eval(total)
         return total
 
@@ -181,13 +185,16 @@ class Lattice:
             first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
             which = dr.gather(mi.UInt32, table.ordered, first + row)
             lane = lanes - row * lines
-            _sweep(self._all_corners[axis], self._own, volume, source, table, which, lane, True)
+            corners = self._all_corners[axis]
+            _sweep(corners, self._own, None, volume, source, table, which, lane, True)
             dr.eval(volume)
             return
         corners = self._corners_across(axis)  # one set at a time is kept
         dr.eval(corners)
+        empty = self._empty.slices if self._empty and source is None else None
         for i in pairs:
-            _sweep(corners, self._own, volume, source, table, table.places[i], self._lanes, False)
+            which = table.places[i]
+            _sweep(corners, self._own, empty, volume, source, table, which, self._lanes, False)
             dr.eval(volume)
 
     def _slices(self, axis: int) -> np.ndarray:
@@ -289,26 +296,33 @@ def _halved(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
 
 
 def sharpened(
-    values: mi.Float, grid: Grid, lower: np.ndarray, upper: np.ndarray, axis: int
+    values: mi.Float,
+    grid: Grid,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    axis: int,
+    index: mi.UInt32,
 ) -> mi.Float:
-    """``values`` of the voxels between ``lower`` and ``upper`` (x, y, z) at their centres, given
-    means over their cross sections across ``axis``: second differences along both other axes take
-    back what the mean has smoothed. Never negative. Laid out by slices across ``axis``.
+    """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z),
+    given means over the cross sections of all voxels across ``axis``, ``values``, laid out by
+    slices: second differences along both other axes take back what the mean has smoothed. Never
+    negative.
     """
-    layout = _by_slice(axis)
-    index, change = dr.arange(mi.UInt32, grid.voxel_count), mi.Float(0)
-    places, strides = _places(grid.resolution, layout), _strides(grid.resolution, layout)
+    places, strides = grid.places(index), _strides(grid.resolution, _by_slice(axis))
+    place = _flat(places, strides)
+    value, change = dr.gather(mi.Float, values, place), mi.Float(0)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
         if k == axis or upper[k] - lower[k] < 3:
             continue
         stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))
-        inside = (at >= first) & (at <= last)
         # At a border, the second difference of the voxel next to it.
-        centre = index + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
-        for other in (centre - stride, centre + stride):
-            here, there = (dr.gather(mi.Float, values, i, inside) for i in (centre, other))
-            change += here - there
-    return dr.maximum(dr.fma(change, dr.opaque(mi.Float, RECEIVED), values), 0)
+        centre = place + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
+        here, below, above = (
+            dr.gather(mi.Float, values, i) for i in (centre, centre - stride, centre + stride)
+        )
+        # Where no line has left anything, nothing is known.
+        change += dr.select((below > 0) & (above > 0), 2 * here - below - above, 0)
+    return dr.maximum(dr.fma(change, dr.opaque(mi.Float, RECEIVED), value), 0)
 
 
 class Table:
@@ -348,9 +362,9 @@ class _Across:
         near = self.since(position)
         return dr.select(voxel == self.entry, dr.minimum(near, 0.5), 0.5)
 
-    def advance(self, voxel: mi.Int32, position: mi.Int32) -> tuple:
-        """Voxel and position in the next slice, and the slices since entry: 1 unless it is new."""
-        moved = position + self.slope
+    def advance(self, voxel: mi.Int32, position: mi.Int32, slices: mi.Int32 | int = 1) -> tuple:
+        """Voxel and position some ``slices`` on, and the slices since entry: 1 unless it is new."""
+        moved = position + self.slope * slices
         position = moved & (ONE - 1)
         voxel = voxel + (moved >> 24)
         outside = mi.UInt32(voxel) >= mi.UInt32(self.sides)
@@ -376,6 +390,7 @@ class _Across:
 def _sweep(
     corners: mi.UInt32,
     own: bool,
+    empty: mi.UInt32 | None,
     volume: mi.Float,
     source: mi.Float | None,
     table: Table,
@@ -383,11 +398,12 @@ def _sweep(
     lanes: mi.UInt32,
     together: bool,
 ):
-    """Follows a pair of directions. ``together``: lanes of all pairs at once, with a ``source`` of
-    its own.
+    """Follows a pair of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
+    ``together``: lanes of all pairs at once, with a ``source`` of its own.
     """
     row = [dr.gather(mi.Int32, table.integers, which * _INTEGERS + i) for i in range(_INTEGERS)]
-    nb, nc, na, sb, sc, sa, base, tb, tc, ta, shift, mb, fb, eb, gb, mc, fc, ec, gc = row
+    nb, nc, na, sb, sc, sa, base, tb, tc, ta, shift, mb, fb, eb, gb, mc, fc, ec, gc = row[:19]
+    cells = row[19:]
     length, light, light_back, weight, quantum, *detail = (
         dr.gather(mi.Float, table.numbers, which * _NUMBERS + i) for i in range(_NUMBERS)
     )
@@ -415,14 +431,24 @@ def _sweep(
     slice_, slice_back = shift + width, shift + ta * (na - 1) + width
     L, L_back, s0, s0_back = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
     scale, area = quantum * length, dr.rcp(length)
-    k = mi.Int32(0)
-    while dr.hint(active, label="slices"):
+    # Slices behind, of both ways; where they skip some, each is in a slice of its own.
+    k, k_back, active_back = mi.Int32(0), mi.Int32(0), mi.Bool(active)
+    ahead, ahead_back = mi.Int32(1), mi.Int32(1)
+    needed, needed_back = mi.Bool(active), mi.Bool(active)
+    while dr.hint(active | active_back, label="slices"):
+        if dr.hint(empty is not None, mode="scalar"):
+            ahead = _slices(empty, cells, ib, ic, k, active)
+            ahead_back = _slices(empty, cells, kb, kc, na - 1 - k_back, active_back)
+            needed, needed_back = active & (ahead == 0), active_back & (ahead_back == 0)
+            ahead, ahead_back = dr.maximum(ahead, 1), dr.maximum(ahead_back, 1)
+        else:
+            active_back = needed = needed_back = active
         index = mi.UInt32(ib * sb + ic * sc + off)
         index_back = mi.UInt32(kb * sb + kc * sc + off_back)
         # Of the half before the middle of the slice, and of the half behind it.
-        s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, active)
+        s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, needed)
         s_next_back, s_back = _levels(
-            corners, own, slice_back, back_b, back_c, kb, gb, kc, gc, active
+            corners, own, slice_back, back_b, back_c, kb, gb, kc, gc, needed_back
         )
         L = dr.select(since < 1, light, L)
         L_back = dr.select(since_back < 1, light_back, L_back)
@@ -435,10 +461,10 @@ def _sweep(
                 dr.scatter_reduce(dr.ReduceOp.Add, volume, L, index, active)
                 dr.scatter_reduce(dr.ReduceOp.Add, volume, L_back, index_back, active)
             else:
-                before = dr.gather(mi.Float, volume, index, active)
-                before_back = dr.gather(mi.Float, volume, index_back, active)
-                dr.scatter(volume, before + L + dr.select(middle, L_back, 0), index, active)
-                dr.scatter(volume, before_back + L_back, index_back, active & ~middle)
+                before = dr.gather(mi.Float, volume, index, needed)
+                before_back = dr.gather(mi.Float, volume, index_back, needed_back)
+                dr.scatter(volume, before + L + dr.select(middle, L_back, 0), index, needed)
+                dr.scatter(volume, before_back + L_back, index_back, needed_back & ~middle)
         else:
             if dr.hint(together, mode="scalar"):
                 voxel, voxel_back = mi.Vector4f(0), mi.Vector4f(0)
@@ -468,18 +494,27 @@ def _sweep(
                 dr.scatter(volume, voxel + tally, index, active)
                 dr.scatter(volume, voxel_back + tally_back, index_back, active & ~middle)
         s0, s0_back = s_next, s_next_back
-        ib, fb, since = there_b.advance(ib, fb)
-        ic, fc, near = there_c.advance(ic, fc)
+        ib, fb, since = there_b.advance(ib, fb, ahead)
+        ic, fc, near = there_c.advance(ic, fc, ahead)
         since = dr.minimum(near, since)
-        kb, gb, since_back = back_b.advance(kb, gb)
-        kc, gc, near_back = back_c.advance(kc, gc)
+        kb, gb, since_back = back_b.advance(kb, gb, ahead_back)
+        kc, gc, near_back = back_c.advance(kc, gc, ahead_back)
         since_back = dr.minimum(near_back, since_back)
-        off += sa
-        off_back -= sa
-        slice_ += ta
-        slice_back -= ta
-        k += 1
+        off += sa * ahead
+        off_back -= sa * ahead_back
+        slice_ += ta * ahead
+        slice_back -= ta * ahead_back
+        k += ahead
         active &= k < na
+        if dr.hint(empty is not None, mode="scalar"):
+            k_back += ahead_back
+            active_back &= k_back < na
+
+
+def _slices(empty, strides, b, c, a, active) -> mi.Int32:
+    """Slices that a line may skip from voxel (b, c) of slice ``a``, 0 where it is needed."""
+    cell = sum(n * mi.Int32(mi.UInt32(i) // CELL) for n, i in zip(strides, (b, c, a), strict=True))
+    return mi.Int32(dr.gather(mi.UInt32, empty, mi.UInt32(cell), active))
 
 
 def _levels(corners, own, slice_, across_b, across_c, ib, fb, ic, fc, active) -> tuple:

@@ -61,7 +61,9 @@ class Sweep:
         detail = _detail(medium, grid)
         extinction = baked(medium, medium.sigma_t, detail)
         box = _occupied_box(cache)
-        self._lattices = [Lattice(grid, s, *box, detail) for s in extinction]
+        # Blocks of the medium's voxels reach farther than these.
+        sparse = medium.sigma_t.grid is not None and detail.shape == medium.sigma_t.grid.shape
+        self._lattices = [Lattice(grid, s, *box, detail, cache.active, sparse) for s in extinction]
         # For single scattering the albedo does not matter here.
         self._levels: list[Level] = []
         if cache.max_depth != 2:
@@ -113,38 +115,40 @@ class Sweep:
             if key not in found:
                 found[key] = self._solved(tables[key[0]], *key)
             for layer, phi in zip(layers, found[key], strict=True):
-                layer.append(phi if phi is None else self._gathered(phi, colour[c]))
+                layer.append(phi if phi is None else phi * dr.opaque(mi.Float, colour[c]))
         dr.eval(layers)
         return (*layers[0], *layers[1]), (None,) * cache.channels
 
     def _solved(self, rows: list, light: int, medium: int) -> tuple:
-        """Irradiance at all voxels: straight from the emitters, and scattered, if it is wanted."""
+        """Irradiance at the active voxels: straight from the emitters, and scattered, if wanted."""
         if not self._levels:
-            return self._uncollided(self._lattices[medium], rows, light), None
+            return self._uncollided(rows, light, medium)[1], None
         level, (first, *rows) = self._levels[medium], rows
-        uncollided = self._uncollided(level.lattice, rows, light)
-        total = 0 * uncollided
+        from_far, uncollided = self._uncollided(rows, light, medium)
+        total = 0 * from_far
         phi = self._collided(level, first, light)
         for known, row in enumerate(rows, 1):
             received, again = level.scatter(phi, level.lattice.table(*row))
-            total = total + received
+            total = total + dr.gather(mi.Float, received, self.cache.active)
             if self.cache.max_depth < 0:
                 # Of all orders there is now another estimate: on average they have less noise.
                 old, new = (dr.opaque(mi.Float, n / (known + 1)) for n in (known, 1))
                 phi = phi * old + self._with_near_light(again, light) * new
             dr.eval(total, phi)
-        total = self._with_near_light(total * dr.opaque(mi.Float, 1 / len(rows)), light)
         # Both layers with the same directions: under a white sky the sum has no noise.
-        scattered = dr.maximum(total - uncollided, 0)
+        scattered = dr.maximum(total * dr.opaque(mi.Float, 1 / len(rows)) - from_far, 0)
         dr.eval(scattered)
         return uncollided, scattered
 
-    def _uncollided(self, lattice: Lattice, rows: list, light: int) -> mi.Float:
-        """Irradiance straight from the emitters, on average over passes."""
+    def _uncollided(self, rows: list, light: int, medium: int) -> tuple[mi.Float, mi.Float]:
+        """Irradiance straight from emitters that are far away, on average over passes, and from all
+        emitters.
+        """
         directions, entering, _, offsets = (np.concatenate(p) for p in zip(*rows, strict=True))
         lit = entering.any(axis=1)
-        volume = lattice.carry(directions[lit], entering[lit], offsets[lit])
-        return self._with_near_light(volume * dr.opaque(mi.Float, 1 / len(rows)), light)
+        values = self._lattices[medium].carry(directions[lit], entering[lit], offsets[lit])
+        from_far = values * dr.opaque(mi.Float, 1 / len(rows))
+        return from_far, from_far + sum(near[light] for near in self._direct)
 
     def _collided(self, level: Level, row: tuple, light: int) -> mi.Float:
         """Mean irradiance of collisions, of all orders but the last."""
@@ -165,10 +169,6 @@ class Sweep:
             dr.scatter_reduce(dr.ReduceOp.Add, volume, light[channel], self.cache.active)
         dr.eval(volume)
         return volume
-
-    def _gathered(self, volume: mi.Float, scale: float) -> mi.Float:
-        """A volume at the active voxels."""
-        return dr.gather(mi.Float, volume, self.cache.active) * dr.opaque(mi.Float, scale)
 
 
 def _detail(medium: MediumGrid, grid: Grid) -> Grid:

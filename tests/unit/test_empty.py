@@ -1,0 +1,114 @@
+"""What lines of a lattice may skip: distances by brute force, and light that is the same to
+rounding.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.solvers import empty, lattice
+from mitsuba_irrcache.solvers.empty import CELL, Emptiness
+from mitsuba_irrcache.solvers.lattice import Lattice
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SHAPE = (26, 21, 32)
+SIDES = SHAPE[::-1]
+
+
+def sparse(share: float = 1e-3) -> np.ndarray:
+    """A few occupied voxels (z, y, x), and a solid ball."""
+    occupied = np.random.default_rng(2).random(SHAPE) < share
+    at = np.moveaxis(np.indices(SHAPE), 0, -1) - [14, 8, 20]
+    return occupied | (np.linalg.norm(at, axis=-1) < 3.5)
+
+
+def found(occupied: np.ndarray, lower, upper) -> np.ndarray | None:
+    needed = mi.UInt32(np.flatnonzero(occupied).tolist())
+    emptiness = Emptiness.find(Grid(SHAPE, np.eye(4)), needed, np.array(lower), np.array(upper))
+    if emptiness is None:
+        return None
+    shape = [-(-(b - a) // CELL) for a, b in zip(lower, upper, strict=True)][::-1]
+    return np.array(emptiness.slices).reshape(shape)
+
+
+def test_lines_skip_what_is_empty_and_no_more():
+    """Within the slices that may be skipped from any voxel of a cell there is no occupied voxel,
+    and no side of the box; the first cell that stops it is nearer than two cells behind them.
+    """
+    occupied = sparse()
+    lower, upper = (2, 1, 3), (31, 20, 26)  # odd sides among them
+    occupied[:3] = occupied[:, :1] = occupied[:, 20:] = occupied[..., :2] = occupied[..., 31:] = 0
+    slices = found(occupied, lower, upper)
+    blocked = np.pad(occupied[3:26, 1:20, 2:31], 40, constant_values=True)
+    longest = 0
+    for z, y, x in np.ndindex(*slices.shape):
+        n = int(slices[z, y, x])
+        first = np.array([z, y, x]) * CELL + 40
+        here = blocked[tuple(np.s_[a : a + CELL] for a in first)]
+        inside = here[: 23 - z * CELL, : 19 - y * CELL, : 29 - x * CELL]
+        assert (n == 0) == inside.any()
+        if n > 1:  # reached from any voxel of the cell in fewer than n slices
+            assert not blocked[tuple(np.s_[a - n + 1 : a + CELL + n - 1] for a in first)].any()
+        if n and n < (empty.REACH - 1) * CELL:
+            wide = n + 2 * CELL
+            assert blocked[tuple(np.s_[a - wide : a + CELL + wide] for a in first)].any()
+        longest = max(longest, n)
+    assert longest > 2 * CELL
+
+
+def test_nothing_is_skipped_where_it_gains_too_little():
+    assert found(np.ones(SHAPE, bool), (0, 0, 0), SIDES) is None
+    assert found(sparse(), (0, 0, 0), SIDES) is not None
+
+
+@pytest.mark.parametrize("box", [((0, 0, 0), (32, 21, 26)), ((3, 1, 2), (32, 20, 25))])
+@pytest.mark.parametrize("detailed", [False, True])
+def test_light_is_the_same(monkeypatch, box, detailed):
+    """Whichever way lines go, and where they enter: with voxels of the medium, and its detail."""
+    monkeypatch.setattr(lattice, "SMALL", 0)
+    monkeypatch.setattr(lattice, "RECEIVED", 0.0)
+    monkeypatch.setattr(empty, "WORTHWHILE", 1.0)
+    occupied = sparse()
+    lower, upper = (np.array(end) for end in box)
+    keep = np.zeros_like(occupied)
+    keep[tuple(np.s_[a:b] for a, b in zip(lower[::-1], upper[::-1], strict=True))] = True
+    occupied &= keep
+    grid = medium = Grid(SHAPE, np.eye(4))
+    density = np.where(occupied, 40.0, 0)
+    if detailed:
+        medium = Grid((13, 7, 16), np.eye(4))
+        coarse = np.add.reduceat(density, np.arange(0, 26, 2), axis=0)
+        coarse = np.add.reduceat(coarse, np.arange(0, 21, 3), axis=1)
+        density = np.add.reduceat(coarse, np.arange(0, 32, 2), axis=2)
+        # What a line sees of a value reaches as far as its neighbours.
+        seen = np.kron(density > 0, np.ones((2, 3, 2))) > 0
+        occupied = keep & (_dilated(seen, 3))
+    else:
+        occupied = keep & _dilated(occupied, 1)
+    wanted = mi.UInt32(np.flatnonzero(occupied).tolist())
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(12, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    light, offsets = rng.random((12, 2)), rng.random((12, 2))
+    values = [
+        np.array(
+            Lattice(
+                grid, mi.Float(density.ravel().tolist()), lower, upper, medium, wanted, skip
+            ).carry(directions, light, offsets)
+        )
+        for skip in (False, True)
+    ]
+    assert values[0].max() > 2 * values[0].min()
+    np.testing.assert_allclose(*values, rtol=1e-6)
+
+
+def _dilated(mask: np.ndarray, by: int) -> np.ndarray:
+    for axis in range(3):
+        padded = np.pad(mask, [(by, by) if k == axis else (0, 0) for k in range(3)])
+        views = np.lib.stride_tricks.sliding_window_view(padded, 2 * by + 1, axis)
+        mask = views.any(axis=-1)
+    return mask
