@@ -122,9 +122,9 @@ class Sweep:
     def _solved(self, rows: list, light: int, medium: int) -> tuple:
         """Irradiance at the active voxels: straight from the emitters, and scattered, if wanted."""
         if not self._levels:
-            return self._uncollided(rows, light, medium)[1], None
+            return self._uncollided(self._lattices[medium], rows, light)[1], None
         level, (first, *rows) = self._levels[medium], rows
-        from_far, uncollided = self._uncollided(rows, light, medium)
+        from_far, uncollided = self._uncollided(level.lattice, rows, light)
         total = 0 * from_far
         phi = self._collided(level, first, light)
         for known, row in enumerate(rows, 1):
@@ -140,13 +140,13 @@ class Sweep:
         dr.eval(scattered)
         return uncollided, scattered
 
-    def _uncollided(self, rows: list, light: int, medium: int) -> tuple[mi.Float, mi.Float]:
+    def _uncollided(self, lattice: Lattice, rows: list, light: int) -> tuple[mi.Float, mi.Float]:
         """Irradiance straight from emitters that are far away, on average over passes, and from all
         emitters.
         """
         directions, entering, _, offsets = (np.concatenate(p) for p in zip(*rows, strict=True))
         lit = entering.any(axis=1)
-        values = self._lattices[medium].carry(directions[lit], entering[lit], offsets[lit])
+        values = lattice.carry(directions[lit], entering[lit], offsets[lit])
         from_far = values * dr.opaque(mi.Float, 1 / len(rows))
         return from_far, from_far + sum(near[light] for near in self._direct)
 
