@@ -13,6 +13,7 @@ import SimpleITK
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.dicom_lengths import check_lengths
 
 EXTENSIONS = (".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".dcm")
 # Deflate cannot shrink anything further than this (zlib.net/zlib_tech.html).
@@ -45,6 +46,8 @@ def read_image(path: str | os.PathLike) -> VolumeData:
     path = Path(path)
     if not path.is_file():
         raise IrrcacheError(f"volume file {path} does not exist")
+    if path.suffix == ".dcm":
+        check_lengths(path)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
     try:
@@ -93,7 +96,9 @@ def _image_bytes(path: Path, reader: SimpleITK.ImageFileReader) -> int:
 def _check_file_holds(path: Path, image_bytes: int) -> None:
     """Compare what the header promises with the file, and unpack a ``.gz`` once to its end."""
     if path.suffix == ".dcm":
-        return  # the pixel data may be compressed by any codec; GDCM checks it
+        # The pixel data may be compressed by any codec.
+        _check_ratio(path, path.stat().st_size, image_bytes)
+        return
     if path.suffix == ".gz":
         _check_ratio(path, path.stat().st_size, image_bytes)
         _check_gzip(path, image_bytes)

@@ -122,6 +122,20 @@ def test_dicom_is_sorted_by_position_and_rescaled(tmp_path):
     assert volume.unit == "HU"
 
 
+@pytest.mark.parametrize("how", ["element", "no element"])
+def test_dicom_that_promises_more_than_it_has(tmp_path, how):
+    """One wrong byte in a slice of a kilobyte took gigabytes; it is refused by name now."""
+    write_dicom(tmp_path / "ct", [0.0, 1.0, 2.0])
+    file = tmp_path / "ct" / "a07.dcm"
+    content = file.read_bytes()
+    rows = content.index(struct.pack("<HH", 0x0028, 0x0010) + b"US")
+    lie = b"UN\0\0\0\0\0\x7f" if how == "element" else b"\x01\x02"
+    file.write_bytes(content[: rows + 4] + lie + content[rows + 4 + len(lie) :])
+    said = r"\(0028,0010\) promises 2130706432 bytes" if how == "element" else "no element"
+    with pytest.raises(IrrcacheError, match=rf"a07\.dcm.*{said}"):
+        read_volume(tmp_path / "ct")
+
+
 def test_tilted_gantry_is_placed_as_it_was(tmp_path):
     write_dicom(tmp_path / "ct", [0.0, 2.0, 4.0], shear=0.5)
     volume = read_volume(tmp_path / "ct")
