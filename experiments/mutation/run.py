@@ -63,7 +63,7 @@ def verdict(mutant: Mutant) -> dict:
         command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", *mutant.tests]
         environment = os.environ | {"PYTHONPATH": str(copy)}
         done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
-    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
     if done.returncode not in (0, 1):
         raise RuntimeError(f"the tests did not run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
     return {"by": failed[0] if failed else SURVIVED, "seconds": time.perf_counter() - started}
