@@ -163,6 +163,7 @@ def _listen(pipe, process, tally: Tally, first: int, count: int) -> int:
         return count
     except EOFError:
         tally.crashes += 1
+        tally.errors.append(f"mutant {index + 1}: the process ended")
         return index + 2
     finally:
         process.kill()
