@@ -149,13 +149,9 @@ def observe(
     cache = integrator.cache
     if cache is None:
         return Found(image, None, None, settings)
-    unit = 4 * np.pi
-    phi, error = (np.array(v, dtype=np.float64) / unit for v in _light(cache))
+    light = cache.irradiance, cache.standard_error
+    phi, error = (np.array(v, dtype=np.float64) / (4 * np.pi) for v in light)
     return Found(image, phi, error, settings)
-
-
-def _light(cache) -> tuple[mi.TensorXf, mi.TensorXf]:
-    return cache.irradiance, cache.standard_error
 
 
 def refusal(action: Callable[[], object]) -> str:
