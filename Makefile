@@ -5,7 +5,7 @@ READY := .venv/.ready
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo paper test lint clean
+.PHONY: help setup demo paper test stress lint clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -20,6 +20,10 @@ paper: setup ## compute the paper's figures and tables, 20 minutes; FULL=1: the 
 
 test: setup ## run the tests
 	$(BIN)/python -m pytest
+
+stress: setup ## try every hazard and fault, 15 minutes; ends with tables of what held
+	$(BIN)/python -m experiments.stability.run
+	$(BIN)/python -m experiments.faults.run
 
 lint: setup ## check style and format
 	$(BIN)/ruff check

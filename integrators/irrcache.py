@@ -23,7 +23,7 @@ from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.sight import Sight, SimpleSight
 from mitsuba_irrcache.stopping import Stopped, Stopping
 from mitsuba_irrcache.uncertainty import uncertainty_of
-from mitsuba_irrcache.variants import require_variant
+from mitsuba_irrcache.variants import require_same_variant, require_variant
 from mitsuba_irrcache.versions import check_versions
 
 SOLVERS = ("auto", "path", "sweep")
@@ -145,7 +145,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        require_variant(mi.variant())
+        self._variant = mi.variant()
+        require_variant(self._variant)
         require_llvm()
         check_versions()
         super().__init__(props)
@@ -209,6 +210,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def prepare(self, scene: mi.Scene) -> None:
         """Builds or completes the cache for ``scene``, unless it is up to date."""
+        require_same_variant(self._variant, mi.variant())
         self._stopping.begin(self._timeout)
         try:
             with dr.suspend_grad():

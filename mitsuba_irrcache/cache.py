@@ -326,19 +326,17 @@ class IrradianceCache:
             return cls._restore(description, arrays)
         except CacheFileError:
             raise
-        except (
-            OSError,
-            ValueError,
-            KeyError,
-            TypeError,
-            zipfile.BadZipFile,
-            EOFError,
-            MemoryError,
-        ) as error:
-            raise CacheFileError(
-                f'"{path}" is not a readable irradiance cache ({error}); delete it or name another '
-                "cache_file."
-            ) from error
+        except Exception as error:  # whatever a damaged file makes of itself
+            raise _unreadable(path, error) from error
+
+    @staticmethod
+    def description_of(path: str | Path) -> tuple[dict[str, str], int]:
+        """Fingerprint of a file and its samples per voxel, without its arrays; raises as `load`."""
+        try:
+            description = json.loads(_read_arrays(Path(path), ())["description"].tobytes())
+            return dict(description["fingerprint"]), sum(_streams(description).values())
+        except Exception as error:  # as in `load`
+            raise _unreadable(path, error) from error
 
     @classmethod
     def _restore(cls, description: dict, arrays: dict[str, np.ndarray]) -> IrradianceCache:
@@ -363,20 +361,26 @@ class IrradianceCache:
         moments = arrays["moments"] if count else np.zeros((0, width), np.float32)
         if (moments.shape, moments.dtype) != ((count * channels, width), np.float32):
             raise ValueError(f"moments of shape {moments.shape} and type {moments.dtype}")
-        if not all(np.isfinite(values).all() for values in (totals, spreads, moments)):
+        largest = max(float(np.abs(v).max(initial=0)) for v in (totals, spreads, moments))
+        if not largest < np.finfo(np.float32).max:  # NaN too
             raise ValueError("it holds values that are not finite")
+        if min(values.min(initial=0) for values in (totals, spreads)) < 0:
+            raise ValueError("it holds light that is negative")
+        streams, batch = _streams(description), int(description["batch"])
+        if batch < 1 or any(n % batch for n in streams.values()):
+            raise ValueError(f"samples {streams} in batches of {batch}")
         cache = cls(
             grid,
             mi.UInt32(active),
             channels,
             int(description["max_depth"]),
             dict(description["fingerprint"]),
-            int(description["batch"]),
+            batch,
             correlated,
             count,
         )
         cache._moments = [mi.Float(t) if t.any() else None for t in moments]
-        cache.streams = {int(seed): int(n) for seed, n in description["streams"].items()}
+        cache.streams = streams
         cache._totals = [cache.real(t) if t.any() else None for t in totals]
         cache._spreads = [cache.real(t) if t.any() else None for t in spreads]
         return cache
@@ -426,14 +430,32 @@ def _root_correction(variance: mi.Float) -> mi.Float:
     return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)
 
 
-def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an uncompressed npz: a file cannot claim more memory than it has bytes."""
+def _unreadable(path: str | Path, error: Exception) -> CacheFileError:
+    return CacheFileError(
+        f'"{path}" is not a readable irradiance cache ({error}); delete it or name another '
+        "cache_file."
+    )
+
+
+def _streams(description: dict) -> dict[int, int]:
+    """Samples by seed."""
+    streams = {int(seed): int(n) for seed, n in description["streams"].items()}
+    if min(streams.values(), default=0) < 0:
+        raise ValueError(f"samples {streams}")
+    return streams
+
+
+def _read_arrays(path: Path, names: tuple[str, ...] = ARRAYS) -> dict[str, np.ndarray]:
+    """The description and some arrays of an uncompressed npz: a file cannot claim more memory than
+    it has bytes.
+    """
     with zipfile.ZipFile(path) as archive:
         if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
             raise ValueError("it is compressed")
     with np.load(path, allow_pickle=False) as archive:
-        names = ("description", *ARRAYS, *({"moments"} & set(archive.files)))
-        return {name: archive[name] for name in names}
+        if names:
+            names = (*names, *({"moments"} & set(archive.files)))
+        return {name: archive[name] for name in ("description", *names)}
 
 
 def active_voxels(medium, grid: Grid) -> mi.UInt32:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,20 +12,25 @@ from typing import BinaryIO
 
 from .errors import IrrcacheError
 
+#: Seconds after which a temporary file that nobody has written to is left over from a process that
+#: was killed.
+ABANDONED = 3600.0
+
 
 @contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """A binary file that replaces ``path`` when the block ends, and vanishes if the block raises.
 
-    It is written beside ``path`` under a temporary name, flushed to the disk, then renamed.
+    It is written beside ``path`` under a temporary name, flushed to the disk, then renamed. Those
+    that killed processes have left are removed. Raises IrrcacheError where it cannot be written.
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise IrrcacheError(f'cannot write "{path}": the folder "{path.parent}" does not exist.')
+    prefix, suffix = f".{path.name}.", ".tmp"
+    _remove_abandoned(path.parent, prefix, suffix)
     try:
-        handle, temporary = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.name}.", suffix=".tmp"
-        )
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=suffix)
     except OSError as error:
         raise IrrcacheError(f'cannot write "{path}": {error.strerror}.') from error
     try:
@@ -34,10 +40,23 @@ def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
+        if isinstance(error, OSError):
+            reason = error.strerror or str(error)
+            raise IrrcacheError(f'cannot write "{path}": {reason}.') from error
         raise
+
+
+def _remove_abandoned(folder: Path, prefix: str, suffix: str) -> None:
+    """Removes temporary files of one name that nobody writes to any more."""
+    with suppress(OSError):
+        for entry in os.scandir(folder):
+            if entry.name.startswith(prefix) and entry.name.endswith(suffix):
+                with suppress(OSError):
+                    if time.time() - entry.stat().st_mtime > ABANDONED:
+                        os.unlink(entry.path)
 
 
 def _umask() -> int:

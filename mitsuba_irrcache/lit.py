@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,7 +75,8 @@ class LitMedium:
         if not self.settings.file or not self.name:
             return self.settings.file
         file = Path(self.settings.file)
-        return str(file.with_name(f"{file.stem}.{self.name}{file.suffix}"))
+        own = re.sub(r"[^\w.-]", "_", self.name)  # a name in a scene is no path
+        return str(file.with_name(f"{file.stem}.{own}{file.suffix}"))
 
     @property
     def shown(self) -> IrradianceCache | None:
@@ -153,10 +156,15 @@ class LitMedium:
         overwritten.
         """
         file = Path(self.file)
-        if not file.exists():
-            if not file.parent.is_dir():
+        if not os.path.exists(file):  # says no, where Path.exists may raise
+            if not os.path.isdir(file.parent):
                 raise IrrcacheError(
                     f'irrcache: cache_file "{file}": the folder "{file.parent}" does not exist.'
+                )
+            if not os.access(file.parent, os.W_OK | os.X_OK):
+                raise IrrcacheError(
+                    f'irrcache: cache_file "{file}": nothing can be written to the folder '
+                    f'"{file.parent}"; name another one.'
                 )
             return cache
         stored = IrradianceCache.load(file)
@@ -164,6 +172,7 @@ class LitMedium:
             k for k in cache.fingerprint if stored.fingerprint.get(k) != cache.fingerprint[k]
         ]
         if not differing:
+            _check_like(cache, stored, file)
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
             stored.survey, stored.directional = cache.survey, cache.directional
@@ -227,11 +236,48 @@ class LitMedium:
             )
 
     def save(self) -> None:
-        """Writes the cache to its file, where it has one that has fewer samples."""
+        """Writes the cache to its file, where it has one that has fewer samples, also by now: other
+        processes may share it. The light is not lost with a file that cannot be written.
+        """
         file, cache = self.file, self.cache
-        if file and cache is not None and cache.fingerprint and cache.samples > self.saved_samples:
-            cache.save(file)
+        if not file or cache is None or not cache.fingerprint:
+            return
+        if cache.samples <= self.saved_samples:
+            return
+        try:
+            if not self._is_ahead(file):
+                cache.save(file)
             self.saved_samples = cache.samples
+        except IrrcacheError as error:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"irrcache: {self.label}the cache was not saved: {str(error).rstrip('.')}. It is "
+                "used all the same.",
+            )
+
+    def _is_ahead(self, file: str) -> bool:
+        """Whether another process has written as many samples of the same light meanwhile. Raises
+        CacheFileError if it is other light.
+        """
+        if not Path(file).exists():
+            return False
+        fingerprint, samples = IrradianceCache.description_of(file)
+        if fingerprint != self.cache.fingerprint:
+            raise CacheFileError(f'"{file}" has come to hold the light of another scene')
+        return samples >= self.cache.samples
+
+
+def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> None:
+    """Raises CacheFileError if a file says of itself what it is not."""
+    alike = ("active_count", "channels", "correlated", "max_depth", "moments")
+    differing = [name for name in alike if getattr(cache, name) != getattr(stored, name)]
+    if stored.grid.shared(cache.grid) is not cache.grid:
+        differing.append("grid")
+    if differing:
+        raise CacheFileError(
+            f'irrcache: cache_file "{file}" contradicts itself: {", ".join(differing)} do not fit '
+            "its fingerprint. Delete it."
+        )
 
 
 def _marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:

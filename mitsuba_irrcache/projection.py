@@ -339,9 +339,10 @@ def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
 
     ``sigma`` is the extinction at both ends. ``riemann`` (the paper's rule, order 1) takes all from
     the start; ``trapezoid`` (order 2) takes extinction and sigma_s Phi / (4 pi) as linear in
-    distance; ``exponential`` takes extinction and source as linear in distance (``curved`` ends
-    make it of order 3 where both are smooth) and the transmittance as exact, so that opaque and
-    long segments stay right.
+    distance, but no more than the segment absorbs: of opaque ones it would make as many times more
+    as they are thick; ``exponential`` takes extinction and source as linear in distance (``curved``
+    ends make it of order 3 where both are smooth) and the transmittance as exact, so that opaque
+    and long segments stay right.
     """
     sigma_a, sigma_b = sigma
     if quadrature == "riemann":
@@ -349,7 +350,10 @@ def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
         return (absorbed, dr.zeros(type(absorbed))), 1 - absorbed
     passed = dr.exp(-0.5 * (sigma_a + sigma_b) * length)
     if quadrature == "trapezoid":
-        return (0.5 * length * sigma_a, 0.5 * length * (passed * sigma_b)), passed
+        near, far = 0.5 * length * sigma_a, 0.5 * length * (passed * sigma_b)
+        total, absorbed = near + far, absorptance(0.5 * (sigma_a + sigma_b) * length)
+        share = dr.select(total > absorbed, absorbed / total, 1)
+        return (near * share, far * share), passed
     return exponential_weights(sigma_a * length, sigma_b * length), passed
 
 

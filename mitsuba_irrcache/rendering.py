@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import drjit as dr
 import mitsuba as mi
 
+from .errors import IrrcacheError
 from .layers import interleaved
 
 #: Camera samples in one kernel launch: bounds the memory of the sampler's state (16 bytes each).
@@ -31,9 +32,16 @@ def render_film(
     channels: Sequence[str] = (),
 ) -> mi.Film:
     """Renders ``radiance`` to the sensor's film, ``spp`` samples per pixel (0: the sampler's own
-    count); ``channels`` names those beside radiance and alpha.
+    count); ``channels`` names those beside radiance and alpha. Raises IrrcacheError for a film
+    without pixels.
     """
     film, sampler = sensor.film(), sensor.sampler().clone()
+    if min(film.crop_size()) == 0:
+        width, height = film.crop_size()
+        raise IrrcacheError(
+            f"irrcache: the crop window of the film is {width} x {height} pixels; crop_width and "
+            "crop_height must be at least 1."
+        )
     if spp:
         sampler.set_sample_count(spp)
     spp = sampler.sample_count()
@@ -41,8 +49,6 @@ def render_film(
     size = mi.ScalarVector2u(film.crop_size()) + 2 * border
     pixels = int(size.x) * int(size.y)
     film.prepare(list(channels))
-    if not pixels:
-        return film
     per_pass = _divisor(spp, max(1, LANES // pixels))
     sampler.set_samples_per_wavefront(per_pass)
     sampler.seed(seed, pixels * per_pass)

@@ -13,6 +13,7 @@ import numpy as np
 
 from .boundary import Boundary, boundary_of
 from .errors import UnsupportedSceneError
+from .lamps import point_lights, position_of
 from .medium import MediumGrid, bake, children
 from .phase import refuse_sharp
 from .surroundings import Surroundings, probe
@@ -25,6 +26,8 @@ CLOSED_RAYS, CLOSED_TOLERANCE = 1024, 0.05
 RAY_OFFSET = 9e-5
 #: ... which should not exceed this part of the shortest side of a medium.
 LARGEST_OFFSET = 0.002
+#: Steps between positions in single precision that a side of a medium, and a voxel, must have.
+STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
 
 
 def bake_media(scene: mi.Scene) -> list[MediumGrid]:
@@ -33,10 +36,31 @@ def bake_media(scene: mi.Scene) -> list[MediumGrid]:
 
     Raises UnsupportedSceneError, naming the object, for what would not be rendered right.
     """
-    if not media_of(scene):
+    media = media_of(scene)
+    if not media:
         return []
+    for medium, shapes in media.items():
+        for shape in shapes:
+            lower, upper = (np.array(p) for p in (shape.bbox().min, shape.bbox().max))
+            finest = (upper - lower).max() / STEPS_OF_A_SIDE
+            _check_distance(medium.id(), np.abs([lower, upper]).max(), finest)
     boundary = simple_boundary(scene)
-    return bake_general(scene) if boundary is None else [_bake_simple(scene, boundary)]
+    grids = bake_general(scene) if boundary is None else [_bake_simple(scene, boundary)]
+    for grid in grids:
+        corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
+        _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
+    return grids
+
+
+def _check_distance(name: str, distance: float, finest: float) -> None:
+    """Refuses a medium so far away from the origin that positions in it cannot be told apart."""
+    step = float(np.spacing(np.float32(distance)))
+    if step > finest:
+        _refuse(
+            f'medium "{name}" is {distance:.2g} away from the origin, where single precision tells '
+            f"positions {step:.1g} apart only",
+            " Scale it up, or move it to the origin.",
+        )
 
 
 def media_of(scene: mi.Scene) -> dict[mi.Medium, list[mi.Shape]]:
@@ -87,8 +111,8 @@ def bake_scene(scene: mi.Scene) -> MediumGrid | None:
 
 
 def _bake_simple(scene: mi.Scene, boundary: Boundary) -> MediumGrid:
-    for emitter in _point_lights(scene):
-        position = _position(emitter)
+    for emitter in point_lights(scene):
+        position = position_of(emitter)
         if boundary.contains(position):
             _refuse_inside(emitter, position)
     (medium,) = media_of(scene)
@@ -122,8 +146,8 @@ def bake_general(scene: mi.Scene) -> list[MediumGrid]:
             'shape that only bounds a medium needs <bsdf type="null"/>.',
         )
     _warn_of_scale(scene, grids)
-    for emitter in _point_lights(scene):
-        position = _position(emitter)
+    for emitter in point_lights(scene):
+        position = position_of(emitter)
         pointer = probe(scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
         if dr.any(pointer != None):  # noqa: E711
             _refuse_inside(emitter, position)
@@ -255,17 +279,6 @@ def _warn_of_scale(scene: mi.Scene, grids: list[MediumGrid]) -> None:
                 f"in this scene skip up to {offset:.1g}, as in volpath: light is lost. Scale the "
                 "scene up, or move it to the origin.",
             )
-
-
-def _point_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    flag = mi.EmitterFlags.DeltaPosition
-    return [e for e in scene.emitters() if mi.has_flag(e.flags(), flag)]
-
-
-def _position(emitter: mi.Emitter) -> np.ndarray:
-    params = mi.traverse(emitter)
-    position = params["position"] if "position" in params else params["to_world"].translation()
-    return np.array(position, dtype=np.float64).ravel()
 
 
 def _refuse_inside(emitter: mi.Emitter, position: np.ndarray) -> None:

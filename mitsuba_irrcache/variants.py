@@ -23,3 +23,12 @@ def require_variant(variant: str) -> None:
         f'irrcache does not run in variant "{variant}": {reason}. '
         f"Use mi.set_variant with one of: {', '.join(SUPPORTED)}."
     )
+
+
+def require_same_variant(made: str, current: str) -> None:
+    """Raises IrrcacheError where a scene is to be rendered in another variant than it is of."""
+    if made != current:
+        raise IrrcacheError(
+            f'irrcache: the scene was loaded in variant "{made}", and "{current}" is set now; load '
+            f'it again, or say mi.set_variant("{made}").'
+        )

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache import BATCH, LAYERS, IrradianceCache
+from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers import volume_path
 from mitsuba_irrcache.tracking import free_flight, transmittance
@@ -155,6 +156,7 @@ class _Estimator:
     ) -> None:
         orders = _orders(cache)
         self.scene, self.medium, self.cache = scene, medium, cache
+        self.places = Places(scene, cache.grid)
         self.multiple = orders > 1
         self.orders, self.seed, self.rr_depth = (
             dr.opaque(mi.UInt32, n) for n in (orders, seed, rr_depth)
@@ -189,7 +191,7 @@ class _Estimator:
         within = lane - row * per_batch + dr.opaque(mi.UInt32, start)
         place = dr.gather(mi.UInt32, voxels, lane // per_voxel)
         voxel = dr.gather(mi.UInt32, cache.active, place)
-        layers = self._layers(cache.grid.centers(voxel), batch, within, voxel)
+        layers = self._layers(self.places.of(voxel), batch, within, voxel)
         double = dr.float64_array_t(mi.Float)
         # A layer that is zero throughout comes as a literal without a width.
         none = dr.zeros(mi.Float, dr.width(lane))

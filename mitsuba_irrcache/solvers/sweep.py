@@ -16,6 +16,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.grid import Field, Grid, GridField
+from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.lattice import Lattice
@@ -78,7 +79,7 @@ class Sweep:
                 )
                 for c in range(max(len(albedo), len(sigma_t)))
             ]
-        self._direct = self._sky.near_light(medium, grid.centers(cache.active))
+        self._direct = self._sky.near_light(medium, Places(scene, grid).of(cache.active))
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Adds ``samples`` directions per voxel, a multiple of the cache's batch.

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.dicom_lengths import check_lengths
 
 _POSITION = "0020|0032"
 _ORIENTATION = "0020|0037"
@@ -30,10 +31,13 @@ def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> V
         series: SeriesInstanceUID.
 
     Raises:
-        IrrcacheError: no DICOM files, several series and none named, a single slice, or slices
-            missing, doubled or unevenly spaced.
+        IrrcacheError: no DICOM files, a truncated one, several series and none named, a single
+            slice, or slices missing, doubled or unevenly spaced.
     """
     folder = Path(folder)
+    for file in sorted(folder.iterdir()):
+        if file.is_file():
+            check_lengths(file)
     uid = _choose_series(folder, series)
     files = _series_files(folder, uid)
     if len(files) < 2:

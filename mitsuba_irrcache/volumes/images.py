@@ -13,6 +13,7 @@ import SimpleITK
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.dicom_lengths import check_lengths
 
 EXTENSIONS = (".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".dcm")
 # Deflate cannot shrink anything further than this (zlib.net/zlib_tech.html).
@@ -21,6 +22,8 @@ _COMPRESSED = re.compile(
     rb"^(?:encoding:\s*(?:gz|gzip|bz2|bzip2)|CompressedData\s*=\s*True)\s*$", re.I | re.M
 )
 _DETACHED = re.compile(rb"^(?:data ?file:\s*|ElementDataFile\s*=\s*)(.+?)\s*$", re.I | re.M)
+_DIMENSIONS = re.compile(rb"^\s*NDims\s*[=:]\s*([-+]?\d+)", re.M)
+_MOST_DIMENSIONS = 10
 _COMPONENT_BYTES = {
     SimpleITK.sitkUInt8: 1,
     SimpleITK.sitkInt8: 1,
@@ -45,6 +48,10 @@ def read_image(path: str | os.PathLike) -> VolumeData:
     path = Path(path)
     if not path.is_file():
         raise IrrcacheError(f"volume file {path} does not exist")
+    if path.suffix == ".dcm":
+        check_lengths(path)
+    if path.suffix.lower() in (".mha", ".mhd"):
+        _check_dimensions(path)
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
     try:
@@ -66,6 +73,16 @@ def read_image(path: str | os.PathLike) -> VolumeData:
         direction=np.array(image.GetDirection()).reshape(3, 3),
         source=str(path),
     )
+
+
+def _check_dimensions(path: Path) -> None:
+    """Refuses a MetaImage of more dimensions than MetaIO has places for: it does not look."""
+    with path.open("rb") as stream:
+        found = _DIMENSIONS.search(stream.read(64 * 1024))
+    if found is not None and not 1 <= float(found[1]) <= _MOST_DIMENSIONS:
+        raise IrrcacheError(
+            f"{path} says that it has {found[1].decode()} dimensions; a volume has 3"
+        )
 
 
 def _check_scalar_volume(path: Path, reader: SimpleITK.ImageFileReader) -> None:
@@ -93,7 +110,9 @@ def _image_bytes(path: Path, reader: SimpleITK.ImageFileReader) -> int:
 def _check_file_holds(path: Path, image_bytes: int) -> None:
     """Compare what the header promises with the file, and unpack a ``.gz`` once to its end."""
     if path.suffix == ".dcm":
-        return  # the pixel data may be compressed by any codec; GDCM checks it
+        # The pixel data may be compressed by any codec.
+        _check_ratio(path, path.stat().st_size, image_bytes)
+        return
     if path.suffix == ".gz":
         _check_ratio(path, path.stat().st_size, image_bytes)
         _check_gzip(path, image_bytes)

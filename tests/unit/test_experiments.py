@@ -10,6 +10,8 @@ import pytest
 from experiments import analysis, methods, scenes
 from experiments.figure2 import plot as figure2_plot
 from experiments.figure2 import run as figure2_run
+from experiments.mutation.mutants import MUTANTS
+from experiments.mutation.run import PROJECT
 from experiments.options import FULL, QUICK, Options, Size
 from experiments.others import run as others_run
 from experiments.recording import LATE, STRIP, Recording, times
@@ -194,3 +196,11 @@ def test_scenes_of_others_are_skipped_without_data(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(others_run, "SCENES", absent)
     others_run.run(Options(output=tmp_path))
     assert capsys.readouterr().out.count("skipped") == 2
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda m: m.name)
+def test_mutants_fit_the_library(mutant):
+    """Each still has one place to change, changes it, and names tests that there are."""
+    text = (PROJECT / "mitsuba_irrcache" / mutant.file).read_text()
+    assert text.count(mutant.old) == 1 and mutant.new != mutant.old
+    assert all((PROJECT / test).is_file() for test in mutant.tests)

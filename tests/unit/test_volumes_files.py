@@ -122,6 +122,35 @@ def test_dicom_is_sorted_by_position_and_rescaled(tmp_path):
     assert volume.unit == "HU"
 
 
+@pytest.mark.parametrize("how", ["data", "about the file"])
+def test_dicom_that_promises_more_than_it_has(tmp_path, how):
+    """One wrong byte in a slice of a kilobyte took gigabytes; it is refused by name now."""
+    write_dicom(tmp_path / "ct", [0.0, 1.0, 2.0])
+    file = tmp_path / "ct" / "a07.dcm"
+    content = file.read_bytes()
+    if how == "data":  # the number of rows: 2 bytes long
+        lie = content.replace(
+            struct.pack("<HHI", 0x28, 0x10, 2), struct.pack("<HHI", 0x28, 0x10, 2**31)
+        )
+        said = r"\(0028,0010\) promises 2147483648 bytes"
+    else:
+        lie = content.replace(b"\x02\0\x02\0UI", b"\x02\0\x02\0\1\2")
+        said = "no element"
+    assert lie != content
+    file.write_bytes(lie)
+    with pytest.raises(IrrcacheError, match=rf"a07\.dcm.*{said}"):
+        read_volume(tmp_path / "ct")
+
+
+@pytest.mark.parametrize("count", [0, -3, 11, 2147483648])
+def test_meta_images_of_impossible_dimensions(tmp_path, count):
+    """2^31 of them ended the process."""
+    file = write_image(tmp_path / "a.mha", ramp())
+    file.write_bytes(file.read_bytes().replace(b"NDims = 3", b"NDims = %d" % count))
+    with pytest.raises(IrrcacheError, match=rf"a\.mha says that it has {count} dimensions"):
+        read_volume(file)
+
+
 def test_tilted_gantry_is_placed_as_it_was(tmp_path):
     write_dicom(tmp_path / "ct", [0.0, 2.0, 4.0], shear=0.5)
     volume = read_volume(tmp_path / "ct")

@@ -1,0 +1,203 @@
+"""Faults as they are made: each a line of the library that is wrong in one place, with the tests
+that should say so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+CLOSED_FORMS = "tests/correctness/test_closed_forms.py"
+SWEEP = "tests/system/test_sweep.py"
+UNBIASED = "tests/system/test_unbiased.py"
+PROJECTION = "tests/unit/test_projection.py"
+CACHE = "tests/unit/test_cache.py"
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """``old``, which occurs once in ``file`` (of mitsuba_irrcache), is replaced by ``new``."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+MUTANTS = (
+    Mutant(
+        "a factor 4 pi dropped (projection)",
+        "projection.py",
+        "albedo * phi * dr.inv_four_pi, known",
+        "albedo * phi, known",
+        (CLOSED_FORMS,),
+    ),
+    Mutant(
+        "1 % of what is scattered lost (sweep)",
+        "solvers/scattering.py",
+        "phi * self.albedo * dr.inv_four_pi",
+        "phi * self.albedo * (0.99 * dr.inv_four_pi)",
+        (SWEEP,),
+    ),
+    Mutant(
+        "cache voxels shifted by half a voxel",
+        "grid.py",
+        "*self.places(index)) + 0.5)",
+        "*self.places(index)))",
+        (CLOSED_FORMS,),
+    ),
+    Mutant(
+        "lookups shifted by half a voxel",
+        "grid.py",
+        "s = dr.clip(u - 0.5, 0.0",
+        "s = dr.clip(u, 0.0",
+        ("tests/unit/test_grid.py",),
+    ),
+    Mutant(
+        "extinction of coarse caches shifted by half a voxel (sweep)",
+        "solvers/lattice.py",
+        "self.lower[k] * ratio[k] - 0.5, self",
+        "self.lower[k] * ratio[k], self",
+        (SWEEP,),
+    ),
+    Mutant(
+        "the cosine of the slope forgotten: length of a line in a slice (sweep)",
+        "solvers/lattice.py",
+        "[1 / abs(velocity[axis]), *ways",
+        "[1 / np.linalg.norm(velocity), *ways",
+        (SWEEP,),
+    ),
+    Mutant(
+        "the cosine of the slope forgotten: area of a line (sweep)",
+        "solvers/lattice.py",
+        "mi.Vector4f(0, middle, lost * area, weight * tau * area)",
+        "mi.Vector4f(0, middle, lost, weight * tau)",
+        (SWEEP,),
+    ),
+    Mutant(
+        "lines that leave through a side go on with their light (sweep)",
+        "solvers/lattice.py",
+        "return voxel, position, dr.select(outside, self.since(position), 1.0)",
+        "return voxel, position, dr.select(outside, mi.Float(1.0), 1.0)",
+        (SWEEP,),
+    ),
+    Mutant(
+        "sharpening with the wrong sign (sweep)",
+        "solvers/lattice.py",
+        "change += here - there",
+        "change += there - here",
+        (SWEEP,),
+    ),
+    Mutant(
+        "light of an environment from the other side (sweep)",
+        "solvers/directions.py",
+        "interaction.wi = mi.Vector3f(directions.T",
+        "interaction.wi = mi.Vector3f(-directions.T",
+        (SWEEP,),
+    ),
+    Mutant(
+        "the last segment skipped",
+        "projection.py",
+        "active &= t < far",
+        "active &= t + step < far",
+        (PROJECTION,),
+    ),
+    Mutant(
+        "the curvature of a segment with the wrong sign",
+        "projection.py",
+        "dr.maximum(1 - 2 * sag / (a + b), 0)",
+        "dr.maximum(1 + 2 * sag / (a + b), 0)",
+        (PROJECTION,),
+    ),
+    Mutant(
+        "rays stopped at 5 % of their light",
+        "projection.py",
+        "EARLY_STOP = 1e-4",
+        "EARLY_STOP = 5e-2",
+        (PROJECTION,),
+    ),
+    Mutant(
+        "the background in front of the medium",
+        "sight.py",
+        "View(scattered, transmittance * background, transmittance",
+        "View(scattered, background, transmittance",
+        (CLOSED_FORMS,),
+    ),
+    Mutant(
+        "one order of scattering too many (path)",
+        "solvers/path.py",
+        "order = mi.UInt32(1)",
+        "order = mi.UInt32(0)",
+        (UNBIASED,),
+    ),
+    Mutant(
+        "a bounce counted twice (path)",
+        "solvers/path.py",
+        "scattered += dr.select(active, weight * light, 0)",
+        "scattered += dr.select(active, weight * light * dr.select(order == 2, 2, 1), 0)",
+        (UNBIASED,),
+    ),
+    Mutant(
+        "the albedo forgotten (path)",
+        "solvers/path.py",
+        "weight *= medium.albedo.at_world(position, active)",
+        "weight *= 1",
+        (UNBIASED,),
+    ),
+    Mutant(
+        "roulette without its weight (path)",
+        "solvers/path.py",
+        "            weight /= survival\n",
+        "",
+        (UNBIASED,),
+    ),
+    Mutant(
+        "1 % of all collisions missed (path)",
+        "tracking.py",
+        "choice * majorant < sigma_t)",
+        "choice * majorant < 0.99 * sigma_t)",
+        ("tests/unit/test_tracking.py", UNBIASED, CLOSED_FORMS),
+    ),
+    Mutant(
+        "roulette without its weight (transmittance)",
+        "tracking.py",
+        "result * (ROULETTE_BELOW / largest), 0)",
+        "result, 0)",
+        ("tests/unit/test_tracking.py", UNBIASED),
+    ),
+    Mutant(
+        "emitters counted twice: sampled and met (surfaces)",
+        "transport.py",
+        "share = dr.select(sampled, power_heuristic(pdf, density), 1)",
+        "share = mi.Float(1)",
+        ("tests/system/test_surfaces.py",),
+    ),
+    Mutant(
+        "light scattered backwards (phase functions)",
+        "phase.py",
+        "found.p, found.wi = p, -direction",
+        "found.p, found.wi = p, direction",
+        ("tests/system/test_phase.py",),
+    ),
+    Mutant(
+        "standard errors of samples, not of batches",
+        "cache.py",
+        "spread / (n * (n - 1))",
+        "spread / (n * (n * self.batch - 1))",
+        (CACHE,),
+    ),
+    Mutant(
+        "roots of noisy values not made up for",
+        "cache.py",
+        "return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)",
+        "return 1 + 0 * variance",
+        (CACHE,),
+    ),
+    Mutant(
+        "means of two caches not weighted by their samples",
+        "cache.py",
+        "(n * more / (n + more))",
+        "(n * more / (n + more + 1))",
+        (CACHE,),
+    ),
+)

@@ -1,0 +1,82 @@
+"""Whether the elements of a DICOM file are where they say they are.
+
+A file of a kilobyte can say that one of its elements is 4 GB long. GDCM believes it, and takes the
+memory before it finds out. So lengths are looked at before.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+from mitsuba_irrcache.errors import IrrcacheError
+
+_PREAMBLE, _MAGIC = 128, b"DICM"
+#: Value representations whose length has 4 bytes, after 2 that are reserved.
+_LONG = {b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"}
+_IMPLICIT, _BIG, _DEFLATED = (
+    "1.2.840.10008.1.2",
+    "1.2.840.10008.1.2.2",
+    "1.2.840.10008.1.2.1.99",
+)
+#: Written by some instead of a value representation.
+_UNKNOWN = {b"??", b"  ", b"\0\0"}
+_META, _ITEM = 0x0002, 0xFFFE
+_TRANSFER_SYNTAX = (0x0002, 0x0010)
+_UNDEFINED = 0xFFFFFFFF
+
+
+def check_lengths(path: str | os.PathLike) -> None:
+    """Walks over the elements of a DICOM file; other files, and what cannot be followed, are left
+    to the reader.
+
+    Raises:
+        IrrcacheError: an element reaches beyond the end of the file, or is none.
+    """
+    path = Path(path)
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        if stream.read(_PREAMBLE + 4)[_PREAMBLE:] != _MAGIC:
+            return
+        syntax = ""
+        while stream.tell() + 8 <= size:
+            tag, length = _header(stream, syntax)
+            if length is None or (syntax == _DEFLATED and tag[0] != _META):
+                return
+            if length == _UNDEFINED:
+                continue  # its items follow, each with a header of its own
+            end = stream.tell() + length
+            if end > size:
+                raise IrrcacheError(
+                    f"{path} is truncated or damaged: its element ({tag[0]:04x},{tag[1]:04x}) "
+                    f"promises {length} bytes up to byte {end}, but the file has {size}; copy it "
+                    "again"
+                )
+            if tag == _TRANSFER_SYNTAX:
+                syntax = stream.read(length).rstrip(b"\0 ").decode("ascii", "replace")
+            stream.seek(end)
+
+
+def _header(stream: BinaryIO, syntax: str) -> tuple[tuple[int, int], int | None]:
+    """Tag and length of the next element; no length where it has no known form."""
+    start = stream.read(8)
+    # The part about the file itself is always explicit and little endian.
+    meta = struct.unpack("<H", start[:2])[0] == _META
+    order = ">" if syntax == _BIG and not meta else "<"
+    tag = struct.unpack(order + "HH", start[:4])
+    if tag[0] == _ITEM or (syntax == _IMPLICIT and not meta):
+        return tag, struct.unpack(order + "I", start[4:])[0]
+    form = start[4:6]
+    if form in _UNKNOWN:
+        return tag, None
+    if not (form.isalpha() and form.isupper()):
+        raise IrrcacheError(
+            f"{stream.name} is damaged: at byte {stream.tell() - 8} there is no element of a DICOM "
+            "file; copy it again"
+        )
+    if form not in _LONG:
+        return tag, struct.unpack(order + "H", start[6:])[0]
+    rest = stream.read(4)
+    return tag, struct.unpack(order + "I", rest)[0] if len(rest) == 4 else None

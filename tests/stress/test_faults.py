@@ -1,0 +1,225 @@
+"""What happens to a cache when the world around it fails.
+
+Many more kills and damaged files: ``make stress``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from experiments.faults import formats, run
+from experiments.stability.worlds import Matter, scene
+from mitsuba_irrcache.cache import IrradianceCache
+from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
+from mitsuba_irrcache.files import ABANDONED, atomic_write
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SETTINGS = {"solver": "path", "resolution": 4, "cache_spp": 8, "max_depth": 2}
+
+
+def filled(file: Path, samples: int, sigma_t: float = 1.0) -> mi.Scene:
+    """A scene with a cache of so many samples, which is in the file."""
+    settings = SETTINGS | {"cache_file": str(file), "cache_spp": samples}
+    built = scene(settings, Matter(sigma_t))
+    built.integrator().prepare(built)
+    return built
+
+
+WRITER = """
+import sys
+sys.modules["package"] = package = type(sys)("package")  # without Mitsuba, which takes a second
+package.__path__ = ["mitsuba_irrcache"]
+from package.files import atomic_write
+content = [bytes([n]) * (1 << 22) for n in range(8)]
+for n in range(10**6):
+    with atomic_write(sys.argv[1]) as file:
+        for start in range(0, 1 << 22, 1 << 20):
+            file.write(content[n % 8][start : start + (1 << 20)])
+    print(n, flush=True)
+"""
+
+
+def test_killed_while_writing(tmp_path):
+    """A process that writes nothing but one file of 4 MB, killed at 6 moments: it is always whole,
+    and the next one clears away what was left, once that is old enough.
+    """
+    file, rng = tmp_path / "light.cache", np.random.default_rng(3)
+    for _ in range(6):
+        command = [sys.executable, "-c", WRITER, str(file)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2])
+        process.stdout.readline()
+        time.sleep(rng.uniform(0.02, 0.08))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        content = np.fromfile(file, np.uint8)
+        assert content.size == 1 << 22 and (content == content[0]).all()
+    assert any(tmp_path.glob(".light.cache.*.tmp"))  # some were hit in the middle
+
+
+def test_what_killed_processes_left_is_removed(tmp_path):
+    old, new = tmp_path / ".a.bin.x.tmp", tmp_path / ".a.bin.y.tmp"
+    for path in (old, new, tmp_path / ".b.bin.x.tmp"):
+        path.write_bytes(b"half")
+    past = time.time() - ABANDONED - 1
+    os.utime(old, (past, past))
+    with atomic_write(tmp_path / "a.bin") as file:
+        file.write(b"whole")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {".a.bin.y.tmp", ".b.bin.x.tmp", "a.bin"}
+
+
+CROWDED = """
+import os, resource, sys
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from experiments.stability.worlds import Matter, scene
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+settings = {"solver": "path", "resolution": 4, "cache_spp": 8, "max_depth": 2}
+built = scene(settings | {"cache_file": sys.argv[1] + "/light.cache"}, Matter())
+print(mi.render(built, spp=1).array[0] > 0, os.listdir(sys.argv[1]))
+os.chmod(sys.argv[1], 0o555)
+os.setuid(65534)
+built = scene(settings | {"cache_file": sys.argv[1] + "/light.cache"}, Matter(0.5))
+try:
+    built.integrator().prepare(built)
+except Exception as error:
+    print(error, built.integrator().cache)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits of this kind")
+def test_a_full_disk_and_a_folder_that_is_read_only():
+    """Full disk: the image is there, with a warning, and no half of a file. Read-only folder: that
+    is said before any work is done. (It takes root to become a user who may not write there.)
+    """
+    with tempfile.TemporaryDirectory() as folder:  # pytest's are out of reach for others
+        os.chmod(folder, 0o755)
+        command = [sys.executable, "-c", CROWDED, folder]
+        said = subprocess.run(
+            command, capture_output=True, text=True, cwd=Path(__file__).parents[2], timeout=100
+        )
+    assert "True []" in said.stdout, said
+    assert "cache was not saved" in said.stdout + said.stderr
+    if "PermissionError" not in said.stderr:
+        assert "nothing can be written" in said.stdout and said.stdout.strip().endswith("None")
+
+
+def test_a_file_that_another_process_has_filled_further(tmp_path):
+    """Two processes share a file: the one that has fewer samples does not overwrite the other's."""
+    file = tmp_path / "light.cache"
+    slow = filled(file, 8)
+    filled(file, 64)
+    slow.integrator().cache_spp = 16
+    slow.integrator().prepare(slow)
+    assert slow.integrator().cache.samples == 16
+    assert IrradianceCache.load(file).samples == 64
+
+
+def test_a_file_that_another_scene_has_taken_meanwhile(tmp_path):
+    """Both began without a file; the second to end finds it taken, and leaves it alone."""
+    file = tmp_path / "light.cache"
+    settings = SETTINGS | {"cache_file": str(file)}
+    slow = scene(settings, Matter(2.0))
+    slow.integrator().progress = lambda *_: file.exists() or filled(file, 8)
+    slow.integrator().prepare(slow)
+    assert slow.integrator().cache.samples == 8
+    again = filled(file, 8)  # still the first one's: it would be refused else
+    assert again.integrator().cache.samples == 8
+
+
+def rewritten(file: Path, **changes) -> None:
+    """Changes what a cache file says of itself."""
+    arrays = dict(np.load(file))
+    description = json.loads(arrays["description"].tobytes()) | changes
+    arrays["description"] = np.frombuffer(json.dumps(description).encode(), np.uint8)
+    with file.open("wb") as stream:
+        np.savez(stream, **arrays)
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"shape": [4000, 4000, 4000]},
+        {"to_world": (2 * np.eye(4)).tolist()},
+        {"batch": 0},
+        {"batch": 7},
+        {"streams": {"0": -8}},
+        {"streams": [8]},
+        {"max_depth": 3},
+    ],
+    ids=str,
+)
+def test_files_that_lie_are_refused(tmp_path, lie):
+    """Their fingerprint is that of the scene, but for one thing that they say."""
+    file = tmp_path / "light.cache"
+    filled(file, 8)
+    rewritten(file, **lie)
+    with pytest.raises((IrrcacheError, RuntimeError), match=r"light\.cache"):
+        filled(file, 8)
+
+
+@pytest.mark.parametrize(("value", "said"), [(-1e-3, "negative"), (1e300, "not finite")])
+def test_impossible_light_is_refused(tmp_path, value, said):
+    """Negative, or finite in double precision only."""
+    file = tmp_path / "light.cache"
+    filled(file, 8)
+    arrays = dict(np.load(file))
+    arrays["totals"][0, 3] = value
+    with file.open("wb") as stream:
+        np.savez(stream, **arrays)
+    with pytest.raises(CacheFileError, match=said):
+        IrradianceCache.load(file)
+
+
+def test_volumes_that_were_tampered_with():
+    """20 mutants of a file, read in a process of its own; all formats: ``make stress``."""
+    (nrrd,) = (f for f in formats.FORMATS if f.name == "a.nrrd")
+    tally = run.fuzz(nrrd, 20)
+    assert tally.tried == 20 and not tally.failed, tally
+
+
+def test_caches_that_were_tampered_with(tmp_path):
+    """60 mutants and lies: refused by name, or read and finite."""
+    (cache_format,) = (f for f in formats.FORMATS if f.name == "light.cache")
+    file = tmp_path / "light.cache"
+    cache_format.make(file)
+    content, refused = file.read_bytes(), 0
+    for index in range(60):
+        file.write_bytes(cache_format.mutate(content, np.random.default_rng((2, index))))
+        try:
+            cache_format.read(file)
+        except CacheFileError:
+            refused += 1
+    assert 30 < refused <= 60
+
+
+def test_memory_is_predicted(tmp_path):
+    """What a cache takes is said before it is taken, in bytes, with the remedy."""
+    too_large = scene({"solver": "sweep", "resolution": 5000}, Matter())
+    with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB.*are free; lower resolution"):
+        too_large.integrator().prepare(too_large)
+
+
+def test_another_variant_in_the_middle():
+    """A scene belongs to the variant that it was loaded in; back in that one, all is as before."""
+    built = scene(SETTINGS, Matter())
+    before = np.array(mi.render(built, spp=1))
+    try:
+        mi.set_variant("llvm_ad_mono")
+        with pytest.raises(IrrcacheError, match=r"llvm_ad_rgb.*load it again"):
+            built.integrator().prepare(built)
+    finally:
+        mi.set_variant("llvm_ad_rgb")
+    np.testing.assert_array_equal(np.array(mi.render(built, spp=1)), before)

@@ -1,0 +1,96 @@
+"""Hazards from `experiments.stability`, a quick choice of them; all of them: ``make stress``."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments.stability import properties as p
+from experiments.stability.hazards import SETTINGS, Case, cases
+from experiments.stability.run import described, run_case
+from experiments.stability.worlds import Camera, Matter, World, scene
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+#: One or two of each hazard: those that failed once, and those that are most extreme.
+CHOSEN = {
+    "optical depth": ("1e+30, white", "1000, white"),
+    "extinction": ("1e-45 and 1e-40",),
+    "albedo": ("0", "0.9999999"),
+    "world scale": ("1e-06", "1e+06"),
+    "offset": ("100000", "1e+06", "1e+07"),
+    "voxels": ("1:1:100",),
+    "grid": ("1x1x1", "13x11x7, furnace"),
+    "rays": ("in faces and edges, furnace", "denormal, transmittance"),
+    "camera": ("on a corner (cube)", "1e6 away (sphere)"),
+    "light": ("a point at a voxel's centre beside a ball", "a texel of 1e+06"),
+    "film": ("1x1", "a crop of 0x0"),
+    "empty": ("1e-38 everywhere",),
+    "samples": ("2^25 in one voxel",),
+}
+
+
+def chosen() -> list[Case]:
+    """The cases of `CHOSEN`."""
+    return [case for case in cases() if case.name in CHOSEN.get(case.hazard, ())]
+
+
+def test_the_choice_names_cases_that_there_are(rgb):
+    assert len(chosen()) == sum(map(len, CHOSEN.values()))
+
+
+@pytest.mark.parametrize("hazard", CHOSEN)
+def test_hazards(hazard):
+    """The properties of `experiments.stability.properties`, both solvers, each with its bound."""
+    rows = []
+    for case in (c for c in chosen() if c.hazard == hazard):
+        rows += run_case(case, "llvm_ad_rgb", quadratures=("exponential",))
+    assert rows
+    assert not [described(row) for row in rows if not row["held"]]
+
+
+def test_no_segment_makes_light():
+    """The trapezoid's weights were half the optical depth of a segment, however opaque: a wall
+    shone 20 times brighter than the sky.
+    """
+    wall = Matter(np.full((4, 4, 4), 80.0, np.float32), 1.0)
+    settings = SETTINGS | {"solver": "sweep", "quadrature": "trapezoid"}
+    found = p.observe(scene(settings, wall), settings, 4)
+    name, error, admitted = p.no_brighter()(found)
+    assert error <= admitted, name
+
+
+EXTREME = [0.0, 1e-45, 1e-38, 1e-12, 1e-3, 0.1, 1.0, 10.0, 100.0]
+
+
+@st.composite
+def matters(draw) -> Matter:
+    """Media of any voxels, edges and placement."""
+    shape = tuple(draw(st.integers(1, 7)) for _ in range(3))
+    values = draw(st.lists(st.sampled_from(EXTREME), min_size=1, max_size=8))
+    sigma_t = np.resize(np.float32(values), shape)
+    edges = tuple(draw(st.sampled_from([0.02, 0.5, 2.0, 3.0])) for _ in range(3))
+    albedo = draw(st.sampled_from([0.0, 1e-30, 0.5, 1 - 1e-7, 1.0]))
+    kind = draw(st.sampled_from(["cube", "sphere"]))
+    turn = draw(st.sampled_from([0.0, 30.0, 45.0, 90.0]))
+    return Matter(sigma_t, albedo, edges, kind, turn, draw(st.booleans()))
+
+
+@settings(derandomize=True, max_examples=20, deadline=None, database=None)
+@given(
+    matter=matters(),
+    scale=st.sampled_from([1e-6, 1e-2, 1.0, 1e3, 1e6]),
+    origin=st.tuples(*[st.sampled_from([-3.0, -1.0, 0.0, 1e-40, 0.5, 1.0, 4.0])] * 3),
+    quadrature=st.sampled_from(["riemann", "trapezoid", "exponential"]),
+)
+def test_any_medium_under_a_white_sky(matter, scale, origin, quadrature):
+    """Finite, not negative, no brighter than the sky, at any scale and from anywhere."""
+    camera = Camera(origin, (0.3, 0.2, 0.1), 60.0)
+    options = SETTINGS | {"solver": "sweep", "quadrature": quadrature, "resolution": 6}
+    built = scene(options, matter, camera=camera, world=World(scale))
+    found = p.observe(built, options, 2)
+    for check in (p.finite, p.not_negative, p.no_brighter()):
+        name, error, admitted = check(found)
+        assert error <= admitted, name
