@@ -34,7 +34,8 @@ class Macrocells:
         self.sides = tuple(dr.opaque(mi.Int32, n) for n in shape[::-1])
 
     @staticmethod
-    def build(sigma_t: Field, boundary: Boundary) -> Macrocells:
+    def build(sigma_t: Field, boundary: Boundary | None) -> Macrocells:
+        """Of a constant, one cell over the ``boundary``."""
         if isinstance(sigma_t, ConstantField):
             majorant = dr.opaque(mi.Float, sigma_t.maximum)
             minorant = dr.opaque(mi.Float, sigma_t.minimum)

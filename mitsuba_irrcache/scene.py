@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from .boundary import Boundary, boundary_of
+from .emission import Emission, place_emission
 from .errors import UnsupportedSceneError
 from .medium import MediumGrid, bake, children
 from .phase import refuse_sharp
@@ -27,16 +28,21 @@ RAY_OFFSET = 9e-5
 LARGEST_OFFSET = 0.002
 
 
-def bake_media(scene: mi.Scene) -> list[MediumGrid]:
+def bake_media(scene: mi.Scene, emission: Emission | None = None) -> list[MediumGrid]:
     """The media of a scene that a camera may see other than through a surface, on their grids; none
-    where there are none.
+    where there are none. They shine with ``emission``.
 
     Raises UnsupportedSceneError, naming the object, for what would not be rendered right.
     """
     if not media_of(scene):
+        place_emission(emission, [])
         return []
     boundary = simple_boundary(scene)
-    return bake_general(scene) if boundary is None else [_bake_simple(scene, boundary)]
+    if boundary is None:
+        return bake_general(scene, emission)
+    grid = _bake_simple(scene, boundary)
+    place_emission(emission, [grid])
+    return [grid]
 
 
 def media_of(scene: mi.Scene) -> dict[mi.Medium, list[mi.Shape]]:
@@ -97,7 +103,7 @@ def _bake_simple(scene: mi.Scene, boundary: Boundary) -> MediumGrid:
     return grid
 
 
-def bake_general(scene: mi.Scene) -> list[MediumGrid]:
+def bake_general(scene: mi.Scene, emission: Emission | None = None) -> list[MediumGrid]:
     """The media of any scene on grids that know their `Surroundings`; only those that are seen."""
     shapes, grids, seen = scene.shapes(), [], []
     for shape in shapes:
@@ -115,6 +121,9 @@ def bake_general(scene: mi.Scene) -> list[MediumGrid]:
             if grid.phase is not None:
                 refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
     Surroundings(scene, grids)
+    place_emission(emission, grids)
+    if not seen and emission is not None:
+        _refuse("all media are behind surfaces, and the emission in them is unknown to volpath")
     if not seen:
         mi.Log(
             mi.LogLevel.Warn,
