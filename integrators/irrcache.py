@@ -100,6 +100,18 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
          the noise of the cache), ``bias`` (expected error of the luminance, from the resolution of
          the cache). (Default: none)
 
+     * - emission
+       - |float|, |rgb| or |volume|
+       - Light that media send out themselves (Mitsuba's have none): radiance emitted along each
+         unit of length [W m^-3 sr^-1], sigma_a L_e of the paper's eq. 1. Nothing multiplies it:
+         matter with no extinction can shine. A ``gridvolume`` lies in world space by its own
+         ``to_world``; media shine within it. Emission counts as an emitter: depth 1 shows it, 2
+         what is scattered once. ``hide_emitters`` does not hide it. (Default: none)
+
+     * - emission_scale
+       - |float|
+       - Multiplies the emission. (Default: 1)
+
      * - cache_file
        - |string|
        - Load the cache from this file if it is there, write it when it was computed. A file
@@ -169,7 +181,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             raise IrrcacheError(
                 f"irrcache: step is {self._step:g}; it must lie between 0.001 and 1000 voxel edges."
             )
-        self._builder = CacheBuilder(self._settings)
+        self._emission = props.get("emission", None)
+        scale = float(props.get("emission_scale", 1.0))
+        self._builder = CacheBuilder(self._settings, self._emission, scale)
         self._timeout = float(props.get("timeout", -1.0))
         self._stopping = Stopping()
         self._sight: SimpleSight | Sight | None = None
@@ -207,6 +221,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     @cache_spp.setter
     def cache_spp(self, samples: int) -> None:
         self._builder.samples = _checked("cache_spp", samples, 0, "0 (chosen) or a number")
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        super().traverse(callback)
+        if isinstance(self._emission, mi.Object):
+            callback.put("emission", self._emission, mi.ParamFlags.NonDifferentiable)
 
     def prepare(self, scene: mi.Scene) -> None:
         """Builds or completes the cache for ``scene``, unless it is up to date."""

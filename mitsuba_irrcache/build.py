@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from .cache import IrradianceCache
 from .choices import choose_solver
+from .emission import Emission, bake_emission
 from .fingerprint import Snapshot
 from .lit import CacheSettings, LitMedium
 from .medium import MediumGrid
@@ -30,8 +31,12 @@ Progress = Callable[[str, int, int], None]
 class CacheBuilder:
     """Keeps the media and caches of one scene up to date, and does no work twice."""
 
-    def __init__(self, settings: CacheSettings) -> None:
+    def __init__(
+        self, settings: CacheSettings, emission: object = None, emission_scale: float = 1.0
+    ) -> None:
+        """``emission`` is what `emission.bake_emission` takes; None: media do not shine."""
         self.settings = settings
+        self._emission, self._emission_scale = emission, emission_scale
         #: samples per voxel to build up to (0: chosen); a higher number refines the caches
         self.samples = settings.samples
         #: goes up with every change of a medium or a cache
@@ -62,7 +67,8 @@ class CacheBuilder:
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
         """Makes media and caches fit ``scene``."""
-        snapshot = Snapshot(scene)
+        volume = self._emission if isinstance(self._emission, mi.Volume) else None
+        snapshot = Snapshot(scene, volume)
         changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
         if self._snapshot is None or changes:
             edited = bool(changes) and id(scene) == self._scene_id
@@ -71,7 +77,7 @@ class CacheBuilder:
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             self.parts, self._snapshot = [], None
             self.revision += 1
-            media = bake_media(scene)
+            media = bake_media(scene, self._baked_emission())
             if media:
                 solver = choose_solver(scene, self.settings.solver, media[0])
             self.parts = [
@@ -81,6 +87,11 @@ class CacheBuilder:
             self._scene_id, self._snapshot = id(scene), snapshot
         for number, part in enumerate(self.parts):
             self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
+
+    def _baked_emission(self) -> Emission | None:
+        if self._emission is None:
+            return None
+        return bake_emission(self._emission, self._emission_scale)
 
     def _refine(self, scene: mi.Scene, part: LitMedium, progress: path.Progress | None) -> None:
         changed = True  # the solver may be stopped half-way

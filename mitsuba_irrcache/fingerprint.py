@@ -21,7 +21,8 @@ class Snapshot:
     changed.
     """
 
-    def __init__(self, scene: mi.Scene) -> None:
+    def __init__(self, scene: mi.Scene, emission: mi.Volume | None = None) -> None:
+        """``emission`` belongs to the integrator, which may not be the scene's."""
         camera_side = (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.ReconstructionFilter)
         params = mi.traverse(scene)
         self._values = {
@@ -29,6 +30,9 @@ class Snapshot:
             for key, entry in params.properties.items()
             if not isinstance(entry[2], camera_side)
         }
+        if emission is not None:
+            own = mi.traverse(emission)
+            self._values |= {f"emission.{key}": own[key] for key in own.keys()}
         self._identities = {key: _identity(value) for key, value in self._values.items()}
 
     def changes(self, other: Snapshot) -> list[str]:
@@ -70,6 +74,8 @@ def _medium_digest(medium: MediumGrid) -> str:
     parts = [*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()]
     if medium.phase is not None:
         parts.append(np.float32(medium.phase.moments))
+    if medium.emission is not None:
+        parts += ["emission", *_field_parts(medium.emission.field)]
     return _digest(*parts)
 
 

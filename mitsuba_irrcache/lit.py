@@ -127,7 +127,8 @@ class LitMedium:
         if medium.surroundings is not None:
             survey = medium.surroundings.survey(scene, grid, medium)
             active = dr.compress(survey.reach & _marked(grid, active))
-        if medium.albedo.maximum == 0 or not scene.emitters():
+        dark = not scene.emitters() and medium.emission is None
+        if medium.albedo.maximum == 0 or dark:
             active = mi.UInt32()
         mi.Log(
             mi.LogLevel.Info,

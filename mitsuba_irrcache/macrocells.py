@@ -34,8 +34,10 @@ class Macrocells:
         self.sides = tuple(dr.opaque(mi.Int32, n) for n in shape[::-1])
 
     @staticmethod
-    def build(sigma_t: Field, boundary: Boundary, size: int = 0) -> Macrocells:
-        """Blocks of ``size`` voxels along each edge; 0: at least 4, at most 64 blocks."""
+    def build(sigma_t: Field, boundary: Boundary | None, size: int = 0) -> Macrocells:
+        """Blocks of ``size`` voxels along each edge (0: at least 4, at most 64 blocks); of a
+        constant, one cell over the ``boundary``.
+        """
         if isinstance(sigma_t, ConstantField):
             majorant = dr.opaque(mi.Float, sigma_t.maximum)
             minorant = dr.opaque(mi.Float, sigma_t.minimum)

@@ -33,6 +33,8 @@ class MediumGrid:
         self.albedo = albedo
         self.boundary = boundary
         self.bbox = bbox
+        #: what it sends out itself; None where it does not (see `emission`)
+        self.emission: object | None = None
         #: None where it is isotropic
         self.phase: Phase | None = None
         #: what it is called among others
@@ -109,8 +111,8 @@ def bake(medium: mi.Medium, boundary: Boundary) -> MediumGrid:
         raise IrrcacheError(
             f"irrcache: {name} has scale {scale}; it must be finite and not negative."
         )
-    sigma_t = _field(volumes["sigma_t"], f"sigma_t of {name}", scale)
-    albedo = _field(volumes["albedo"], f"albedo of {name}", 1.0)
+    sigma_t = baked_field(volumes["sigma_t"], f"sigma_t of {name}", scale)
+    albedo = baked_field(volumes["albedo"], f"albedo of {name}", 1.0)
     if sigma_t.grid is not None and albedo.grid is not None:
         albedo.grid = albedo.grid.shared(sigma_t.grid)
     if albedo.maximum > 1.0 + 1e-6:
@@ -144,7 +146,8 @@ def children(node: mi.Object) -> dict[str, mi.Object]:
     return callback.found
 
 
-def _field(volume: mi.Volume, name: str, scale: float) -> Field:
+def baked_field(volume: mi.Volume, name: str, scale: float) -> Field:
+    """A ``constvolume`` or ``gridvolume`` times ``scale``; errors call it ``name``."""
     if volume.class_name() == "ConstVolume":
         return _constant(volume, name, scale)
     if volume.class_name() != "GridVolume":
@@ -257,10 +260,12 @@ def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
     )
     worst = float(dr.max(error)[0]) / scale
     if worst > 0.02:
-        raise UnsupportedSceneError(
-            f"irrcache: {name} does not interpolate as expected (difference of {worst:.1%} of its "
-            "maximum). "
-            'Only trilinear, clamped volumes are supported: use filter_type "trilinear" and '
-            'wrap_mode "clamp", '
-            'or render with "volpath".'
-        )
+        raise volume_error(f"{name}, off by {worst:.1%} of its maximum,")
+
+
+def volume_error(name: str) -> UnsupportedSceneError:
+    """For volumes whose values between the voxels are not those that are expected."""
+    return UnsupportedSceneError(
+        f"irrcache: {name} does not interpolate as expected. Only trilinear, clamped volumes are "
+        'supported: use filter_type "trilinear" and wrap_mode "clamp", or render with "volpath".'
+    )

@@ -1,7 +1,9 @@
 """Projection of the cache to the screen: ray marching of the radiative transfer equation (paper,
 eq. 1).
 
-    L = int T sigma_s Phi / (4 pi) dt + T L_background
+    L = int T (sigma_s Phi / (4 pi) + j) dt + T L_background
+
+where j is what the medium sends out itself (`emission`).
 
 One step is as long as the shortest voxel edge, of the medium's grids and the cache's, times
 ``step``; steps end on the medium's bounds, never beyond. The lattice of steps is shifted by a
@@ -20,6 +22,7 @@ import numpy as np
 from .directional import DirectionalField
 from .distance import chebyshev
 from .edges import Edges
+from .emission import Emission
 from .grid import ConstantField, Field, GridField
 from .layers import Layers, luminance
 from .macrocells import Macrocells, Walk
@@ -35,6 +38,12 @@ EARLY_STOP = 1e-4
 #: Where no more than these fractions of a ray's radiance can still be added, steps are twice and
 #: four times as long: what they miss, they miss of a small rest only.
 COARSER, COARSEST = 0.2, 0.03
+#: Points and weights of three-point quadrature over [0, 1].
+GAUSS_LEGENDRE = (
+    (0.5 - 0.3872983346, 5 / 18),
+    (0.5, 8 / 18),
+    (0.5 + 0.3872983346, 5 / 18),
+)
 #: Macrocells that rays look ahead for matter.
 REACH = 8
 
@@ -65,7 +74,8 @@ class Projection:
         #: surfaces that end the light, where there are any
         self.edges: Edges | None = None
         albedo = _constant_if_it_is(medium.albedo)
-        grids = [f.grid for f in (medium.sigma_t, medium.albedo, irradiance) if f and f.grid]
+        fields = medium.sigma_t, medium.albedo, irradiance, medium.emission
+        grids = [f.grid for f in fields if f and f.grid]
         # Where nothing varies, one step is exact.
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
         self.step = dr.opaque(mi.Float, float(length))
@@ -73,7 +83,9 @@ class Projection:
         if directional is not None:
             brightest *= directional.directional.phase.peak
         self.brightest = dr.opaque(mi.Float, brightest)
-        self.clearance = Clearance(medium.macrocells)
+        emission = medium.emission
+        self.brightest_emission = dr.opaque(mi.Float, emission.maximum if emission else 0.0)
+        self.clearance = Clearance(medium.macrocells, emission)
         needed = [medium.sigma_t]
         needed += [irradiance] if irradiance else []
         needed += [albedo] if irradiance or layered else []
@@ -129,8 +141,9 @@ class Projection:
         offset: mi.Float,
         active: mi.Bool,
     ):
-        """Scattered radiance and transmittance between ``near`` and ``far``, as two
-        ``mi.Spectrum``, and the sums that `layers` makes `Layers` of.
+        """Scattered radiance, transmittance and the radiance that the medium itself sends out,
+        between ``near`` and ``far``, each an ``mi.Spectrum``; between the last two the sums that
+        `layers` makes `Layers` of.
 
         ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is the
         radiance behind the medium, which early termination has to know.
@@ -146,9 +159,11 @@ class Projection:
         grey = self.medium.sigma_t.channels == 1
         view = self.seen_along(ray.d)
         transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
-        radiance = mi.Spectrum(0)
+        radiance, emitted, shine = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
+        emission = self.medium.emission
         gathered = self.nothing()
         brightest = dr.maximum(self.brightest, dr.max(background))
+        brightest += self.brightest_emission * dr.maximum(far - near, 0)
         # A float counts steps exactly up to 2^24; longer lattices are coarser, not endless.
         limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
         while dr.hint(active, label="ray march"):
@@ -192,23 +207,29 @@ class Projection:
                         (near_light, far_light),
                         (known, next_known),
                     )
+                if dr.hint(emission is not None, mode="scalar"):
+                    next_shine = mi.Spectrum(emission.at_world(ray(end), True))
+                    sides = emission_weights(self.quadrature, ends[0], length)
+                    emitted += transmittance * (sides[0] * shine + sides[1] * next_shine)
+                    shine = next_shine
                 transmittance *= passed
                 before, before_source, before_length = extinction, source, length
                 extinction, source, known = next_extinction, next_source, next_known
                 # The most that can still be added, over what there is (without any light: 1).
                 left = dr.max(mi.Spectrum(transmittance)) * dr.select(brightest == 0, 1, brightest)
-                sofar = dr.select(brightest == 0, 1, dr.max(radiance))
+                sofar = dr.select(brightest == 0, 1, dr.max(radiance + emitted))
                 active &= left > EARLY_STOP * sofar
                 if dr.hint(self.quadrature == "exponential", mode="scalar"):
                     stride = dr.select(left > COARSER * sofar, mi.UInt32(1), 2)
                     stride = dr.select(left > COARSEST * sofar, stride, 4)
+            shine = dr.select(skip, 0, shine)
             extinction = dr.select(skip, 0, extinction)
             before = dr.select(skip, 0, before)
             before_length = dr.select(skip, step, before_length)
             t = end
             k += 1
             active &= t < far
-        return radiance, mi.Spectrum(transmittance), gathered
+        return radiance, mi.Spectrum(transmittance), gathered, emitted
 
     def _nowhere(self) -> tuple:
         """What `fetch` returns, of no place."""
@@ -259,13 +280,16 @@ class Projection:
 
 
 class Clearance:
-    """For each macrocell the Chebyshev distance to the nearest one with extinction, in macrocells:
-    0 where it has some itself, at most `REACH`.
+    """For each macrocell the Chebyshev distance to the nearest one with extinction or light of its
+    own, in macrocells: 0 where it has some itself, at most `REACH`.
     """
 
-    def __init__(self, cells: Macrocells) -> None:
+    def __init__(self, cells: Macrocells, emission: Emission | None = None) -> None:
         self.cells = cells
-        self.distance = chebyshev(cells.majorant > 0, cells.shape, REACH)
+        occupied = cells.majorant > 0
+        if emission is not None:
+            occupied |= emission.reaches(cells)
+        self.distance = chebyshev(occupied, cells.shape, REACH)
 
     def exit(self, walk: Walk, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Float]:
         """Whether the place at ``t`` is empty, and the distance along the ray, at least ``t``, up
@@ -367,9 +391,36 @@ def exponential_weights(tau_a, tau_b) -> tuple:
     empty end of a segment that enters a surface far too much.
     """
     near = 0.0
-    for u, weight in ((0.5 - 0.3872983346, 5 / 18), (0.5, 8 / 18), (0.5 + 0.3872983346, 5 / 18)):
+    for u, weight in GAUSS_LEGENDRE:
         near = near + weight * absorptance(u * (tau_a * (1 - 0.5 * u) + tau_b * (0.5 * u)))
     return near, dr.maximum(absorptance(0.5 * (tau_a + tau_b)) - near, 0.0)
+
+
+def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
+    """Weights of the emission at both ends of a segment, int_0^1 (1 - u | u) e^-tau(u) du times its
+    ``length``; ``sigma`` is the extinction at both ends.
+
+    ``exponential`` takes both as linear. With s such that ds is in proportion to e^-m u du, m the
+    optical depth, what is left to integrate is e^-(tau(u) - m u), 1 where extinction is constant:
+    exact there, whatever the depth, and 4 % off at worst where it rises from 0 to 20. ``riemann``
+    and ``trapezoid`` are what they are for scattered light.
+    """
+    sigma_a, sigma_b = sigma
+    mean = 0.5 * (sigma_a + sigma_b) * length
+    zero = dr.zeros(type(mean))
+    if quadrature == "riemann":
+        return zero + length, zero
+    if quadrature == "trapezoid":
+        return zero + 0.5 * length, 0.5 * length * dr.exp(-mean)
+    absorbed, thin = absorptance(mean), mean < 1e-3
+    bend = 0.5 * (sigma_a - sigma_b) * length
+    near, far = zero, zero
+    for s, weight in GAUSS_LEGENDRE:
+        u = dr.select(thin, s, -dr.log(1 - s * absorbed) / dr.select(thin, 1, mean))
+        part = weight * dr.exp(-bend * u * (1 - u))
+        near, far = near + part * (1 - u), far + part * u
+    scale = length * dr.select(thin, 1 - 0.5 * mean, absorbed / dr.select(thin, 1, mean))
+    return scale * near, scale * far
 
 
 def absorptance(tau):

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from .boundary import Boundary, boundary_of
+from .emission import Emission, place_emission
 from .errors import UnsupportedSceneError
 from .lamps import point_lights, position_of
 from .medium import MediumGrid, bake, children
@@ -30,14 +31,15 @@ LARGEST_OFFSET = 0.002
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
 
 
-def bake_media(scene: mi.Scene) -> list[MediumGrid]:
+def bake_media(scene: mi.Scene, emission: Emission | None = None) -> list[MediumGrid]:
     """The media of a scene that a camera may see other than through a surface, on their grids; none
-    where there are none.
+    where there are none. They shine with ``emission``.
 
     Raises UnsupportedSceneError, naming the object, for what would not be rendered right.
     """
     media = media_of(scene)
     if not media:
+        place_emission(emission, [])
         return []
     for medium, shapes in media.items():
         for shape in shapes:
@@ -45,7 +47,11 @@ def bake_media(scene: mi.Scene) -> list[MediumGrid]:
             finest = (upper - lower).max() / STEPS_OF_A_SIDE
             _check_distance(medium.id(), np.abs([lower, upper]).max(), finest)
     boundary = simple_boundary(scene)
-    grids = bake_general(scene) if boundary is None else [_bake_simple(scene, boundary)]
+    if boundary is None:
+        grids = bake_general(scene, emission)
+    else:
+        grids = [_bake_simple(scene, boundary)]
+        place_emission(emission, grids)
     for grid in grids:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
@@ -121,7 +127,7 @@ def _bake_simple(scene: mi.Scene, boundary: Boundary) -> MediumGrid:
     return grid
 
 
-def bake_general(scene: mi.Scene) -> list[MediumGrid]:
+def bake_general(scene: mi.Scene, emission: Emission | None = None) -> list[MediumGrid]:
     """The media of any scene on grids that know their `Surroundings`; only those that are seen."""
     shapes, grids, seen = scene.shapes(), [], []
     for shape in shapes:
@@ -139,6 +145,9 @@ def bake_general(scene: mi.Scene) -> list[MediumGrid]:
             if grid.phase is not None:
                 refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
     Surroundings(scene, grids)
+    place_emission(emission, grids)
+    if not seen and emission is not None:
+        _refuse("all media are behind surfaces, and the emission in them is unknown to volpath")
     if not seen:
         mi.Log(
             mi.LogLevel.Warn,

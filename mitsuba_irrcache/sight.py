@@ -23,8 +23,8 @@ FAINT = 0.1
 
 class View:
     """What rays have found: ``scattered`` light of the media, ``background`` (emitters and
-    surfaces, seen through the media), the ``transmittance`` of the way, ``alpha``, and the sums
-    that `Projection.layers` makes layers of.
+    surfaces, seen through the media, and light of these themselves), the ``transmittance`` of the
+    way, ``alpha``, and the sums that `Projection.layers` makes layers of.
     """
 
     def __init__(
@@ -70,13 +70,15 @@ class SimpleSight:
         entered = entry > -1e-5 * (leave - entry)
         hit &= (far > 0) if medium is not None else entered
         near = dr.maximum(near, 0)
-        scattered, transmittance, gathered = self.projection.march(
+        scattered, transmittance, gathered, emitted = self.projection.march(
             ray, near, far, background, 1 - sampler.next_1d(active), active & hit
         )
+        if self.lit:
+            background = transmittance * background + emitted
         alpha = mi.Float(1)
         if not visible:  # dr.mean would write the number of samples into the kernel
             alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
-        return View(scattered, transmittance * background, transmittance, alpha, gathered)
+        return View(scattered, background, transmittance, alpha, gathered)
 
 
 class Sight:
@@ -167,9 +169,12 @@ class Sight:
                 hit, entry, leave = projection.medium.intersect(ray)
                 entry, leave = dr.maximum(entry, near), dr.minimum(leave, far)
                 hit &= active & (pointer == projection.medium.pointer)
-                found, through, sums = projection.march(ray, entry, leave, bright, offset, hit)
+                found, through, sums, shine = projection.march(
+                    ray, entry, leave, bright, offset, hit
+                )
                 scale = luminance(passed)
                 scattered += passed * found
+                background += dr.select(lit, passed * shine, 0)
                 gathered = _added(gathered, sums, passed, scale)
                 passed *= through
             # Emitters, and what lies behind them if they are hidden.

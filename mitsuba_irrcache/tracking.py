@@ -30,8 +30,9 @@ def free_flight(
     rng: mi.PCG32,
     active: mi.Bool,
 ):
-    """Delta tracking from ``near`` to ``far``: whether the ray collides, where, and the weight
-    carried on.
+    """Delta tracking from ``near`` to ``far``: whether the ray collides, where, the weight carried
+    on, the generator, and the radiance that the medium itself has added, an unbiased estimate of
+    int T j dt times the weight.
 
     With grey extinction the weight is unchanged. With coloured extinction a collision is accepted
     with the probability that the current weights give it, and the weights make up for each
@@ -43,7 +44,10 @@ def free_flight(
     active = mi.Bool(active) & (near < far)
     collided = mi.Bool(False)
     grey = medium.sigma_t.channels == 1
-    weight = mi.Spectrum(weight)
+    weight, emitted = mi.Spectrum(weight), mi.Spectrum(0)
+    shines_from, shines_to = near, far
+    if dr.hint(medium.emission is not None, mode="scalar"):
+        shines_from, shines_to = medium.emission.interval(ray, near, far)
     while dr.hint(active, label="free flight"):
         majorant = walk.majorant(cell, active)
         wall, following = walk.exit(cell, t)
@@ -52,6 +56,11 @@ def free_flight(
         tentative = active & ~leaves
         sigma_t = medium.sigma_t.at_world(ray(candidate), tentative)
         choice = rng.next_float32(active)
+        if dr.hint(medium.emission is not None, mode="scalar"):
+            begin = dr.maximum(t, shines_from)
+            end = dr.minimum(dr.select(leaves, wall, candidate), shines_to)
+            light, rng = medium.emission.between(ray, begin, end, rng, active & (begin < end))
+            emitted += weight * light
         if dr.hint(grey, mode="scalar"):
             collides = tentative & (choice * majorant < sigma_t)
         else:
@@ -65,7 +74,7 @@ def free_flight(
         t = dr.select(leaves, wall, candidate)
         cell = dr.select(leaves, following, cell)
         active &= ~collides & (t < far)
-    return collided, t, weight, rng
+    return collided, t, weight, rng, emitted
 
 
 @dr.syntax

@@ -42,21 +42,22 @@ class Media:
         weight: mi.Spectrum,
         rng: mi.PCG32,
         active: mi.Bool,
-    ) -> tuple[mi.Bool, mi.Float, mi.Spectrum, mi.PCG32]:
-        """Free flight up to ``far``: whether the ray collides, where, and its weight behind that,
-        the albedo included.
+    ) -> tuple[mi.Bool, mi.Float, mi.Spectrum, mi.PCG32, mi.Spectrum]:
+        """Free flight up to ``far``: whether the ray collides, where, its weight behind that, the
+        albedo included, the generator, and what the media on the way send out, weighted.
         """
-        collided, t = mi.Bool(False), mi.Float(far)
+        collided, t, emitted = mi.Bool(False), mi.Float(far), mi.Spectrum(0)
         for grid in self.grids:
             hit, near, end = grid.intersect(ray)
             hit &= active & (pointer == grid.pointer)
             near, end = dr.maximum(near, 0), dr.minimum(end, far)
-            here, place, weight, rng = free_flight(grid, ray, near, end, weight, rng, hit)
+            here, place, weight, rng, light = free_flight(grid, ray, near, end, weight, rng, hit)
+            emitted += light
             albedo = mi.Spectrum(grid.albedo.at_world(ray(place), here))
             weight = dr.select(here, weight * albedo, weight)
             t = dr.select(here, place, t)
             collided |= here
-        return collided, t, weight, rng
+        return collided, t, weight, rng, emitted
 
     def transmittance(
         self, pointer: mi.MediumPtr, ray: mi.Ray3f, far: mi.Float, rng: mi.PCG32, active: mi.Bool
@@ -172,8 +173,8 @@ def trace(
     active: mi.Bool,
     cached: Callable | None = None,
 ):
-    """One path per lane: radiance that came straight from emitters, radiance that was scattered,
-    whether anything was scattered, and the random generator.
+    """One path per lane: radiance that came straight from emitters or media that shine, radiance
+    that was scattered, whether anything was scattered, and the random generator.
 
     ``cached``, if given, maps a medium, a ray and a distance to a position in it and a mask to the
     irradiance there (as much as the ray sees of it), and whether it is known; where it is, paths
@@ -197,7 +198,12 @@ def trace(
         weight = dr.select(active, weight / survival, weight)
 
         si = scene.ray_intersect(ray, active)
-        collided, t, weight, rng = media.fly(pointer, ray, si.t, weight, rng, active & ~clear)
+        collided, t, weight, rng, light = media.fly(
+            pointer, ray, si.t, weight, rng, active & ~clear
+        )
+        first = depth == start.depth
+        straight += dr.select(first, light, 0)
+        scattered += dr.select(first, 0, light)
         clear = mi.Bool(False)
         surface = active & ~collided
         met |= collided
@@ -221,7 +227,6 @@ def trace(
         density = scene.pdf_emitter_direction(last, record, sampled)
         share = dr.select(sampled, power_heuristic(pdf, density), 1)
         light = dr.select(glows, weight * emitter.eval(si, glows) * share, 0)
-        first = depth == start.depth
         straight += dr.select(first, light, 0)
         scattered += dr.select(first, 0, light)
         surface &= si.is_valid()

@@ -69,7 +69,9 @@ class Sky:
     and narrow, and point-like lights nearby.
     """
 
-    def __init__(self, scene: mi.Scene) -> None:
+    def __init__(self, scene: mi.Scene, glows: bool = False) -> None:
+        """``glows``: there is light besides, whose colour is its own."""
+        self._glows = glows
         self._environment = scene.environment()
         self._suns, self._near = [], []
         for emitter in scene.emitters():
@@ -92,7 +94,7 @@ class Sky:
         brightest = light.max(axis=(0, 1))
         colour = brightest / brightest.max() if brightest.max() > 0 else np.ones(channels)
         apart = np.abs(light - light.max(axis=-1, keepdims=True) * colour)
-        if not self._near and apart.max() <= 1e-6 * light.max():
+        if not self._near and not self._glows and apart.max() <= 1e-6 * light.max():
             return [[(d, light.max(axis=-1), w, o) for d, light, w, o in tables]], colour
         by_channel = [
             [(d, light[..., c], w, o) for d, light, w, o in tables] for c in range(channels)

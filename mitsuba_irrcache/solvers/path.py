@@ -45,7 +45,8 @@ def refine(
     The stream goes on where an earlier call with the same seed stopped. If ``progress`` raises,
     passes that are complete stay in the cache.
     """
-    if not cache.active_count or _orders(cache) < 1 or not scene.emitters():
+    dark = not scene.emitters() and medium.emission is None
+    if not cache.active_count or _orders(cache) < 1 or dark:
         cache.note_samples(seed, samples)
         return
     estimator = _Estimator(scene, medium, cache, seed, rr_depth)
@@ -157,7 +158,8 @@ class _Estimator:
         orders = _orders(cache)
         self.scene, self.medium, self.cache = scene, medium, cache
         self.places = Places(scene, cache.grid)
-        self.multiple = orders > 1
+        # Light of the medium itself is found on the way to the next collision.
+        self.multiple = orders > 1 or medium.emission is not None
         self.orders, self.seed, self.rr_depth = (
             dr.opaque(mi.UInt32, n) for n in (orders, seed, rr_depth)
         )
@@ -270,19 +272,24 @@ def _estimate(
     uncollided, rng = direct_light(
         scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always
     )
-    scattered = mi.Spectrum(0)
+    scattered, glowing = mi.Spectrum(0), medium.emission is not None
+    further = 1 if glowing else 0  # flights beyond the last collision
     if dr.hint(multiple, mode="scalar"):
         weight = mi.Spectrum(1)
         direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
         order = mi.UInt32(1)
-        active = order < orders
+        active = order - further < orders
         while dr.hint(active, label="scattering orders"):
             ray = mi.Ray3f(position, direction)
             hit, near, far = medium.intersect(ray)
             near = dr.maximum(near, 0)
-            collided, t, weight, rng = free_flight(
+            collided, t, weight, rng, light = free_flight(
                 medium, ray, near, far, weight, rng, active & hit
             )
+            if dr.hint(glowing, mode="scalar"):
+                uncollided += dr.select(order == 1, 4 * dr.pi * light, 0)
+                scattered += dr.select(order == 1, 0, 4 * dr.pi * light)
+                active &= order < orders
             active &= collided
             position = dr.select(active, ray(t), position)
             weight *= medium.albedo.at_world(position, active)
@@ -297,7 +304,7 @@ def _estimate(
             sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
             direction = mi.warp.square_to_uniform_sphere(sample)
             order += 1
-            active &= order < orders
+            active &= order - further < orders
     return uncollided, scattered
 
 

@@ -1,9 +1,10 @@
 """The solver ``sweep``: light is carried along lines that all voxels share, all voxels at once.
 
 See `lattice` for the lines, `directions` for where they point, `scattering` for light that is
-scattered more than once. A batch is a chain of its own, with random numbers of its own: batches are
-independent of each other, so their scatter is the error of their mean, whatever the voxels and
-orders of scattering in a batch share.
+scattered more than once, `glow` for light of the medium itself, which is followed voxel by voxel. A
+batch is a chain of its own, with random numbers of its own: batches are independent of each other,
+so their scatter is the error of their mean, whatever the voxels and orders of scattering in a batch
+share.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.directions import Sky
+from mitsuba_irrcache.solvers.glow import emitted_light
 from mitsuba_irrcache.solvers.lattice import Lattice
 from mitsuba_irrcache.solvers.scattering import Level
 
@@ -55,7 +57,7 @@ class Sweep:
         self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int
     ) -> None:
         self.cache, self.seed = cache, seed
-        self._sky = Sky(scene)
+        self._sky = Sky(scene, medium.emission is not None)
         if not cache.active_count:
             return
         grid = cache.grid
@@ -79,7 +81,9 @@ class Sweep:
                 )
                 for c in range(max(len(albedo), len(sigma_t)))
             ]
-        self._direct = self._sky.near_light(medium, Places(scene, grid).of(cache.active))
+        self._medium, self._places = medium, Places(scene, grid).of(cache.active)
+        self._direct = self._sky.near_light(medium, self._places)
+        self._emitted: list[mi.Spectrum] = []  # of a batch
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Adds ``samples`` directions per voxel, a multiple of the cache's batch.
@@ -108,6 +112,9 @@ class Sweep:
             pairs, passes = DIRECTIONS // 2, cache.batch // DIRECTIONS + 1
         rng = np.random.default_rng((self.seed, number))
         tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
+        if self._medium.emission is not None:
+            light = emitted_light(self._medium, self._places, cache.batch, self.seed, number)
+            self._emitted = [light]
         found: dict[tuple[int, int], tuple] = {}
         layers = [], []
         for c in range(cache.channels):
@@ -149,7 +156,8 @@ class Sweep:
         lit = entering.any(axis=1)
         values = lattice.carry(directions[lit], entering[lit], offsets[lit])
         from_far = values * dr.opaque(mi.Float, 1 / len(rows))
-        return from_far, from_far + sum(near[light] for near in self._direct)
+        near = sum(emitted[light] for emitted in (*self._direct, *self._emitted))
+        return from_far, from_far + near
 
     def _collided(self, level: Level, row: tuple, light: int) -> mi.Float:
         """Mean irradiance of collisions, of all orders but the last."""
@@ -165,7 +173,7 @@ class Sweep:
         return phi
 
     def _with_near_light(self, volume: mi.Float, channel: int) -> mi.Float:
-        for light in self._direct:
+        for light in (*self._direct, *self._emitted):
             dr.eval(volume)
             dr.scatter_reduce(dr.ReduceOp.Add, volume, light[channel], self.cache.active)
         dr.eval(volume)

@@ -49,11 +49,13 @@ class Comparison:
 def compare(scenes):
     """A function: renders a scene with both integrators."""
 
-    def run(shape, max_depth=-1, irrcache=None, spp=SPP, hide=False, **objects) -> Comparison:
+    def run(
+        shape, max_depth=-1, irrcache=None, spp=SPP, hide=False, stock="volpath", **objects
+    ) -> Comparison:
         depth = {"max_depth": max_depth, "rr_depth": 1000, "hide_emitters": hide}
         settings = {"resolution": 16, "cache_spp": 64} | (irrcache or {})
         mine = scenes.load({"type": "irrcache", **depth, **settings}, shape, **objects)
-        stock = scenes.load({"type": "volpath", **depth}, shape, **objects)
+        stock = scenes.load({"type": stock, **depth}, shape, **objects)
         images = [scenes.image(mine, spp=spp // 4, seed=seed) for seed in (1, 2)]
         images += [scenes.image(stock, spp=spp, seed=seed) for seed in (1, 2)]
         return Comparison(*images)
@@ -111,6 +113,16 @@ def test_rgb_grids(scenes, compare):
 def test_homogeneous_rgb(scenes, compare, max_depth):
     medium = scenes.medium((1.0, 1.2, 1.4), (0.9, 0.6, 0.95))
     compare(scenes.boundary(medium), max_depth).check()
+
+
+@pytest.mark.parametrize("max_depth", [2, -1])
+def test_chromatic_extinction(scenes, compare, max_depth):
+    """1 : 4 : 12, at default settings, against ``volpathmis``: volpath, which samples the mean of
+    the channels, has 250 times its variance in the thin one here. Measured: 0.4 to 0.6 %.
+    """
+    medium = scenes.medium((0.5, 2.0, 6.0), (0.95, 0.9, 0.8))
+    settings = {"resolution": 0, "cache_spp": 0, "solver": "auto"}
+    compare(scenes.boundary(medium), max_depth, settings, 1024, stock="volpathmis").check(rmse=0.01)
 
 
 def test_constant_albedo_in_a_heterogeneous_medium(scenes, compare):

@@ -35,7 +35,7 @@ def march(projection, origin, direction, background=0.0, offset=1.0, lanes=1):
     ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
     _, near, far = projection.medium.intersect(ray)
     near = dr.maximum(near, 0) + dr.zeros(mi.Float, lanes)
-    radiance, transmittance, gathered = projection.march(
+    radiance, transmittance, gathered, _ = projection.march(
         ray, near, far, mi.Spectrum(background), shift, mi.Bool(True)
     )
     assert not gathered, "without layers nothing else is gathered"
@@ -210,7 +210,7 @@ def test_skipping_empty_macrocells_changes_nothing():
     for cells in (medium.macrocells, occupied):
         medium.macrocells = cells
         projection = Projection(medium, irradiance, "exponential", 1.0)
-        radiance, passed, _ = projection.march(ray, near, far, mi.Spectrum(1), offset, hit)
+        radiance, passed, *_ = projection.march(ray, near, far, mi.Spectrum(1), offset, hit)
         results.append([np.array(v.x) for v in (radiance, passed)])
     assert results[0][0].max() > 0.1
     np.testing.assert_allclose(results[0], results[1], rtol=1e-4, atol=1e-5)

@@ -71,7 +71,7 @@ def test_free_flights_have_the_density_of_the_medium(channels):
     """
     medium, values = column_medium(channels)
     ray, near, rng = lanes(-1.0)
-    collided, t, weight, _ = free_flight(
+    collided, t, weight, *_ = free_flight(
         medium, ray, near, near + 2.0, mi.Spectrum(1.0), rng, mi.Bool(True)
     )
     collided, t, weight = np.array(collided), np.array(t), np.array(weight, dtype=np.float64)
@@ -93,7 +93,7 @@ def test_coloured_weights_stay_bounded():
     """
     medium, _ = column_medium(3, 4.0)
     ray, near, rng = lanes(-1.0)
-    _, _, weight, _ = free_flight(
+    _, _, weight, *_ = free_flight(
         medium, ray, near, near + 2.0, mi.Spectrum(1.0), rng, mi.Bool(True)
     )
     weight = np.array(weight)

@@ -1,0 +1,251 @@
+"""Light that media send out themselves, which Mitsuba's have not: against closed forms, and in
+enclosures where everything has to be as bright as everything else.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SKY = {"type": "constant", "radiance": 1.0}
+DARK = {"emitter": None, "sun": None}
+DENSITY = (5, 6, 7)
+SOLVERS = ["path", "sweep"]
+
+
+def straight_ahead(scenes, size: int = 8) -> dict:
+    """A sensor that looks along z at the square [-0.5, 0.5]^2, by parallel rays."""
+    look = mi.ScalarTransform4f().look_at([0, 0, -5], [0, 0, 0], [0, 1, 0])
+    film = scenes.description({}, None, size)["sensor"]["film"]
+    half = mi.ScalarTransform4f().scale([0.5, 0.5, 1])
+    return {"type": "orthographic", "to_world": look @ half, "film": film}
+
+
+def rendered(scenes, shape, emission, spp: int = 4, size: int = 8, objects=None, **settings):
+    """The image, in parallel rays unless ``objects`` has a sensor, and the scene."""
+    integrator = {"type": "irrcache", "emission": emission, "resolution": 16} | settings
+    objects = {"sensor": straight_ahead(scenes, size)} | DARK | (objects or {})
+    scene = scenes.load(integrator, shape, **objects)
+    return scenes.image(scene, spp=spp), scene
+
+
+def prepare(scenes, shape, emission, **settings) -> None:
+    """As far as the cache: what it raises is not wrapped by Mitsuba."""
+    scene = scenes.load({"type": "irrcache", "emission": emission} | settings, shape, **DARK)
+    scene.integrator().prepare(scene)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-3, 0.7, 40.0])
+@pytest.mark.parametrize("emission", [2.0, {"type": "rgb", "value": [1.0, 2.0, 0.0]}])
+def test_homogeneous_slab(scenes, sigma, emission):
+    """Two units of j that absorbs: j / sigma (1 - exp(-sigma s)), j s where nothing is absorbed."""
+    shape = scenes.boundary(scenes.medium(sigma, 0.0))
+    found, _ = rendered(scenes, shape, emission, emission_scale=1.5)
+    j = 1.5 * np.array([1.0, 2.0, 0.0] if isinstance(emission, dict) else [2.0] * 3)
+    expected = j * (2.0 if sigma == 0 else -np.expm1(-sigma * 2) / sigma)
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=2e-5)
+
+
+@pytest.mark.parametrize("quadrature", ["riemann", "trapezoid", "exponential"])
+def test_heterogeneous_slab(scenes, quadrature):
+    """Coloured extinction and emission that both vary along the ray, against fine quadrature."""
+    z = (np.arange(24) + 0.5) / 24
+    column = np.ones((24, 1, 1, 1))
+    sigma_t = (6 * z**2)[:, None, None, None] * [1.0, 0.5, 2.0] * column
+    j = (4 * z * (1 - z))[:, None, None, None] * [1.0, 2.0, 3.0] * column
+    place = scenes.placement()
+    shape = scenes.boundary(scenes.medium(sigma_t, 0.0, place), place)
+    settings = {"quadrature": quadrature, "step": 0.1}
+    found, _ = rendered(scenes, shape, scenes.volume(j, place), spp=16, **settings)
+    t = (np.arange(40000) + 0.5) / 20000
+    for c in range(3):
+        sigma, shine = (np.interp(t / 2, z, v[:, 0, 0, c]) for v in (sigma_t, j))
+        depth = np.cumsum(sigma) - 0.5 * sigma
+        expected = (np.exp(-depth / 20000) * shine).sum() / 20000
+        tolerance = 2e-2 if quadrature == "riemann" else 1e-3
+        assert found[..., c].mean() == pytest.approx(expected, rel=tolerance)
+
+
+def test_flame_in_empty_space(scenes):
+    """A block of light where the medium is empty, in front of matter that shades its back half."""
+    sigma_t = np.zeros((32, 8, 8), np.float32)
+    sigma_t[28:] = 1.0
+    place = scenes.placement()
+    shape = scenes.boundary(scenes.medium(sigma_t, 0.0, place), place)
+    flame = scenes.placement((2.0, 2.0, 0.5), center=(0, 0, -0.3))
+    found, _ = rendered(scenes, shape, scenes.volume(np.full((2, 2, 2), 3.0), flame), spp=64)
+    np.testing.assert_allclose(found.mean(), 3.0 * 0.5, rtol=5e-3)
+    np.testing.assert_allclose(found, 3.0 * 0.5, rtol=0.03)  # the block's faces cut steps
+    behind = scenes.placement((2.0, 2.0, 0.2), center=(0, 0, 1.0))  # all in matter, half outside
+    light = scenes.volume(np.full((2, 2, 2), 3.0), behind)
+    found, _ = rendered(scenes, shape, light, spp=64, step=0.2)
+    t = np.linspace(0.9, 1.0, 2001)
+    z = np.interp(np.linspace(0, 1.0, 20001), *_profile(sigma_t[:, 0, 0]))
+    depth = np.interp(t, np.linspace(0, 1.0, 20001), np.cumsum(z) / 20000)
+    assert found.mean() == pytest.approx(3.0 * np.trapezoid(np.exp(-depth), t), rel=5e-3)
+
+
+def _profile(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres in [-1, 1] and values of voxels in a row."""
+    return (np.arange(len(values)) + 0.5) / len(values) * 2 - 1, values
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_uncollided_light_in_a_sphere(scenes, solver):
+    """Phi = int_S2 j / sigma (1 - e^(-sigma s)) dw at every voxel, s the way out."""
+    shape = scenes.boundary(scenes.medium(1.0, 0.5), scenes.placement(), "sphere")
+    settings = {"solver": solver, "max_depth": 2, "resolution": 15, "cache_spp": 512}
+    _, scene = rendered(scenes, shape, 0.7, size=2, **settings)
+    cache = scene.integrator().cache
+    z, y, x = np.indices(cache.grid.shape)
+    place = (np.stack([x, y, z], axis=-1) + 0.5) / 7.5 - 1
+    r = np.linalg.norm(place, axis=-1)
+    cosine, weight = np.polynomial.legendre.leggauss(200)
+    way = r[..., None] * cosine + np.sqrt(np.maximum(1 - r[..., None] ** 2 * (1 - cosine**2), 0))
+    expected = 2 * np.pi * 0.7 * (weight * -np.expm1(-way)).sum(axis=-1)
+    inside = r < 0.99
+    measured = np.array(cache.uncollided)[..., 0]
+    ratio = measured[inside] / expected[inside]
+    assert ratio.mean() == pytest.approx(1, abs=2e-3)
+    assert ratio.std() < 0.05
+    assert not np.array(cache.scattered).any()
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_equilibrium(scenes, solver):
+    """Matter that emits what it absorbs, (1 - albedo) sigma_t, under a sky of 1: all is 1, in every
+    colour, with all orders of scattering; with fewer there is less of it.
+    """
+    place = scenes.placement(turn=25)
+    density, albedo = scenes.texture(DENSITY, 0.0, 3.0, 4), np.array([0.9, 0.6, 0.2])
+    shape = scenes.boundary(scenes.medium(density, albedo, place), place)
+    j = scenes.volume(density[..., None] * (1 - albedo), place)
+    settings = {"solver": solver, "cache_spp": 256, "rr_depth": 1000}
+    objects = {"emitter": SKY, "sensor": scenes.description({}, None, 24)["sensor"]}
+    found, _ = rendered(scenes, shape, j, 16, objects=objects, **settings)
+    assert np.abs(found.mean(axis=(0, 1)) - 1).max() < 4e-3
+    assert np.abs(found - 1).max() < 0.05
+    less = rendered(scenes, shape, j, 4, objects=objects, max_depth=3, **settings)[0]
+    assert less.mean() < found.mean() - 1e-3
+
+
+def test_equilibrium_among_surfaces(scenes):
+    """The same with grey balls that shine as much as they do not reflect, one in the medium, one
+    beside it, and two media, one of them with coloured extinction.
+    """
+    density, albedo = scenes.texture(DENSITY, 0.5, 2.0, 4), 0.7
+    place = scenes.placement()
+    fog = scenes.medium(density, albedo, place) | {"id": "fog"}
+    glow = {"type": "area", "radiance": 0.5}
+    grey = {"type": "diffuse", "reflectance": 0.5}
+    ball = {"type": "sphere", "radius": 0.4, "bsdf": grey, "glow": glow}
+    other = scenes.medium((1.0, 2.0, 0.5), 1.0)
+    objects = {
+        "fog": fog,
+        "inner": ball | {"center": [0.3, 0.2, 0], "exterior": {"type": "ref", "id": "fog"}},
+        "outer": ball | {"center": [-0.8, 1.6, -0.5]},
+        "clean": scenes.boundary(other, scenes.placement(center=(2.2, 0, 0))),
+        "emitter": SKY,
+        "sensor": scenes.description({}, None, 24)["sensor"],
+    }
+    shape = scenes.boundary({"type": "ref", "id": "fog"}, place)
+    # The clean medium absorbs nothing, and the volume ends before it.
+    j = scenes.volume((1 - albedo) * density, place)
+    settings = {"resolution": 16, "cache_spp": 64, "rr_depth": 1000}
+    found, _ = rendered(scenes, shape, j, 32, objects=objects, **settings)
+    assert np.abs(found.mean(axis=(0, 1)) - 1).max() < 6e-3
+    assert np.sqrt(((found - 1) ** 2).mean()) < 0.03
+
+
+def flame(scenes) -> tuple[dict, dict]:
+    """Coloured light in a corner of a cloud, some of it in an empty part."""
+    place = scenes.placement()
+    density = scenes.texture((8, 8, 8), 0.5, 3.0, 4)
+    density[:4, :4] = 0
+    shape = scenes.boundary(scenes.medium(density, 0.9, place), place)
+    light = scenes.texture((4, 4, 4, 3), 0.0, 1.0, 8) * [9.0, 3.0, 1.0]
+    where = scenes.placement((0.9, 0.8, 1.0), turn=30, center=(0.1, -0.2, -0.1))
+    return shape, scenes.volume(light, where)
+
+
+@pytest.mark.parametrize("max_depth", [2, 3, -1])
+def test_solvers_agree(scenes, max_depth):
+    """Order by order, in every colour; with rays from outside of all planes of symmetry."""
+    shape, light = flame(scenes)
+    objects = {"sensor": scenes.description({}, None, 24)["sensor"]}
+    settings = {"max_depth": max_depth, "resolution": 32, "cache_spp": 256, "rr_depth": 1000}
+    settings["objects"] = objects
+    images = [rendered(scenes, shape, light, 16, solver=s, **settings)[0] for s in SOLVERS]
+    means = [image.mean(axis=(0, 1)) for image in images]
+    np.testing.assert_allclose(*means, rtol=0.01)
+    assert np.sqrt(((images[0] - images[1]) ** 2).mean()) < 0.02 * images[0].mean()
+
+
+def test_orders(scenes):
+    """Nothing of depth 0; at depth 1 what reaches the camera unscattered, which is background."""
+    shape, light = flame(scenes)
+    assert not rendered(scenes, shape, light, max_depth=0)[0].any()
+    settings = {"aovs": "colour,illumination,background", "solver": "sweep"}
+    values = rendered(scenes, shape, light, max_depth=2, cache_spp=64, **settings)[0]
+    image, colour, illumination, background = np.split(values, 4, axis=-1)
+    np.testing.assert_allclose(colour * illumination + background, image, rtol=1e-4, atol=1e-5)
+    seen = rendered(scenes, shape, light, max_depth=1)[0]
+    assert background.mean() == pytest.approx(seen.mean(), rel=0.02)  # in steps of other lengths
+    assert seen.mean() > 0.1 and image.mean() > 1.05 * seen.mean()
+
+
+def test_mono(mono, scenes):
+    shape = scenes.boundary(scenes.medium(0.5, 0.5))
+    colour = {"type": "rgb", "value": [1.0, 1.0, 1.0]}
+    found, _ = rendered(scenes, shape, colour, max_depth=1)
+    np.testing.assert_allclose(found, 2 * -np.expm1(-1.0), rtol=1e-5)
+
+
+def test_edits_renew_the_cache(scenes, tmp_path):
+    shape, light = flame(scenes)
+    file = str(tmp_path / "light.npz")
+    settings = {"max_depth": 2, "cache_spp": 16, "cache_file": file}
+    before, scene = rendered(scenes, shape, light, **settings)
+    cache = scene.integrator().cache
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.endswith("emission.data")]
+    params[key] = 2 * params[key]
+    params.update()
+    after = scenes.image(scene, spp=4)
+    assert scene.integrator().cache is not cache
+    np.testing.assert_allclose(after.mean(), 2 * before.mean(), rtol=1e-4)
+    with pytest.raises(CacheFileError, match="medium"):
+        prepare(scenes, shape, light, emission_scale=2.0, **settings)
+
+
+BAD = {
+    "negative": (-1.0, {}, "not negative"),
+    "infinite": (float("inf"), {}, "finite"),
+    "text": ("bright", {}, "must be a number, a colour"),
+    "scale": (1.0, {"emission_scale": -2.0}, "emission_scale is -2"),
+}
+
+
+@pytest.mark.parametrize(("emission", "settings", "message"), BAD.values(), ids=BAD)
+def test_bad_values_are_refused(scenes, emission, settings, message):
+    with pytest.raises(IrrcacheError, match=message):
+        prepare(scenes, scenes.boundary(scenes.medium(1.0, 0.5)), emission, **settings)
+
+
+def test_bad_volumes_are_refused(scenes):
+    shape, values = scenes.boundary(scenes.medium(1.0, 0.5)), np.ones((3, 3, 3))
+    values[1, 2, 0] = -1
+    with pytest.raises(IrrcacheError, match=r"emission.*\(z, y, x\) = \(1, 2, 0\)"):
+        prepare(scenes, shape, scenes.volume(values))
+    values[1, 2, 0] = 5
+    with pytest.raises(IrrcacheError, match=r"emission.*trilinear"):
+        prepare(scenes, shape, scenes.volume(values, filter_type="nearest"))
+    with pytest.raises(IrrcacheError, match=r"no medium.*to_world"):
+        prepare(scenes, shape, scenes.volume(values, scenes.placement(center=(5, 0, 0))))
+    with pytest.raises(IrrcacheError, match=r"emission.*medium"):
+        prepare(scenes, None, 1.0)
