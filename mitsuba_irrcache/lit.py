@@ -219,7 +219,9 @@ class LitMedium:
         settings, cache = self.settings, self.cache
         if self.solver == "sweep":
             if self._sweep is None:
-                self._sweep = sweep.Sweep(scene, self.medium, cache, settings.seed)
+                self._sweep = sweep.Sweep(
+                    scene, self.medium, cache, settings.seed, settings.rr_depth
+                )
             self._sweep.refine(missing, progress)
         else:
             path.refine(

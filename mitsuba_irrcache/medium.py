@@ -33,6 +33,8 @@ class MediumGrid:
         self.albedo = albedo
         self.boundary = boundary
         self.bbox = bbox
+        #: whether there is no more to its bounds than ``boundary``; others are larger than it
+        self.exact = True
         #: None where it is isotropic
         self.phase: Phase | None = None
         #: what it is called among others

@@ -20,7 +20,7 @@ arithmetic, and the odd part of what is integrated over directions cancels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -131,13 +131,22 @@ class Lattice:
                 for k in across
                 for x in (ratio[k], self.lower[k] * ratio[k] - 0.5, self.detail.resolution[k] - 1)
             ]
-        return Table(integers, numbers, axes)
+        rows = Rows(axes, velocities[np.arange(count), axes] > 0, integers)
+        return Table(integers, numbers, rows)
 
-    def carry(self, directions: np.ndarray, light: np.ndarray, offsets: np.ndarray) -> mi.Float:
+    def carry(
+        self,
+        directions: np.ndarray,
+        light: np.ndarray,
+        offsets: np.ndarray,
+        entering: Callable | None = None,
+    ) -> mi.Float:
         """Irradiance at the centres of all voxels of the grid: the light that enters along pairs of
-        directions, told as in `table`.
+        directions, told as in `table`; instead of that ``light``, line by line, if a function of
+        the table is given that makes `Entering`.
         """
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
+        table.entering = entering(table) if entering is not None else None
         total = dr.opaque(mi.Float, 0, self.grid.voxel_count)
         for axis, pairs in table.by_axis:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
@@ -181,13 +190,19 @@ class Lattice:
             first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
             which = dr.gather(mi.UInt32, table.ordered, first + row)
             lane = lanes - row * lines
-            _sweep(self._all_corners[axis], self._own, volume, source, table, which, lane, True)
+            _sweep(
+                self._all_corners[axis], self._own, volume, source, table, table.entering, which,
+                lane, True,
+            )  # fmt: skip
             dr.eval(volume)
             return
         corners = self._corners_across(axis)  # one set at a time is kept
         dr.eval(corners)
         for i in pairs:
-            _sweep(corners, self._own, volume, source, table, table.places[i], self._lanes, False)
+            _sweep(
+                corners, self._own, volume, source, table, table.entering, table.places[i],
+                self._lanes, False,
+            )  # fmt: skip
             dr.eval(volume)
 
     def _slices(self, axis: int) -> np.ndarray:
@@ -314,16 +329,67 @@ def sharpened(
 class Table:
     """Parameters of pairs of directions as arrays: another direction compiles nothing."""
 
-    def __init__(self, integers: np.ndarray, numbers: np.ndarray, axes: np.ndarray) -> None:
+    def __init__(self, integers: np.ndarray, numbers: np.ndarray, rows: Rows) -> None:
+        self.rows = rows
+        #: the light that enters, where it is not the same along all lines of a pair
+        self.entering: Entering | None = None
         self.integers = mi.Int32(integers.astype(np.int32).ravel())
         self.numbers = mi.Float(numbers.astype(np.float32).ravel())
-        found = [(axis, np.flatnonzero(axes == axis).tolist()) for axis in range(3)]
+        found = [(axis, np.flatnonzero(rows.axis == axis).tolist()) for axis in range(3)]
         #: the pairs of each dominant axis, which have their corners in common
         self.by_axis = [(axis, pairs) for axis, pairs in found if pairs]
         self.places = [dr.opaque(mi.UInt32, i) for i in range(len(integers))]
         self.order = [i for _, pairs in self.by_axis for i in pairs]
         # One more, since kernels that read an array of a single value are different ones.
         self.ordered = mi.UInt32([*self.order, 0, 1])
+
+
+class Rows:
+    """The lines of pairs of directions: for each (n) the dominant ``axis`` and whether the first of
+    the pair goes ``forward`` along it, the other axes (n, 2), the voxels of the box along these two
+    and the axis (n, 3); what lines move by across the axis from slice to slice, ``slopes``, and
+    where between whole numbers they pass the first slice, ``starts`` (n, 2) [voxels].
+    """
+
+    def __init__(self, axis: np.ndarray, forward: np.ndarray, integers: np.ndarray) -> None:
+        self.axis, self.forward, self.sides = axis, forward, integers[:, :3]
+        self.across = np.array([[k for k in range(3) if k != a] for a in axis]).reshape(-1, 2)
+        self.slopes, self.starts = integers[:, [11, 15]] / ONE, integers[:, [12, 16]] / ONE
+
+
+class Entering:
+    """The light that enters a box along lines [irradiance: radiance times solid angle].
+
+    The lines of a pair are told apart by where they pass the first slice, or would if they did not
+    enter the box behind it. A scale times these two coordinates, moved, is a place among cells,
+    each of which has two of the ``values``: along the axis, and against it.
+    """
+
+    def __init__(
+        self, places: np.ndarray, cells: np.ndarray, values: mi.Float | None = None
+    ) -> None:
+        """``places``: for each pair scale, moves (2) and slopes (2) of the lines; ``cells``: the
+        first value, and the cells along both axes.
+        """
+        self._places = mi.Float(places.ravel().tolist())
+        self._cells = mi.UInt32(cells.ravel().tolist())
+        self.values = values
+
+    def pair(self, which: mi.UInt32) -> list:
+        """What `at` has to know of pairs."""
+        places = [dr.gather(mi.Float, self._places, which * 5 + i) for i in range(5)]
+        return places + [dr.gather(mi.UInt32, self._cells, which * 3 + i) for i in range(3)]
+
+    def at(self, pair: list, way: int, slice_, ib, fb, ic, fc, active) -> mi.Float:
+        """The light of lines that are at these voxels, and positions in them, in a slice."""
+        scale, move_b, move_c, slope_b, slope_c, first, nb, nc = pair
+        k = mi.Float(slice_)
+        b = dr.fma(-slope_b, k, dr.fma(mi.Float(fb), 1 / ONE, mi.Float(ib)))
+        c = dr.fma(-slope_c, k, dr.fma(mi.Float(fc), 1 / ONE, mi.Float(ic)))
+        b, c = (mi.Int32(dr.floor(dr.fma(x, scale, m))) for x, m in ((b, move_b), (c, move_c)))
+        active = active & (b >= 0) & (c >= 0) & (b < mi.Int32(nb)) & (c < mi.Int32(nc))
+        place = first + (mi.UInt32(c) * nb + mi.UInt32(b)) * 2 + way
+        return dr.gather(mi.Float, self.values, place, active)
 
 
 class _Across:
@@ -379,6 +445,7 @@ def _sweep(
     volume: mi.Float,
     source: mi.Float | None,
     table: Table,
+    entering: Entering | None,
     which: mi.UInt32,
     lanes: mi.UInt32,
     together: bool,
@@ -416,6 +483,8 @@ def _sweep(
     L, L_back, s0, s0_back = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
     scale, area = quantum * length, dr.rcp(length)
     k = mi.Int32(0)
+    if dr.hint(entering is not None, mode="scalar"):
+        pair = entering.pair(which)
     while dr.hint(active, label="slices"):
         index = mi.UInt32(ib * sb + ic * sc + off)
         index_back = mi.UInt32(kb * sb + kc * sc + off_back)
@@ -424,8 +493,14 @@ def _sweep(
         s_next_back, s_back = _levels(
             corners, own, slice_back, back_b, back_c, kb, gb, kc, gc, active
         )
-        L = dr.select(since < 1, light, L)
-        L_back = dr.select(since_back < 1, light_back, L_back)
+        if dr.hint(entering is not None, mode="scalar"):
+            new, new_back = active & (since < 1), active & (since_back < 1)
+            found = entering.at(pair, 0, k, ib, fb, ic, fc, new)
+            found_back = entering.at(pair, 1, na - 1 - k, kb, gb, kc, gc, new_back)
+            L, L_back = dr.select(new, found, L), dr.select(new_back, found_back, L_back)
+        else:
+            L = dr.select(since < 1, light, L)
+            L_back = dr.select(since_back < 1, light_back, L_back)
         # In the middle slice both ways are in the same voxel: the first to write writes for both.
         middle = off == off_back
         if dr.hint(source is None, mode="scalar"):

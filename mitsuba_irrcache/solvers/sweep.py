@@ -8,7 +8,7 @@ orders of scattering in a batch share.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +17,10 @@ import numpy as np
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
 from mitsuba_irrcache.solvers.directions import Sky
-from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp, split
+from mitsuba_irrcache.solvers.lattice import Lattice, Table
 from mitsuba_irrcache.solvers.scattering import Level
 
 #: Directions per voxel of a batch, pairs of opposite ones. Spread evenly together, 32 leave half
@@ -37,9 +39,65 @@ Progress = Callable[[int, int], None]
 
 
 def takes(emitter: mi.Emitter) -> bool:
-    """Whether the light of an emitter can be swept: it comes from far away, or from a point."""
+    """Whether the light of an emitter can be swept: it comes from far away, or from a point, or
+    from an area that shines in all directions.
+    """
     flags = mi.EmitterFlags.Infinite, mi.EmitterFlags.DeltaDirection, mi.EmitterFlags.DeltaPosition
-    return any(mi.has_flag(emitter.flags(), flag) for flag in flags)
+    surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+    return is_lamp(emitter) if surface else any(mi.has_flag(emitter.flags(), f) for f in flags)
+
+
+class Pass:
+    """Directions, light from far away along them (n, 2), weights and offsets, as `Lattice.table`
+    wants them; and among surfaces, what arrives there along their lines: the ``rows`` of
+    ``arrivals``, of which a ``channel`` is taken.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[np.ndarray],
+        arrivals: Arrivals | None = None,
+        rows: np.ndarray | None = None,
+        channel: int = 0,
+    ) -> None:
+        self.directions, self.light, self.weights, self.offsets = parts
+        self.arrivals, self.rows, self.channel = arrivals, rows, channel
+
+    @staticmethod
+    def joined(passes: Sequence[Pass]) -> Pass:
+        """All of these as one."""
+        names = "directions", "light", "weights", "offsets"
+        parts = [np.concatenate([getattr(p, name) for p in passes]) for name in names]
+        arrivals, channel = passes[0].arrivals, passes[0].channel
+        rows = None if arrivals is None else np.concatenate([p.rows for p in passes])
+        return Pass(parts, arrivals, rows, channel)
+
+    def table(self, lattice: Lattice) -> Table:
+        """Of ``lattice``, with all the light that enters."""
+        table = lattice.table(self.directions, self.light, self.weights, self.offsets)
+        if self.arrivals is not None:
+            table.entering = self.arrivals.returning(self.channel, lattice, table, self.rows, True)
+        return table
+
+    def straight(self, lattice: Lattice) -> mi.Float:
+        """Irradiance at all voxels, of light straight from emitters."""
+        lit, entering = self.light.any(axis=1), None
+        if self.arrivals is not None:
+            lit |= (self.weights > 0) & self.arrivals.meets_lamps
+            rows = self.rows[lit]
+            entering = lambda table: self.arrivals.directly(self.channel, table, rows)  # noqa: E731
+        return lattice.carry(self.directions[lit], self.light[lit], self.offsets[lit], entering)
+
+    def solve(self, level: Level, phi: mi.Float) -> mi.Float:
+        """All orders of scattering, of which ``phi`` is the first."""
+        even, returning = self.weights != 0, None  # the others carry light of emitters only
+        if self.arrivals is not None:
+            rows = self.rows[even]
+            returning = lambda lattice, table: self.arrivals.returning(  # noqa: E731
+                self.channel, lattice, table, rows, False
+            )
+        parts = self.directions[even], self.weights[even], self.offsets[even]
+        return level.solve(phi, *parts, returning)
 
 
 def batch_of(samples: int, max_depth: int) -> int:
@@ -51,8 +109,14 @@ class Sweep:
     """Fills ``cache``, which lies over ``medium``."""
 
     def __init__(
-        self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        cache: IrradianceCache,
+        seed: int,
+        rr_depth: int = 5,
     ) -> None:
+        """``rr_depth`` is that of paths between surfaces."""
         self.cache, self.seed = cache, seed
         self._sky = Sky(scene)
         if not cache.active_count:
@@ -60,7 +124,7 @@ class Sweep:
         grid = cache.grid
         detail = _detail(medium, grid)
         extinction = baked(medium, medium.sigma_t, detail)
-        box = _occupied_box(cache)
+        box = occupied_box(grid, cache.active)
         self._lattices = [Lattice(grid, s, *box, detail) for s in extinction]
         # For single scattering the albedo does not matter here.
         self._levels: list[Level] = []
@@ -76,7 +140,16 @@ class Sweep:
                 )
                 for c in range(max(len(albedo), len(sigma_t)))
             ]
-        self._direct = self._sky.near_light(medium, grid.centers(cache.active))
+        centers = grid.centers(cache.active)
+        self._around: Around | None = None
+        if medium.surroundings is None:
+            self._direct = self._sky.near_light(medium, centers)
+            return
+        small, large = split(scene, grid, *box)
+        self._around = Around(scene, medium, large, rr_depth)
+        place = dr.gather(mi.UInt32, cache.survey.place, cache.active)
+        pointer = medium.surroundings.pointer(place)
+        self._lamps = Lamps(scene, medium, small, self._sky.near, centers, pointer)
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Adds ``samples`` directions per voxel, a multiple of the cache's batch.
@@ -104,57 +177,74 @@ class Sweep:
         if self._levels:  # one pass more tells what is scattered again
             pairs, passes = DIRECTIONS // 2, cache.batch // DIRECTIONS + 1
         rng = np.random.default_rng((self.seed, number))
-        tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
+        if self._around is None:
+            tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
+            by_channel = [[Pass(row) for row in rows] for rows in tables]
+        else:
+            by_channel = self._arriving([self._sky.rows(pairs, rng) for _ in range(passes)], number)
+            colour = np.ones(cache.channels)
         found: dict[tuple[int, int], tuple] = {}
         layers = [], []
         for c in range(cache.channels):
             # Channels that differ by a factor only are computed once.
-            key = min(c, len(tables) - 1), min(c, len(self._levels or self._lattices) - 1)
+            key = min(c, len(by_channel) - 1), min(c, len(self._levels or self._lattices) - 1)
             if key not in found:
-                found[key] = self._solved(tables[key[0]], *key)
+                found[key] = self._solved(by_channel[key[0]], *key)
             for layer, phi in zip(layers, found[key], strict=True):
                 layer.append(phi if phi is None else self._gathered(phi, colour[c]))
         dr.eval(layers)
         return (*layers[0], *layers[1]), (None,) * cache.channels
 
-    def _solved(self, rows: list, light: int, medium: int) -> tuple:
+    def _arriving(self, rows: list[tuple], number: int) -> list[list[Pass]]:
+        """Passes among surfaces, for each channel; for one, if all are alike."""
+        joined = [np.concatenate(parts) for parts in zip(*rows, strict=True)]
+        seed = self.seed, number
+        arrivals = Arrivals(self._around, self._lattices[0], joined, bool(self._levels), seed)
+        self._direct = self._lamps.light(seed)
+        channels = 1 if is_grey([*arrivals.kinds, *self._direct]) else self.cache.channels
+        ends = np.cumsum([0] + [len(row[0]) for row in rows])
+        return [
+            [
+                Pass((d, light[..., c], w, o), arrivals, np.arange(*ends[i : i + 2]), c)
+                for i, (d, light, w, o) in enumerate(rows)
+            ]
+            for c in range(channels)
+        ]
+
+    def _solved(self, passes: list[Pass], light: int, medium: int) -> tuple:
         """Irradiance at all voxels: straight from the emitters, and scattered, if it is wanted."""
         if not self._levels:
-            return self._uncollided(self._lattices[medium], rows, light), None
-        level, (first, *rows) = self._levels[medium], rows
-        uncollided = self._uncollided(level.lattice, rows, light)
+            return self._uncollided(self._lattices[medium], passes, light), None
+        level, (first, *passes) = self._levels[medium], passes
+        uncollided = self._uncollided(level.lattice, passes, light)
         total = 0 * uncollided
         phi = self._collided(level, first, light)
-        for known, row in enumerate(rows, 1):
-            received, again = level.scatter(phi, level.lattice.table(*row))
+        for known, each in enumerate(passes, 1):
+            received, again = level.scatter(phi, each.table(level.lattice))
             total = total + received
             if self.cache.max_depth < 0:
                 # Of all orders there is now another estimate: on average they have less noise.
                 old, new = (dr.opaque(mi.Float, n / (known + 1)) for n in (known, 1))
                 phi = phi * old + self._with_near_light(again, light) * new
             dr.eval(total, phi)
-        total = self._with_near_light(total * dr.opaque(mi.Float, 1 / len(rows)), light)
+        total = self._with_near_light(total * dr.opaque(mi.Float, 1 / len(passes)), light)
         # Both layers with the same directions: under a white sky the sum has no noise.
         scattered = dr.maximum(total - uncollided, 0)
         dr.eval(scattered)
         return uncollided, scattered
 
-    def _uncollided(self, lattice: Lattice, rows: list, light: int) -> mi.Float:
+    def _uncollided(self, lattice: Lattice, passes: list[Pass], light: int) -> mi.Float:
         """Irradiance straight from the emitters, on average over passes."""
-        directions, entering, _, offsets = (np.concatenate(p) for p in zip(*rows, strict=True))
-        lit = entering.any(axis=1)
-        volume = lattice.carry(directions[lit], entering[lit], offsets[lit])
-        return self._with_near_light(volume * dr.opaque(mi.Float, 1 / len(rows)), light)
+        volume = Pass.joined(passes).straight(lattice)
+        return self._with_near_light(volume * dr.opaque(mi.Float, 1 / len(passes)), light)
 
-    def _collided(self, level: Level, row: tuple, light: int) -> mi.Float:
+    def _collided(self, level: Level, first: Pass, light: int) -> mi.Float:
         """Mean irradiance of collisions, of all orders but the last."""
-        table = level.lattice.table(*row)
+        table = first.table(level.lattice)
         _, phi = level.scatter(None, table)
         phi = self._with_near_light(phi, light)
         if self.cache.max_depth < 0:
-            directions, _, weights, offsets = row
-            even = weights != 0  # the others carry light of emitters only
-            return level.solve(phi, directions[even], weights[even], offsets[even])
+            return first.solve(level, phi)
         for _ in range(self.cache.max_depth - 3):
             phi = self._with_near_light(level.scatter(phi, table)[1], light)
         return phi
@@ -240,8 +330,15 @@ def _mean(medium, field, grid, index, points, cut: bool):
     return [s / mi.Float(count) for s in sums]
 
 
-def _occupied_box(cache: IrradianceCache) -> tuple[np.ndarray, np.ndarray]:
-    """The least box of voxels (x, y, z; lower end, upper end) that holds all active ones."""
-    ends = [(dr.min(p), dr.max(p)) for p in cache.grid.places(cache.active)]
+def is_grey(spectra: Sequence[mi.Spectrum]) -> bool:
+    """Whether all channels are the same."""
+    same = [dr.all(c == spectrum[0]) for spectrum in spectra for c in list(spectrum)[1:]]
+    dr.eval(same)
+    return all(s[0] for s in same)
+
+
+def occupied_box(grid: Grid, active: mi.UInt32) -> tuple[np.ndarray, np.ndarray]:
+    """The least box of voxels (x, y, z; lower end, upper end) that holds all ``active`` ones."""
+    ends = [(dr.min(p), dr.max(p)) for p in grid.places(active)]
     dr.eval(ends)
     return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])

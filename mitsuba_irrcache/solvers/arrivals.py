@@ -1,0 +1,266 @@
+"""The light that arrives at a medium's box among surfaces, along the lines of the solver ``sweep``.
+
+Where there are surfaces, what comes along a line is not told by its direction. It is followed back
+to where it comes from: one path for each line and way, from the point where the line enters the
+box, or one for a few lines next to each other where these are many. What emitters send straight
+along a line is known without paths, but for whether it gets there.
+
+A path that comes upon the medium again ends with its first collision: what is scattered towards it
+there, it brings back, and this light is only known once the solver knows it. So what arrives is
+``emitted + returned phi(place)``, linear in phi, with places and factors that stay as they are
+while phi is solved for: surfaces become part of the operator whose fixed point phi is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.solvers.lattice import Entering, Lattice, Table
+from mitsuba_irrcache.surroundings import probe
+from mitsuba_irrcache.transport import Start, out_of, trace
+
+#: Cells of a direction, at most about: paths are followed for one line in each, and rays that only
+#: find what is in the way of an emitter's light are cheaper.
+CELLS, LIT_CELLS = 1 << 14, 1 << 16
+#: Paths begin so far within the box [voxels]: surfaces may lie on its faces.
+WITHIN = 1e-3
+_NUMBERS = 12
+
+
+class Around:
+    """What is around a medium, as far as its light comes from there.
+
+    ``lamps`` are area emitters that lines meet by chance: what the others send straight to a voxel
+    is known otherwise. ``rr_depth`` is that of paths.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, medium: MediumGrid, lamps: Sequence[mi.EmitterPtr], rr_depth: int
+    ) -> None:
+        self.scene, self.media = scene, medium.surroundings.media
+        self.pointer, self.lamps = medium.pointer, list(lamps)
+        self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+        self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
+
+
+class Arrivals:
+    """The light that arrives along the lines of a table of ``lattice``."""
+
+    def __init__(
+        self,
+        around: Around,
+        lattice: Lattice,
+        rows: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        paths: bool,
+        seed: tuple[int, int],
+    ) -> None:
+        """``rows`` are directions, light from far away (n, 2, channels), weights and offsets as
+        for `Lattice.table`. Without ``paths``, light comes straight from emitters only.
+        """
+        directions, light, weights, offsets = rows
+        self.lattice = lattice
+        #: whether light straight from emitters comes along lines that no light from far away has
+        self.meets_lamps = bool(around.lamps)
+        self._lines = lattice.table(directions, light[..., 0], weights, offsets).rows
+        self._cells(np.where(weights > 0, CELLS, LIT_CELLS))
+        numbers, colours = self._numbers(directions, light, weights)
+        lanes = dr.arange(mi.UInt32, self._count)
+        found = _follow(around, self, lanes, numbers, colours, paths, seed)
+        #: for each channel: straight from emitters; all of what does not depend on phi; factors of
+        #: phi; and for all of them, the voxels of phi
+        self.straight, self.emitted, self.returned, self.voxel = found
+        self._voxels: dict[tuple, mi.UInt32] = {lattice.grid.shape: self.voxel}
+
+    @property
+    def kinds(self) -> tuple[list, list, list]:
+        """All that has channels."""
+        return self.straight, self.emitted, self.returned
+
+    def directly(self, channel: int, table: Table, rows: np.ndarray) -> Entering:
+        """Light straight from emitters, along the lines of a ``table`` of the same lattice for
+        these ``rows``.
+        """
+        return Entering(*self._placed(self.lattice, table, rows), self.straight[channel])
+
+    def returning(
+        self, channel: int, lattice: Lattice, table: Table, rows: np.ndarray, emitted: bool
+    ) -> Returning:
+        """Light along the lines of a ``table`` for these ``rows``, which follow each other, of the
+        same lattice or one of a coarser grid; without what is ``emitted`` unless that is wanted.
+        """
+        grid = lattice.grid
+        if grid.shape not in self._voxels:
+            self._voxels[grid.shape] = _coarser(self.lattice.grid, grid, self.voxel)
+        places, cells = self._placed(lattice, table, rows)
+        start, count = int(cells[0, 0]), int(self._ends[rows[-1]] - cells[0, 0])
+        cells[:, 0] -= start
+        here = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        sources = [self.returned[channel], *([self.emitted[channel]] if emitted else [])]
+        values = [dr.gather(mi.Float, source, here) for source in sources]
+        voxel = dr.gather(mi.UInt32, self._voxels[grid.shape], here)
+        dr.eval(values, voxel)
+        return Returning(places, cells, voxel, *values)
+
+    def _cells(self, most: np.ndarray) -> None:
+        """Lays out cells: blocks of lines, so many along an edge that there are not too ``many``
+        in a direction.
+        """
+        lines = self._lines
+        length = lines.sides[:, 2:]
+        # The first slice passes the middle of the first voxels.
+        moved = np.stack([-0.5 * lines.slopes, (length - 0.5) * lines.slopes])
+        self._least = np.floor(-lines.starts - moved.max(axis=0))
+        last = np.ceil(lines.sides[:, :2] - lines.starts - moved.min(axis=0))
+        count = last - self._least + 1
+        self._edge = np.maximum(1, np.ceil(np.sqrt(count.prod(axis=1) / most)))
+        self._sides = np.ceil(count / self._edge[:, None]).astype(np.int64)
+        self._ends = np.cumsum(2 * self._sides.prod(axis=1))
+        self._first, self._count = np.concatenate([[0], self._ends[:-1]]), int(self._ends[-1])
+
+    def _numbers(
+        self, directions: np.ndarray, light: np.ndarray, weights: np.ndarray
+    ) -> tuple[tuple[mi.UInt32, mi.Float], mi.Float]:
+        """What `_follow` has to know of each row."""
+        lines = self._lines
+        integers = np.column_stack([self._first, self._sides[:, 0], lines.axis, lines.across[:, 0]])
+        sign = np.where(lines.forward, 1.0, -1.0)
+        parts = [sign[:, None] * directions, lines.slopes, lines.starts + self._least]
+        parts += [lines.sides, self._edge, weights]
+        numbers = np.column_stack(parts)
+        ways = np.where(lines.forward[:, None, None], light, light[:, ::-1])
+        as_list = mi.UInt32([*integers.ravel().tolist(), 0xFFFFFFFF])  # the end, to be searched for
+        return (as_list, mi.Float(numbers.ravel().tolist())), mi.Float(ways.ravel().tolist())
+
+    def _placed(
+        self, lattice: Lattice, table: Table, rows: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The first arguments of `Entering`."""
+        mine, lines = self.lattice, table.rows
+        ratio = float(round((lattice.grid.voxel_size / mine.grid.voxel_size)[0]))
+        lower, across, n = mine.lower, lines.across, np.arange(len(rows))
+        # Where the lines are that pass the first slice of the finest grid at 0, in the coarser one.
+        ahead = (lower[lines.axis] + 0.5) / ratio - lattice.lower[lines.axis] - 0.5
+        moves = ratio * (lattice.lower[across] + lines.slopes * ahead[n, None]) - lower[across]
+        moves = moves - self._lines.starts[rows] - self._least[rows] + 0.5
+        edge = self._edge[rows, None]
+        places = np.hstack([ratio / edge, moves / edge, lines.slopes])
+        return places, np.column_stack([self._first[rows], self._sides[rows]])
+
+
+class Returning(Entering):
+    """`Entering` light ``emitted + returned phi(voxel)``."""
+
+    def __init__(
+        self,
+        places: np.ndarray,
+        cells: np.ndarray,
+        voxel: mi.UInt32,
+        returned: mi.Float,
+        emitted: mi.Float | None = None,
+    ) -> None:
+        super().__init__(places, cells)
+        self._voxel, self._returned, self._emitted = voxel, returned, emitted
+
+    def receive(self, phi: mi.Float | None) -> None:
+        """Where the mean irradiance of collisions is ``phi`` (None: 0)."""
+        light = dr.zeros(mi.Float, dr.width(self._voxel))
+        if phi is not None:
+            light = self._returned * dr.gather(mi.Float, phi, self._voxel)
+        self.values = light if self._emitted is None else light + self._emitted
+        dr.eval(self.values)
+
+
+def _coarser(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
+    """The voxels of a coarser grid of the hierarchy in which those of the fine one lie."""
+    ratio = round((coarse.voxel_size / fine.voxel_size)[0])
+    x, y, z = (p // dr.opaque(mi.UInt32, ratio) for p in fine.places(voxel))
+    nx, ny, _ = (mi.UInt32(n) for n in coarse.sides)
+    result = (z * ny + y) * nx + x
+    dr.eval(result)
+    return result
+
+
+def _follow(
+    around: Around,
+    arrivals: Arrivals,
+    lanes: mi.UInt32,
+    numbers: tuple[mi.UInt32, mi.Float],
+    colours: mi.Float,
+    paths: bool,
+    seed: tuple[int, int],
+) -> tuple[list, list, list, mi.UInt32]:
+    """What arrives along the lines of all cells, both ways in turn; see `Arrivals`."""
+    integers, values = numbers
+    grid, lower = arrivals.lattice.grid, arrivals.lattice.lower
+    row = dr.binary_search(
+        0,
+        len(arrivals._first) - 1,
+        lambda i: dr.gather(mi.UInt32, integers, (i + 1) * 4) <= lanes,
+    )
+    start, wide, axis, axis_b = (dr.gather(mi.UInt32, integers, row * 4 + i) for i in range(4))
+    dx, dy, dz, slope_b, slope_c, least_b, least_c, nb, nc, na, edge, weight = (
+        dr.gather(mi.Float, values, row * _NUMBERS + i) for i in range(_NUMBERS)
+    )
+    within = lanes - start
+    back, cell = (within & 1) == 1, within >> 1
+    cell_c = cell // dr.maximum(wide, 1)
+    cell_b = cell - cell_c * wide
+    state = mi.sample_tea_32(lanes, mi.sample_tea_32(*(dr.opaque(mi.UInt32, s) for s in seed))[0])
+    rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
+    # The line through the first slice: the only one of its cell, or any.
+    b, c = (
+        least + mi.Float(place) * edge + dr.select(edge > 1, rng.next_float32() * edge - 0.5, 0)
+        for least, place in ((least_b, cell_b), (least_c, cell_c))
+    )
+    near, far = mi.Float(0), na
+    for at, slope, side in ((b, slope_b, nb), (c, slope_c, nc)):
+        ends = -at / slope + 0.5, (side - at) / slope + 0.5
+        near, far = dr.maximum(near, dr.minimum(*ends)), dr.minimum(far, dr.maximum(*ends))
+    hit = near < far
+    a = dr.select(back, far, near)
+    b, c = dr.fma(a - 0.5, slope_b, b), dr.fma(a - 0.5, slope_c, c)
+    a, b, c = (dr.clip(x, WITHIN, n - WITHIN) for x, n in ((a, na), (b, nb), (c, nc)))
+    place = [
+        dr.select(axis == k, a, dr.select(axis_b == k, b, c)) + dr.opaque(mi.Float, float(lower[k]))
+        for k in range(3)
+    ]
+    p = grid.world.point(mi.Point3f(place))
+    # Back along the light.
+    ray = mi.Ray3f(p, mi.Vector3f(dx, dy, dz) * dr.select(back, 1, -1))
+    pointer = probe(around.scene, ray.o, ray.d)
+
+    channels = dr.size_v(mi.Spectrum)
+    way = (row * 2 + dr.select(back, 1, 0)) * channels
+    light = mi.Spectrum([dr.gather(mi.Float, colours, way + i) for i in range(channels)])
+    lit = hit & (dr.max(light) > 0)
+    if around.lamps:
+        lit |= hit & (weight > 0)
+    passed, glow, rng = out_of(around.scene, around.media, ray, pointer, around.lamps, rng, lit)
+    straight = dr.select(lit, light * passed + weight * glow, 0)
+    emitted, returned, voxel = straight, mi.Spectrum(0), mi.UInt32(0)
+    if paths:
+        begin = Start(ray, pointer, depth=1, pdf=0.0, clear=pointer == around.pointer)
+        _, scattered, _, end, _ = trace(
+            around.scene, around.media, begin, around.max_depth, around.rr_depth, False, rng,
+            hit & (weight > 0), lambda medium: medium == around.pointer,
+        )  # fmt: skip
+        emitted = straight + weight * scattered
+        returned = weight * end.weight * dr.inv_four_pi
+        u = grid.coordinates.point(end.p)
+        nx, ny, _ = grid.sides
+        x, y, z = (
+            mi.Int32(dr.clip(dr.floor(v), 0, mi.Float(n - 1)))
+            for v, n in zip(u, grid.sides, strict=True)
+        )
+        voxel = mi.UInt32((z * ny + y) * nx + x)
+    none = dr.zeros(mi.Float, dr.width(lanes))
+    layers = [[v + none for v in kind] for kind in (straight, emitted, returned)]
+    voxel = voxel + dr.zeros(mi.UInt32, dr.width(lanes))
+    dr.eval(layers, voxel)
+    return *layers, voxel
