@@ -25,9 +25,10 @@ from mitsuba_irrcache.solvers.lattice import Entering, Lattice, Table
 from mitsuba_irrcache.surroundings import probe
 from mitsuba_irrcache.transport import Start, out_of, trace
 
-#: Cells of a direction, at most about: paths are followed for one line in each, and rays that only
-#: find what is in the way of an emitter's light are cheaper.
-CELLS, LIT_CELLS = 1 << 14, 1 << 16
+#: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
+#: find what is in the way of an emitter's light are cheaper. What comes from surfaces differs more
+#: from one direction to the next than between lines next to each other.
+CELLS, LIT_CELLS = 1 << 12, 1 << 16
 #: Paths begin so far within the box [voxels]: surfaces may lie on its faces.
 WITHIN = 1e-3
 _NUMBERS = 12
@@ -58,15 +59,16 @@ class Arrivals:
         lattice: Lattice,
         rows: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         paths: bool,
-        seed: tuple[int, int],
+        seed: tuple[int, int, int],
     ) -> None:
         """``rows`` are directions, light from far away (n, 2, channels), weights and offsets as
-        for `Lattice.table`. Without ``paths``, light comes straight from emitters only.
+        for `Lattice.table`: light from surfaces comes along those that have a weight. Without
+        ``paths``, light comes straight from emitters only.
         """
         directions, light, weights, offsets = rows
         self.lattice = lattice
-        #: whether light straight from emitters comes along lines that no light from far away has
-        self.meets_lamps = bool(around.lamps)
+        #: rows along which light may come straight from emitters
+        self.lit = light.any(axis=(1, 2)) | ((weights > 0) & bool(around.lamps))
         self._lines = lattice.table(directions, light[..., 0], weights, offsets).rows
         self._cells(np.where(weights > 0, CELLS, LIT_CELLS))
         numbers, colours = self._numbers(directions, light, weights)
@@ -92,7 +94,7 @@ class Arrivals:
         self, channel: int, lattice: Lattice, table: Table, rows: np.ndarray, emitted: bool
     ) -> Returning:
         """Light along the lines of a ``table`` for these ``rows``, which follow each other, of the
-        same lattice or one of a coarser grid; without what is ``emitted`` unless that is wanted.
+        same lattice or that of a coarser grid; without what is ``emitted`` unless that is wanted.
         """
         grid = lattice.grid
         if grid.shape not in self._voxels:
@@ -193,7 +195,7 @@ def _follow(
     numbers: tuple[mi.UInt32, mi.Float],
     colours: mi.Float,
     paths: bool,
-    seed: tuple[int, int],
+    seed: tuple[int, int, int],
 ) -> tuple[list, list, list, mi.UInt32]:
     """What arrives along the lines of all cells, both ways in turn; see `Arrivals`."""
     integers, values = numbers
@@ -211,7 +213,8 @@ def _follow(
     back, cell = (within & 1) == 1, within >> 1
     cell_c = cell // dr.maximum(wide, 1)
     cell_b = cell - cell_c * wide
-    state = mi.sample_tea_32(lanes, mi.sample_tea_32(*(dr.opaque(mi.UInt32, s) for s in seed))[0])
+    first, batch, use = (dr.opaque(mi.UInt32, s) for s in seed)
+    state = mi.sample_tea_32(lanes, mi.sample_tea_32(first, batch)[0] + use)
     rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
     # The line through the first slice: the only one of its cell, or any.
     b, c = (

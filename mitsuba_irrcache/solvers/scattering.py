@@ -81,7 +81,7 @@ class Level:
         sent = nothing if phi is None else phi * self.albedo * dr.inv_four_pi
         volume = dr.ravel(mi.Vector4f(sent, nothing, nothing, nothing))
         dr.eval(volume)
-        if table.entering is not None:
+        if table.entering is not None and phi is not None:
             table.entering.receive(phi)
         self.lattice.scatter(volume, table)
         index = dr.arange(mi.UInt32, count)

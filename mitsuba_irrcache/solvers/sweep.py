@@ -17,10 +17,11 @@ import numpy as np
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
+from mitsuba_irrcache.solvers.arrivals import Around
 from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp, split
-from mitsuba_irrcache.solvers.lattice import Lattice, Table
+from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass, arriving
 from mitsuba_irrcache.solvers.scattering import Level
 
 #: Directions per voxel of a batch, pairs of opposite ones. Spread evenly together, 32 leave half
@@ -45,59 +46,6 @@ def takes(emitter: mi.Emitter) -> bool:
     flags = mi.EmitterFlags.Infinite, mi.EmitterFlags.DeltaDirection, mi.EmitterFlags.DeltaPosition
     surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
     return is_lamp(emitter) if surface else any(mi.has_flag(emitter.flags(), f) for f in flags)
-
-
-class Pass:
-    """Directions, light from far away along them (n, 2), weights and offsets, as `Lattice.table`
-    wants them; and among surfaces, what arrives there along their lines: the ``rows`` of
-    ``arrivals``, of which a ``channel`` is taken.
-    """
-
-    def __init__(
-        self,
-        parts: Sequence[np.ndarray],
-        arrivals: Arrivals | None = None,
-        rows: np.ndarray | None = None,
-        channel: int = 0,
-    ) -> None:
-        self.directions, self.light, self.weights, self.offsets = parts
-        self.arrivals, self.rows, self.channel = arrivals, rows, channel
-
-    @staticmethod
-    def joined(passes: Sequence[Pass]) -> Pass:
-        """All of these as one."""
-        names = "directions", "light", "weights", "offsets"
-        parts = [np.concatenate([getattr(p, name) for p in passes]) for name in names]
-        arrivals, channel = passes[0].arrivals, passes[0].channel
-        rows = None if arrivals is None else np.concatenate([p.rows for p in passes])
-        return Pass(parts, arrivals, rows, channel)
-
-    def table(self, lattice: Lattice) -> Table:
-        """Of ``lattice``, with all the light that enters."""
-        table = lattice.table(self.directions, self.light, self.weights, self.offsets)
-        if self.arrivals is not None:
-            table.entering = self.arrivals.returning(self.channel, lattice, table, self.rows, True)
-        return table
-
-    def straight(self, lattice: Lattice) -> mi.Float:
-        """Irradiance at all voxels, of light straight from emitters."""
-        lit, entering = self.light.any(axis=1), None
-        if self.arrivals is not None:
-            lit |= (self.weights > 0) & self.arrivals.meets_lamps
-            rows = self.rows[lit]
-            entering = lambda table: self.arrivals.directly(self.channel, table, rows)  # noqa: E731
-        return lattice.carry(self.directions[lit], self.light[lit], self.offsets[lit], entering)
-
-    def solve(self, level: Level, phi: mi.Float) -> mi.Float:
-        """All orders of scattering, of which ``phi`` is the first."""
-        even, returning = self.weights != 0, None  # the others carry light of emitters only
-        if self.arrivals is not None:
-            rows = self.rows[even]
-            returning = lambda lattice, table: self.arrivals.returning(  # noqa: E731
-                self.channel, lattice, table, rows, False
-            )
-        parts = self.directions[even], self.weights[even], self.offsets[even]
-        return level.solve(phi, *parts, returning)
 
 
 def batch_of(samples: int, max_depth: int) -> int:
@@ -181,8 +129,12 @@ class Sweep:
             tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
             by_channel = [[Pass(row) for row in rows] for rows in tables]
         else:
-            by_channel = self._arriving([self._sky.rows(pairs, rng) for _ in range(passes)], number)
-            colour = np.ones(cache.channels)
+            seed = self.seed, number
+            lattice, colour = self._lattices[0], np.ones(cache.channels)
+            by_channel, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
+            self._direct = self._lamps.light(seed)
+            if is_grey([*kinds, *self._direct]):
+                by_channel = by_channel[:1]
         found: dict[tuple[int, int], tuple] = {}
         layers = [], []
         for c in range(cache.channels):
@@ -195,23 +147,7 @@ class Sweep:
         dr.eval(layers)
         return (*layers[0], *layers[1]), (None,) * cache.channels
 
-    def _arriving(self, rows: list[tuple], number: int) -> list[list[Pass]]:
-        """Passes among surfaces, for each channel; for one, if all are alike."""
-        joined = [np.concatenate(parts) for parts in zip(*rows, strict=True)]
-        seed = self.seed, number
-        arrivals = Arrivals(self._around, self._lattices[0], joined, bool(self._levels), seed)
-        self._direct = self._lamps.light(seed)
-        channels = 1 if is_grey([*arrivals.kinds, *self._direct]) else self.cache.channels
-        ends = np.cumsum([0] + [len(row[0]) for row in rows])
-        return [
-            [
-                Pass((d, light[..., c], w, o), arrivals, np.arange(*ends[i : i + 2]), c)
-                for i, (d, light, w, o) in enumerate(rows)
-            ]
-            for c in range(channels)
-        ]
-
-    def _solved(self, passes: list[Pass], light: int, medium: int) -> tuple:
+    def _solved(self, passes: list[Pass] | list[ArrivingPass], light: int, medium: int) -> tuple:
         """Irradiance at all voxels: straight from the emitters, and scattered, if it is wanted."""
         if not self._levels:
             return self._uncollided(self._lattices[medium], passes, light), None
@@ -220,7 +156,7 @@ class Sweep:
         total = 0 * uncollided
         phi = self._collided(level, first, light)
         for known, each in enumerate(passes, 1):
-            received, again = level.scatter(phi, each.table(level.lattice))
+            received, again = each.scatter(level, phi)
             total = total + received
             if self.cache.max_depth < 0:
                 # Of all orders there is now another estimate: on average they have less noise.
@@ -233,20 +169,21 @@ class Sweep:
         dr.eval(scattered)
         return uncollided, scattered
 
-    def _uncollided(self, lattice: Lattice, passes: list[Pass], light: int) -> mi.Float:
+    def _uncollided(
+        self, lattice: Lattice, passes: list[Pass] | list[ArrivingPass], light: int
+    ) -> mi.Float:
         """Irradiance straight from the emitters, on average over passes."""
-        volume = Pass.joined(passes).straight(lattice)
+        volume = passes[0].uncollided(passes, lattice)
         return self._with_near_light(volume * dr.opaque(mi.Float, 1 / len(passes)), light)
 
-    def _collided(self, level: Level, first: Pass, light: int) -> mi.Float:
+    def _collided(self, level: Level, first: Pass | ArrivingPass, light: int) -> mi.Float:
         """Mean irradiance of collisions, of all orders but the last."""
-        table = first.table(level.lattice)
-        _, phi = level.scatter(None, table)
+        _, phi = first.scatter(level, None)
         phi = self._with_near_light(phi, light)
         if self.cache.max_depth < 0:
             return first.solve(level, phi)
         for _ in range(self.cache.max_depth - 3):
-            phi = self._with_near_light(level.scatter(phi, table)[1], light)
+            phi = self._with_near_light(first.scatter(level, phi)[1], light)
         return phi
 
     def _with_near_light(self, volume: mi.Float, channel: int) -> mi.Float:
