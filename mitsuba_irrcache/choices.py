@@ -80,7 +80,7 @@ def _why_not_sweep(
         return None
     box = sweep.occupied_box(grid, active)
     for other in medium.surroundings.media.grids:
-        if other is not medium and boxes_meet(grid, *box, *corners_of(other.frame)):
+        if other is not medium and boxes_meet(grid, *box, corners_of(other.frame)):
             return f'medium "{other.name}" reaches into {name}'
     found = obstacle(scene, grid, *box)
     return found and f"{found} reaches into {name}"
@@ -108,10 +108,13 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
         count = np.clip(np.ceil(per_path), 32, 96)
         grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"
     elif solver == "sweep" and data.voxel_count <= MOST_VOXELS:
-        sides = _finer(medium.sigma_t)
-        finer = (sides > data.resolution).any()
+        sides, reason = _finer(medium.sigma_t), "of the medium"
+        if (sides > data.resolution).any():
+            reason = "finer than those of the medium, which is dense"
+        if medium.surroundings is not None and sides.max() < AMONG_SURFACES[0]:
+            sides = np.ceil(sides * (AMONG_SURFACES[0] / sides.max())).astype(int)
+            reason = f"finer than those of the medium, {AMONG_SURFACES[0]} among surfaces"
         grid = Grid(tuple(int(n) for n in sides[::-1]), frame)
-        reason = "finer than those of the medium, which is dense" if finer else "of the medium"
     else:
         most = 128 if solver == "path" else round(MOST_VOXELS ** (1 / 3))
         grid = Grid.near_cubic(frame, min(max(data.shape), most))

@@ -121,7 +121,7 @@ class LitMedium:
         _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments)
         warn_of_dense_border(medium, grid)
         active, survey = active_voxels(medium, grid), None
-        if medium.surroundings is not None:
+        if medium.surroundings is not None and self.solver == "path":  # else nothing is among them
             survey = medium.surroundings.survey(scene, grid, medium)
             active = dr.compress(survey.reach & _marked(grid, active))
         if medium.albedo.maximum == 0 or not scene.emitters():

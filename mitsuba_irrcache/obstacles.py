@@ -64,7 +64,7 @@ def boxes_meet(grid: Grid, lower: np.ndarray, upper: np.ndarray, corners: np.nda
     slack = SLACK * grid.voxel_size.min()
     for to_axes, small in ((np.eye(4), slack), (grid.coordinates.matrix, SLACK)):
         back = to_axes @ grid.world.matrix
-        mine, other = (p @ m[:3, :3].T + m[:3, 3] for p, m in ((own, back), (corners, to_axes)))
+        mine, other = _mapped(back, own), _mapped(to_axes, corners)
         if (other.max(axis=0) < mine.min(axis=0) + small).any():
             return False
         if (other.min(axis=0) > mine.max(axis=0) - small).any():
@@ -74,19 +74,24 @@ def boxes_meet(grid: Grid, lower: np.ndarray, upper: np.ndarray, corners: np.nda
 
 def corners_of(frame: np.ndarray) -> np.ndarray:
     """Of the unit cube's image (8, 3)."""
-    return _PICK @ frame[:3, :3].T + frame[:3, 3]
+    return _mapped(frame, _PICK)
+
+
+def _mapped(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Images of points (n, 3) under an affine map."""
+    return (matrix[:3, :3] * points[:, None, :]).sum(axis=-1) + matrix[:3, 3]
 
 
 def _begins_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
     """Whether a vertex of a mesh, or all of another shape, is in the box."""
-    if shape.is_mesh():
-        positions = dr.unravel(mi.Point3f, mi.Float(mi.traverse(shape)["vertex_positions"]))
-        u = grid.coordinates.point(positions)
+    vertices = mi.traverse(shape).get("vertex_positions")
+    if vertices is not None:
+        u = grid.coordinates.point(dr.unravel(mi.Point3f, mi.Float(vertices)))
         low, high = (mi.Point3f(*(float(v) for v in end)) for end in (lower, upper))
         return bool(dr.any(dr.all((u > low + SLACK) & (u < high - SLACK))))
     box = shape.bbox()
     ends = np.where(_PICK, np.array(box.max), np.array(box.min))
-    u = ends @ grid.coordinates.matrix[:3, :3].T + grid.coordinates.matrix[:3, 3]
+    u = _mapped(grid.coordinates.matrix, ends)
     return bool((u > lower).all() and (u < upper).all())
 
 

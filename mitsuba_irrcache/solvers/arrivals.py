@@ -71,9 +71,7 @@ class Arrivals:
         self.lit = light.any(axis=(1, 2)) | ((weights > 0) & bool(around.lamps))
         self._lines = lattice.table(directions, light[..., 0], weights, offsets).rows
         self._cells(np.where(weights > 0, CELLS, LIT_CELLS))
-        numbers, colours = self._numbers(directions, light, weights)
-        lanes = dr.arange(mi.UInt32, self._count)
-        found = _follow(around, self, lanes, numbers, colours, paths, seed)
+        found = _follow(around, self, *self._numbers(directions, light, weights), paths, seed)
         #: for each channel: straight from emitters; all of what does not depend on phi; factors of
         #: phi; and for all of them, the voxels of phi
         self.straight, self.emitted, self.returned, self.voxel = found
@@ -139,6 +137,45 @@ class Arrivals:
         as_list = mi.UInt32([*integers.ravel().tolist(), 0xFFFFFFFF])  # the end, to be searched for
         return (as_list, mi.Float(numbers.ravel().tolist())), mi.Float(ways.ravel().tolist())
 
+    def begin(
+        self, numbers: tuple[mi.UInt32, mi.Float], seed: tuple[int, int, int]
+    ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Ray3f, mi.PCG32]:
+        """For each value that cells have: the number of the row's way (two in each), the row's
+        weight, whether the line meets the box, the ray from there to where light comes from, and a
+        random generator.
+        """
+        integers, values = numbers
+        lanes = dr.arange(mi.UInt32, self._count)
+        row = dr.binary_search(
+            0,
+            len(self._first) - 1,
+            lambda i: dr.gather(mi.UInt32, integers, (i + 1) * 4) <= lanes,
+        )
+        start, wide, axis, axis_b = (dr.gather(mi.UInt32, integers, row * 4 + i) for i in range(4))
+        dx, dy, dz, slope_b, slope_c, least_b, least_c, nb, nc, na, edge, weight = (
+            dr.gather(mi.Float, values, row * _NUMBERS + i) for i in range(_NUMBERS)
+        )
+        within = lanes - start
+        back, cell = (within & 1) == 1, within >> 1
+        cell_c = cell // dr.maximum(wide, 1)
+        cell_b = cell - cell_c * wide
+        first, batch, use = (dr.opaque(mi.UInt32, s) for s in seed)
+        state = mi.sample_tea_32(lanes, mi.sample_tea_32(first, batch)[0] + use)
+        rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
+        lines = least_b, least_c, slope_b, slope_c, nb, nc, na
+        b, c, near, far, rng = _one_of(edge, mi.Float(cell_b), mi.Float(cell_c), *lines, rng)
+        hit = near < far
+        a = dr.select(back, far, near)
+        b, c = dr.fma(a - 0.5, slope_b, b), dr.fma(a - 0.5, slope_c, c)
+        a, b, c = (dr.clip(x, WITHIN, n - WITHIN) for x, n in ((a, na), (b, nb), (c, nc)))
+        place = [
+            dr.select(axis == k, a, dr.select(axis_b == k, b, c)) + dr.opaque(mi.Float, float(low))
+            for k, low in enumerate(self.lattice.lower)
+        ]
+        p = self.lattice.grid.world.point(mi.Point3f(place))
+        ray = mi.Ray3f(p, mi.Vector3f(dx, dy, dz) * dr.select(back, 1, -1))
+        return row * 2 + dr.select(back, 1, 0), weight, hit, ray, rng
+
     def _placed(
         self, lattice: Lattice, table: Table, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -153,6 +190,36 @@ class Arrivals:
         edge = self._edge[rows, None]
         places = np.hstack([ratio / edge, moves / edge, lines.slopes])
         return places, np.column_stack([self._first[rows], self._sides[rows]])
+
+
+@dr.syntax
+def _one_of(edge, cell_b, cell_c, least_b, least_c, slope_b, slope_c, nb, nc, na, rng):
+    """Of the lines of a cell, ``edge`` along either axis, one of those that meet the box: where it
+    passes the first slice, and where along the axis it enters the box and leaves it.
+    """
+    b, c, near, far = mi.Float(0), mi.Float(0), mi.Float(1) + 0 * na, 0 * na
+    k, met = mi.Float(0), mi.Float(0)
+    while dr.hint(k < edge * edge, label="lines of a cell"):
+        row = dr.floor(k / edge)
+        at_b, at_c = least_b + cell_b * edge + (k - row * edge), least_c + cell_c * edge + row
+        begin, end = mi.Float(0), mi.Float(na)
+        first, last = -at_b / slope_b + 0.5, (nb - at_b) / slope_b + 0.5
+        begin, end = (
+            dr.maximum(begin, dr.minimum(first, last)),
+            dr.minimum(end, dr.maximum(first, last)),
+        )
+        first, last = -at_c / slope_c + 0.5, (nc - at_c) / slope_c + 0.5
+        begin, end = (
+            dr.maximum(begin, dr.minimum(first, last)),
+            dr.minimum(end, dr.maximum(first, last)),
+        )
+        meets = begin < end
+        met += dr.select(meets, 1.0, 0.0)
+        chosen = meets & (rng.next_float32() * met < 1)
+        b, c = dr.select(chosen, at_b, b), dr.select(chosen, at_c, c)
+        near, far = dr.select(chosen, begin, near), dr.select(chosen, end, far)
+        k += 1
+    return b, c, near, far, rng
 
 
 class Returning(Entering):
@@ -191,56 +258,17 @@ def _coarser(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
 def _follow(
     around: Around,
     arrivals: Arrivals,
-    lanes: mi.UInt32,
     numbers: tuple[mi.UInt32, mi.Float],
     colours: mi.Float,
     paths: bool,
     seed: tuple[int, int, int],
 ) -> tuple[list, list, list, mi.UInt32]:
     """What arrives along the lines of all cells, both ways in turn; see `Arrivals`."""
-    integers, values = numbers
-    grid, lower = arrivals.lattice.grid, arrivals.lattice.lower
-    row = dr.binary_search(
-        0,
-        len(arrivals._first) - 1,
-        lambda i: dr.gather(mi.UInt32, integers, (i + 1) * 4) <= lanes,
-    )
-    start, wide, axis, axis_b = (dr.gather(mi.UInt32, integers, row * 4 + i) for i in range(4))
-    dx, dy, dz, slope_b, slope_c, least_b, least_c, nb, nc, na, edge, weight = (
-        dr.gather(mi.Float, values, row * _NUMBERS + i) for i in range(_NUMBERS)
-    )
-    within = lanes - start
-    back, cell = (within & 1) == 1, within >> 1
-    cell_c = cell // dr.maximum(wide, 1)
-    cell_b = cell - cell_c * wide
-    first, batch, use = (dr.opaque(mi.UInt32, s) for s in seed)
-    state = mi.sample_tea_32(lanes, mi.sample_tea_32(first, batch)[0] + use)
-    rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
-    # The line through the first slice: the only one of its cell, or any.
-    b, c = (
-        least + mi.Float(place) * edge + dr.select(edge > 1, rng.next_float32() * edge - 0.5, 0)
-        for least, place in ((least_b, cell_b), (least_c, cell_c))
-    )
-    near, far = mi.Float(0), na
-    for at, slope, side in ((b, slope_b, nb), (c, slope_c, nc)):
-        ends = -at / slope + 0.5, (side - at) / slope + 0.5
-        near, far = dr.maximum(near, dr.minimum(*ends)), dr.minimum(far, dr.maximum(*ends))
-    hit = near < far
-    a = dr.select(back, far, near)
-    b, c = dr.fma(a - 0.5, slope_b, b), dr.fma(a - 0.5, slope_c, c)
-    a, b, c = (dr.clip(x, WITHIN, n - WITHIN) for x, n in ((a, na), (b, nb), (c, nc)))
-    place = [
-        dr.select(axis == k, a, dr.select(axis_b == k, b, c)) + dr.opaque(mi.Float, float(lower[k]))
-        for k in range(3)
-    ]
-    p = grid.world.point(mi.Point3f(place))
-    # Back along the light.
-    ray = mi.Ray3f(p, mi.Vector3f(dx, dy, dz) * dr.select(back, 1, -1))
+    grid = arrivals.lattice.grid
+    way, weight, hit, ray, rng = arrivals.begin(numbers, seed)
     pointer = probe(around.scene, ray.o, ray.d)
 
-    channels = dr.size_v(mi.Spectrum)
-    way = (row * 2 + dr.select(back, 1, 0)) * channels
-    light = mi.Spectrum([dr.gather(mi.Float, colours, way + i) for i in range(channels)])
+    light = dr.gather(mi.Spectrum, colours, way)
     lit = hit & (dr.max(light) > 0)
     if around.lamps:
         lit |= hit & (weight > 0)
@@ -262,8 +290,8 @@ def _follow(
             for v, n in zip(u, grid.sides, strict=True)
         )
         voxel = mi.UInt32((z * ny + y) * nx + x)
-    none = dr.zeros(mi.Float, dr.width(lanes))
+    none = dr.zeros(mi.Float, dr.width(weight))
     layers = [[v + none for v in kind] for kind in (straight, emitted, returned)]
-    voxel = voxel + dr.zeros(mi.UInt32, dr.width(lanes))
+    voxel = voxel + dr.zeros(mi.UInt32, dr.width(weight))
     dr.eval(layers, voxel)
     return *layers, voxel

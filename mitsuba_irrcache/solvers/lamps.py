@@ -63,8 +63,8 @@ def _solid_angle(emitter: mi.Emitter, grid: Grid, lower: np.ndarray, upper: np.n
 
 
 class Lamps:
-    """Irradiance at world positions ``p`` in ``medium``, which start in the media ``pointer``: from
-    ``small`` area lights, and from point-like ``lights``.
+    """Irradiance at world positions ``p`` in ``medium``: from ``small`` area lights, and from
+    point-like ``lights``.
     """
 
     def __init__(
@@ -74,10 +74,9 @@ class Lamps:
         small: Sequence[mi.Emitter],
         lights: Sequence[mi.Emitter],
         p: mi.Point3f,
-        pointer: mi.MediumPtr,
     ) -> None:
         around = medium.surroundings.media.grids
-        self._scene, self._medium, self._p, self._pointer = scene, medium, p, pointer
+        self._scene, self._medium, self._p = scene, medium, p
         self._others = Media([grid for grid in around if grid is not medium])
         self._small = len(small)
         if small:
@@ -98,7 +97,7 @@ class Lamps:
         state = mi.sample_tea_32(lane, seeds[1])
         rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
         light = _sampled(
-            self._scene, self._medium, self._others, self._emitters, self._p, self._pointer,
+            self._scene, self._medium, self._others, self._emitters, self._p,
             dr.opaque(mi.UInt32, self._small), dr.opaque(mi.UInt32, samples), rng,
         )  # fmt: skip
         dr.eval(light)
@@ -108,27 +107,28 @@ class Lamps:
         """Irradiance from a point-like emitter."""
         rng = mi.PCG32(dr.width(self._p))
         light, _ = _shone(
-            self._scene, self._medium, self._others, emitter, self._p, self._pointer,
+            self._scene, self._medium, self._others, emitter, self._p,
             mi.Point2f(0.5), rng,
         )  # fmt: skip
         dr.eval(light)
         return light
 
 
-def _shone(scene, medium, others, emitter, p, pointer, sample, rng) -> tuple:
+def _shone(scene, medium, others, emitter, p, sample, rng) -> tuple:
     """One sample of the irradiance at ``p`` straight from an emitter, and the random generator."""
     vertex = dr.zeros(mi.Interaction3f, dr.width(p))
     vertex.p = p
     record, light = emitter.sample_direction(vertex, sample)
     lit = dr.max(light) > 0
-    passed, rng = visibility(scene, others, vertex, record.p, pointer, rng, lit)
+    # The medium itself is marched through apart, without noise.
+    passed, rng = visibility(scene, others, vertex, record.p, medium.pointer, rng, lit)
     lit &= dr.max(passed) > 0
     passed *= marched(medium, mi.Ray3f(p, record.d), record.dist, lit)
     return dr.select(lit, light * passed, 0), rng
 
 
 @dr.syntax
-def _sampled(scene, medium, others, emitters, p, pointer, count, samples, rng):
+def _sampled(scene, medium, others, emitters, p, count, samples, rng):
     """The mean of samples of the irradiance from all of ``count`` lamps."""
     shift = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
     total, k = mi.Spectrum(0), mi.UInt32(0)
@@ -139,7 +139,7 @@ def _sampled(scene, medium, others, emitters, p, pointer, count, samples, rng):
         u = mi.Float(k) * 0.7548776662466927 + shift.x
         v = mi.Float(k) * 0.5698402909980532 + shift.y
         sample = mi.Point2f(u - dr.floor(u), v - dr.floor(v))
-        light, rng = _shone(scene, medium, others, emitter, p, pointer, sample, rng)
+        light, rng = _shone(scene, medium, others, emitter, p, sample, rng)
         total += light
         k += 1
     return total * (mi.Float(count) / mi.Float(samples))

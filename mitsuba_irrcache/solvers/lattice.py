@@ -353,7 +353,7 @@ class Rows:
 
     def __init__(self, axis: np.ndarray, forward: np.ndarray, integers: np.ndarray) -> None:
         self.axis, self.forward, self.sides = axis, forward, integers[:, :3]
-        self.across = np.array([[k for k in range(3) if k != a] for a in axis]).reshape(-1, 2)
+        self.across = np.array([[k for k in range(3) if k != a] for a in axis], int).reshape(-1, 2)
         self.slopes, self.starts = integers[:, [11, 15]] / ONE, integers[:, [12, 16]] / ONE
 
 

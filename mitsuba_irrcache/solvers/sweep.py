@@ -95,9 +95,7 @@ class Sweep:
             return
         small, large = split(scene, grid, *box)
         self._around = Around(scene, medium, large, rr_depth)
-        place = dr.gather(mi.UInt32, cache.survey.place, cache.active)
-        pointer = medium.surroundings.pointer(place)
-        self._lamps = Lamps(scene, medium, small, self._sky.near, centers, pointer)
+        self._lamps = Lamps(scene, medium, small, self._sky.near, centers)
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Adds ``samples`` directions per voxel, a multiple of the cache's batch.
