@@ -45,7 +45,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - rr_depth
        - |int|
-       - Depth from which paths of the solver ``path`` are ended by Russian roulette. (Default: 5)
+       - Depth from which paths of the solver ``path``, and paths between surfaces, are ended by
+         Russian roulette. (Default: 5)
 
      * - hide_emitters
        - |bool|
@@ -54,15 +55,16 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - solver
        - |string|
        - How the cache is computed: ``sweep`` (light carried along lines that all voxels share),
-         ``path`` (Monte Carlo at every voxel), or ``auto``: ``sweep`` unless there are surfaces,
-         area emitters or several media. The log says which, and why. (Default: ``auto``)
+         ``path`` (Monte Carlo at every voxel), or ``auto``: ``sweep`` unless surfaces or other
+         media are among the voxels. The log says which, and why. (Default: ``auto``)
 
      * - resolution
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
          0: the voxels of the data, up to twice as many along each axis where they are dense, at
          most 2^25 of them, for ``path`` at most 128 along a side; two per mean free path, 32 to 96,
-         in a homogeneous medium; 32 to 64 along a side where there are surfaces or several media.
+         in a homogeneous medium; for ``path`` 32 to 64 along a side where there are surfaces or
+         several media.
          (Default: 0)
 
      * - cache_spp
@@ -134,7 +136,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     and area emitters may be anywhere. What is seen on them is path traced, by as many paths as
     there are samples per pixel, and is ``background``. Where there is no more than one medium in a
     box or sphere, and light from far away or from points outside of it, nothing has to be ray
-    traced, and the solver ``sweep`` can be used. Point-like emitters in a medium, media without
+    traced. The solver ``sweep`` can be used for isotropic media in boxes or spheres with neither
+    surfaces nor other media among their voxels; where there are surfaces, with ``max_depth`` 2 or
+    -1. Point-like emitters in a medium, media without
     bounds and sharp phase functions are refused by name. What glass encloses is rendered as
     ``volpath`` does, and so is a scene without media.
 

@@ -78,11 +78,17 @@ class CacheBuilder:
             self.parts, self._snapshot = [], None
             self.revision += 1
             media = bake_media(scene, self._baked_emission())
-            if media:
-                solver = choose_solver(scene, self.settings.solver, media[0])
+            wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
             self.parts = [
-                LitMedium(scene, m, self.settings, solver, m.name if len(media) > 1 else "", edited)
-                for m in media
+                LitMedium(
+                    scene,
+                    medium,
+                    self.settings,
+                    choose_solver(scene, medium, *wanted),
+                    medium.name if len(media) > 1 else "",
+                    edited,
+                )
+                for medium in media
             ]
             self._scene_id, self._snapshot = id(scene), snapshot
         for number, part in enumerate(self.parts):

@@ -6,11 +6,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .cache import IrradianceCache
+from .cache import IrradianceCache, active_voxels
 from .errors import IrrcacheError
 from .grid import Grid, GridField
 from .layers import luminance
 from .medium import MediumGrid
+from .obstacles import boxes_meet, corners_of, obstacle
 from .solvers import sweep
 
 #: Optical depth of a voxel at the boundary of a medium from which on the pixels there are off by
@@ -33,31 +34,59 @@ SINGLE, MULTIPLE = 128, 64
 
 
 def choose_solver(
-    scene: mi.Scene, solver: str, medium: MediumGrid | None = None
+    scene: mi.Scene, medium: MediumGrid, solver: str, max_depth: int = -1, resolution: int = 0
 ) -> tuple[str, str]:
-    """The solver for a scene, one of whose media is ``medium``, and why."""
-    if medium is not None and medium.surroundings is not None:
-        media = medium.surroundings.media
-        if solver == "sweep" and not media.isotropic:
-            raise IrrcacheError(
-                'irrcache: solver "sweep" knows isotropic scattering only, and this scene has a '
-                'medium with another phase function; set solver to "path" or "auto".'
-            )
-        if solver == "sweep":
-            raise IrrcacheError(
-                'irrcache: solver "sweep" carries light through one medium in a box or sphere '
-                "only, and this scene has surfaces, area emitters, other boundaries or several "
-                'media; set solver to "path" or "auto".'
-            )
-        if not media.isotropic:
-            return "path", "a phase function is not isotropic"
-        return "path", "there are surfaces or several media"
-    if solver != "auto":
+    """The solver for a ``medium`` of a scene, and why.
+
+    Raises IrrcacheError where ``sweep`` is told that cannot be used.
+    """
+    if solver == "path":
         return solver, "as told"
+    reason = _why_not_sweep(scene, medium, max_depth, resolution)
+    if reason and solver == "sweep":
+        raise IrrcacheError(
+            f'irrcache: solver "sweep" cannot be used in this scene, since {reason}; set solver to '
+            '"path" or "auto".'
+        )
+    if reason:
+        return "path", reason
+    if solver == "sweep":
+        return solver, "as told"
+    if medium.surroundings is None:
+        return "sweep", "all light comes from far away or from points"
+    return "sweep", "no surface and no other medium is among the voxels"
+
+
+def _why_not_sweep(
+    scene: mi.Scene, medium: MediumGrid, max_depth: int, resolution: int
+) -> str | None:
+    """Why light cannot be swept through ``medium``; None where it can."""
+    name = f'medium "{medium.name}"'
     for emitter in scene.emitters():
         if not sweep.takes(emitter):
-            return "path", f'emitter "{emitter.id()}" is neither far away nor a point'
-    return "sweep", "all light comes from far away or from points"
+            kind = f'"{emitter.id()}" ({emitter.class_name()})'
+            return f"emitter {kind} is neither far away nor a point nor an even area"
+    if medium.surroundings is None:
+        return None
+    if not medium.surroundings.media.isotropic:
+        return "a phase function is not isotropic"
+    for shining in medium.surroundings.media.grids:
+        if shining.emission is not None:
+            return f'medium "{shining.name}" shines among surfaces'
+    if not medium.exact:
+        return f"{name} is bounded by other shapes than one box or sphere"
+    if max_depth > 2:
+        return f"among surfaces it knows one or all orders of scattering, not max_depth {max_depth}"
+    grid, _ = choose_grid(medium, resolution, "sweep")
+    active = active_voxels(medium, grid)
+    if not dr.width(active):
+        return None
+    box = sweep.occupied_box(grid, active)
+    for other in medium.surroundings.media.grids:
+        if other is not medium and boxes_meet(grid, *box, corners_of(other.frame)):
+            return f'medium "{other.name}" reaches into {name}'
+    found = obstacle(scene, grid, *box)
+    return found and f"{found} reaches into {name}"
 
 
 def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid, str]:
@@ -71,7 +100,7 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     data, frame = medium.sigma_t.grid, medium.frame
     longest = np.linalg.norm(frame[:3, :3], axis=0).max()
     per_path = 2 * longest * medium.sigma_t.maximum
-    if not resolution and medium.surroundings is not None:
+    if not resolution and medium.surroundings is not None and solver == "path":
         least, most = AMONG_SURFACES
         count = np.ceil(per_path) if data is None else max(data.shape)
         grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
@@ -82,10 +111,13 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
         count = np.clip(np.ceil(per_path), 32, 96)
         grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"
     elif solver == "sweep" and data.voxel_count <= MOST_VOXELS:
-        sides = _finer(medium.sigma_t)
-        finer = (sides > data.resolution).any()
+        sides, reason = _finer(medium.sigma_t), "of the medium"
+        if (sides > data.resolution).any():
+            reason = "finer than those of the medium, which is dense"
+        if medium.surroundings is not None and sides.max() < AMONG_SURFACES[0]:
+            sides = np.ceil(sides * (AMONG_SURFACES[0] / sides.max())).astype(int)
+            reason = f"finer than those of the medium, {AMONG_SURFACES[0]} among surfaces"
         grid = Grid(tuple(int(n) for n in sides[::-1]), frame)
-        reason = "finer than those of the medium, which is dense" if finer else "of the medium"
     else:
         most = 128 if solver == "path" else round(MOST_VOXELS ** (1 / 3))
         grid = Grid.near_cubic(frame, min(max(data.shape), most))

@@ -124,7 +124,7 @@ class LitMedium:
         _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments)
         warn_of_dense_border(medium, grid)
         active, survey = active_voxels(medium, grid), None
-        if medium.surroundings is not None:
+        if medium.surroundings is not None and self.solver == "path":  # else nothing is among them
             survey = medium.surroundings.survey(scene, grid, medium)
             active = dr.compress(survey.reach & _marked(grid, active))
         dark = not scene.emitters() and medium.emission is None
@@ -229,7 +229,9 @@ class LitMedium:
         settings, cache = self.settings, self.cache
         if self.solver == "sweep":
             if self._sweep is None:
-                self._sweep = sweep.Sweep(scene, self.medium, cache, settings.seed)
+                self._sweep = sweep.Sweep(
+                    scene, self.medium, cache, settings.seed, settings.rr_depth
+                )
             self._sweep.refine(missing, progress)
         else:
             path.refine(

@@ -35,6 +35,8 @@ class MediumGrid:
         self.bbox = bbox
         #: what it sends out itself; None where it does not (see `emission`)
         self.emission: object | None = None
+        #: whether there is no more to its bounds than ``boundary``; others are larger than it
+        self.exact = True
         #: None where it is isotropic
         self.phase: Phase | None = None
         #: what it is called among others

@@ -133,7 +133,9 @@ def bake_general(scene: mi.Scene, emission: Emission | None = None) -> list[Medi
     for shape in shapes:
         _check_shape(scene, shape)
     for medium, filled in media_of(scene).items():
-        grid = bake(medium, Boundary("box", _extent(medium, filled)))
+        exact = _exact_boundary(scene, filled)
+        grid = bake(medium, exact or Boundary("box", _extent(medium, filled)))
+        grid.exact = exact is not None
         grid.pointer, grid.name = mi.MediumPtr(medium), _name(medium, [g.name for g in grids])
         dr.make_opaque(grid.pointer)
         grids.append(grid)
@@ -161,6 +163,14 @@ def bake_general(scene: mi.Scene, emission: Emission | None = None) -> list[Medi
         if dr.any(pointer != None):  # noqa: E711
             _refuse_inside(emitter, position)
     return seen
+
+
+def _exact_boundary(scene: mi.Scene, filled: list[mi.Shape]) -> Boundary | None:
+    """Of the one box or sphere that a medium fills; None where it fills others."""
+    try:
+        return boundary_of(scene, filled[0]) if len(filled) == 1 else None
+    except UnsupportedSceneError:
+        return None
 
 
 def _name(medium: mi.Medium, taken: list[str]) -> str:

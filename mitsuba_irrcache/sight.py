@@ -15,7 +15,7 @@ import mitsuba as mi
 from .layers import luminance
 from .projection import Projection
 from .surroundings import Surroundings
-from .transport import MOST_CROSSINGS, Start, behind, is_null, trace
+from .transport import MOST_CROSSINGS, End, Start, behind, is_null, trace
 
 #: Surfaces seen through less than this transmittance are traced by roulette.
 FAINT = 0.1
@@ -97,7 +97,7 @@ class Sight:
         self.projection = max(projections, key=lambda p: p.channel_count)
         self.hide_emitters = hide_emitters
         #: the caches hold what paths of any length find; for shorter ones they hold too much
-        self.cached = self._irradiance if max_depth < 0 else None
+        self.known = self._is_known if max_depth < 0 else None
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
 
@@ -121,7 +121,7 @@ class Sight:
         traced = stopped & (rng.next_float32(stopped) < chance)
         weight = dr.select(traced, passed / chance, 0)
         start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
-        straight, reflected, met, _ = trace(
+        straight, reflected, met, last, _ = trace(
             scene,
             self.surroundings.media,
             start,
@@ -130,8 +130,10 @@ class Sight:
             self.hide_emitters,
             rng,
             traced,
-            self.cached,
+            self.known,
         )
+        if self.known is not None:
+            reflected += last.weight * self._irradiance(last) * dr.inv_four_pi
         background += dr.select(traced, weight * (straight + reflected), 0)
         alpha = mi.Float(1)
         if self.hide_emitters or scene.environment() is None:
@@ -198,18 +200,22 @@ class Sight:
             active &= crosses & (dr.max(passed) > 0) & (crossings < MOST_CROSSINGS)
         return scattered, background, passed, gathered, segment, pointer, stopped, escaped
 
-    def _irradiance(
-        self, pointer: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float, active: mi.Bool
-    ) -> tuple[mi.Spectrum, mi.Bool]:
-        """The cached irradiance, as much as ``ray`` sees of it, and whether there is a cache."""
-        result, known = mi.Spectrum(0), mi.Bool(False)
+    def _is_known(self, pointer: mi.MediumPtr) -> mi.Bool:
+        """Whether the light in a medium is cached."""
+        known = mi.Bool(False)
         for projection in self.projections:
-            here = active & (pointer == projection.medium.pointer)
-            known |= here
+            known |= pointer == projection.medium.pointer
+        return known
+
+    def _irradiance(self, end: End) -> mi.Spectrum:
+        """The cached irradiance where paths end, as much as they see of it."""
+        result = mi.Spectrum(0)
+        for projection in self.projections:
+            here = (dr.max(end.weight) > 0) & (end.pointer == projection.medium.pointer)
             if projection.irradiance is not None:
-                phi = mi.Spectrum(projection.irradiance_at(ray(t), ray.d, here))
+                phi = mi.Spectrum(projection.irradiance_at(end.p, end.direction, here))
                 result = dr.select(here, phi, result)
-        return result, known
+        return result
 
 
 def _added(gathered: list, sums: list, passed: mi.Spectrum, scale: mi.Float) -> list:

@@ -122,6 +122,41 @@ def visibility(
     return dr.select(crossings < MOST_CROSSINGS, through, 0), rng
 
 
+@dr.syntax
+def out_of(
+    scene: mi.Scene,
+    media: Media,
+    ray: mi.Ray3f,
+    pointer: mi.MediumPtr,
+    lamps: Sequence[mi.EmitterPtr],
+    rng: mi.PCG32,
+    active: mi.Bool,
+):
+    """Straight along ``ray``, through null surfaces and media: an unbiased estimate of what passes
+    out of the scene, the radiance of those ``lamps`` that are met on the way, and the random
+    generator.
+    """
+    through, light, escaped = mi.Spectrum(1), mi.Spectrum(0), mi.Bool(False)
+    ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
+    crossings = mi.UInt32(0)
+    while dr.hint(active, label="out of the scene"):
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid()
+        passed, rng = media.transmittance(pointer, ray, si.t, rng, active)
+        through = dr.select(active, through * passed, through)
+        escaped |= active & ~hit
+        for lamp in lamps:
+            shines = hit & (si.shape.emitter() == lamp)
+            light += dr.select(shines, through * si.shape.emitter().eval(si, shines), 0)
+        passed = si.bsdf().eval_null_transmission(si, hit)
+        through = dr.select(hit, through * passed, through)
+        pointer = dr.select(hit, behind(si, ray.d, pointer), pointer)
+        ray = si.spawn_ray(ray.d)
+        crossings += 1
+        active &= hit & (dr.max(through) > 0) & (crossings < MOST_CROSSINGS)
+    return dr.select(escaped, through, 0), light, rng
+
+
 def emitted_to(
     scene: mi.Scene,
     media: Media,
@@ -161,6 +196,18 @@ class Start:
         self.depth, self.pdf, self.clear = depth, pdf, clear
 
 
+class End:
+    """Where paths end in a medium whose light is known: the place, the direction in which they got
+    there, the medium, and the weight of what is scattered towards them there (with the albedo); 0
+    for paths that end elsewhere.
+    """
+
+    def __init__(
+        self, p: mi.Point3f, direction: mi.Vector3f, pointer: mi.MediumPtr, weight: mi.Spectrum
+    ) -> None:
+        self.p, self.direction, self.pointer, self.weight = p, direction, pointer, weight
+
+
 @dr.syntax
 def trace(
     scene: mi.Scene,
@@ -171,14 +218,13 @@ def trace(
     hide_emitters: bool,
     rng: mi.PCG32,
     active: mi.Bool,
-    cached: Callable | None = None,
+    known: Callable | None = None,
 ):
     """One path per lane: radiance that came straight from emitters or media that shine, radiance
-    that was scattered, whether anything was scattered, and the random generator.
+    that was scattered, whether anything was scattered, its `End`, and the random generator.
 
-    ``cached``, if given, maps a medium, a ray and a distance to a position in it and a mask to the
-    irradiance there (as much as the ray sees of it), and whether it is known; where it is, paths
-    end with their first collision. It has to hold all that the path could still find.
+    ``known``, if given, tells of media whether their light is known: all that a path could still
+    find there. Paths end with their first collision in such a medium.
     """
     straight, scattered = mi.Spectrum(0), mi.Spectrum(0)
     weight, eta = mi.Spectrum(1), mi.Float(1)
@@ -188,6 +234,8 @@ def trace(
     last = dr.zeros(mi.Interaction3f)  #: the vertex before
     last.p = ray.o
     clear, met = mi.Bool(start.clear), mi.Bool(False)
+    place, heading, where = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.MediumPtr(pointer)
+    left = mi.Spectrum(0)  #: the weight at the end
     active = mi.Bool(active) & (depth < max_depth)
     context = mi.BSDFContext()
     while dr.hint(active, label="paths"):
@@ -207,11 +255,13 @@ def trace(
         clear = mi.Bool(False)
         surface = active & ~collided
         met |= collided
-        if dr.hint(cached is not None, mode="scalar"):
-            irradiance, known = cached(pointer, ray, t, collided)
-            light = weight * irradiance * dr.inv_four_pi
-            scattered += dr.select(collided & known, light, 0)
-            collided &= ~known
+        if dr.hint(known is not None, mode="scalar"):
+            ends = collided & known(pointer)
+            place = dr.select(ends, ray(t), place)
+            heading = dr.select(ends, ray.d, heading)
+            where = dr.select(ends, pointer, where)
+            left = dr.select(ends, weight, left)
+            collided &= ~ends
 
         # Emitters that are met by chance, weighted against sampling them from the last vertex.
         emitter = si.emitter(scene, surface)
@@ -285,7 +335,7 @@ def trace(
         met |= turned
         crossings += 1
         active &= (collided | surface) & (depth < max_depth) & (crossings < MOST_CROSSINGS)
-    return straight, scattered, met, rng
+    return straight, scattered, met, End(place, heading, where, left), rng
 
 
 def _phase_value(

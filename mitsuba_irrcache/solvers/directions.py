@@ -73,12 +73,12 @@ class Sky:
         """``glows``: there is light besides, whose colour is its own."""
         self._glows = glows
         self._environment = scene.environment()
-        self._suns, self._near = [], []
+        self._suns, self.near = [], []
         for emitter in scene.emitters():
             if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
                 self._suns.append(_sun(emitter))
             elif mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
-                self._near.append(emitter)
+                self.near.append(emitter)
 
     def tables(
         self, passes: int, pairs: int, channels: int, rng: np.random.Generator
@@ -89,19 +89,19 @@ class Sky:
         factors (channels) of what these give. Where channels differ by a factor only, there is one
         list for all.
         """
-        tables = [self._rows(pairs, rng) for _ in range(passes)]
+        tables = [self.rows(pairs, rng) for _ in range(passes)]
         light = np.concatenate([table[1] for table in tables])
         brightest = light.max(axis=(0, 1))
         colour = brightest / brightest.max() if brightest.max() > 0 else np.ones(channels)
         apart = np.abs(light - light.max(axis=-1, keepdims=True) * colour)
-        if not self._near and not self._glows and apart.max() <= 1e-6 * light.max():
+        if not self.near and not self._glows and apart.max() <= 1e-6 * light.max():
             return [[(d, light.max(axis=-1), w, o) for d, light, w, o in tables]], colour
         by_channel = [
             [(d, light[..., c], w, o) for d, light, w, o in tables] for c in range(channels)
         ]
         return by_channel, np.ones(channels)
 
-    def _rows(self, pairs: int, rng: np.random.Generator) -> tuple:
+    def rows(self, pairs: int, rng: np.random.Generator) -> tuple:
         """Directions of a pass, irradiance along both ways (n, 2, channels), weights, offsets: an
         even set, which light from voxels takes too, and those that only emitters need.
         """
@@ -161,7 +161,7 @@ class Sky:
 
     def near_light(self, medium: MediumGrid, position: mi.Point3f) -> list[mi.Spectrum]:
         """Irradiance at ``position`` from each point-like light nearby."""
-        return [_from_point(emitter, medium, position) for emitter in self._near]
+        return [_from_point(emitter, medium, position) for emitter in self.near]
 
 
 def _even(count: int) -> np.ndarray:

@@ -20,7 +20,7 @@ arithmetic, and the odd part of what is integrated over directions cancels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -141,13 +141,22 @@ class Lattice:
                 for k in across
                 for x in (ratio[k], self.lower[k] * ratio[k] - 0.5, self.detail.resolution[k] - 1)
             ]
-        return Table(integers, numbers, axes)
+        rows = Rows(axes, velocities[np.arange(count), axes] > 0, integers)
+        return Table(integers, numbers, rows)
 
-    def carry(self, directions: np.ndarray, light: np.ndarray, offsets: np.ndarray) -> mi.Float:
+    def carry(
+        self,
+        directions: np.ndarray,
+        light: np.ndarray,
+        offsets: np.ndarray,
+        entering: Callable | None = None,
+    ) -> mi.Float:
         """Irradiance at the centres of the wanted voxels: the light that enters along pairs of
-        directions, told as in `table`.
+        directions, told as in `table`; instead of that ``light``, line by line, if a function of
+        the table is given that makes `Entering`.
         """
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
+        table.entering = entering(table) if entering is not None else None
         box = self.lower, self.lower + self.sides
         total = dr.opaque(mi.Float, 0, dr.width(self._wanted))
         for axis, pairs in table.by_axis:
@@ -186,15 +195,19 @@ class Lattice:
             which = dr.gather(mi.UInt32, table.ordered, first + row)
             lane = lanes - row * lines
             corners = self._all_corners[axis]
-            _sweep(corners, self._own, None, volume, source, table, which, lane, True)
+            _sweep(
+                corners, self._own, None, volume, source, table, table.entering, which, lane, True
+            )
             dr.eval(volume)
             return
         corners = self._corners_across(axis)  # one set at a time is kept
         dr.eval(corners)
         empty = self._empty.slices if self._empty and source is None else None
         for i in pairs:
-            which = table.places[i]
-            _sweep(corners, self._own, empty, volume, source, table, which, self._lanes, False)
+            _sweep(
+                corners, self._own, empty, volume, source, table, table.entering, table.places[i],
+                self._lanes, False,
+            )  # fmt: skip
             dr.eval(volume)
 
     def _slices(self, axis: int) -> np.ndarray:
@@ -328,16 +341,67 @@ def sharpened(
 class Table:
     """Parameters of pairs of directions as arrays: another direction compiles nothing."""
 
-    def __init__(self, integers: np.ndarray, numbers: np.ndarray, axes: np.ndarray) -> None:
+    def __init__(self, integers: np.ndarray, numbers: np.ndarray, rows: Rows) -> None:
+        self.rows = rows
+        #: the light that enters, where it is not the same along all lines of a pair
+        self.entering: Entering | None = None
         self.integers = mi.Int32(integers.astype(np.int32).ravel())
         self.numbers = mi.Float(numbers.astype(np.float32).ravel())
-        found = [(axis, np.flatnonzero(axes == axis).tolist()) for axis in range(3)]
+        found = [(axis, np.flatnonzero(rows.axis == axis).tolist()) for axis in range(3)]
         #: the pairs of each dominant axis, which have their corners in common
         self.by_axis = [(axis, pairs) for axis, pairs in found if pairs]
         self.places = [dr.opaque(mi.UInt32, i) for i in range(len(integers))]
         self.order = [i for _, pairs in self.by_axis for i in pairs]
         # One more, since kernels that read an array of a single value are different ones.
         self.ordered = mi.UInt32([*self.order, 0, 1])
+
+
+class Rows:
+    """The lines of pairs of directions: for each (n) the dominant ``axis`` and whether the first of
+    the pair goes ``forward`` along it, the other axes (n, 2), the voxels of the box along these two
+    and the axis (n, 3); what lines move by across the axis from slice to slice, ``slopes``, and
+    where between whole numbers they pass the first slice, ``starts`` (n, 2) [voxels].
+    """
+
+    def __init__(self, axis: np.ndarray, forward: np.ndarray, integers: np.ndarray) -> None:
+        self.axis, self.forward, self.sides = axis, forward, integers[:, :3]
+        self.across = np.array([[k for k in range(3) if k != a] for a in axis], int).reshape(-1, 2)
+        self.slopes, self.starts = integers[:, [11, 15]] / ONE, integers[:, [12, 16]] / ONE
+
+
+class Entering:
+    """The light that enters a box along lines [irradiance: radiance times solid angle].
+
+    The lines of a pair are told apart by where they pass the first slice, or would if they did not
+    enter the box behind it. A scale times these two coordinates, moved, is a place among cells,
+    each of which has two of the ``values``: along the axis, and against it.
+    """
+
+    def __init__(
+        self, places: np.ndarray, cells: np.ndarray, values: mi.Float | None = None
+    ) -> None:
+        """``places``: for each pair scale, moves (2) and slopes (2) of the lines; ``cells``: the
+        first value, and the cells along both axes.
+        """
+        self._places = mi.Float(places.ravel().tolist())
+        self._cells = mi.UInt32(cells.ravel().tolist())
+        self.values = values
+
+    def pair(self, which: mi.UInt32) -> list:
+        """What `at` has to know of pairs."""
+        places = [dr.gather(mi.Float, self._places, which * 5 + i) for i in range(5)]
+        return places + [dr.gather(mi.UInt32, self._cells, which * 3 + i) for i in range(3)]
+
+    def at(self, pair: list, way: int, slice_, ib, fb, ic, fc, active) -> mi.Float:
+        """The light of lines that are at these voxels, and positions in them, in a slice."""
+        scale, move_b, move_c, slope_b, slope_c, first, nb, nc = pair
+        k = mi.Float(slice_)
+        b = dr.fma(-slope_b, k, dr.fma(mi.Float(fb), 1 / ONE, mi.Float(ib)))
+        c = dr.fma(-slope_c, k, dr.fma(mi.Float(fc), 1 / ONE, mi.Float(ic)))
+        b, c = (mi.Int32(dr.floor(dr.fma(x, scale, m))) for x, m in ((b, move_b), (c, move_c)))
+        active = active & (b >= 0) & (c >= 0) & (b < mi.Int32(nb)) & (c < mi.Int32(nc))
+        place = first + (mi.UInt32(c) * nb + mi.UInt32(b)) * 2 + way
+        return dr.gather(mi.Float, self.values, place, active)
 
 
 class _Across:
@@ -394,6 +458,7 @@ def _sweep(
     volume: mi.Float,
     source: mi.Float | None,
     table: Table,
+    entering: Entering | None,
     which: mi.UInt32,
     lanes: mi.UInt32,
     together: bool,
@@ -435,6 +500,8 @@ def _sweep(
     k, k_back, active_back = mi.Int32(0), mi.Int32(0), mi.Bool(active)
     ahead, ahead_back = mi.Int32(1), mi.Int32(1)
     needed, needed_back = mi.Bool(active), mi.Bool(active)
+    if dr.hint(entering is not None, mode="scalar"):
+        pair = entering.pair(which)
     while dr.hint(active | active_back, label="slices"):
         if dr.hint(empty is not None, mode="scalar"):
             ahead = _slices(empty, cells, ib, ic, k, active)
@@ -443,6 +510,7 @@ def _sweep(
             ahead, ahead_back = dr.maximum(ahead, 1), dr.maximum(ahead_back, 1)
         else:
             active_back = needed = needed_back = active
+            k_back = k
         index = mi.UInt32(ib * sb + ic * sc + off)
         index_back = mi.UInt32(kb * sb + kc * sc + off_back)
         # Of the half before the middle of the slice, and of the half behind it.
@@ -450,8 +518,14 @@ def _sweep(
         s_next_back, s_back = _levels(
             corners, own, slice_back, back_b, back_c, kb, gb, kc, gc, needed_back
         )
-        L = dr.select(since < 1, light, L)
-        L_back = dr.select(since_back < 1, light_back, L_back)
+        if dr.hint(entering is not None, mode="scalar"):
+            new, new_back = active & (since < 1), active_back & (since_back < 1)
+            found = entering.at(pair, 0, k, ib, fb, ic, fc, new)
+            found_back = entering.at(pair, 1, na - 1 - k_back, kb, gb, kc, gc, new_back)
+            L, L_back = dr.select(new, found, L), dr.select(new_back, found_back, L_back)
+        else:
+            L = dr.select(since < 1, light, L)
+            L_back = dr.select(since_back < 1, light_back, L_back)
         # In the middle slice both ways are in the same voxel: the first to write writes for both.
         middle = off == off_back
         if dr.hint(source is None, mode="scalar"):

@@ -9,6 +9,8 @@ grids by the same means: errors are corrected there, grid by grid (multigrid).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -79,6 +81,8 @@ class Level:
         sent = nothing if phi is None else phi * self.albedo * dr.inv_four_pi
         volume = dr.ravel(mi.Vector4f(sent, nothing, nothing, nothing))
         dr.eval(volume)
+        if table.entering is not None and phi is not None:
+            table.entering.receive(phi)
         self.lattice.scatter(volume, table)
         index = dr.arange(mi.UInt32, count)
         source, phi, lost, depth = dr.gather(mi.Vector4f, volume, index)
@@ -89,13 +93,22 @@ class Level:
         return phi, collided
 
     def solve(
-        self, b: mi.Float, directions: np.ndarray, weights: np.ndarray, offsets: np.ndarray
+        self,
+        b: mi.Float,
+        directions: np.ndarray,
+        weights: np.ndarray,
+        offsets: np.ndarray,
+        returning: Callable | None = None,
     ) -> mi.Float:
-        """Solves phi = A phi + b for directions as in `Lattice.table`."""
+        """Solves phi = A phi + b for directions as in `Lattice.table`. ``returning``, if given,
+        makes of a lattice and such a table of it the light that enters because phi is what it is.
+        """
         dark = np.zeros((len(directions), 2))  # no light enters from outside
         tables, level = [], self
         while True:
             tables.append(level.lattice.table(directions, dark, weights, offsets))
+            if returning is not None:
+                tables[-1].entering = returning(level.lattice, tables[-1])
             if level.coarsest:
                 break
             level = level.coarser

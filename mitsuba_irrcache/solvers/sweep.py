@@ -9,7 +9,7 @@ share.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -19,9 +19,12 @@ from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.solvers.arrivals import Around
 from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.glow import emitted_light
+from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp, split
 from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass, arriving
 from mitsuba_irrcache.solvers.scattering import Level
 
 #: Directions per voxel of a batch, pairs of opposite ones. Spread evenly together, 32 leave half
@@ -40,9 +43,12 @@ Progress = Callable[[int, int], None]
 
 
 def takes(emitter: mi.Emitter) -> bool:
-    """Whether the light of an emitter can be swept: it comes from far away, or from a point."""
+    """Whether the light of an emitter can be swept: it comes from far away, or from a point, or
+    from an area that shines in all directions.
+    """
     flags = mi.EmitterFlags.Infinite, mi.EmitterFlags.DeltaDirection, mi.EmitterFlags.DeltaPosition
-    return any(mi.has_flag(emitter.flags(), flag) for flag in flags)
+    surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+    return is_lamp(emitter) if surface else any(mi.has_flag(emitter.flags(), f) for f in flags)
 
 
 def batch_of(samples: int, max_depth: int) -> int:
@@ -54,8 +60,14 @@ class Sweep:
     """Fills ``cache``, which lies over ``medium``."""
 
     def __init__(
-        self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        cache: IrradianceCache,
+        seed: int,
+        rr_depth: int = 5,
     ) -> None:
+        """``rr_depth`` is that of paths between surfaces."""
         self.cache, self.seed = cache, seed
         self._sky = Sky(scene, medium.emission is not None)
         if not cache.active_count:
@@ -63,7 +75,7 @@ class Sweep:
         grid = cache.grid
         detail = _detail(medium, grid)
         extinction = baked(medium, medium.sigma_t, detail)
-        box = _occupied_box(cache)
+        box = occupied_box(grid, cache.active)
         # Blocks of the medium's voxels reach farther than these.
         sparse = medium.sigma_t.grid is not None and detail.shape == medium.sigma_t.grid.shape
         self._lattices = [Lattice(grid, s, *box, detail, cache.active, sparse) for s in extinction]
@@ -82,8 +94,14 @@ class Sweep:
                 for c in range(max(len(albedo), len(sigma_t)))
             ]
         self._medium, self._places = medium, Places(scene, grid).of(cache.active)
-        self._direct = self._sky.near_light(medium, self._places)
         self._emitted: list[mi.Spectrum] = []  # of a batch
+        self._around: Around | None = None
+        if medium.surroundings is None:
+            self._direct = self._sky.near_light(medium, self._places)
+            return
+        small, large = split(scene, grid, *box)
+        self._around = Around(scene, medium, large, rr_depth)
+        self._lamps = Lamps(scene, medium, small, self._sky.near, self._places)
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Adds ``samples`` directions per voxel, a multiple of the cache's batch.
@@ -111,32 +129,41 @@ class Sweep:
         if self._levels:  # one pass more tells what is scattered again
             pairs, passes = DIRECTIONS // 2, cache.batch // DIRECTIONS + 1
         rng = np.random.default_rng((self.seed, number))
-        tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
         if self._medium.emission is not None:
             light = emitted_light(self._medium, self._places, cache.batch, self.seed, number)
             self._emitted = [light]
+        if self._around is None:
+            tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
+            by_channel = [[Pass(row) for row in rows] for rows in tables]
+        else:
+            seed = self.seed, number
+            lattice, colour = self._lattices[0], np.ones(cache.channels)
+            by_channel, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
+            self._direct = self._lamps.light(seed)
+            if is_grey([*kinds, *self._direct]):
+                by_channel = by_channel[:1]
         found: dict[tuple[int, int], tuple] = {}
         layers = [], []
         for c in range(cache.channels):
             # Channels that differ by a factor only are computed once.
-            key = min(c, len(tables) - 1), min(c, len(self._levels or self._lattices) - 1)
+            key = min(c, len(by_channel) - 1), min(c, len(self._levels or self._lattices) - 1)
             if key not in found:
-                found[key] = self._solved(tables[key[0]], *key)
+                found[key] = self._solved(by_channel[key[0]], *key)
             for layer, phi in zip(layers, found[key], strict=True):
                 layer.append(phi if phi is None else phi * dr.opaque(mi.Float, colour[c]))
         dr.eval(layers)
         return (*layers[0], *layers[1]), (None,) * cache.channels
 
-    def _solved(self, rows: list, light: int, medium: int) -> tuple:
+    def _solved(self, passes: list[Pass] | list[ArrivingPass], light: int, medium: int) -> tuple:
         """Irradiance at the active voxels: straight from the emitters, and scattered, if wanted."""
         if not self._levels:
-            return self._uncollided(self._lattices[medium], rows, light)[1], None
-        level, (first, *rows) = self._levels[medium], rows
-        from_far, uncollided = self._uncollided(level.lattice, rows, light)
-        total = 0 * from_far
+            return self._uncollided(self._lattices[medium], passes, light)[1], None
+        level, (first, *passes) = self._levels[medium], passes
+        swept, uncollided = self._uncollided(level.lattice, passes, light)
+        total = 0 * swept
         phi = self._collided(level, first, light)
-        for known, row in enumerate(rows, 1):
-            received, again = level.scatter(phi, level.lattice.table(*row))
+        for known, each in enumerate(passes, 1):
+            received, again = each.scatter(level, phi)
             total = total + dr.gather(mi.Float, received, self.cache.active)
             if self.cache.max_depth < 0:
                 # Of all orders there is now another estimate: on average they have less noise.
@@ -144,32 +171,29 @@ class Sweep:
                 phi = phi * old + self._with_near_light(again, light) * new
             dr.eval(total, phi)
         # Both layers with the same directions: under a white sky the sum has no noise.
-        scattered = dr.maximum(total * dr.opaque(mi.Float, 1 / len(rows)) - from_far, 0)
+        scattered = dr.maximum(total * dr.opaque(mi.Float, 1 / len(passes)) - swept, 0)
         dr.eval(scattered)
         return uncollided, scattered
 
-    def _uncollided(self, lattice: Lattice, rows: list, light: int) -> tuple[mi.Float, mi.Float]:
-        """Irradiance straight from emitters that are far away, on average over passes, and from all
+    def _uncollided(
+        self, lattice: Lattice, passes: list[Pass] | list[ArrivingPass], light: int
+    ) -> tuple[mi.Float, mi.Float]:
+        """Irradiance straight from emitters along lines, on average over passes, and from all
         emitters.
         """
-        directions, entering, _, offsets = (np.concatenate(p) for p in zip(*rows, strict=True))
-        lit = entering.any(axis=1)
-        values = lattice.carry(directions[lit], entering[lit], offsets[lit])
-        from_far = values * dr.opaque(mi.Float, 1 / len(rows))
+        values = passes[0].uncollided(passes, lattice)
+        swept = values * dr.opaque(mi.Float, 1 / len(passes))
         near = sum(emitted[light] for emitted in (*self._direct, *self._emitted))
-        return from_far, from_far + near
+        return swept, swept + near
 
-    def _collided(self, level: Level, row: tuple, light: int) -> mi.Float:
+    def _collided(self, level: Level, first: Pass | ArrivingPass, light: int) -> mi.Float:
         """Mean irradiance of collisions, of all orders but the last."""
-        table = level.lattice.table(*row)
-        _, phi = level.scatter(None, table)
+        _, phi = first.scatter(level, None)
         phi = self._with_near_light(phi, light)
         if self.cache.max_depth < 0:
-            directions, _, weights, offsets = row
-            even = weights != 0  # the others carry light of emitters only
-            return level.solve(phi, directions[even], weights[even], offsets[even])
+            return first.solve(level, phi)
         for _ in range(self.cache.max_depth - 3):
-            phi = self._with_near_light(level.scatter(phi, table)[1], light)
+            phi = self._with_near_light(first.scatter(level, phi)[1], light)
         return phi
 
     def _with_near_light(self, volume: mi.Float, channel: int) -> mi.Float:
@@ -249,8 +273,15 @@ def _mean(medium, field, grid, index, points, cut: bool):
     return [s / mi.Float(count) for s in sums]
 
 
-def _occupied_box(cache: IrradianceCache) -> tuple[np.ndarray, np.ndarray]:
-    """The least box of voxels (x, y, z; lower end, upper end) that holds all active ones."""
-    ends = [(dr.min(p), dr.max(p)) for p in cache.grid.places(cache.active)]
+def is_grey(spectra: Sequence[mi.Spectrum]) -> bool:
+    """Whether all channels are the same."""
+    same = [dr.all(c == spectrum[0]) for spectrum in spectra for c in list(spectrum)[1:]]
+    dr.eval(same)
+    return all(s[0] for s in same)
+
+
+def occupied_box(grid: Grid, active: mi.UInt32) -> tuple[np.ndarray, np.ndarray]:
+    """The least box of voxels (x, y, z; lower end, upper end) that holds all ``active`` ones."""
+    ends = [(dr.min(p), dr.max(p)) for p in grid.places(active)]
     dr.eval(ends)
     return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])

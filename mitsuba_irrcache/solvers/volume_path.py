@@ -39,9 +39,7 @@ def contributions(
     light *= power_heuristic(record.pdf, density)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
     start = Start(mi.Ray3f(position, direction), pointer, depth=1, pdf=dr.inv_four_pi)
-    straight, scattered, _, rng = trace(
-        scene, media, start, max_depth, rr_depth, False, rng, always
-    )
+    straight, scattered, *_ = trace(scene, media, start, max_depth, rr_depth, False, rng, always)
     sphere = 4 * dr.pi
     return [
         (record.d, light, mi.Spectrum(0)),

@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.build import choose_solver
+from mitsuba_irrcache.choices import choose_solver
+from mitsuba_irrcache.scene import bake_media
 from mitsuba_irrcache.solvers import lattice, scattering, sweep
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -323,9 +324,10 @@ def test_the_choice_of_solver(scenes):
     )
     for objects in lights:
         scene = scenes.load({"type": "irrcache", "solver": "auto"}, soft_cloud(scenes), **objects)
-        solver, reason = choose_solver(scene, "auto")
+        (medium,) = bake_media(scene)
+        solver, reason = choose_solver(scene, medium, "auto")
         assert solver == "sweep" and "far away or from points" in reason
-        assert choose_solver(scene, "path") == ("path", "as told")
+        assert choose_solver(scene, medium, "path") == ("path", "as told")
         scene.integrator().prepare(scene)
         assert scene.integrator().cache.correlated
 

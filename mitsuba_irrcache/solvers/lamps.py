@@ -1,0 +1,145 @@
+"""Light of small emitters nearby, at each voxel of the solver ``sweep`` among surfaces.
+
+The lines that all voxels share meet a small lamp rarely, and then all at once. So points on lamps
+are sampled from each voxel, and the lines do not count what they meet of these. Large lamps close
+by are left to the lines: from there, few points on them matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.solvers.directions import marched
+from mitsuba_irrcache.transport import Media, visibility
+
+#: Solid angle of an emitter, seen from where in the medium it is largest, from which on lines are
+#: relied upon to meet it [sr]; an upper bound, area over squared distance, is what is compared.
+LARGE = 12.0
+#: Points from which the distance to an emitter is told.
+POINTS = 1024
+#: Points on lamps that are sampled from each voxel in a batch; one on each, if there are more, but
+#: never more than the latter.
+SAMPLES, MOST_SAMPLES = 4, 16
+
+
+def is_lamp(emitter: mi.Emitter) -> bool:
+    """Whether it is an area light that shines in all directions."""
+    flags = emitter.flags()
+    return mi.has_flag(flags, mi.EmitterFlags.Surface) and not mi.has_flag(
+        flags, mi.EmitterFlags.Delta
+    )
+
+
+def split(
+    scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray
+) -> tuple[list[mi.Emitter], list[mi.Emitter]]:
+    """Area lights that are small, and that are large, as seen from the box of voxels of ``grid``
+    between ``lower`` and ``upper`` (x, y, z).
+    """
+    small, large = [], []
+    for emitter in scene.emitters():
+        if is_lamp(emitter):
+            angle = _solid_angle(emitter, grid, lower, upper)
+            (small if angle < LARGE else large).append(emitter)
+    return small, large
+
+
+def _solid_angle(emitter: mi.Emitter, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> float:
+    """An upper bound, about."""
+    rng = mi.PCG32(POINTS)
+    shape = emitter.get_shape()
+    found = shape.sample_position(0.0, mi.Point2f(rng.next_float32(), rng.next_float32()))
+    low, high = (mi.Point3f(*(float(v) for v in end)) for end in (lower, upper))
+    nearest = dr.clip(grid.coordinates.point(found.p), low, high)
+    squared = dr.min(dr.squared_norm(grid.world.point(nearest) - found.p))
+    area = dr.max(shape.surface_area())
+    return float(area[0]) / max(float(squared[0]), 1e-12)
+
+
+class Lamps:
+    """Irradiance at world positions ``p`` in ``medium``: from ``small`` area lights, and from
+    point-like ``lights``.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        small: Sequence[mi.Emitter],
+        lights: Sequence[mi.Emitter],
+        p: mi.Point3f,
+    ) -> None:
+        around = medium.surroundings.media.grids
+        self._scene, self._medium, self._p = scene, medium, p
+        self._others = Media([grid for grid in around if grid is not medium])
+        self._small = len(small)
+        if small:
+            pointers = [mi.EmitterPtr(e) for e in small]
+            self._emitters = dr.zeros(mi.EmitterPtr, len(small) + 1)
+            for i, emitter in enumerate(pointers):
+                dr.scatter(self._emitters, emitter, mi.UInt32(i))
+            dr.eval(self._emitters)
+        self._lights = [self._from(light) for light in lights]
+
+    def light(self, seed: tuple[int, int]) -> list[mi.Spectrum]:
+        """Irradiance from each point-like light, and a sample of that from all lamps."""
+        if not self._small:
+            return self._lights
+        samples = min(max(SAMPLES, self._small), MOST_SAMPLES)
+        lane = dr.arange(mi.UInt32, dr.width(self._p))
+        seeds = mi.sample_tea_32(*(dr.opaque(mi.UInt32, s) for s in seed))
+        state = mi.sample_tea_32(lane, seeds[1])
+        rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
+        light = _sampled(
+            self._scene, self._medium, self._others, self._emitters, self._p,
+            dr.opaque(mi.UInt32, self._small), dr.opaque(mi.UInt32, samples), rng,
+        )  # fmt: skip
+        dr.eval(light)
+        return [*self._lights, light]
+
+    def _from(self, emitter: mi.Emitter) -> mi.Spectrum:
+        """Irradiance from a point-like emitter."""
+        rng = mi.PCG32(dr.width(self._p))
+        light, _ = _shone(
+            self._scene, self._medium, self._others, emitter, self._p,
+            mi.Point2f(0.5), rng,
+        )  # fmt: skip
+        dr.eval(light)
+        return light
+
+
+def _shone(scene, medium, others, emitter, p, sample, rng) -> tuple:
+    """One sample of the irradiance at ``p`` straight from an emitter, and the random generator."""
+    vertex = dr.zeros(mi.Interaction3f, dr.width(p))
+    vertex.p = p
+    record, light = emitter.sample_direction(vertex, sample)
+    lit = dr.max(light) > 0
+    # The medium itself is marched through apart, without noise.
+    passed, rng = visibility(scene, others, vertex, record.p, medium.pointer, rng, lit)
+    lit &= dr.max(passed) > 0
+    passed *= marched(medium, mi.Ray3f(p, record.d), record.dist, lit)
+    return dr.select(lit, light * passed, 0), rng
+
+
+@dr.syntax
+def _sampled(scene, medium, others, emitters, p, count, samples, rng):
+    """The mean of samples of the irradiance from all of ``count`` lamps."""
+    shift = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    total, k = mi.Spectrum(0), mi.UInt32(0)
+    while dr.hint(k < samples, label="lamps"):
+        # The same number on each lamp, as far as it goes; evenly spread over it.
+        which = mi.UInt32((mi.Float(k) + shift.z) / mi.Float(samples) * mi.Float(count))
+        emitter = dr.gather(mi.EmitterPtr, emitters, dr.minimum(which, count - 1))
+        u = mi.Float(k) * 0.7548776662466927 + shift.x
+        v = mi.Float(k) * 0.5698402909980532 + shift.y
+        sample = mi.Point2f(u - dr.floor(u), v - dr.floor(v))
+        light, rng = _shone(scene, medium, others, emitter, p, sample, rng)
+        total += light
+        k += 1
+    return total * (mi.Float(count) / mi.Float(samples))

@@ -1,0 +1,158 @@
+"""A pass of the solver ``sweep``: directions, and the light that enters along them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
+from mitsuba_irrcache.solvers.directions import Sky, spread
+from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.scattering import Level
+
+#: Directions and what belongs to them, as `Lattice.table` wants it.
+Rows = Sequence[np.ndarray]
+#: Directions of a pass along which light arrives where there are surfaces: it differs from one to
+#: the next by more than the light between voxels.
+ARRIVING = 64
+
+
+class Pass:
+    """Directions, light from far away along them, weights and offsets: light that enters and light
+    from voxels goes the same ways.
+    """
+
+    def __init__(self, rows: Rows) -> None:
+        self.rows = rows
+
+    @staticmethod
+    def uncollided(passes: Sequence[Pass], lattice: Lattice) -> mi.Float:
+        """Irradiance at the wanted voxels straight from the emitters, the sum of all ``passes``."""
+        directions, light, _, offsets = joined([p.rows for p in passes])
+        lit = light.any(axis=1)
+        return lattice.carry(directions[lit], light[lit], offsets[lit])
+
+    def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        """As `Level.scatter`, with the light that enters."""
+        return level.scatter(phi, level.lattice.table(*self.rows))
+
+    def solve(self, level: Level, b: mi.Float) -> mi.Float:
+        """All orders of scattering, of which ``b`` is the first."""
+        directions, _, weights, offsets = self.rows
+        even = weights != 0  # the others carry light of emitters only
+        return level.solve(b, directions[even], weights[even], offsets[even])
+
+
+class ArrivingPass:
+    """Among surfaces: light that arrives comes along more directions than light between voxels,
+    ``inner`` ones.
+
+    ``arrivals`` are those along the ``rows``, which are from number ``start`` on there; ``returns``
+    those along the inner ones, by which light that leaves the medium comes back to it while all
+    orders are solved for, if they are in this pass. A ``channel`` is taken of both.
+    """
+
+    def __init__(
+        self,
+        rows: Rows,
+        inner: Rows,
+        arrivals: Arrivals,
+        start: int,
+        returns: Arrivals | None,
+        channel: int,
+    ) -> None:
+        self.rows, self.inner = rows, inner
+        self.arrivals, self.returns, self.channel = arrivals, returns, channel
+        self.numbers = np.arange(start, start + len(rows[0]))
+
+    @staticmethod
+    def uncollided(passes: Sequence[ArrivingPass], lattice: Lattice) -> mi.Float:
+        """As `Pass.uncollided`."""
+        directions, light, _, offsets = joined([p.rows for p in passes])
+        arrivals, channel = passes[0].arrivals, passes[0].channel
+        numbers = np.concatenate([p.numbers for p in passes])
+        lit = arrivals.lit[numbers]
+        return lattice.carry(
+            directions[lit],
+            light[lit],
+            offsets[lit],
+            lambda table: arrivals.directly(channel, table, numbers[lit]),
+        )
+
+    def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        """As `Level.scatter`, with the light that arrives."""
+        table = level.lattice.table(*self.rows)
+        of_table = self.channel, level.lattice, table, self.numbers
+        table.entering = self.arrivals.returning(*of_table, emitted=True)
+        table.entering.receive(phi)
+        found = level.scatter(None, table)
+        if phi is None:
+            return found
+        # Apart from each other: either lets as much collide as its own lines lose.
+        between = level.scatter(phi, level.lattice.table(*self.inner))
+        both = tuple(a + b for a, b in zip(found, between, strict=True))
+        dr.eval(both)
+        return both
+
+    def solve(self, level: Level, b: mi.Float) -> mi.Float:
+        """As `Pass.solve`; light may leave the medium between two orders."""
+        directions, _, weights, offsets = self.inner
+        numbers = np.arange(len(directions))
+        return level.solve(
+            b,
+            directions,
+            weights,
+            offsets,
+            lambda *of_table: self.returns.returning(
+                self.channel, *of_table, numbers, emitted=False
+            ),
+        )
+
+
+def arriving(
+    around: Around,
+    sky: Sky,
+    lattice: Lattice,
+    passes: int,
+    pairs: int,
+    rng: np.random.Generator,
+    seed: tuple[int, int],
+) -> tuple[list[list[ArrivingPass]], list[list[mi.Float]]]:
+    """Passes among surfaces for each channel, of which the first one's orders can be solved for if
+    there are several; and what differs between channels. ``pairs`` are those between voxels.
+    """
+    several = passes > 1
+    rows = [sky.rows(ARRIVING // 2 if several else pairs, rng) for _ in range(passes)]
+    inner = []
+    for _ in range(passes):
+        directions, weights = spread(pairs, rng)
+        dark = np.zeros((pairs, *rows[0][1].shape[1:]))
+        inner.append((directions, dark, weights, rng.random((pairs, 2))))
+    arrivals = Arrivals(around, lattice, joined(rows), several, (*seed, 0))
+    returns = Arrivals(around, lattice, inner[0], several, (*seed, 1)) if several else None
+    starts = np.cumsum([0] + [len(row[0]) for row in rows])
+    kinds = [*arrivals.kinds, *(returns.kinds if several else ())]
+    by_channel = [
+        [
+            ArrivingPass(
+                of_channel(row, c), of_channel(own, c), arrivals, start, None if i else returns, c
+            )
+            for i, (row, own, start) in enumerate(zip(rows, inner, starts, strict=False))
+        ]
+        for c in range(len(kinds[0]))
+    ]
+    return by_channel, kinds
+
+
+def joined(rows: Sequence[Rows]) -> tuple[np.ndarray, ...]:
+    """Several sets as one."""
+    return tuple(np.concatenate(parts) for parts in zip(*rows, strict=True))
+
+
+def of_channel(rows: Rows, channel: int) -> Rows:
+    """Rows with light in all channels (n, 2, channels) for one of them."""
+    directions, light, weights, offsets = rows
+    return directions, light[..., channel], weights, offsets

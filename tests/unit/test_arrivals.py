@@ -1,0 +1,108 @@
+"""Light that arrives along lines: which line gets which."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.scene import bake_media
+from mitsuba_irrcache.solvers import arrivals
+from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
+from mitsuba_irrcache.solvers.lattice import Entering, Lattice
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+DIRECTIONS = np.array([[0.2, 0.5, 1.0], [1.0, -0.7, 0.4], [-0.3, -1.0, 0.6], [0.0, 0.0, -1.0]])
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
+
+
+class Nothing:
+    """What is around a medium where that does not matter."""
+
+    lamps = ()
+
+
+def swept(lattice: Lattice, found: Arrivals, values: mi.Float, i: int, offset) -> np.ndarray:
+    """What the lines of direction ``i`` bring to the voxels of ``lattice``, through nothing."""
+    dark, rows = np.zeros((1, 2)), np.array([i])
+
+    def entering(table):
+        return Entering(*found._placed(lattice, table, rows), values)
+
+    volume = lattice.carry(DIRECTIONS[rows], dark, offset[rows], entering)
+    return np.array(volume, dtype=np.float64).reshape(lattice.grid.shape)
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    """Arrivals without anything to be followed."""
+    monkeypatch.setattr(arrivals, "_follow", lambda *args: (None, None, None, mi.UInt32(0)))
+
+
+@pytest.mark.parametrize("way", [0, 1])
+@pytest.mark.parametrize("cells", [1 << 14, 30], ids=["lines", "blocks"])
+@pytest.mark.parametrize("coarse", [False, True])
+def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way, cells, coarse):
+    """A quantity that is constant along lines, told at the points of entry, is found at all voxels
+    of the box as it is there: in a turned, stretched grid, on a coarser one, and if some lines
+    share a cell, within its size.
+    """
+    monkeypatch.setattr(arrivals, "CELLS", cells)
+    place = scenes.placement((1.0, 3.0, 2.0), turn=35, mirror=True)
+    grid = Grid((12, 10, 8), place)
+    lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])
+    fine = Lattice(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
+    offsets = np.random.default_rng(3).random((len(DIRECTIONS), 2))
+    rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
+    found = Arrivals(Nothing, fine, rows, True, (0, 0, 0))
+    _, _, hit, ray, _ = found.begin(found._numbers(*rows[:3])[0], (0, 0, 0))
+    lattice, low, high = fine, lower, upper
+    if coarse:
+        half = Grid((6, 5, 4), place)
+        low, high = lower // 2, upper // 2
+        lattice = Lattice(half, dr.zeros(mi.Float, half.voxel_count), low, high)
+    inside = np.s_[low[2] : high[2], low[1] : high[1], low[0] : high[0]]
+    at = np.moveaxis(np.indices(lattice.grid.shape)[::-1], 0, -1) + 0.5
+    world = lattice.grid.world.matrix
+    centres = (at @ world[:3, :3].T + world[:3, 3])[inside]
+    edge = np.linalg.norm(lattice.grid.voxel_size)
+    for i, direction in enumerate(DIRECTIONS):
+        across = np.cross(direction, [0.3, 0.8, -0.5])
+        across /= np.linalg.norm(across)
+        along = dr.dot(mi.Vector3f(*across.tolist()), mi.Vector3f(ray.o)) + 10
+        is_way = (dr.arange(mi.UInt32, dr.width(along)) & 1) == way
+        values = dr.select(hit & is_way, along, 0)
+        dr.eval(values)
+        brought = swept(lattice, found, values, i, offsets)[inside]
+        share = 1 if cells > 30 else found._edge.max()
+        error = np.abs(brought - (centres @ across + 10))
+        assert error.max() < 0.9 * edge * share
+        # Lines are not at centres, but on all sides of them.
+        assert abs((brought - (centres @ across + 10)).mean()) < 0.5 * edge * share
+
+
+def test_what_returns_is_linear_in_phi(scenes):
+    """White walls all around a medium in the dark: nothing is emitted, and what returns is what
+    left, so that with phi everywhere 4 pi no more than radiance 1 arrives, and that along lines
+    which meet the medium again; the places are voxels of it.
+    """
+    wall = {"type": "sphere", "radius": 4.0, "flip_normals": True}
+    wall["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    shape = scenes.boundary(scenes.medium(40.0, 1.0))
+    scene = scenes.load({"type": "irrcache"}, shape, 4, emitter=None, wall=wall)
+    (medium,) = bake_media(scene)
+    grid = Grid((8, 8, 8), medium.frame)
+    lattice = Lattice(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)
+    offsets = np.random.default_rng(1).random((len(DIRECTIONS), 2))
+    rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
+    found = Arrivals(Around(scene, medium, [], 1000), lattice, rows, True, (1, 2, 0))
+    returned, voxel = np.array(found.returned[0]) * 4 * np.pi, np.array(found.voxel)
+    assert np.array(found.emitted).max() == 0
+    _, _, hit, _, _ = found.begin(found._numbers(*rows[:3])[0], (1, 2, 0))
+    returned = returned[np.array(hit)]
+    assert returned.mean() == pytest.approx(1, rel=0.02)
+    places = np.stack(np.unravel_index(voxel[np.array(hit)], grid.shape), axis=1)
+    assert ((places == 0) | (places == 7)).any(axis=1).mean() > 0.98  # of 5 mean free paths
