@@ -84,8 +84,8 @@ MUTANTS = (
     Mutant(
         "sharpening with the wrong sign (sweep)",
         "solvers/lattice.py",
-        "change += here - there",
-        "change += there - here",
+        "2 * here - below - above, 0)",
+        "below + above - 2 * here, 0)",
         (SWEEP,),
     ),
     Mutant(
