@@ -361,8 +361,8 @@ class IrradianceCache:
         moments = arrays["moments"] if count else np.zeros((0, width), np.float32)
         if (moments.shape, moments.dtype) != ((count * channels, width), np.float32):
             raise ValueError(f"moments of shape {moments.shape} and type {moments.dtype}")
-        largest = max(float(np.abs(v).max(initial=0)) for v in (totals, spreads, moments))
-        if not largest < np.finfo(np.float32).max:  # NaN too
+        largest = np.max([np.abs(v).max(initial=0) for v in (totals, spreads, moments)])
+        if not largest < float(np.finfo(np.float32).max):  # NaN too
             raise ValueError("it holds values that are not finite")
         if min(values.min(initial=0) for values in (totals, spreads)) < 0:
             raise ValueError("it holds light that is negative")

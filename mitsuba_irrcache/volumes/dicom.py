@@ -103,7 +103,10 @@ def _slice_placement(files: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, st
 
 
 def _numbers(text: str) -> list[float]:
-    return [float(number) for number in text.split("\\")]
+    try:
+        return [float(number) for number in text.split("\\")]
+    except ValueError as error:
+        raise IrrcacheError(f"a DICOM slice is placed at {text!r}, which is no position") from error
 
 
 def _check_gaps(folder: Path, positions: np.ndarray, normal: np.ndarray) -> None:

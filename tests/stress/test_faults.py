@@ -170,13 +170,15 @@ def test_files_that_lie_are_refused(tmp_path, lie):
         filled(file, 8)
 
 
-@pytest.mark.parametrize(("value", "said"), [(-1e-3, "negative"), (1e300, "not finite")])
+@pytest.mark.parametrize(
+    ("value", "said"), [(-1e-3, "negative"), (1e300, "not finite"), (np.nan, "not finite")]
+)
 def test_impossible_light_is_refused(tmp_path, value, said):
     """Negative, or finite in double precision only."""
     file = tmp_path / "light.cache"
     filled(file, 8)
     arrays = dict(np.load(file))
-    arrays["totals"][0, 3] = value
+    arrays["spreads"][0, 3] = value
     with file.open("wb") as stream:
         np.savez(stream, **arrays)
     with pytest.raises(CacheFileError, match=said):
