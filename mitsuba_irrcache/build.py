@@ -16,6 +16,7 @@ from .lit import CacheSettings, LitMedium
 from .medium import MediumGrid
 from .scene import bake_media
 from .solvers import path
+from .stopping import Pause
 
 __all__ = ["CacheBuilder", "CacheSettings", "Progress"]
 
@@ -44,6 +45,9 @@ class CacheBuilder:
         self._saves_when_filled = True
         #: whether the first two batches may be shown in pieces; see `path.Opening`
         self.early = False
+        #: its action is called often while the solver ``sweep`` is at work, between launches: other
+        #: things may be computed meanwhile; what it raises drops the batch that is computed
+        self.pause = Pause()
 
     @property
     def medium(self) -> MediumGrid | None:
@@ -62,6 +66,12 @@ class CacheBuilder:
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
         """Makes media and caches fit ``scene``."""
+        self.fit(scene)
+        for number, part in enumerate(self.parts):
+            self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
+
+    def fit(self, scene: mi.Scene) -> None:
+        """Makes the media fit ``scene``, with empty caches where the old ones do not hold."""
         snapshot = Snapshot(scene)
         changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
         if self._snapshot is None or changes:
@@ -75,12 +85,18 @@ class CacheBuilder:
             if media:
                 solver = choose_solver(scene, self.settings.solver, media[0])
             self.parts = [
-                LitMedium(scene, m, self.settings, solver, m.name if len(media) > 1 else "", edited)
+                LitMedium(
+                    scene,
+                    m,
+                    self.settings,
+                    solver,
+                    m.name if len(media) > 1 else "",
+                    edited,
+                    self.pause,
+                )
                 for m in media
             ]
             self._scene_id, self._snapshot = id(scene), snapshot
-        for number, part in enumerate(self.parts):
-            self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
 
     def _refine(self, scene: mi.Scene, part: LitMedium, progress: path.Progress | None) -> None:
         changed = True  # the solver may be stopped half-way

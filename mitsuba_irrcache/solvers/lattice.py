@@ -20,7 +20,7 @@ arithmetic, and the odd part of what is integrated over directions cancels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -62,8 +62,11 @@ class Lattice:
         lower: np.ndarray,
         upper: np.ndarray,
         detail: Grid | None = None,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:
         self.grid, self.detail = grid, detail or grid
+        #: called after every launch; see `CacheBuilder.pause`
+        self.pause = pause
         self._own = self.detail.shape == grid.shape  # each voxel has its own extinction
         self.lower, self.sides = np.array(lower), np.array(upper) - np.array(lower)
         self._to_voxels = grid.coordinates.matrix[:3, :3]
@@ -183,12 +186,14 @@ class Lattice:
             lane = lanes - row * lines
             _sweep(self._all_corners[axis], self._own, volume, source, table, which, lane, True)
             dr.eval(volume)
+            self.pause()
             return
         corners = self._corners_across(axis)  # one set at a time is kept
         dr.eval(corners)
         for i in pairs:
             _sweep(corners, self._own, volume, source, table, table.places[i], self._lanes, False)
             dr.eval(volume)
+            self.pause()
 
     def _slices(self, axis: int) -> np.ndarray:
         """Values of the extinction along x, y, z: a slice for each of the grid's along ``axis``."""

@@ -51,7 +51,12 @@ class Sweep:
     """Fills ``cache``, which lies over ``medium``."""
 
     def __init__(
-        self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        cache: IrradianceCache,
+        seed: int,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:
         self.cache, self.seed = cache, seed
         self._sky = Sky(scene)
@@ -61,7 +66,7 @@ class Sweep:
         detail = _detail(medium, grid)
         extinction = baked(medium, medium.sigma_t, detail)
         box = _occupied_box(cache)
-        self._lattices = [Lattice(grid, s, *box, detail) for s in extinction]
+        self._lattices = [Lattice(grid, s, *box, detail, pause) for s in extinction]
         # For single scattering the albedo does not matter here.
         self._levels: list[Level] = []
         if cache.max_depth != 2:
