@@ -46,6 +46,9 @@ class Server:
         server.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, control_width="medium"
         )
+        # There is nothing in the browser's own scene: no light has to be computed for it.
+        server.scene.configure_default_lights(False)
+        server.scene.configure_environment_map(None)
         self._set_first_camera()
         camera = next(iter(session.cameras.values()))
         self.panel = LightPanel(server, session, camera.up)
