@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import ipaddress
+import logging
 import math
 import threading
 from pathlib import Path
@@ -13,12 +14,13 @@ from urllib.parse import urlsplit
 import viser
 import viser._messages as messages
 
-from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.view.panel import LightPanel
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.transfer_panel import TransferPanel
 from mitsuba_irrcache.view.visitor import Visitor
+
+LOG = logging.getLogger(__name__)
 
 LOCAL = ("localhost", "127.0.0.1", "::1")
 
@@ -105,8 +107,8 @@ class Server:
         async def check(connection: object) -> None:
             live = websockets._live_connections[connection.client_id]
             if not is_own_page(live.request.headers, self.host):
+                LOG.warning("a page of another site was refused")
                 await live.close(1008, "pages of other sites are refused")
-                raise IrrcacheError("view: a page of another site was refused.")
 
         websockets._client_connect_cb.insert(0, check)
 
@@ -120,7 +122,8 @@ def is_own_page(headers: dict[str, str], host: str) -> bool:
     if origin is None:
         return True
     asked = urlsplit(f"//{headers.get('Host', '')}")
-    if urlsplit(origin).netloc != asked.netloc:
+    own = urlsplit(origin)
+    if (own.scheme, own.netloc) != ("http", asked.netloc):
         return False
     return not is_local(host) or (asked.hostname or "") in LOCAL
 
