@@ -22,9 +22,9 @@ pytestmark = [
     pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine"),
 ]
 
-SIZE = (620, 260)
+SIZE = (700, 260)
 #: The part of a window, in pixels from the left, that the panel never covers.
-CLEAR = 300
+CLEAR = 340
 
 
 @pytest.fixture(scope="module")
