@@ -89,7 +89,7 @@ def stopping(window: Window, repeats: int) -> dict[str, float]:
         found.append(min(full) - last)
     return {
         "full resolution after stopping, median [s]": float(np.median(found)),
-        "  slowest [s]": max(found),
+        "  slowest stop [s]": max(found),
     }
 
 
@@ -112,7 +112,7 @@ def editing(window: Window, repeats: int) -> dict[str, float]:
         found.append(min(after) - began)
     return {
         f"picture after an edit ({label}), median [s]": float(np.median(found)),
-        "  slowest [s]": max(found),
+        "  slowest edit [s]": max(found),
     }
 
 
