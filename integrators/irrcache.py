@@ -15,14 +15,12 @@ from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.filtering import FILTERS, filter_illumination
 from mitsuba_irrcache.layers import AOVS, Layers, parse_aovs
-from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.progressive import Frame, Targets, frames
 from mitsuba_irrcache.projection import QUADRATURES, Projection
 from mitsuba_irrcache.rendering import fill_film, planes, render_film
 from mitsuba_irrcache.runtime import require_llvm
-from mitsuba_irrcache.sight import Sight, SimpleSight
+from mitsuba_irrcache.sight import Sight, SimpleSight, sight_of
 from mitsuba_irrcache.stopping import Stopped, Stopping
-from mitsuba_irrcache.uncertainty import uncertainty_of
 from mitsuba_irrcache.variants import require_same_variant, require_variant
 from mitsuba_irrcache.versions import check_versions
 
@@ -265,27 +263,15 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _make_sight(self) -> SimpleSight | Sight | None:
         """What sees the caches as they are; None where there is no medium to be seen."""
-        settings, parts = self._settings, self._builder.parts
-        if not parts:
-            return None
-        projections = [self._project(part.medium, part.shown) for part in parts]
-        surroundings = parts[0].medium.surroundings
-        if surroundings is None:
-            return SimpleSight(projections[0], settings.max_depth, self._hide_emitters)
-        depths = settings.max_depth, settings.rr_depth
-        return Sight(surroundings, projections, *depths, self._hide_emitters)
-
-    def _project(self, medium: MediumGrid, cache: IrradianceCache | None) -> Projection:
-        lit = cache is not None and cache.active_count and cache.samples
-        field = cache.field() if lit else None
-        uncertainty = uncertainty_of(cache) if lit and self._with_error else None
-        directional = cache.directional_field(field.channels) if lit else None
-        projection = Projection(
-            medium, field, self._quadrature, self._step, self._layered, uncertainty, directional
+        return sight_of(
+            self._builder.parts,
+            self._settings,
+            self._hide_emitters,
+            self._quadrature,
+            self._step,
+            self._layered,
+            self._with_error,
         )
-        if lit and cache.survey is not None:
-            projection.edges = cache.survey.edges
-        return projection
 
     @property
     def _projection(self) -> Projection:

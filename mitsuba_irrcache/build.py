@@ -17,6 +17,7 @@ from .lit import CacheSettings, LitMedium
 from .medium import MediumGrid
 from .scene import bake_media
 from .solvers import path
+from .stopping import Pause
 
 __all__ = ["CacheBuilder", "CacheSettings", "Progress"]
 
@@ -49,6 +50,9 @@ class CacheBuilder:
         self._saves_when_filled = True
         #: whether the first two batches may be shown in pieces; see `path.Opening`
         self.early = False
+        #: its action is called often while the solver ``sweep`` is at work, between launches: other
+        #: things may be computed meanwhile; what it raises drops the batch that is computed
+        self.pause = Pause()
 
     @property
     def medium(self) -> MediumGrid | None:
@@ -67,6 +71,12 @@ class CacheBuilder:
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
         """Makes media and caches fit ``scene``."""
+        self.fit(scene)
+        for number, part in enumerate(self.parts):
+            self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
+
+    def fit(self, scene: mi.Scene) -> None:
+        """Makes the media fit ``scene``, with empty caches where the old ones do not hold."""
         volume = self._emission if isinstance(self._emission, mi.Volume) else None
         snapshot = Snapshot(scene, volume)
         changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
@@ -87,12 +97,11 @@ class CacheBuilder:
                     choose_solver(scene, medium, *wanted),
                     medium.name if len(media) > 1 else "",
                     edited,
+                    self.pause,
                 )
                 for medium in media
             ]
             self._scene_id, self._snapshot = id(scene), snapshot
-        for number, part in enumerate(self.parts):
-            self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
 
     def _baked_emission(self) -> Emission | None:
         if self._emission is None:

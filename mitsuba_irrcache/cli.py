@@ -1,4 +1,4 @@
-"""The command ``irrcache``: render, compare, import, doctor."""
+"""The command ``irrcache``: render, view, compare, import, doctor."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 #: Name, module and description of each command.
 COMMANDS = (
     ("render", "render", "render a scene with irrcache"),
+    ("view", "view.command", "look at a scene or a volume in the browser"),
     ("compare", "compare.command", "measure error against time of any integrators"),
     ("import", "volumes.importer", "make a scene of a CT, MR or other volume"),
     ("doctor", "doctor", "check this machine and say what to install"),

@@ -59,6 +59,11 @@ def write_image(
     return png
 
 
+def write_pixels(path: Path, pixels: np.ndarray) -> None:
+    """Writes ``pixels``, uint8 (height, width, channel), to a PNG as they are."""
+    _write(oiio.ImageBuf(np.ascontiguousarray(pixels)), path, oiio.UINT8)
+
+
 def read_image(path: str | Path) -> np.ndarray:
     """The pixels of an image file (height, width, channel), float32, as they are stored."""
     return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +41,7 @@ class LitMedium:
     2).
 
     ``solver`` is what `choices.choose_solver` says; ``name`` tells the medium from the
-    scene's others, "" where there are none.
+    scene's others, "" where there are none; ``pause`` is as in `CacheBuilder`.
     """
 
     def __init__(
@@ -51,8 +52,10 @@ class LitMedium:
         solver: tuple[str, str],
         name: str,
         edited: bool,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:
         self.settings, self.medium, self.name = settings, medium, name
+        self._pause = pause
         #: samples per voxel in the file
         self.saved_samples = 0
         #: path or sweep, and why
@@ -146,11 +149,15 @@ class LitMedium:
         self.saved_samples = 0
         if not self.file:
             return cache
-        cache.fingerprint = digests(scene, medium) | {
-            "settings": f"solver {self.solver}, max_depth {settings.max_depth}, "
-            f"grid {grid.shape[::-1]}" + (f", moments {moments}" if moments else "")
-        }
+        cache.fingerprint = self._fingerprint(scene, cache)
         return self._resume(cache, edited)
+
+    def _fingerprint(self, scene: mi.Scene, cache: IrradianceCache) -> dict[str, str]:
+        moments = f", moments {cache.moments}" if cache.moments else ""
+        return digests(scene, self.medium) | {
+            "settings": f"solver {self.solver}, max_depth {cache.max_depth}, "
+            f"grid {cache.grid.shape[::-1]}{moments}"
+        }
 
     def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache:
         """The cache on disk where it is of the same light; a foreign file is refused, never
@@ -229,14 +236,18 @@ class LitMedium:
         settings, cache = self.settings, self.cache
         if self.solver == "sweep":
             if self._sweep is None:
-                self._sweep = sweep.Sweep(
-                    scene, self.medium, cache, settings.seed, settings.rr_depth
-                )
+                arguments = settings.seed, settings.rr_depth, self._pause
+                self._sweep = sweep.Sweep(scene, self.medium, cache, *arguments)
             self._sweep.refine(missing, progress)
         else:
             path.refine(
                 scene, self.medium, cache, missing, settings.seed, settings.rr_depth, progress
             )
+
+    def save_as(self, scene: mi.Scene, file: str | Path) -> None:
+        """Writes a copy of the cache that fits ``scene`` to a file of any name."""
+        self.cache.fingerprint = self._fingerprint(scene, self.cache)
+        self.cache.save(file)
 
     def save(self) -> None:
         """Writes the cache to its file, where it has one that has fewer samples, also by now: other

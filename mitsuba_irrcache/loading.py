@@ -6,10 +6,12 @@ import inspect
 import re
 from contextlib import suppress
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mitsuba as mi
 
 from .errors import IrrcacheError
+from .scene_text import scene_element
 
 #: Properties that every volumetric path integrator shares, and that keep their meaning here.
 SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
@@ -38,6 +40,45 @@ def load_scene(
         mi.parser.transform_all(config, state)
         if integrator is not None:
             _replace_integrator(state, integrator, path)
+        scene = mi.parser.instantiate(config, state)
+    return scene[0] if isinstance(scene, list) else scene
+
+
+def scene_text(
+    path: str | Path, parameters: dict[str, str] | None = None, integrator: str | None = None
+) -> str:
+    """The XML of a scene with all its $parameters filled in and all included files in one; with
+    another ``integrator`` as in `load_scene`.
+    """
+    path = Path(path)
+    _, state = _parse(path, parameters)
+    if integrator is not None:
+        _replace_integrator(state, integrator, path)
+    return ElementTree.tostring(scene_element(state), encoding="unicode")
+
+
+def filled(text: str, integrator: str) -> str:
+    """An XML text as `scene_text` makes it of a file."""
+    state = mi.parser.parse_string(mi.parser.ParserConfig(mi.variant()), text)
+    _replace_integrator(state, integrator, Path("scene.xml"))
+    return ElementTree.tostring(scene_element(state), encoding="unicode")
+
+
+def scene_of_text(
+    text: str, folder: str | Path, grids: dict[str, mi.VolumeGrid] | None = None
+) -> mi.Scene:
+    """The scene of an XML text whose files are in ``folder``, but for those named in ``grids``:
+    volumes that need no file.
+    """
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_string(config, text)
+    with _search_path(Path(folder)):
+        for node in state.nodes:
+            name = node.props.get("filename", None)
+            if node.type == mi.ObjectType.Volume and name in (grids or {}):
+                del node.props["filename"]
+                node.props["grid"] = grids[name]
+        mi.parser.transform_all(config, state)
         scene = mi.parser.instantiate(config, state)
     return scene[0] if isinstance(scene, list) else scene
 

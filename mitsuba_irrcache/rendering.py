@@ -142,6 +142,27 @@ class PixelPositions:
         return mi.Point2f([mi.Float(b >> 8) * 2.0**-24 for b in bits])
 
 
+def pixel_of(index: mi.UInt32, width: int) -> mi.Vector2i:
+    """Column and row of the pixels with these numbers, where rows have ``width`` of them."""
+    columns = dr.opaque(mi.UInt32, width)
+    row = index // columns
+    return mi.Vector2i(mi.Int32(index - row * columns), mi.Int32(row))
+
+
+def camera_ray(
+    sensor: mi.Sensor, sampler: mi.Sampler, position: mi.Point2f
+) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+    """A ray through each ``position`` on the film, in pixels, and the sensor's weight of it."""
+    film = sensor.film()
+    scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / int(n)) for n in film.crop_size()))
+    on_film = (position - mi.Vector2f(film.crop_offset())) * scale
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    return sensor.sample_ray_differential(time, 0, on_film, aperture)
+
+
 def _splat(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
@@ -156,18 +177,10 @@ def _splat(
     film = sensor.film()
     lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
     index = lane // dr.opaque(mi.UInt32, per_pass)
-    width = dr.opaque(mi.UInt32, int(size.x))
-    row = index // width
-    pixel = mi.Vector2f(mi.Vector2i(mi.Int32(index - row * width), mi.Int32(row)) - border)
+    pixel = mi.Vector2f(pixel_of(index, int(size.x)) - border)
     pixel += mi.Vector2f(film.crop_offset())
     position = pixel + spread.next(index, lane - index * dr.opaque(mi.UInt32, per_pass))
-    scale = 1 / mi.ScalarVector2f(film.crop_size())
-    on_film = (position - mi.Vector2f(film.crop_offset())) * scale
-    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    time = mi.Float(sensor.shutter_open())
-    if sensor.shutter_open_time() > 0:
-        time += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray_differential(time, 0, on_film, aperture)
+    ray, weight = camera_ray(sensor, sampler, position)
     ray.scale_differential(dr.rsqrt(float(spp)))
     value, alpha, further = radiance(sampler, ray, weight, mi.Bool(True))
     rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)

@@ -12,13 +12,51 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .cache import IrradianceCache
 from .layers import luminance
+from .lit import CacheSettings, LitMedium
+from .medium import MediumGrid
 from .projection import Projection
 from .surroundings import Surroundings
 from .transport import MOST_CROSSINGS, End, Start, behind, is_null, trace
+from .uncertainty import uncertainty_of
 
 #: Surfaces seen through less than this transmittance are traced by roulette.
 FAINT = 0.1
+
+
+def sight_of(
+    parts: list[LitMedium],
+    settings: CacheSettings,
+    hide_emitters: bool = False,
+    quadrature: str = "exponential",
+    step: float = 1.0,
+    layered: bool = False,
+    with_error: bool = False,
+) -> SimpleSight | Sight | None:
+    """What sees the caches of ``parts`` as they are; None where there is no medium to be seen.
+
+    ``layered`` and ``with_error`` are what `Projection` gathers beside the radiance.
+    """
+    if not parts:
+        return None
+
+    def project(medium: MediumGrid, cache: IrradianceCache | None) -> Projection:
+        lit = cache is not None and cache.active_count and cache.samples
+        field = cache.field() if lit else None
+        uncertainty = uncertainty_of(cache) if lit and with_error else None
+        directional = cache.directional_field(field.channels) if lit else None
+        projection = Projection(medium, field, quadrature, step, layered, uncertainty, directional)
+        if lit and cache.survey is not None:
+            projection.edges = cache.survey.edges
+        return projection
+
+    projections = [project(part.medium, part.shown) for part in parts]
+    surroundings = parts[0].medium.surroundings
+    if surroundings is None:
+        return SimpleSight(projections[0], settings.max_depth, hide_emitters)
+    depths = settings.max_depth, settings.rr_depth
+    return Sight(surroundings, projections, *depths, hide_emitters)
 
 
 class View:

@@ -11,6 +11,17 @@ class Stopped(Exception):  # noqa: N818 (no error: the user wants it)
     """Ends the build of a cache; what is complete stays."""
 
 
+class Pause:
+    """What a solver calls between its launches: ``action``, which may be set at any time."""
+
+    def __init__(self) -> None:
+        self.action: Callable[[], None] | None = None
+
+    def __call__(self) -> None:
+        if self.action is not None:
+            self.action()
+
+
 class Stopping:
     """Says when to stop: once `cancel` was called, from any thread, or so long after `begin`."""
 

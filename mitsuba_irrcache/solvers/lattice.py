@@ -67,8 +67,11 @@ class Lattice:
         detail: Grid | None = None,
         wanted: mi.UInt32 | None = None,
         sparse: bool = False,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:
         self.grid, self.detail = grid, detail or grid
+        #: called after every launch; see `CacheBuilder.pause`
+        self.pause = pause
         self._own = self.detail.shape == grid.shape  # each voxel has its own extinction
         self.lower, self.sides = np.array(lower), np.array(upper) - np.array(lower)
         self._to_voxels = grid.coordinates.matrix[:3, :3]
@@ -199,6 +202,7 @@ class Lattice:
                 corners, self._own, None, volume, source, table, table.entering, which, lane, True
             )
             dr.eval(volume)
+            self.pause()
             return
         corners = self._corners_across(axis)  # one set at a time is kept
         dr.eval(corners)
@@ -209,6 +213,7 @@ class Lattice:
                 self._lanes, False,
             )  # fmt: skip
             dr.eval(volume)
+            self.pause()
 
     def _slices(self, axis: int) -> np.ndarray:
         """Values of the extinction along x, y, z: a slice for each of the grid's along ``axis``."""

@@ -55,7 +55,8 @@ class Level:
             # The weights of the means that follow are shares of the extinction.
             self._children = [(i, dr.select(total > 0, s / total, 0)) for i, s in children]
             dr.eval(sigma_t, self._children)
-            lattice = Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
+            box = np.zeros(3, int), grid.resolution
+            lattice = Lattice(grid, sigma_t, *box, pause=self.lattice.pause)
             self._coarser = Level(grid, sigma_t, self.restrict(self.albedo), lattice)
         return self._coarser
 

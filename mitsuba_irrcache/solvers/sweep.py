@@ -66,6 +66,7 @@ class Sweep:
         cache: IrradianceCache,
         seed: int,
         rr_depth: int = 5,
+        pause: Callable[[], None] = lambda: None,
     ) -> None:
         """``rr_depth`` is that of paths between surfaces."""
         self.cache, self.seed = cache, seed
@@ -78,7 +79,8 @@ class Sweep:
         box = occupied_box(grid, cache.active)
         # Blocks of the medium's voxels reach farther than these.
         sparse = medium.sigma_t.grid is not None and detail.shape == medium.sigma_t.grid.shape
-        self._lattices = [Lattice(grid, s, *box, detail, cache.active, sparse) for s in extinction]
+        rest = *box, detail, cache.active, sparse, pause
+        self._lattices = [Lattice(grid, s, *rest) for s in extinction]
         # For single scattering the albedo does not matter here.
         self._levels: list[Level] = []
         if cache.max_depth != 2:

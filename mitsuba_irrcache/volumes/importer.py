@@ -30,19 +30,30 @@ _AIR_LIKE = -200
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``irrcache import`` on ``parser``."""
-    parser.add_argument(
-        "input",
-        nargs="+",
-        metavar="INPUT",
-        help="NRRD, NIfTI, MetaImage or .vol file, DICOM folder, raw file(s) in one or in slices, "
-        "or one made here: phantom:thorax (a chest), phantom:cloud (needs --density), each with "
-        ":X,Y,Z after it for another size",
-    )
+    add_input(parser)
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="a new folder, or FOLDER/scene.xml"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier import")
-    _add_appearance(parser.add_argument_group("appearance (one is needed)"))
+    add_options(parser)
+
+
+def add_input(parser: argparse.ArgumentParser, besides: str = "") -> None:
+    """Declare what is read; ``besides`` names what else may be."""
+    parser.add_argument(
+        "input",
+        nargs="+",
+        metavar="INPUT",
+        help=f"{besides}NRRD, NIfTI, MetaImage or .vol file, DICOM folder, raw file(s) in one or "
+        "in slices, or one made here: phantom:thorax (a chest), phantom:cloud (needs --density), "
+        "each with :X,Y,Z after it for another size",
+    )
+
+
+def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    """Declare how a volume is read and seen; whether it is a volume at all may be open."""
+    needed = "one is needed" if required else "for volumes: one is needed"
+    _add_appearance(parser.add_argument_group(f"appearance ({needed})"), required)
     _add_processing(parser.add_argument_group("processing, in this order"))
     _add_raw(parser.add_argument_group("raw files"))
     parser.add_argument("--series", metavar="UID", help="which series of a DICOM folder")
@@ -63,13 +74,11 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         IrrcacheError: input that cannot be used; nothing is left behind.
     """
-    mapping = _mapping(args)
-    volume = _process(_read(args), args)
-    _warn_about_unit(volume, mapping)
+    volume, mapping = _volume(args)
     resampled, sigma_t, albedo = processing.bake(
         volume, mapping, _target_size(volume, args), args.supersample
     )
-    settings = SceneSettings(max_depth=args.max_depth, up=_up(args))
+    settings = SceneSettings(max_depth=args.max_depth, up=up_axis(args))
     written = write_scene(
         args.output, resampled, mapping, sigma_t, albedo, settings, overwrite=args.overwrite
     )
@@ -77,8 +86,31 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_appearance(group: argparse._ArgumentGroup) -> None:
-    choice = group.add_mutually_exclusive_group(required=True)
+def read(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | DensityMapping]:
+    """The volume that ``args`` name, at the resolution that they want, and how it is seen."""
+    volume, mapping = _volume(args)
+    size = _target_size(volume, args)
+    return volume if size == volume.size else processing.resample(volume, size), mapping
+
+
+def _volume(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | DensityMapping]:
+    if not has_appearance(args):
+        raise IrrcacheError(
+            f"{args.input[0]}: say how it is seen: --preset, --transfer-function or --density."
+        )
+    mapping = _mapping(args)
+    volume = _process(_read(args), args)
+    _warn_about_unit(volume, mapping)
+    return volume, mapping
+
+
+def has_appearance(args: argparse.Namespace) -> bool:
+    """Whether ``args`` say how a volume is seen."""
+    return any(v is not None for v in (args.preset, args.transfer_function, args.density))
+
+
+def _add_appearance(group: argparse._ArgumentGroup, required: bool) -> None:
+    choice = group.add_mutually_exclusive_group(required=required)
     choice.add_argument("--preset", metavar="NAME", help=", ".join(preset_names()))
     choice.add_argument("--transfer-function", metavar="FILE", help="a JSON file")
     choice.add_argument(
@@ -210,7 +242,7 @@ def _target_size(volume: VolumeData, args: argparse.Namespace) -> processing.Siz
     return volume.size
 
 
-def _up(args: argparse.Namespace) -> str:
+def up_axis(args: argparse.Namespace) -> str:
     """Graphics volumes have y up, medical ones the patient's head at +z."""
     if args.up is not None:
         return args.up

@@ -1,0 +1,155 @@
+"""A real browser, headless, that looks at ``irrcache view`` and notes when pictures appear."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from playwright.sync_api import Locator, Page, sync_playwright
+
+#: Names that Chromium is installed under.
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+#: Notes the time of every mouse event, and of every picture that goes to the screen: from images
+#: that were made of received data, not of the page itself.
+_HOOKS = """
+(() => {
+  const now = () => performance.timeOrigin + performance.now();
+  window.__moves = []; window.__shown = [];
+  for (const kind of ['pointermove', 'wheel'])
+    window.addEventListener(kind, () => window.__moves.push(now()), true);
+  for (const name of ['texImage2D', 'texSubImage2D']) {
+    const original = WebGL2RenderingContext.prototype[name];
+    WebGL2RenderingContext.prototype[name] = function (...args) {
+      const image = args[args.length - 1];
+      if (image instanceof HTMLImageElement && image.src.startsWith('blob:')) {
+        const entry = {width: image.width, height: image.height, src: image.src, at: 0};
+        window.__shown.push(entry);
+        requestAnimationFrame(() => { entry.at = now(); });
+      }
+      return original.apply(this, args);
+    };
+  }
+})();
+"""
+
+
+def chromium() -> str | None:
+    """Where Chromium is; None where it is not."""
+    return next(filter(None, map(shutil.which, CHROMIUM)), None)
+
+
+@contextmanager
+def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
+    """``irrcache view`` with these arguments in a process of its own, and its address; what it
+    prints goes to ``log``.
+    """
+    command = [sys.executable, "-m", "mitsuba_irrcache", "view", *arguments, "--no-browser"]
+    with open(log, "w") as stream:
+        process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
+    try:
+        while not (found := re.search(r"http://\S+", log.read_text())):
+            if process.poll() is not None:
+                raise RuntimeError(f"the viewer ended: {log.read_text()}")
+            time.sleep(0.05)
+        yield found.group()
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+class Window:
+    """A browser window that looks at the viewer."""
+
+    def __init__(self, page: Page, address: str) -> None:
+        self.page = page
+        #: what the console said: (kind, text)
+        self.console: list[tuple[str, str]] = []
+        page.on("console", lambda message: self.console.append((message.type, message.text)))
+        page.on("pageerror", lambda error: self.console.append(("error", str(error))))
+        page.add_init_script(_HOOKS)
+        self.opened = time.time()
+        page.goto(f"{address}?fixedDpr=1")
+
+    @property
+    def errors(self) -> list[str]:
+        """Errors in the console."""
+        return [text for kind, text in self.console if kind == "error"]
+
+    def moves(self) -> list[float]:
+        """When the mouse moved, seconds."""
+        return [t / 1000 for t in self.page.evaluate("window.__moves")]
+
+    def shown(self) -> list[dict]:
+        """The pictures that were shown: "at" (seconds), "width" and "height"."""
+        entries = self.page.evaluate("window.__shown.filter(e => e.at > 0)")
+        return [entry | {"at": entry["at"] / 1000} for entry in entries]
+
+    def note(self) -> str:
+        """What the window says of its picture, "" before there is one."""
+        found = self.page.get_by_text(re.compile(r"per pixel$")).first
+        return found.inner_text() if found.count() else ""
+
+    def wait_for(self, note: str, seconds: float = 20.0) -> None:
+        """Until the window's note on its picture matches."""
+        pattern = re.compile(note)
+        self.page.get_by_text(pattern).first.wait_for(state="attached", timeout=1000 * seconds)
+
+    def field(self, label: str) -> Locator:
+        """The input of the control with this label."""
+        row = "ancestor::div[contains(@class, 'mantine-Flex-root')][1]"
+        return self.page.locator(
+            f"xpath=//label[text()='{label}']/{row}//input[not(@type='hidden')]"
+        ).first
+
+    def enter(self, label: str, value: object) -> None:
+        """Writes a value into a control."""
+        field = self.field(label)
+        field.fill(str(value))
+        field.press("Enter")
+
+    def choose(self, label: str, option: str) -> None:
+        """Picks the first option of a list that begins like this."""
+        self.field(label).click()
+        pattern = re.compile(rf"^{re.escape(option)}")
+        self.page.get_by_role("option", name=pattern).filter(visible=True).first.click()
+
+    def orbit(self, steps: int, pixels: float, pause: float, first: float = 60.0) -> None:
+        """Drags the mouse from ``first`` on, in ``steps`` of so many pixels."""
+        mouse, height = self.page.mouse, self.page.viewport_size["height"]
+        mouse.move(first, 0.8 * height)
+        mouse.down()
+        for step in range(1, steps + 1):
+            mouse.move(first + step * pixels, 0.8 * height)
+            self.page.wait_for_timeout(1000 * pause)
+        mouse.up()
+
+    def zoom(self, turns: int, pause: float = 0.05) -> None:
+        """Turns the wheel."""
+        for _ in range(abs(turns)):
+            self.page.mouse.wheel(0, 100 if turns > 0 else -100)
+            self.page.wait_for_timeout(1000 * pause)
+
+
+class Browser:
+    """Chromium, for as many windows as are opened; a context manager."""
+
+    def __enter__(self) -> Browser:
+        self._playwright = sync_playwright().start()
+        arguments = ["--no-sandbox", "--enable-unsafe-swiftshader"]
+        self._browser = self._playwright.chromium.launch(executable_path=chromium(), args=arguments)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._browser.close()
+        self._playwright.stop()
+
+    def open(self, address: str, size: tuple[int, int] = (512, 512)) -> Window:
+        """A new window of this (width, height)."""
+        page = self._browser.new_page(viewport={"width": size[0], "height": size[1]})
+        return Window(page, address)

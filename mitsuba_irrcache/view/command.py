@@ -1,0 +1,122 @@
+"""``irrcache view``: look at a scene or a volume in the browser."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import signal
+import threading
+import webbrowser
+from pathlib import Path
+
+import mitsuba as mi
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.loading import integrator_of, parse_parameters
+from mitsuba_irrcache.render import REPLACED
+from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.variants import SUPPORTED
+from mitsuba_irrcache.volumes import importer
+from mitsuba_irrcache.volumes.scene import SceneSettings
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``irrcache view``: those of ``render`` for a scene, of ``import`` for a
+    volume.
+    """
+    importer.add_input(parser, "scene XML, or what irrcache import reads: ")
+    parser.add_argument(
+        "-m",
+        "--mode",
+        default="llvm_ad_rgb",
+        choices=SUPPORTED,
+        help="variant (default: %(default)s)",
+    )
+    parser.add_argument(
+        "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
+        help="value of a $parameter of the scene; repeatable",
+    )  # fmt: skip
+    parser.add_argument(
+        "-i", "--integrator", metavar="irrcache{KEY=VALUE,...}", help="properties of irrcache"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="FOLDER",
+        help="where files are saved, made if it is not there (default: in the browser)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--host", default="127.0.0.1",
+        help="address to listen on; any other lets other machines in (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--port", type=int, default=8080, help="or the next one that is free")
+    parser.add_argument("--no-browser", action="store_true", help="only print the address")
+    parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
+    importer.add_options(parser, required=False)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Shows it until Ctrl-C."""
+    if importlib.util.find_spec("viser") is None:
+        raise IrrcacheError(
+            'the viewer needs the package "viser": pip install "mitsuba_irrcache[view]".'
+        )
+    if args.mode.startswith("llvm"):
+        require_llvm()
+    if args.output is not None and not args.output.absolute().parent.is_dir():
+        raise IrrcacheError(f'--output is "{args.output}", whose parent folder is not there.')
+    mi.set_variant(args.mode)
+    mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
+    _show(args)
+    return 0
+
+
+def _show(args: argparse.Namespace) -> None:
+    from mitsuba_irrcache.view.server import Server, is_local
+    from mitsuba_irrcache.view.session import Session
+
+    document, appearance = _document(args)
+    session = Session(document)
+    session.start()
+    server = None
+    try:
+        server = Server(session, args.host, args.port, args.output, appearance)
+        print(f"irrcache view: {server.address} (Ctrl-C ends it)", flush=True)
+        if not is_local(args.host):
+            print("irrcache view: other machines can connect, and change what is seen", flush=True)
+        if not args.no_browser:
+            webbrowser.open(server.address)
+        _wait()
+    finally:
+        if server is not None:
+            server.stop()
+        session.stop()
+
+
+def _document(args: argparse.Namespace) -> tuple:
+    """The scene as a document, and where it is made of data, these."""
+    from mitsuba_irrcache.view.appearance import Appearance
+    from mitsuba_irrcache.view.document import Document
+
+    path = Path(args.input[0])
+    if path.suffix.lower() == ".xml":
+        if importer.has_appearance(args):
+            raise IrrcacheError("a scene has its medium: --preset and the like are for volumes.")
+        parameters = parse_parameters(args.define)
+        integrator = args.integrator
+        if integrator is None and integrator_of(path, parameters) in REPLACED:
+            integrator = "irrcache"
+        return Document.load(path, parameters, integrator), None
+    volume, mapping = importer.read(args)
+    appearance = Appearance(volume, mapping)
+    settings = SceneSettings(
+        integrator="irrcache", max_depth=args.max_depth, up=importer.up_axis(args)
+    )
+    return appearance.document(settings), appearance
+
+
+def _wait() -> None:
+    """Until Ctrl-C, or a request to terminate."""
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    while not ended.wait(0.5):
+        pass

@@ -1,0 +1,349 @@
+"""The scene that is looked at, as its XML: what is edited is rendered, and saved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.lit import CacheSettings
+from mitsuba_irrcache.loading import filled, scene_of_text, scene_text
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.light import Seeing
+from mitsuba_irrcache.volumes.mitsuba_vol import write_vol
+
+#: What the viewer calls things that have no name.
+SUN_ID, MEDIUM_ID = "sun", "medium"
+#: Samples per pixel of a scene that is saved.
+SAVED_SAMPLES = 16
+_ENVIRONMENTS = ("constant", "envmap")
+_TRUE = ("true", "True")
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """What of the light can be changed.
+
+    Attributes:
+        environment: factor of the radiance that the scene gives its environment.
+        rotation: of the environment about the upward axis, in degrees, added to the scene's.
+        sun: irradiance of a sun across its direction; 0 for none.
+        azimuth, elevation: where the sun stands, in degrees: about the upward axis, above the
+            horizon.
+    """
+
+    environment: float = 1.0
+    rotation: float = 0.0
+    sun: float = 0.0
+    azimuth: float = 30.0
+    elevation: float = 50.0
+
+
+class Document:
+    """A scene XML in ``folder``, whose parts can be changed. ``volumes`` are the arrays (z, y, x[,
+    channel]) of volumes, by the names of the files that they have once they are saved.
+    """
+
+    def __init__(
+        self, text: str, folder: str | Path, volumes: dict[str, np.ndarray] | None = None
+    ) -> None:
+        self._root = ElementTree.fromstring(text)
+        self.folder = Path(folder)
+        self._volumes: dict[str, np.ndarray] = {}
+        self._grids: dict[str, mi.VolumeGrid] = {}
+        self.set_volumes(volumes or {})
+        if self._integrator is None or self._integrator.get("type") != "irrcache":
+            raise IrrcacheError("view: the scene's integrator is not irrcache.")
+        self._original = ElementTree.fromstring(text)
+        self.lighting = self._lighting()
+
+    @classmethod
+    def load(
+        cls, path: Path, parameters: dict[str, str] | None = None, integrator: str | None = None
+    ) -> Document:
+        """Of a scene file; as `loading.load_scene`."""
+        return cls(scene_text(path, parameters, integrator), path.parent)
+
+    @classmethod
+    def of_text(cls, text: str, volumes: dict[str, np.ndarray]) -> Document:
+        """Of the XML of a scene with $parameters, whose only files are ``volumes``."""
+        return cls(filled(text, "irrcache"), ".", volumes)
+
+    # ------------------------------------------------------------------ what it says
+
+    def scene(self) -> mi.Scene:
+        """Mitsuba's scene of it."""
+        return scene_of_text(self._text(self._root), self.folder, self._grids)
+
+    @property
+    def settings(self) -> CacheSettings:
+        """What its integrator says of the cache."""
+        read = self._read
+        return CacheSettings(
+            max_depth=int(read("max_depth", -1)),
+            rr_depth=int(read("rr_depth", 5)),
+            solver=str(read("solver", "auto")),
+            resolution=int(read("resolution", 0)),
+            seed=int(read("cache_seed", 0)),
+        )
+
+    @property
+    def seeing(self) -> Seeing:
+        """What its integrator says of the image."""
+        return Seeing(
+            self._read("hide_emitters", "false") in _TRUE,
+            str(self._read("quadrature", "exponential")),
+            float(self._read("step", 1.0)),
+        )
+
+    @property
+    def has_environment(self) -> bool:
+        return self._environment(self._root) is not None
+
+    @property
+    def density(self) -> float:
+        """Factor of the extinction of all media."""
+        scales = [float(m.find("float[@name='scale']").get("value")) for m in self._scaled()]
+        return scales[0] / self._original_scale(0) if scales else 1.0
+
+    def state(self) -> tuple:
+        """All that can be changed, to `restore` it."""
+        return self._text(self._root), dict(self._volumes), dict(self._grids), self.lighting
+
+    def restore(self, state: tuple) -> None:
+        """Undoes all changes since `state`."""
+        text, volumes, grids, self.lighting = state
+        self._root = ElementTree.fromstring(text)
+        self._volumes, self._grids = dict(volumes), dict(grids)
+
+    # ------------------------------------------------------------------ changes
+
+    def set_volumes(self, volumes: dict[str, np.ndarray]) -> None:
+        """Other values for the volumes of these names."""
+        for name, values in volumes.items():
+            self._volumes[name] = values
+            self._grids[name] = mi.VolumeGrid(values.reshape(*values.shape[:3], -1))
+
+    def set_max_depth(self, depth: int) -> None:
+        if depth < -1 or depth == 0:
+            raise IrrcacheError(f"max_depth is {depth}; it must be -1 (all orders) or at least 1.")
+        _set(self._integrator, "integer", "max_depth", str(depth))
+
+    def set_density(self, factor: float) -> None:
+        """Multiplies the extinction that the scene gives its media."""
+        if not 0 < factor < 1e6:
+            raise IrrcacheError(f"the density is {factor:g}; it must be above 0, and below 1e6.")
+        for number, medium in enumerate(self._scaled()):
+            _set(medium, "float", "scale", repr(self._original_scale(number) * factor))
+
+    def set_lighting(self, lighting: Lighting, up: Sequence[float]) -> None:
+        """Changes environment and sun; ``up`` is the upward axis."""
+        if not lighting.environment >= 0 or not lighting.sun >= 0:
+            raise IrrcacheError("light cannot be negative; give 0 for none.")
+        self._set_environment(lighting, up)
+        self._set_sun(lighting, up)
+        self.lighting = lighting
+
+    # ------------------------------------------------------------------ saving
+
+    def save(
+        self,
+        path: Path,
+        camera: Camera,
+        size: tuple[int, int],
+        medium: bool,
+        integrator: dict[str, tuple[str, str]],
+        note: str,
+    ) -> list[Path]:
+        """Writes the scene as ``camera`` sees it, with pictures of ``size`` (width, height), and
+        beside it the volumes that are in no file yet.
+
+        ``medium`` tells whether the camera is inside the medium; ``integrator`` are properties to
+        be set, as (kind, value) by name; ``note`` becomes a comment. Returns all files written.
+        """
+        root = ElementTree.fromstring(self._text(self._root))
+        for default in root.findall("default"):
+            root.remove(default)
+        for sensor in root.findall("sensor"):
+            root.remove(sensor)
+        node = root.find("integrator")
+        for name, (kind, value) in integrator.items():
+            _set(node, kind, name, value)
+        written = [path]
+        for string in root.iter("string"):
+            if string.get("name") == "filename":
+                name = string.get("value")
+                if name in self._volumes:
+                    file = path.with_name(f"{path.stem}.{name}")
+                    write_vol(file, self._volumes[name])
+                    written.append(file)
+                    string.set("value", file.name)
+                elif (self.folder / name).exists():
+                    string.set("value", str((self.folder / name).resolve()))
+        sensor = _sensor(camera, size)
+        if medium:
+            inside = next(root.iter("medium"))
+            inside.set("id", inside.get("id") or MEDIUM_ID)
+            ElementTree.SubElement(sensor, "ref", name="medium", id=inside.get("id"))
+        root.append(sensor)  # after the medium that it may refer to
+        root.insert(0, ElementTree.Comment(f" {note} "))
+        path.write_text(self._text(root), encoding="utf-8")
+        return written
+
+    # ------------------------------------------------------------------ details
+
+    @property
+    def _integrator(self) -> ElementTree.Element | None:
+        return self._root.find("integrator")
+
+    def _read(self, name: str, default: object) -> object:
+        found = self._integrator.find(f"*[@name='{name}']")
+        return default if found is None else found.get("value")
+
+    @staticmethod
+    def _text(root: ElementTree.Element) -> str:
+        ElementTree.indent(root, "    ")
+        return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+    def _scaled(self) -> list[ElementTree.Element]:
+        """All media, each with its ``scale`` told."""
+        media = list(self._root.iter("medium"))
+        for number, medium in enumerate(media):
+            if medium.find("float[@name='scale']") is None:
+                _set(medium, "float", "scale", repr(self._original_scale(number)))
+        return media
+
+    def _original_scale(self, number: int) -> float:
+        medium = list(self._original.iter("medium"))[number]
+        found = medium.find("float[@name='scale']")
+        return 1.0 if found is None else float(found.get("value"))
+
+    @staticmethod
+    def _environment(root: ElementTree.Element) -> ElementTree.Element | None:
+        return next((e for e in root.findall("emitter") if e.get("type") in _ENVIRONMENTS), None)
+
+    @staticmethod
+    def _sun(root: ElementTree.Element) -> ElementTree.Element | None:
+        return next((e for e in root.findall("emitter") if e.get("type") == "directional"), None)
+
+    def _lighting(self) -> Lighting:
+        """As the scene has it; a sun of its own is told by the mean of its colour."""
+        sun = self._sun(self._root)
+        if sun is None:
+            return Lighting()
+        colour = _numbers(sun.find("*[@name='irradiance']"), (1.0, 1.0, 1.0))
+        return Lighting(sun=float(np.mean(colour)), **self._sun_angles(sun))
+
+    def _sun_angles(self, sun: ElementTree.Element) -> dict[str, float]:
+        vector = sun.find("vector[@name='direction']")
+        if vector is None:
+            return {}
+        towards = -np.array([float(vector.get(axis)) for axis in "xyz"])
+        towards /= np.linalg.norm(towards)
+        return {
+            "azimuth": float(np.degrees(np.arctan2(towards[1], towards[0]))),
+            "elevation": float(np.degrees(np.arcsin(np.clip(towards[2], -1, 1)))),
+        }
+
+    def _set_environment(self, lighting: Lighting, up: Sequence[float]) -> None:
+        node, original = self._environment(self._root), self._environment(self._original)
+        if node is None:
+            return
+        if node.get("type") == "constant":
+            _scale_colour(node, original, "radiance", lighting.environment)
+            return
+        scale = original.find("float[@name='scale']")
+        scale = 1.0 if scale is None else float(scale.get("value"))
+        _set(node, "float", "scale", repr(scale * lighting.environment))
+        for transform in node.findall("transform"):
+            node.remove(transform)
+        given = original.find("transform")
+        turned = ElementTree.SubElement(node, "transform", name="to_world")
+        turned.extend([] if given is None else list(given))
+        x, y, z = (repr(float(c)) for c in up)
+        ElementTree.SubElement(turned, "rotate", x=x, y=y, z=z, angle=repr(lighting.rotation))
+
+    def _set_sun(self, lighting: Lighting, up: Sequence[float]) -> None:
+        node, original = self._sun(self._root), self._sun(self._original)
+        if node is not None and lighting.sun == 0:
+            self._root.remove(node)
+            return
+        if lighting.sun == 0:
+            return
+        if node is None:
+            node = ElementTree.SubElement(self._root, "emitter", type="directional", id=SUN_ID)
+        for child in list(node):
+            if child.tag == "transform" or child.get("name") in ("direction", "to_world"):
+                node.remove(child)
+        direction = -_towards(lighting.azimuth, lighting.elevation, up)
+        vector = dict(zip("xyz", (repr(float(c)) for c in direction), strict=True))
+        ElementTree.SubElement(node, "vector", name="direction", **vector)
+        factor, mean = lighting.sun, 1.0
+        if original is not None:
+            colour = _numbers(original.find("*[@name='irradiance']"), (1.0, 1.0, 1.0))
+            mean = float(np.mean(colour)) or 1.0
+        _scale_colour(node, original, "irradiance", factor / mean)
+
+
+def _set(parent: ElementTree.Element, kind: str, name: str, value: str) -> None:
+    """A property of a plugin, in place of one of the same name."""
+    for child in parent.findall(f"*[@name='{name}']"):
+        parent.remove(child)
+    ElementTree.SubElement(parent, kind, name=name, value=value)
+
+
+def _numbers(element: ElementTree.Element | None, default: tuple) -> tuple[float, ...]:
+    if element is None or element.get("value") is None:
+        return default
+    values = element.get("value").replace(",", " ").split()
+    numbers = tuple(float(v) for v in values)
+    return numbers * 3 if len(numbers) == 1 else numbers
+
+
+def _scale_colour(
+    node: ElementTree.Element, original: ElementTree.Element | None, name: str, factor: float
+) -> None:
+    """A colour of an emitter, as it was in the ``original`` times ``factor``."""
+    given = None if original is None else original.find(f"*[@name='{name}']")
+    colour = _numbers(given, (1.0, 1.0, 1.0))
+    _set(node, "rgb", name, " ".join(repr(c * factor) for c in colour))
+
+
+def _towards(azimuth: float, elevation: float, up: Sequence[float]) -> np.ndarray:
+    """The direction in which a sun stands; azimuth 0 is along x, or along y where x is up."""
+    axis = np.array(up, dtype=np.float64) / np.linalg.norm(up)
+    start = np.eye(3)[0] if abs(axis[0]) < 0.9 else np.eye(3)[1]
+    first = start - np.dot(start, axis) * axis
+    first /= np.linalg.norm(first)
+    a, e = np.radians((azimuth, elevation))
+    horizontal = np.cos(a) * first + np.sin(a) * np.cross(axis, first)
+    return np.cos(e) * horizontal + np.sin(e) * axis
+
+
+def _sensor(camera: Camera, size: tuple[int, int]) -> ElementTree.Element:
+    """A ``perspective`` sensor with a box filter, as the viewer has."""
+    sensor = ElementTree.Element("sensor", type="perspective")
+    _set(sensor, "float", "fov", repr(camera.fov))
+    _set(sensor, "string", "fov_axis", "y")
+    near = 1e-4 * camera.distance
+    _set(sensor, "float", "near_clip", repr(near))
+    _set(sensor, "float", "far_clip", repr(1e4 * camera.distance))
+    transform = ElementTree.SubElement(sensor, "transform", name="to_world")
+    origin, target, up = (
+        ", ".join(repr(float(c)) for c in v) for v in (camera.position, camera.target, camera.up)
+    )
+    ElementTree.SubElement(transform, "lookat", origin=origin, target=target, up=up)
+    sampler = ElementTree.SubElement(sensor, "sampler", type="independent")
+    _set(sampler, "integer", "sample_count", str(SAVED_SAMPLES))
+    film = ElementTree.SubElement(sensor, "film", type="hdrfilm")
+    _set(film, "integer", "width", str(size[0]))
+    _set(film, "integer", "height", str(size[1]))
+    _set(film, "string", "pixel_format", "rgb")
+    _set(film, "string", "component_format", "float32")
+    ElementTree.SubElement(film, "rfilter", type="box")
+    return sensor

@@ -1,0 +1,72 @@
+"""Controls whose changes are applied in turn, the newest of each control only."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from viser import GuiEvent, GuiInputHandle
+
+from mitsuba_irrcache.errors import IrrcacheError
+
+LOG = logging.getLogger(__name__)
+
+
+class Editing:
+    """Applies changes one after the other in a thread of its own; while one is being applied, only
+    the newest of each control is kept. A control whose change is refused gets its old value back,
+    and ``tell`` the reason ("" once there is none).
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._lock = threading.Lock()
+        self._waiting: dict[str, Callable[[], None]] = {}
+        self._busy = False
+
+    def submit(self, key: str, change: Callable[[], None]) -> None:
+        """Applies ``change`` soon; an earlier one of the same ``key`` that still waits never."""
+        with self._lock:
+            self._waiting[key] = change
+            if self._busy:
+                return
+            self._busy = True
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def bind(self, handle: GuiInputHandle, apply: Callable[[object], None]) -> None:
+        """Calls ``apply`` with the value of a control whenever a user has changed it."""
+        good = [handle.value]
+
+        def change() -> None:
+            value = handle.value
+            try:
+                apply(value)
+            except IrrcacheError:
+                handle.value = good[0]
+                raise
+            good[0] = value
+
+        def updated(event: GuiEvent) -> None:
+            if event.client is None:  # set by us
+                good[0] = handle.value
+            else:
+                self.submit(str(id(handle)), change)
+
+        handle.on_update(updated)
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    self._busy = False
+                    return
+                change = self._waiting.pop(next(iter(self._waiting)))
+            try:
+                change()
+                self._tell("")
+            except IrrcacheError as error:
+                self._tell(str(error))
+            except Exception as error:
+                LOG.exception("a change in the viewer failed")
+                self._tell(f"{type(error).__name__}: {error}")

@@ -1,0 +1,177 @@
+"""The light of the scene that is looked at, and how it improves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.build import CacheBuilder, CacheSettings
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.lit import LitMedium
+from mitsuba_irrcache.progressive import FIRST, OPENING
+from mitsuba_irrcache.sight import Sight, SimpleSight, sight_of
+from mitsuba_irrcache.surroundings import probe
+
+#: Caches with more voxels than this are preceded by one of `COARSE` voxels along its longest side,
+#: so that new light is there at once.
+MANY_VOXELS, COARSE = 48**3, 32
+#: Directions of the first batch, and so of all; more would make it late.
+DIRECTIONS = 32
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """How the light is shown: as the plugin's properties of these names."""
+
+    hide_emitters: bool = False
+    quadrature: str = "exponential"
+    step: float = 1.0
+
+
+class Seen:
+    """The light of a scene at one time, for camera rays. It stays as it is while the cache goes on
+    growing.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, parts: list[LitMedium], sight: SimpleSight | Sight, layered: bool
+    ) -> None:
+        self.scene, self.sight, self.layered = scene, sight, layered
+        self._parts = parts
+        one = isinstance(sight, SimpleSight)
+        self._projections = [sight.projection] if one else sight.projections
+        self._steps = [p.step for p in self._projections]
+
+    def stride(self, factor: float) -> None:
+        """Makes the steps along rays so many times as long as they should be."""
+        for projection, step in zip(self._projections, self._steps, strict=True):
+            projection.step = step * dr.opaque(mi.Float, factor)
+            dr.eval(projection.step)
+
+    def medium_at(self, position: np.ndarray) -> object | None:
+        """What a camera at ``position`` (3) is in, None for nothing."""
+        medium = self._parts[0].medium
+        if medium.surroundings is None:
+            return medium if medium.boundary.contains(position) else None
+        pointer = probe(self.scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
+        return None if (pointer == None)[0] else pointer  # noqa: E711
+
+
+class Light:
+    """The caches of a ``scene``, better with every `refine`; ``pause`` is called while they are."""
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        settings: CacheSettings,
+        seeing: Seeing,
+        pause: Callable[[], None] | None = None,
+    ) -> None:
+        self.scene, self.settings, self.seeing = scene, settings, seeing
+        self._builder = CacheBuilder(replace(settings, samples=DIRECTIONS, with_error=False))
+        self._builder.pause.action = pause
+        self._builder.early = True
+        self._coarse: LitMedium | None = None
+        #: goes up whenever there is better light to be seen
+        self.revision = 0
+        #: seconds that the solver took
+        self.seconds = 0.0
+        #: whether the last pass has raised something
+        self.failed = False
+        self._seen: dict[tuple[bool, bool], tuple[int, Seen]] = {}
+
+    @property
+    def parts(self) -> list[LitMedium]:
+        """The media with their caches; empty before `prepare`."""
+        return self._builder.parts
+
+    @property
+    def samples(self) -> int:
+        """Per voxel."""
+        return self._builder.done
+
+    @property
+    def solver(self) -> str:
+        return self._builder.solver
+
+    @property
+    def error(self) -> float:
+        """Relative standard error of the caches, NaN before it is known."""
+        return self._builder.relative_error
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether there is nothing to improve."""
+        return bool(self.parts) and self._builder.is_dark
+
+    def prepare(self) -> None:
+        """Finds the media. Raises IrrcacheError for scenes that cannot be rendered, or that have no
+        medium to see.
+        """
+        self._builder.fit(self.scene)
+        if not self.parts:
+            raise IrrcacheError(
+                "view: the scene has no medium that a camera could see; irrcache render shows it."
+            )
+
+    def refine(self) -> None:
+        """A pass of the solver; the first one may be on a coarse grid."""
+        started = perf_counter()
+        self.failed = True
+        try:
+            self._refine()
+        finally:
+            self.seconds += perf_counter() - started
+        self.failed = False
+
+    def _refine(self) -> None:
+        builder, first = self._builder, not self.revision
+        done, batch = builder.done, self.parts[0].cache.batch if self.parts[0].cache else 0
+        if builder.is_dark:
+            pass  # without light there is still something to see
+        elif first and self._is_slow:
+            self._coarse = self._at_once()
+        else:
+            if builder.solver == "path" and done < OPENING:
+                builder.samples = max(2 * done, FIRST)
+            else:
+                builder.samples = done + batch
+            builder.update(self.scene, lambda *_: builder.pause())
+            self._coarse = None
+        self.revision += 1
+
+    @property
+    def _is_slow(self) -> bool:
+        """Whether a coarse grid would be much quicker."""
+        voxels = self.parts[0].cache.grid.voxel_count
+        return self._builder.solver == "sweep" and voxels > MANY_VOXELS
+
+    def _at_once(self) -> LitMedium:
+        """The medium with a first light on a coarse grid."""
+        builder, first = self._builder, self.parts[0]
+        settings = replace(builder.settings, resolution=COARSE)
+        told = first.solver, "a first look"
+        coarse = LitMedium(self.scene, first.medium, settings, told, "", False, builder.pause)
+        coarse.refine(self.scene, coarse.cache.batch, False, None)
+        return coarse
+
+    def seen(self, layered: bool, with_error: bool) -> Seen:
+        """The light as it is now; more of it, see `sight_of`, if wanted."""
+        key = layered, with_error
+        known = self._seen.get(key)
+        if known is None or known[0] != self.revision:
+            parts = self.parts if self._coarse is None else [self._coarse]
+            s = self.seeing
+            sight = sight_of(
+                parts, self.settings, s.hide_emitters, s.quadrature, s.step, layered, with_error
+            )
+            self._seen[key] = known = (
+                self.revision,
+                Seen(self.scene, parts, sight, layered),
+            )
+        return known[1]

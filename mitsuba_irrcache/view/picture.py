@@ -1,0 +1,159 @@
+"""From the light to the pixels of a window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.filtering import filter_illumination
+from mitsuba_irrcache.layers import AOVS, Layers, luminance
+from mitsuba_irrcache.rendering import PixelPositions, pixel_of
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.light import Seen
+
+#: What can be shown of a view.
+KINDS = ("image", "colour", "illumination", "error bar", "transmittance", "depth")
+#: The error bar is shown so many times as bright.
+ERROR_SCALE = 10.0
+#: Curves from radiance to display, all followed by the one of sRGB.
+TONES: dict[str, Callable] = {
+    "sRGB": lambda c: c,
+    "Reinhard": lambda c: c / (1 + dr.maximum(c, 0)),
+    "filmic": lambda c: _filmic(dr.maximum(c, 0)),
+}
+#: Luminance is enough of one random number per sample: streams of passes are this far apart.
+STREAM = 0x9E3779B9
+
+
+@dataclass(frozen=True)
+class Look:
+    """What of a view is shown, and how: one of `KINDS`, ``exposure`` in stops, one of `TONES`, and
+    whether the illumination is ``filtered``.
+    """
+
+    kind: str = "image"
+    exposure: float = 0.0
+    tone: str = "sRGB"
+    filtered: bool = False
+
+    @property
+    def layered(self) -> bool:
+        """Whether it needs more than radiance."""
+        return self.kind != "image" or self.filtered
+
+    @property
+    def with_error(self) -> bool:
+        return self.kind == "error bar" or self.filtered
+
+
+class Samples:
+    """Camera samples of one view of one light, added up: ``size`` is (width, height)."""
+
+    def __init__(self, seen: Seen, camera: Camera, size: tuple[int, int], seed: int = 0) -> None:
+        self.seen, self.camera, self.size, self.seed = seen, camera, size, seed
+        self.count = 0
+        self._sums: list[mi.Float] = []
+
+    def add(self, total: int) -> None:
+        """One sample more for each pixel, where there are to be ``total``."""
+        values = _trace(self.seen, self.camera, self.size, self.seed, self.count, total)
+        if self.count:
+            values = [a + b for a, b in zip(self._sums, values, strict=True)]
+        self._sums = values
+        self.count += 1
+        dr.eval(self._sums)
+
+    @property
+    def layers(self) -> Layers:
+        """Means over the samples; of plain radiance all is background."""
+        scale = dr.opaque(mi.Float, 1 / self.count)
+        means = [s * scale for s in self._sums]
+        if not self.seen.layered:
+            return Layers.background_only(mi.Spectrum(*means))
+        return Layers.of(means)
+
+    def radiance(self, filtered: bool = False) -> mi.Spectrum:
+        """The image, with its illumination ``filtered`` if asked."""
+        layers = self.layers
+        dr.eval(layers)
+        kind = "bilateral" if filtered and self.seen.layered else "none"
+        return layers.radiance(filter_illumination(kind, layers, self.size))
+
+    def picture(self, look: Look, extent: tuple[float, float]) -> np.ndarray:
+        """What a display shows, uint8 (height, width, 3). ``extent`` are the distances at which a
+        depth image is black and white.
+        """
+        return _display(self._shown(look, extent), look, self.size)
+
+    def channels(self, aovs: tuple[str, ...], filtered: bool = False) -> tuple[np.ndarray, list]:
+        """The image with further layers, float32 (height, width, channel), and their names."""
+        layers, radiance = self.layers, self.radiance(filtered)
+        rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
+        planes, names = list(rgb), []
+        for kind in aovs:
+            planes += layers.aov(kind)
+            names += [f"{kind}.{channel}" for channel in AOVS[kind]]
+        width, height = self.size
+        arrays = [np.array(p) for p in planes]
+        flat = [np.broadcast_to(a, width * height) for a in arrays]
+        return np.stack(flat, axis=-1).reshape(height, width, len(flat)), names
+
+    def _shown(self, look: Look, extent: tuple[float, float]) -> mi.Color3f:
+        if look.kind == "image":
+            return mi.Color3f(self.radiance(look.filtered))
+        layers = self.layers
+        if look.kind == "illumination" and look.filtered:
+            found = filter_illumination("bilateral", layers, self.size)
+            return mi.Color3f(layers.illumination if found is None else found)
+        if look.kind == "error bar":
+            return mi.Color3f(
+                ERROR_SCALE * dr.sqrt(dr.square(layers.noise) + dr.square(layers.bias))
+            )
+        if look.kind == "depth":
+            (distance,) = layers.aov("depth")
+            near, far = (dr.opaque(mi.Float, value) for value in extent)
+            seen = luminance(layers.transmittance) < 0.99
+            return mi.Color3f(dr.select(seen, (far - distance) / (far - near), 0))
+        return mi.Color3f(*layers.aov(look.kind))
+
+
+def _trace(
+    seen: Seen, camera: Camera, size: tuple[int, int], seed: int, number: int, total: int
+) -> list[mi.Float]:
+    """Sample ``number`` of each pixel: radiance, or all of its layers."""
+    width, height = size
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed((seed + number * STREAM) & 0xFFFFFFFF, width * height)
+    spread = PixelPositions(sampler, seed, total)
+    spread.first = dr.opaque(mi.UInt32, number)
+    index = dr.arange(mi.UInt32, width * height)
+    at = mi.Point2f(pixel_of(index, width)) + spread.next(index, mi.UInt32(0))
+    scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in size))
+    ray = camera.rays(at * scale, width / height)
+    medium = seen.medium_at(np.array(camera.position))
+    view = seen.sight.look(seen.scene, sampler, ray, medium, mi.Bool(True))
+    if not seen.layered:
+        return list(view.scattered + view.background)
+    parts = view.scattered, view.transmittance, view.gathered, view.background
+    return seen.sight.projection.layers(*parts, mi.Spectrum(1)).channels()
+
+
+def _display(colour: mi.Color3f, look: Look, size: tuple[int, int]) -> np.ndarray:
+    """Pixels in sRGB; transmittance and depth are shown as they are, whatever the exposure."""
+    if look.kind not in ("transmittance", "depth", "colour"):
+        colour = TONES[look.tone](colour * dr.opaque(mi.Float, 2.0**look.exposure))
+    width, height = size
+    colour = dr.clip(colour, 0, 1)
+    curved = dr.select(colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
+    r, g, b = (mi.UInt32(c * 255 + 0.5) for c in curved)
+    packed = np.array((r | (g << 8) | (b << 16)) + dr.zeros(mi.UInt32, width * height))
+    return packed.view(np.uint8).reshape(height, width, 4)[..., :3]
+
+
+def _filmic(c: mi.Color3f) -> mi.Color3f:
+    """A curve with a toe and a shoulder (K. Narkowicz's fit of ACES)."""
+    return c * (2.51 * c + 0.03) / (c * (2.43 * c + 0.59) + 0.14)

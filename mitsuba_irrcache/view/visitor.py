@@ -1,0 +1,185 @@
+"""One browser window: its camera, what it shows, and what it saves."""
+
+from __future__ import annotations
+
+import io
+import math
+import tempfile
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+import viser
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
+from mitsuba_irrcache.view.editing import Editing
+from mitsuba_irrcache.view.keep import checked_name, keep
+from mitsuba_irrcache.view.picture import KINDS, TONES, Look
+from mitsuba_irrcache.view.session import Picture, Session, View
+
+#: Quality of JPEGs of moving cameras, and of pictures that better ones will follow.
+MOVING_QUALITY, RESTING_QUALITY = 80, 95
+#: Seconds between two notes on what is seen.
+NOTE_SECONDS = 0.25
+
+
+class Visitor:
+    """Connects a ``client`` with a window of the session. Saved files go to ``folder``, or without
+    one to the browser.
+    """
+
+    def __init__(self, client: viser.ClientHandle, session: Session, folder: Path | None) -> None:
+        self.client, self.session, self.folder = client, session, folder
+        self._encoder = ThreadPoolExecutor(1)
+        self._noted = 0.0
+        self._view: View | None = None
+        self._look = Look()
+        self.window = session.open(self._show)
+        self._add_controls(client.gui)
+        client.camera.on_update(self._camera_moved)
+        self._look_again()
+
+    def close(self) -> None:
+        """The browser has gone."""
+        self.session.close(self.window)
+        self._encoder.shutdown(wait=False, cancel_futures=True)
+
+    # ------------------------------------------------------------------ controls
+
+    def _add_controls(self, gui: viser.GuiApi) -> None:
+        with gui.add_folder("View", order=1):
+            self._note = gui.add_markdown("")
+            self._refusal = gui.add_markdown("", visible=False)
+            self.editing = Editing(self._refuse)
+            cameras = list(self.session.cameras)
+            self._sensor = gui.add_dropdown("camera", cameras, initial_value=cameras[0])
+            self._reset = gui.add_button("reset camera")
+            fov = math.degrees(self.client.camera.fov)
+            self._fov = gui.add_slider(
+                "field of view", NARROWEST, WIDEST, 0.5, min(max(round(fov, 1), 1.0), 150.0)
+            )
+            self._kind = gui.add_dropdown("show", KINDS)
+            self._exposure = gui.add_slider("exposure", -8.0, 8.0, 0.1, 0.0, hint="stops")
+            self._tone = gui.add_dropdown("tone mapping", tuple(TONES))
+            self._filter = gui.add_checkbox(
+                "filter", False, hint="of the illumination; fades as the light improves"
+            )
+        with gui.add_folder("Keep", order=5, expand_by_default=False):
+            self._name = gui.add_text("name", "view")
+            self._cache = gui.add_checkbox("with the cache", False)
+            self._save = gui.add_button(
+                "save" if self.folder is not None else "download",
+                hint="PNG, EXR with layers, and a scene for irrcache render",
+            )
+            self._saved = gui.add_markdown("")
+        for handle in (self._kind, self._exposure, self._tone, self._filter):
+            self.editing.bind(handle, lambda _: self._set_look())
+        self.editing.bind(self._sensor, lambda name: self._go_to(name))
+        self.editing.bind(self._fov, self._set_fov)
+        self._reset.on_click(lambda _: self._go_to(self._sensor.value))
+        self._save.on_click(lambda _: self.editing.submit("save", self._keep))
+
+    def _set_look(self) -> None:
+        kind, tone, exposure = self._kind.value, self._tone.value, self._exposure.value
+        if kind not in KINDS or tone not in TONES or not -64 <= exposure <= 64:
+            raise IrrcacheError(f"{kind!r}, {tone!r}, exposure {exposure!r}: nothing to be shown.")
+        self._look = Look(kind, float(exposure), tone, bool(self._filter.value))
+        self._look_again()
+
+    def _set_fov(self, degrees: float) -> None:
+        if not NARROWEST <= degrees <= WIDEST:
+            raise IrrcacheError(
+                f"the field of view is {degrees!r}; it must be {NARROWEST:g} to {WIDEST:g} degrees."
+            )
+        self.client.camera.fov = math.radians(degrees)
+        self._look_again()
+
+    def _go_to(self, name: str) -> None:
+        if name not in self.session.cameras:
+            raise IrrcacheError(f"the scene has no camera {name!r}.")
+        camera, place = self.session.cameras[name], self.session.placement.to_browser
+        with self.client.atomic():
+            self.client.camera.up_direction = np.array(camera.up)
+            self.client.camera.position = place(camera.position)
+            self.client.camera.look_at = place(camera.target)
+            self.client.camera.fov = math.radians(camera.fov)
+        self._fov.value = camera.fov
+        self._look_again()
+
+    def _refuse(self, reason: str) -> None:
+        self._refusal.content = f"**Refused:** {reason}" if reason else ""
+        self._refusal.visible = bool(reason)
+
+    # ------------------------------------------------------------------ to the session and back
+
+    async def _camera_moved(self, _: viser.CameraHandle) -> None:
+        self._look_again()
+
+    def _look_again(self) -> None:
+        camera = self.client.camera
+        if camera.image_width < 1 or camera.image_height < 1:
+            return
+        scene = self.session.placement.to_scene
+        seen = Camera(
+            tuple(scene(camera.position).tolist()),
+            tuple(scene(camera.look_at).tolist()),
+            tuple(np.asarray(camera.up_direction, dtype=np.float64).tolist()),
+            float(np.clip(math.degrees(camera.fov), NARROWEST, WIDEST)),
+        )
+        numbers = (*seen.position, *seen.target, *seen.up)
+        if not np.isfinite(numbers).all() or seen.distance == 0 or not any(seen.up):
+            return  # nothing that a camera could be
+        self._view = View(seen, (camera.image_width, camera.image_height), self._look)
+        self.session.look(self.window, self._view)
+
+    def _show(self, picture: Picture) -> None:
+        """In the session's thread: hands on, so that it can go on rendering."""
+        try:
+            self._encoder.submit(self._send, picture)
+        except RuntimeError:  # the browser has just gone
+            return
+
+    def _send(self, picture: Picture) -> None:
+        quality = MOVING_QUALITY if picture.moving else RESTING_QUALITY
+        kind = "png" if picture.final else "jpeg"
+        self.client.scene.set_background_image(picture.pixels, kind, jpeg_quality=quality)
+        if not picture.moving or monotonic() - self._noted > NOTE_SECONDS:
+            self._noted = monotonic()
+            height, width, _ = picture.pixels.shape
+            state = "moving" if picture.moving else "final" if picture.final else "at rest"
+            samples = "1 sample" if picture.samples == 1 else f"{picture.samples} samples"
+            self._note.content = f"{state}: {width} x {height}, {samples} per pixel"
+        self.client.flush()
+
+    # ------------------------------------------------------------------ keeping
+
+    def _keep(self) -> None:
+        name = checked_name(self._name.value)
+        if self._view is None:
+            return
+        view = replace(self._view, look=self._look)
+        self._saved.content = "saving ..."
+        try:
+            if self.folder is not None:
+                self.folder.mkdir(exist_ok=True)
+                files = keep(self.session, view, self.folder, name, self._cache.value)
+                self._saved.content = "saved " + ", ".join(f.name for f in files)
+            else:
+                self._download(view, name)
+                self._saved.content = f"downloaded {name}.zip"
+        except Exception:
+            self._saved.content = ""
+            raise
+
+    def _download(self, view: View, name: str) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            files = keep(self.session, view, Path(folder), name, self._cache.value)
+            packed = io.BytesIO()
+            with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+                for file in files:
+                    archive.write(file, file.name)
+        self.client.send_file_download(f"{name}.zip", packed.getvalue(), save_immediately=True)

@@ -1,0 +1,153 @@
+"""The viewer as a user has it: ``irrcache view`` in a process of its own, and a real browser,
+headless. Skipped where there is no Chromium.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsuba_irrcache.cli import main
+from mitsuba_irrcache.images import read_image
+
+pytest.importorskip("playwright")
+from experiments.viewer.browser import Browser, Window, chromium, viewer
+
+pytestmark = [
+    pytest.mark.usefixtures("rgb"),
+    pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine"),
+]
+
+SIZE = (700, 260)
+#: The part of a window, in pixels from the left, that the panel never covers.
+CLEAR = 340
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def started(tmp_path_factory):
+    """The address of a viewer that shows a chest of few voxels, and the folder of its files."""
+    folder = tmp_path_factory.mktemp("viewer")
+    volume = ("phantom:thorax:40,28,36", "--preset", "ct-chest")
+    arguments = (*volume, "-o", str(folder / "kept"), "--port", "8700")
+    with viewer(arguments, folder / "log.txt") as address:
+        yield address, folder
+    log = (folder / "log.txt").read_text()
+    assert "Traceback" not in log and "rror" not in log, log
+
+
+def settled(window: Window) -> np.ndarray:
+    """What is on the screen once nothing better will follow: float (height, width, 3), without
+    what the panel may cover.
+    """
+    count = -1
+    while count != len(window.shown()):
+        window.wait_for("^final")
+        count = len(window.shown())
+        time.sleep(0.5)
+    return screen(window)
+
+
+def screen(window: Window) -> np.ndarray:
+    shot = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
+    return np.asarray(shot, dtype=float)[:, :CLEAR]
+
+
+def difference(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.abs(a - b).mean())
+
+
+def test_looking_around(browser, started):
+    """Drag, wheel, edit, save, reload, second window: pictures change as they should, and are those
+    of ``irrcache render``.
+    """
+    address, folder = started
+    window = browser.open(address, SIZE)
+    window.page.add_style_tag(content="[class*=Notification] {display: none !important}")
+    window.enter("target error %", 2)
+    first = settled(window)
+    assert first.std() > 20
+
+    # A drag turns the camera, the wheel brings it closer; both show smaller pictures meanwhile.
+    count = len(window.shown())
+    window.orbit(12, 8, 0.02)
+    turned = settled(window)
+    assert difference(turned, first) > 3
+    sizes = [s["width"] for s in window.shown()[count:]]
+    assert min(sizes) < SIZE[0] and sizes[-1] == SIZE[0]
+    window.page.mouse.move(200, 200)
+    window.zoom(-3)
+    closer = settled(window)
+    assert difference(closer, turned) > 3
+
+    # What is kept renders to what is on the screen.
+    window.page.get_by_text("Keep", exact=True).click()
+    window.page.get_by_role("button", name="save", exact=True).click()
+    window.page.get_by_text("saved view").wait_for(timeout=20000)
+    kept = folder / "kept" / "view.xml"
+    assert main(["render", str(kept), "-o", str(folder / "again.exr")]) == 0
+    again = np.rint(255 * read_image(folder / "again.png"))[:, :CLEAR]
+    assert again.shape == closer.shape
+    assert difference(again, closer) < 1.5
+    shown = np.rint(255 * read_image(folder / "kept" / "view.png"))[:, :CLEAR]
+    assert difference(shown, closer) < 1
+
+    # An edit of the transfer function: other matter, and it is saved as such.
+    window.choose("point", "4")
+    window.enter("opacity", 0.6)
+    denser = settled(window)
+    assert difference(denser, closer) > 2
+
+    # A second window has its own camera, the first one's stays; bad input is refused in place.
+    other = browser.open(address, SIZE)
+    other.page.add_style_tag(content="[class*=Notification] {display: none !important}")
+    elsewhere = settled(other)
+    assert difference(elsewhere, denser) > 3
+    assert difference(screen(window), denser) < 0.5
+    other.page.get_by_text("Keep", exact=True).click()
+    other.enter("name", "../escaped")
+    other.page.get_by_role("button", name="save", exact=True).click()
+    other.page.get_by_text("is no name for a file").first.wait_for()
+    assert not list(folder.parent.glob("escaped*")) and not list(folder.glob("escaped*"))
+
+    # A reload loses nothing of what is shared.
+    other.page.reload()
+    other.page.add_style_tag(content="[class*=Notification] {display: none !important}")
+    assert difference(settled(other), elsewhere) < 0.5
+    assert window.errors == [] and other.errors == []
+
+
+def test_pages_of_other_sites_are_refused(started):
+    """And so is a name that another site may have given to this machine."""
+    from viser import __version__
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    from mitsuba_irrcache.view.server import is_own_page
+
+    address = started[0].replace("http", "ws")
+
+    def answers(origin: str) -> bool:
+        protocol = [f"viser-v{__version__}"]
+        with connect(address, origin=origin, subprotocols=protocol, max_size=None) as connection:
+            try:
+                connection.recv(timeout=5)
+            except ConnectionClosed:
+                return False
+            return True
+
+    assert answers(started[0].rstrip("/"))
+    assert not answers("http://example.org")
+    assert not answers(started[0].rstrip("/").replace("http", "https"))
+    assert is_own_page({"Origin": "http://localhost:80", "Host": "localhost:80"}, "127.0.0.1")
+    assert not is_own_page({"Origin": "http://a.org:80", "Host": "a.org:80"}, "127.0.0.1")
+    assert is_own_page({"Origin": "http://a.org:80", "Host": "a.org:80"}, "0.0.0.0")
