@@ -119,8 +119,8 @@ MUTANTS = (
     Mutant(
         "the background in front of the medium",
         "sight.py",
-        "View(scattered, transmittance * background, transmittance",
-        "View(scattered, background, transmittance",
+        "background = transmittance * background + emitted",
+        "background = background + emitted",
         (CLOSED_FORMS,),
     ),
     Mutant(
