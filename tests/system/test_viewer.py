@@ -73,7 +73,7 @@ def test_looking_around(browser, started):
     address, folder = started
     window = browser.open(address, SIZE)
     window.page.add_style_tag(content="[class*=Notification] {display: none !important}")
-    window.enter("target error %", 2)
+    window.enter("target error %", 6)
     first = settled(window)
     assert first.std() > 20
 
