@@ -417,12 +417,14 @@ def test_a_second_filtered_picture_compiles_nothing(scenes, kernels):
 
 def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
     """No errors, no layers, no developed film."""
+    from mitsuba_irrcache import sight
     from mitsuba_irrcache.integrators import irrcache
 
     def forbidden(*args, **kwargs):
         raise AssertionError("not asked for")
 
-    for name in ("uncertainty_of", "planes", "fill_film", "filter_illumination", "Layers"):
+    monkeypatch.setattr(sight, "uncertainty_of", forbidden)
+    for name in ("planes", "fill_film", "filter_illumination", "Layers"):
         monkeypatch.setattr(irrcache, name, forbidden)
     scene = noisy(scenes, {"cache_spp": 8}, size=6)
     assert scenes.image(scene, spp=1).shape == (6, 6, 3)
@@ -431,9 +433,9 @@ def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
 
 def test_layers_without_errors_project_none(scenes, monkeypatch):
     """Colour alone needs no error of the cache, and no second batch."""
-    from mitsuba_irrcache.integrators import irrcache
+    from mitsuba_irrcache import sight
 
-    monkeypatch.setattr(irrcache, "uncertainty_of", None)
+    monkeypatch.setattr(sight, "uncertainty_of", None)
     scene = noisy(scenes, {"cache_spp": 8, "aovs": "colour,depth", "filter": "fixed"}, size=6)
     scenes.image(scene, spp=1)
     assert scene.integrator().cache.samples == 8
