@@ -417,8 +417,9 @@ def test_a_second_filtered_picture_compiles_nothing(scenes, kernels):
 
 def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
     """No errors, no layers, no developed film."""
-    from mitsuba_irrcache import sight
     from mitsuba_irrcache.integrators import irrcache
+
+    from mitsuba_irrcache import sight
 
     def forbidden(*args, **kwargs):
         raise AssertionError("not asked for")
