@@ -53,6 +53,8 @@ def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray)
     """Whether the bounds of a shape meet the box."""
     box = shape.bbox()
     ends = np.array([box.min, box.max], dtype=np.float64)
+    if not np.isfinite(ends).all():
+        return True  # meshes that Mitsuba has merged do not know theirs
     return boxes_meet(grid, lower, upper, np.where(_PICK, ends[1], ends[0]))
 
 
