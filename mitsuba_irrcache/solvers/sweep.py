@@ -77,8 +77,9 @@ class Sweep:
         detail = _detail(medium, grid)
         extinction = baked(medium, medium.sigma_t, detail)
         box = occupied_box(grid, cache.active)
-        # Blocks of the medium's voxels reach farther than these.
-        sparse = medium.sigma_t.grid is not None and detail.shape == medium.sigma_t.grid.shape
+        # Blocks of the medium's voxels, and voxels that lie askew to these, reach farther.
+        data = medium.sigma_t.grid
+        sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
         rest = *box, detail, cache.active, sparse, pause
         self._lattices = [Lattice(grid, s, *rest) for s in extinction]
         # For single scattering the albedo does not matter here.
