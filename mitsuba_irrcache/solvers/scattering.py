@@ -30,11 +30,22 @@ COARSE_TOLERANCE = 2e-4
 class Level:
     """A grid of the hierarchy: extinction, albedo, the lines, and the next coarser level.
 
-    ``sigma_t`` and ``albedo`` hold a value for each voxel.
+    ``sigma_t`` and ``albedo`` hold a value for each voxel. Coarser levels have half the voxels
+    along those axes along which voxels are shortest, or along all if ``evenly``: errors between
+    voxels far apart are found by sweeps, and those between near ones only on coarser grids.
     """
 
-    def __init__(self, grid: Grid, sigma_t: mi.Float, albedo: mi.Float, lattice: Lattice) -> None:
+    def __init__(
+        self,
+        grid: Grid,
+        sigma_t: mi.Float,
+        albedo: mi.Float,
+        lattice: Lattice,
+        evenly: bool = False,
+    ) -> None:
         self.grid, self.sigma_t, self.albedo, self.lattice = grid, sigma_t, albedo, lattice
+        self.evenly = evenly
+        self._ratio = np.array([2, 2, 2]) if evenly else _ratio(grid)  # to the next level: x, y, z
         self._coarser: Level | None = None
         self._children: list[tuple[mi.UInt32, mi.Float]] = []
 
@@ -44,20 +55,22 @@ class Level:
 
     @property
     def coarser(self) -> Level:
-        """The level of half the resolution, made when it is first asked for."""
+        """The level of fewer voxels, made when it is first asked for."""
         if self._coarser is None:
-            grid = _halved(self.grid)
+            grid = _reduced(self.grid, self._ratio)
             children = [
-                (i, dr.gather(mi.Float, self.sigma_t, i) * w) for i, w in _children(self.grid, grid)
+                (i, dr.gather(mi.Float, self.sigma_t, i) * w)
+                for i, w in _children(self.grid, grid, self._ratio)
             ]
             total = sum(s for _, s in children)
-            sigma_t = total / 8
+            sigma_t = total / len(children)
             # The weights of the means that follow are shares of the extinction.
             self._children = [(i, dr.select(total > 0, s / total, 0)) for i, s in children]
             dr.eval(sigma_t, self._children)
             box = np.zeros(3, int), grid.resolution
             lattice = Lattice(grid, sigma_t, *box, pause=self.lattice.pause)
-            self._coarser = Level(grid, sigma_t, self.restrict(self.albedo), lattice)
+            albedo = self.restrict(self.albedo)
+            self._coarser = Level(grid, sigma_t, albedo, lattice, self.evenly)
         return self._coarser
 
     def restrict(self, values: mi.Float) -> mi.Float:
@@ -68,8 +81,10 @@ class Level:
 
     def prolong(self, values: mi.Float) -> mi.Float:
         """Values of the coarser level at the voxels of this one, trilinear."""
-        u = mi.Point3f(*self.grid.places(dr.arange(mi.UInt32, self.grid.voxel_count)))
-        return GridField(self.coarser.grid, values, 1).at(u * 0.5 + 0.25)
+        at = self.grid.places(dr.arange(mi.UInt32, self.grid.voxel_count))
+        share = [dr.opaque(mi.Float, 1 / int(n)) for n in self._ratio]
+        u = mi.Point3f(*((mi.Float(a) + 0.5) * s for a, s in zip(at, share, strict=True)))
+        return GridField(self.coarser.grid, values, 1).at(u)
 
     def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
         """A phi plus the light that enters along ``table``: irradiance, and the mean of it where it
@@ -185,20 +200,31 @@ def _mixed(history: list) -> np.ndarray:
     return images[-1] + share @ (images[:-1] - images[-1])
 
 
-def _halved(grid: Grid) -> Grid:
-    """The grid of voxels twice as large; it may reach beyond the end of ``grid``."""
-    shape = tuple(-(-n // 2) for n in grid.shape)
-    scale = [2 * m / n for m, n in zip(shape[::-1], grid.resolution, strict=True)]
-    return Grid(shape, grid.to_world @ np.diag([*scale, 1.0]))
+def _ratio(grid: Grid) -> np.ndarray:
+    """Voxels along x, y, z of which one of the next level is made: two where they are less than
+    twice as long as the shortest, of those axes that have several.
+    """
+    several = grid.resolution > 1
+    shortest = grid.voxel_size[several].min() if several.any() else 0.0
+    return np.where(several & (grid.voxel_size < 2 * shortest), 2, 1)
 
 
-def _children(fine: Grid, coarse: Grid) -> list[tuple[mi.UInt32, mi.Float]]:
-    """For each corner of a coarse voxel the fine one there, and 1, or 0 where there is none."""
+def _reduced(grid: Grid, ratio: np.ndarray) -> Grid:
+    """The grid of voxels so many times as large; it may reach beyond the end of ``grid``."""
+    sides = -(-grid.resolution // ratio)
+    scale = ratio * sides / grid.resolution
+    return Grid(tuple(int(n) for n in sides[::-1]), grid.to_world @ np.diag([*scale, 1.0]))
+
+
+def _children(fine: Grid, coarse: Grid, ratio: np.ndarray) -> list[tuple[mi.UInt32, mi.Float]]:
+    """For each place of fine voxels in a coarse one the voxel there, and 1, or 0 where there is
+    none.
+    """
     at = coarse.places(dr.arange(mi.UInt32, coarse.voxel_count))
     nx, ny, nz = (int(n) for n in fine.resolution)
     result = []
-    for dz, dy, dx in np.ndindex(2, 2, 2):
-        x, y, z = (2 * a + d for a, d in zip(at, (dx, dy, dz), strict=True))
+    for steps in np.ndindex(*(int(n) for n in ratio[::-1])):
+        x, y, z = (int(n) * a + d for n, a, d in zip(ratio, at, steps[::-1], strict=True))
         inside = (x < nx) & (y < ny) & (z < nz)
         place = dr.select(inside, (z * ny + y) * nx + x, 0)
         result.append((place, dr.select(inside, mi.Float(1), 0)))

@@ -93,6 +93,7 @@ class Sweep:
                     sigma_t[min(c, len(sigma_t) - 1)],
                     albedo[min(c, len(albedo) - 1)],
                     self._lattices[min(c, len(sigma_t) - 1)],
+                    evenly=medium.surroundings is not None,  # as `arrivals` takes for granted
                 )
                 for c in range(max(len(albedo), len(sigma_t)))
             ]

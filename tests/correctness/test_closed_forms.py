@@ -250,8 +250,7 @@ def test_sunlit_slabs(scenes, name, depth, albedo, leaving):
 def test_sunlit_slabs_by_sweeps(scenes, name, depth, albedo, leaving):
     """1a, 1b, 1d by ``sweep``: 1 %, of which 0.4 are the discretisation of layers of 1/32 (1/512 of
     the thin slabs), and 0.5 the noise of 16 batches of directions in thin slabs, where the light
-    along the layer counts most. 1e is beyond the solver: in voxels 300 times wider than thick it
-    says that high orders of scattering do not converge.
+    along the layer counts most. 1e would need a minute.
     """
     thin = depth < 1
     scene = sunlit(scenes, depth, albedo)
