@@ -51,16 +51,27 @@ class Options:
         return path
 
 
-def parse(description: str | None) -> Options:
-    """Options from the command line; sets Mitsuba's variant."""
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """The options that all experiments have which keep what is finished."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--full", action="store_true", help="the paper's sizes: hours")
     parser.add_argument("--force", action="store_true", help="compute again what is there")
     parser.add_argument("-o", "--output", type=Path, default=Path("output"))
-    args = parser.parse_args()
+    return parser
+
+
+def begin() -> None:
+    """Sets Mitsuba's variant."""
     require_llvm()
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
+
+
+def parse(description: str | None) -> Options:
+    """Options from the command line; sets Mitsuba's variant."""
+    parser = parser_of(description)
+    parser.add_argument("--full", action="store_true", help="the paper's sizes: hours")
+    args = parser.parse_args()
+    begin()
     return Options(FULL if args.full else QUICK, args.output, args.force)

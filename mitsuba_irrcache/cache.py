@@ -513,10 +513,9 @@ def _mark(cells: Macrocells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
     (x0, y0, z0), (x1, y1, z1) = _supports(cells, occupied, grid)
     marks = dr.zeros(mi.UInt32, grid.voxel_count)
     x, y, z = mi.Int32(x0), mi.Int32(y0), mi.Int32(z0)
-    sx, sy, _ = grid.sides
     active = mi.Bool(True)
     while dr.hint(active, label="active voxels"):
-        dr.scatter(marks, mi.UInt32(1), mi.UInt32((z * sy + y) * sx + x), active)
+        dr.scatter(marks, mi.UInt32(1), grid.index(x, y, z), active)
         x += 1
         wrap_x = x > x1
         x = dr.select(wrap_x, x0, x)

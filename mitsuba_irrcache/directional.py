@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .grid import Grid, stencil
+from .grid import Grid
 from .layers import interleaved
 from .phase import Phase
 
@@ -167,19 +167,11 @@ class DirectionalField:
 
     def _interpolated(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         """The values of a voxel, trilinear."""
-        nx, ny, _ = self.grid.sides
-        axes = []
-        for c, n in zip(u, self.grid.sides, strict=True):
-            lower, weight, more = stencil(c, n)
-            axes.append(((lower, 1 - weight), (lower + dr.select(more, 1, 0), weight)))
         sums = [mi.Vector4f(0)] * self._loads
-        for z, wz in axes[2]:
-            for y, wy in axes[1]:
-                for x, wx in axes[0]:
-                    voxel = mi.UInt32((z * ny + y) * nx + x) * self._loads
-                    for k in range(self._loads):
-                        values = dr.gather(mi.Vector4f, self.data, voxel + k, active)
-                        sums[k] = dr.fma(wx * wy * wz, values, sums[k])
+        for voxel, weight in self.grid.corners(u):
+            for k in range(self._loads):
+                values = dr.gather(mi.Vector4f, self.data, voxel * self._loads + k, active)
+                sums[k] = dr.fma(weight, values, sums[k])
         return [value for packet in sums for value in packet]
 
 

@@ -85,6 +85,26 @@ class Grid:
         row = index // nx
         return index - row * nx, row % ny, row // ny
 
+    def index(self, x: mi.UInt32, y: mi.UInt32, z: mi.UInt32) -> mi.UInt32:
+        """The flat indices of voxels: the inverse of `places`."""
+        nx, ny, _ = (mi.UInt32(n) for n in self.sides)
+        return (mi.UInt32(z) * ny + mi.UInt32(y)) * nx + mi.UInt32(x)
+
+    def corners(self, u: mi.Point3f) -> list[tuple[mi.UInt32, mi.Float]]:
+        """Flat indices of the eight voxels around ``u``, voxel coordinates, and their trilinear
+        weights.
+        """
+        axes = []
+        for c, n in zip(u, self.sides, strict=True):
+            lower, weight, more = stencil(c, n)
+            axes.append(((lower, 1 - weight), (lower + dr.select(more, 1, 0), weight)))
+        return [
+            (self.index(x, y, z), wx * wy * wz)
+            for z, wz in axes[2]
+            for y, wy in axes[1]
+            for x, wx in axes[0]
+        ]
+
     @staticmethod
     def near_cubic(to_world: np.ndarray, resolution: int) -> Grid:
         """A grid over the unit cube ``to_world`` with ``resolution`` near-cubic voxels along its

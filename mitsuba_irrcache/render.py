@@ -27,10 +27,8 @@ from .variants import SUPPORTED
 REPLACED = ("path", "volpath", "volpathmis", "prbvolpath")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``irrcache render``: those of the ``mitsuba`` command where it has them."""
-    parser.add_argument("scene", help="scene XML")
-    parser.add_argument("-o", "--output", help="EXR to write (default: beside the scene)")
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """What it takes to load a scene: the variant, and its parameters."""
     parser.add_argument(
         "-m",
         "--mode",
@@ -42,6 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
         help="value of a $parameter of the scene; repeatable",
     )  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``irrcache render``: those of the ``mitsuba`` command where it has them."""
+    parser.add_argument("scene", help="scene XML")
+    parser.add_argument("-o", "--output", help="EXR to write (default: beside the scene)")
+    add_scene_options(parser)
     parser.add_argument(
         "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
         help="integrator and its properties (default: irrcache in place of a path tracer)",

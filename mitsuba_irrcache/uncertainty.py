@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from .cache import IrradianceCache
-from .grid import Extension, Grid, GridField, extrapolated, stencil
+from .grid import Extension, Grid, GridField, extrapolated
 from .layers import interleaved
 
 #: Random errors that are projected; their signs are kept in the last bits of a float.
@@ -50,7 +50,7 @@ class UncertaintyField:
         """Relative errors at ``p``, where the irradiance is ``phi``."""
         root = dr.sqrt(phi if isinstance(phi, mi.Float) else dr.sum(phi) / 3)
         sums = [mi.Float(0)] * self.count  # one array: added to below, never in place
-        for voxel, weight in self._corners(self.grid.coordinates.point(p)):
+        for voxel, weight in self.grid.corners(self.grid.coordinates.point(p)):
             deviation, bias = dr.gather(mi.Vector2f, self.data, voxel, active)
             bits = dr.reinterpret_array(mi.UInt32, deviation)
             for k in range(PROBES):
@@ -59,20 +59,6 @@ class UncertaintyField:
             sums[PROBES] = sums[PROBES] + weight * bias
         inverse = dr.select(root > 0, dr.rcp(root), 0)
         return [s * inverse for s in sums]
-
-    def _corners(self, u: mi.Point3f) -> list[tuple[mi.UInt32, mi.Float]]:
-        """The eight voxels around ``u`` and their trilinear weights."""
-        axes = []
-        for c, n in zip(u, self.grid.sides, strict=True):
-            lower, weight, more = stencil(c, n)
-            axes.append(((lower, 1 - weight), (lower + dr.select(more, 1, 0), weight)))
-        nx, ny, _ = self.grid.sides
-        return [
-            (mi.UInt32((z * ny + y) * nx + x), wx * wy * wz)
-            for z, wz in axes[2]
-            for y, wy in axes[1]
-            for x, wx in axes[0]
-        ]
 
 
 def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:

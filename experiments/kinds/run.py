@@ -16,20 +16,18 @@ for the others.
 
 from __future__ import annotations
 
-import argparse
 import gc
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from experiments.options import begin, parser_of
 from experiments.store import Store
 from mitsuba_irrcache.compare.tables import Table
-from mitsuba_irrcache.runtime import require_llvm
 
 SIZE, SPP = 64, 16
 STOCK = ("volpath", "volpathmis")
@@ -282,17 +280,11 @@ def _from(row: dict, error: float) -> str:
 
 def main() -> None:
     """Computes the rows that are missing, as many as the budget lets."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--budget", type=float, default=240, help="no row is begun later")
     parser.add_argument("--seconds", type=float, default=12, help="of half a reference")
-    parser.add_argument("--force", action="store_true", help="compute again what is there")
-    parser.add_argument("-o", "--output", type=Path, default=Path("output"))
     args = parser.parse_args()
-    require_llvm()
-    mi.set_variant("llvm_ad_rgb")
-    mi.set_log_level(mi.LogLevel.Error)
+    begin()
     folder = args.output / "kinds"
     folder.mkdir(parents=True, exist_ok=True)
     store, started = Store(folder / "results.json", args.force), time.perf_counter()

@@ -9,7 +9,6 @@ which test. Ends with 1 if one survives.
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import shutil
@@ -21,6 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from experiments.mutation.mutants import MUTANTS, Mutant
+from experiments.options import parser_of
 from experiments.store import Store
 from mitsuba_irrcache.compare.tables import Table
 
@@ -33,12 +33,8 @@ SURVIVED = "survived"
 
 def main() -> int:
     """Runs the mutants that there is no result of yet."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--only", default="", help="mutants with this in their names")
-    parser.add_argument("--force", action="store_true", help="compute again what is there")
-    parser.add_argument("-o", "--output", type=Path, default=Path("output"))
     args = parser.parse_args()
     folder = args.output / "mutation"
     folder.mkdir(parents=True, exist_ok=True)

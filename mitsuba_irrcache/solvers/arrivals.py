@@ -248,9 +248,7 @@ class Returning(Entering):
 def _coarser(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
     """The voxels of a coarser grid of the hierarchy in which those of the fine one lie."""
     ratio = round((coarse.voxel_size / fine.voxel_size)[0])
-    x, y, z = (p // dr.opaque(mi.UInt32, ratio) for p in fine.places(voxel))
-    nx, ny, _ = (mi.UInt32(n) for n in coarse.sides)
-    result = (z * ny + y) * nx + x
+    result = coarse.index(*(p // dr.opaque(mi.UInt32, ratio) for p in fine.places(voxel)))
     dr.eval(result)
     return result
 
@@ -284,12 +282,11 @@ def _follow(
         emitted = straight + weight * scattered
         returned = weight * end.weight * dr.inv_four_pi
         u = grid.coordinates.point(end.p)
-        nx, ny, _ = grid.sides
-        x, y, z = (
+        at = (
             mi.Int32(dr.clip(dr.floor(v), 0, mi.Float(n - 1)))
             for v, n in zip(u, grid.sides, strict=True)
         )
-        voxel = mi.UInt32((z * ny + y) * nx + x)
+        voxel = grid.index(*at)
     none = dr.zeros(mi.Float, dr.width(weight))
     layers = [[v + none for v in kind] for kind in (straight, emitted, returned)]
     voxel = voxel + dr.zeros(mi.UInt32, dr.width(weight))

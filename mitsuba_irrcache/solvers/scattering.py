@@ -226,6 +226,6 @@ def _children(fine: Grid, coarse: Grid, ratio: np.ndarray) -> list[tuple[mi.UInt
     for steps in np.ndindex(*(int(n) for n in ratio[::-1])):
         x, y, z = (int(n) * a + d for n, a, d in zip(ratio, at, steps[::-1], strict=True))
         inside = (x < nx) & (y < ny) & (z < nz)
-        place = dr.select(inside, (z * ny + y) * nx + x, 0)
+        place = dr.select(inside, fine.index(x, y, z), 0)
         result.append((place, dr.select(inside, mi.Float(1), 0)))
     return result

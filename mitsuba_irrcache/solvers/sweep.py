@@ -245,11 +245,10 @@ def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> 
 def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
     """Means over blocks of so many voxels (x, y, z), which are the voxels of ``grid``."""
     sums: list = [0.0] * field.channels
-    nx, ny, _ = (int(n) for n in field.grid.resolution)
     at = grid.places(dr.arange(mi.UInt32, grid.voxel_count))
     for dz, dy, dx in np.ndindex(*block[::-1]):
-        x, y, z = (a * int(n) + d for a, n, d in zip(at, block, (dx, dy, dz), strict=True))
-        place = ((z * ny + y) * nx + x) * field.channels
+        voxel = (a * int(n) + d for a, n, d in zip(at, block, (dx, dy, dz), strict=True))
+        place = field.grid.index(*voxel) * field.channels
         for c in range(field.channels):
             sums[c] = sums[c] + dr.gather(mi.Float, field.data, place + c)
     values = [total * (field.scale / int(np.prod(block))) for total in sums]

@@ -13,9 +13,8 @@ import mitsuba as mi
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.loading import integrator_of, parse_parameters
-from mitsuba_irrcache.render import REPLACED
+from mitsuba_irrcache.render import REPLACED, add_scene_options
 from mitsuba_irrcache.runtime import require_llvm
-from mitsuba_irrcache.variants import SUPPORTED
 from mitsuba_irrcache.volumes import importer
 from mitsuba_irrcache.volumes.scene import SceneSettings
 
@@ -25,17 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     volume.
     """
     importer.add_input(parser, "scene XML, or what irrcache import reads: ")
-    parser.add_argument(
-        "-m",
-        "--mode",
-        default="llvm_ad_rgb",
-        choices=SUPPORTED,
-        help="variant (default: %(default)s)",
-    )
-    parser.add_argument(
-        "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
-        help="value of a $parameter of the scene; repeatable",
-    )  # fmt: skip
+    add_scene_options(parser)
     parser.add_argument(
         "-i", "--integrator", metavar="irrcache{KEY=VALUE,...}", help="properties of irrcache"
     )
