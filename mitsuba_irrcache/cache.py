@@ -16,6 +16,7 @@ from .directional import Directional, DirectionalField
 from .errors import CacheFileError, IrrcacheError
 from .files import atomic_write
 from .grid import Affine, Grid, RootField
+from .lamps import Falloff
 from .macrocells import Macrocells
 from .survey import Survey
 
@@ -69,6 +70,8 @@ class IrradianceCache:
         self.moments = moments
         #: what the moments are of
         self.directional: Directional | None = None
+        #: how the light of lamps nearby falls off; None where there are none
+        self.falloff: Falloff | None = None
         #: where voxels lie among surfaces; None where there are none
         self.survey: Survey | None = None
         #: samples taken per voxel from each random stream
@@ -146,17 +149,25 @@ class IrradianceCache:
         return self._zeros if spread is None else spread / (n * (n - 1))
 
     def field(self) -> RootField:
-        """Phi for lookups: one channel where all channels agree to the last bit."""
+        """Phi for lookups, over the `falloff` if there is one: one channel where all channels agree
+        to the last bit. Its maximum is that of Phi, or more.
+        """
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
         noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
         roots = [dr.sqrt(m) * _root_correction(v) for m, v in zip(means, noise, strict=True)]
         if all(dr.all(r == roots[0])[0] for r in roots[1:]):
             roots = roots[:1]
         channels = len(roots)
+        if self.falloff is not None:
+            smooth = dr.rsqrt(self.falloff.of_voxels(self.active))
+            roots = [r * smooth for r in roots]
         roots, noise = (self._tensor(x).array for x in (roots, noise[:channels]))
         if self.survey is not None:
             roots = self.survey.filled(roots, channels)
-        return RootField(self.grid, roots, channels, noise)
+        field = RootField(self.grid, roots, channels, noise)
+        if self.falloff is not None:
+            field.maximum *= self.falloff.maximum(self.active)
+        return field
 
     def directional_field(self, channels: int) -> DirectionalField | None:
         """The moments for lookups, where there are any."""

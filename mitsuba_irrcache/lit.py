@@ -17,6 +17,7 @@ from .directional import Directional, sources_of
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import digests
 from .grid import Grid
+from .lamps import Falloff
 from .medium import MediumGrid
 from .memory import available_memory
 from .solvers import path, sweep
@@ -146,6 +147,7 @@ class LitMedium:
             grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
         )
         cache.survey, cache.directional = survey, directional
+        cache.falloff = Falloff.of(scene, grid)
         self.saved_samples = 0
         if not self.file:
             return cache
@@ -184,6 +186,7 @@ class LitMedium:
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
             stored.survey, stored.directional = cache.survey, cache.directional
+            stored.falloff = cache.falloff
             return stored
         if edited:
             mi.Log(
@@ -229,6 +232,7 @@ class LitMedium:
                 moments=cache.moments,
             )
             self._preview.survey, self._preview.directional = cache.survey, cache.directional
+            self._preview.falloff = cache.falloff
             self._opening.fill(self._preview)
         return True
 

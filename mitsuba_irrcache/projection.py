@@ -24,6 +24,7 @@ from .distance import chebyshev
 from .edges import Edges
 from .emission import Emission
 from .grid import ConstantField, Field, GridField
+from .lamps import Falloff
 from .layers import Layers, luminance
 from .macrocells import Macrocells, Walk
 from .medium import MediumGrid
@@ -71,6 +72,8 @@ class Projection:
         self.layered = layered
         self.uncertainty = uncertainty
         self.directional = directional
+        #: how the light of lamps falls off, which the cache is without
+        self.falloff: Falloff | None = None
         #: surfaces that end the light, where there are any
         self.edges: Edges | None = None
         albedo = _constant_if_it_is(medium.albedo)
@@ -92,9 +95,9 @@ class Projection:
         self.lookups = Lookups(needed)
 
     def fetch(self, p: mi.Point3f, active: mi.Bool, view: tuple = ()) -> tuple:
-        """Extinction; albedo Phi / (4 pi), in-scattered radiance per unit of optical depth; and
-        what layers need to know of the point: the albedo, and the relative errors of Phi. ``view``
-        is what `seen_along` says of the ray.
+        """Extinction; albedo Phi / (4 pi), in-scattered radiance per unit of optical depth, without
+        the falloff; and what layers need to know of the point: the albedo, and the relative errors
+        of Phi. ``view`` is what `seen_along` says of the ray.
         """
         sigma_t, *rest = self.lookups.at_world(p, active)
         known = [rest[-1]] if self.layered else []
@@ -119,6 +122,8 @@ class Projection:
     ) -> mi.Float | mi.Color3f:
         """The cached irradiance alone, as much as is seen along ``direction``."""
         phi = self._within_edges(p, self.irradiance.at_world(p, active), active)
+        if self.falloff is not None:
+            phi = phi * self.falloff.at(p)
         if self.directional is None:
             return phi
         return phi * self.directional.factor(p, *self.seen_along(direction), active)
@@ -158,6 +163,7 @@ class Projection:
         before, before_source, before_length = extinction, source, mi.Float(dr.inf)
         grey = self.medium.sigma_t.channels == 1
         view = self.seen_along(ray.d)
+        lamps = self.falloff.along(ray) if self.falloff is not None else []
         transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
         radiance, emitted, shine = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
         emission = self.medium.emission
@@ -197,6 +203,9 @@ class Projection:
                     )
                 weights, passed = segment(self.quadrature, ends[0], length)
                 near_light, far_light = weights[0] * ends[1][0], weights[1] * ends[1][1]
+                if dr.hint(self.falloff is not None, mode="scalar"):
+                    falloff = self.falloff.means(lamps, t, end)
+                    near_light, far_light = near_light * falloff[0], far_light * falloff[1]
                 radiance += transmittance * (near_light + far_light)
                 if dr.hint(self.layered, mode="scalar"):
                     gathered = _gather(

@@ -14,10 +14,9 @@ import numpy as np
 from .boundary import Boundary, boundary_of
 from .emission import Emission, place_emission
 from .errors import UnsupportedSceneError
-from .lamps import point_lights, position_of
 from .medium import MediumGrid, bake, children
 from .phase import refuse_sharp
-from .surroundings import Surroundings, probe
+from .surroundings import Surroundings
 from .transport import MOST_CROSSINGS, is_null
 
 #: Rays that find out whether a shape is closed, and the share of them that may say it is not:
@@ -117,10 +116,6 @@ def bake_scene(scene: mi.Scene) -> MediumGrid | None:
 
 
 def _bake_simple(scene: mi.Scene, boundary: Boundary) -> MediumGrid:
-    for emitter in point_lights(scene):
-        position = position_of(emitter)
-        if boundary.contains(position):
-            _refuse_inside(emitter, position)
     (medium,) = media_of(scene)
     grid = bake(medium, boundary)
     grid.name = medium.id()
@@ -157,11 +152,6 @@ def bake_general(scene: mi.Scene, emission: Emission | None = None) -> list[Medi
             'shape that only bounds a medium needs <bsdf type="null"/>.',
         )
     _warn_of_scale(scene, grids)
-    for emitter in point_lights(scene):
-        position = position_of(emitter)
-        pointer = probe(scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
-        if dr.any(pointer != None):  # noqa: E711
-            _refuse_inside(emitter, position)
     return seen
 
 
@@ -298,13 +288,6 @@ def _warn_of_scale(scene: mi.Scene, grids: list[MediumGrid]) -> None:
                 f"in this scene skip up to {offset:.1g}, as in volpath: light is lost. Scale the "
                 "scene up, or move it to the origin.",
             )
-
-
-def _refuse_inside(emitter: mi.Emitter, position: np.ndarray) -> None:
-    """A point-like light inside a medium: no grid can hold its 1/r^2."""
-    _refuse(
-        f'emitter "{emitter.id()}" ({emitter.class_name()}) is inside the medium, at {position}'
-    )
 
 
 def _refuse(reason: str, hint: str = "") -> None:

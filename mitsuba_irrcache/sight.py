@@ -47,6 +47,8 @@ def sight_of(
         uncertainty = uncertainty_of(cache) if lit and with_error else None
         directional = cache.directional_field(field.channels) if lit else None
         projection = Projection(medium, field, quadrature, step, layered, uncertainty, directional)
+        if lit:
+            projection.falloff = cache.falloff
         if lit and cache.survey is not None:
             projection.edges = cache.survey.edges
         return projection

@@ -64,6 +64,9 @@ class UncertaintyField:
 def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     """The errors of ``cache``, which has at least two batches of samples (one tells no noise)."""
     phi, error = cache.mean_and_error()
+    if cache.falloff is not None:
+        smooth = 1 / cache.falloff.of_voxels(cache.active)
+        phi, error = phi * smooth, error * smooth
     root = dr.sqrt(phi)
     # Of twice the size in Phi, relatively; without a quotient, which explodes in shadows.
     bias = 2 * COARSE_TO_FINE * (_at_half_resolution(cache, root) - root)

@@ -1,8 +1,8 @@
 """Light of small emitters nearby, at each voxel of the solver ``sweep`` among surfaces.
 
 The lines that all voxels share meet a small lamp rarely, and then all at once. So points on lamps
-are sampled from each voxel, and the lines do not count what they meet of these. Large lamps close
-by are left to the lines: from there, few points on them matter.
+are sampled from each voxel, and the lines do not count what they meet of these. Lamps that fill
+much of what the voxels see are left to the lines: few points on them matter to a voxel close by.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.directions import marched
 from mitsuba_irrcache.transport import Media, visibility
 
-#: Solid angle of an emitter, seen from where in the medium it is largest, from which on lines are
-#: relied upon to meet it [sr]; an upper bound, area over squared distance, is what is compared.
-LARGE = 12.0
-#: Points from which the distance to an emitter is told.
+#: Solid angle of an emitter, on average over the voxels, from which on lines are relied upon to
+#: meet it [sr].
+LARGE = 2.0
+#: Points of the voxels' box, and as many on an emitter, that tell of its solid angle.
 POINTS = 1024
 #: Points on lamps that are sampled from each voxel in a batch; one on each, if there are more, but
 #: never more than the latter.
@@ -51,15 +51,16 @@ def split(
 
 
 def _solid_angle(emitter: mi.Emitter, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> float:
-    """An upper bound, about."""
-    rng = mi.PCG32(POINTS)
-    shape = emitter.get_shape()
-    found = shape.sample_position(0.0, mi.Point2f(rng.next_float32(), rng.next_float32()))
-    low, high = (mi.Point3f(*(float(v) for v in end)) for end in (lower, upper))
-    nearest = dr.clip(grid.coordinates.point(found.p), low, high)
-    squared = dr.min(dr.squared_norm(grid.world.point(nearest) - found.p))
-    area = dr.max(shape.surface_area())
-    return float(area[0]) / max(float(squared[0]), 1e-12)
+    """On average over places in the box, about; what is in the way does not count."""
+    rng = np.random.default_rng(POINTS)
+    u = np.float32(rng.random((5, POINTS)))
+    found = emitter.get_shape().sample_position(0.0, mi.Point2f(u[:2]))
+    box = np.float32(lower[:, None] + u[2:] * (upper - lower)[:, None])
+    way = found.p - grid.world.point(mi.Point3f(box))
+    distance = dr.norm(way)
+    cosine = dr.abs(dr.dot(way, found.n)) / distance
+    angle = cosine / (dr.square(distance) * found.pdf)
+    return float(dr.mean(dr.minimum(angle, 2 * dr.pi))[0])
 
 
 class Lamps:

@@ -98,6 +98,11 @@ class Sweep:
                 for c in range(max(len(albedo), len(sigma_t)))
             ]
         self._medium, self._places = medium, Places(scene, grid).of(cache.active)
+        # What is scattered near a lamp is what a voxel gets on average, not in its middle.
+        self._spread = mi.Float(1)
+        if cache.falloff is not None and self._levels:
+            self._spread = cache.falloff.spread(cache.active)
+            dr.eval(self._spread)
         self._emitted: list[mi.Spectrum] = []  # of a batch
         self._around: Around | None = None
         if medium.surroundings is None:
@@ -201,9 +206,10 @@ class Sweep:
         return phi
 
     def _with_near_light(self, volume: mi.Float, channel: int) -> mi.Float:
-        for light in (*self._direct, *self._emitted):
+        near = [light[channel] * self._spread for light in self._direct]
+        for light in (*near, *(light[channel] for light in self._emitted)):
             dr.eval(volume)
-            dr.scatter_reduce(dr.ReduceOp.Add, volume, light[channel], self.cache.active)
+            dr.scatter_reduce(dr.ReduceOp.Add, volume, light, self.cache.active)
         dr.eval(volume)
         return volume
 

@@ -188,10 +188,6 @@ def _matches(pattern: str, text: str) -> bool:
 
 NULL = '<bsdf type="null"/>'
 EXTRAS = {
-    "point light in the medium": (
-        '<emitter type="point" id="bulb"> <point name="position" value="0, 0, 0"/> </emitter>',
-        "bulb.*inside the medium",
-    ),
     "medium without bounds": (
         f'<shape type="sphere" id="hole"> {NULL} <medium name="exterior" type="homogeneous" '
         'id="haze"/> </shape>',

@@ -147,6 +147,15 @@ def scene_lamp_inside(scenes, folder) -> dict:
     }  # fmt: skip
 
 
+def scene_bulb(scenes, folder) -> dict:
+    """A bare bulb in fog over the ground, and a ball in its light."""
+    bulb = {"type": "point", "position": [0.1, 0.4, 0.2], "intensity": 3.0}
+    return {
+        "box": bound(interior=fog((0.6, 0.6, 0.6))), "ground": ground(),
+        "ball": ball((1.5, 0.2, 0)), "bulb": bulb, "sun": None,
+    }  # fmt: skip
+
+
 def scene_two(scenes, folder) -> dict:
     """A medium beside another, whose extinction is coloured, and a third in that."""
     inner = bound("sphere", fog((1, 2, 4)), (0.55, 0, 0), (0.3, 0.3, 0.3), exterior=ref("right"))
@@ -187,6 +196,7 @@ SCENES = {
     "glass": (scene_glass, {}, {}),
     "mesh under a lamp": (scene_lamp_outside, {}, {"tolerance": 0.03}),
     "lamp inside": (scene_lamp_inside, {"resolution": 32}, {"tolerance": 0.04, "noise": 0.04}),
+    "bulb inside": (scene_bulb, {}, {"noise": 0.04}),
     "three media": (scene_two, {}, {}),
     "camera inside": (scene_camera_inside, {"cache_spp": 512}, {}),
     "glass boundary": (scene_glass_boundary, {}, {}),
