@@ -17,7 +17,7 @@ from mitsuba_irrcache.filtering import FILTERS, filter_illumination
 from mitsuba_irrcache.layers import AOVS, Layers, parse_aovs
 from mitsuba_irrcache.progressive import Frame, Targets, frames
 from mitsuba_irrcache.projection import QUADRATURES, Projection
-from mitsuba_irrcache.rendering import fill_film, planes, render_film
+from mitsuba_irrcache.rendering import check_film, fill_film, planes, render_film
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.sight import Sight, SimpleSight, sight_of
 from mitsuba_irrcache.stopping import Stopped, Stopping
@@ -323,6 +323,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     ) -> mi.TensorXf:
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
+        check_film(sensor.film(), spp, len(self.aov_names()))  # before the work of a cache
         with dr.suspend_grad():
             self.prepare(scene)
             if self._sight is None:
@@ -382,8 +383,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _render_empty(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
         """A scene without media, by volpath: all of the image is background."""
-        self._fallback().render(scene, sensor, seed, spp)
         film = sensor.film()
+        check_film(film, spp or sensor.sampler().sample_count(), 0, at_once=True)
+        self._fallback().render(scene, sensor, seed, spp)
         if self._aovs:
             colour, alpha, _ = planes(film, 0)
             channels = (colour * 3)[: dr.size_v(mi.Spectrum)]

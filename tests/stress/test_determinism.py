@@ -92,6 +92,22 @@ def test_with_error_bars_and_filter(threads):
     assert_same(look("sweep", **settings), expected)
 
 
+@pytest.mark.parametrize("name", ["box", "gaussian", "lanczos"])
+def test_films(name, threads):
+    """Five samples per pixel, an odd number: blocks of lanes end within pixels."""
+    film = {"width": 250, "height": 250, "rfilter": {"type": name}}
+    settings = {"type": "irrcache", "solver": "sweep", "resolution": 4, "cache_spp": 32}
+    built = scene(settings, Matter(), camera=Camera(film=film))
+    expected = scene_image(built)
+    for count in (threads, 1, 7):
+        dr.set_thread_count(count)
+        np.testing.assert_array_equal(scene_image(built), expected)
+
+
+def scene_image(built: mi.Scene) -> np.ndarray:
+    return np.array(mi.render(built, spp=5, seed=5))
+
+
 def _look_elsewhere(kind: str) -> tuple[np.ndarray, np.ndarray]:
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from experiments.faults import formats, run
-from experiments.stability.worlds import Matter, scene
+from experiments.stability.worlds import Camera, Matter, scene
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.files import ABANDONED, atomic_write
@@ -84,7 +84,7 @@ CROWDED = """
 import os, resource, sys
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from experiments.stability.worlds import Matter, scene
+from experiments.stability.worlds import Camera, Matter, scene
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 settings = {"solver": "path", "resolution": 4, "cache_spp": 8, "max_depth": 2}
 built = scene(settings | {"cache_file": sys.argv[1] + "/light.cache"}, Matter())
@@ -212,6 +212,34 @@ def test_memory_is_predicted(tmp_path):
     too_large = scene({"solver": "sweep", "resolution": 5000}, Matter())
     with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB.*are free; lower resolution"):
         too_large.integrator().prepare(too_large)
+
+
+@pytest.mark.parametrize("matter", [Matter(), None], ids=["a medium", "none"])
+@pytest.mark.parametrize(
+    ("film", "spp", "said"),
+    [
+        (
+            {"width": 10**6, "height": 10**5},
+            1,
+            r"1000000 x 100000 pixels needs \d+\.\d GiB.*lower",
+        ),
+        ({"width": 4, "height": 4}, 2**32, r"spp is 4294967296"),
+        ({"width": 4, "height": 4}, -1, r"spp is -1; it must be"),
+    ],
+    ids=["pixels", "samples", "negative"],
+)
+def test_absurd_images_are_refused_before_anything_is_computed(matter, film, spp, said):
+    built = scene(SETTINGS, matter, camera=Camera(film=film))
+    with pytest.raises(IrrcacheError, match=said):
+        built.integrator().render(built, spp=spp)
+    assert built.integrator().cache is None
+
+
+def test_absurd_numbers_of_samples_of_an_empty_scene_are_refused():
+    """They would all be in one launch; with a medium they are rendered in passes."""
+    empty = scene(SETTINGS, None, camera=Camera(film={"width": 4096, "height": 4096}))
+    with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB.*lower width, height or spp"):
+        empty.integrator().render(empty, spp=1 << 20)
 
 
 def test_another_variant_in_the_middle():
