@@ -109,6 +109,12 @@ class LitMedium:
         if self.cache is None or self.cache.samples >= self.target(samples):
             return False
         self._fill(scene, self.target(samples) - self.cache.samples, progress)
+        if not self.is_dark and not self.cache.is_finite:
+            self.cache, self._sweep = self._start_cache(scene, edited=False), None
+            raise IrrcacheError(
+                f"irrcache: {self.label}the light in the medium is not finite in single precision; "
+                "lower the radiance of the emitters, and look through sigma_t and albedo."
+            )
         return True
 
     def close(self) -> bool:

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.faults import formats, run
+from experiments.faults import commands, formats, properties, run
 from experiments.stability.worlds import Camera, Matter, scene
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
@@ -205,6 +205,100 @@ def test_caches_that_were_tampered_with(tmp_path):
         except CacheFileError:
             refused += 1
     assert 30 < refused <= 60
+
+
+def tried(case: Path, run_case, mutate, count: int) -> int:
+    """Tries so many mutants of a case in this process; how many of them are refused by name."""
+    content, refused = case.read_bytes(), 0
+    for index in range(count):
+        case.write_bytes(mutate(content, np.random.default_rng((3, index))))
+        try:
+            run_case(case)
+        except IrrcacheError:
+            refused += 1
+    return refused
+
+
+def test_properties_that_nobody_should_write(tmp_path):
+    """Each of 80 scenes is rendered, or refused by a message that names what is wrong."""
+    case = tmp_path / "properties.json"
+    properties.write_valid(case)
+    properties.render_case(case)
+    refused = tried(case, properties.render_case, properties.mutated_properties, 80)
+    assert 40 < refused < 75
+
+
+def test_command_lines_that_nobody_should_type(tmp_path):
+    """Each of 40 does its work, or prints an error and leaves nothing behind."""
+    case = tmp_path / "command.json"
+    commands.write_valid(case)
+    commands.run_case(case)
+    refused = tried(case, commands.run_case, commands.mutated_command, 40)
+    assert 25 < refused < 40
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["render", "none.xml", "-o", "\udc80.exr"], ["import", "\udc80", "--density", "-o", "x"]],
+    ids=["render", "import"],
+)
+def test_arguments_that_are_no_text_are_refused_without_a_traceback(tmp_path, arguments):
+    """In a process of its own: what is printed has to be encoded."""
+    command = [sys.executable, "-m", "mitsuba_irrcache", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=60)
+    assert done.returncode == 1 and b"Traceback" not in done.stderr
+    assert done.stderr.startswith(b"irrcache: error: ") and not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("hide_emitters", "false"),
+        ("aovs", 1),
+        ("cache_file", 3),
+        ("cache_file", "."),
+        ("timeout", float("nan")),
+        ("timeout", "1"),
+        ("step", True),
+        ("emission_scale", [1.0, 2.0, 3.0]),
+        ("filter", [1.0, 2.0, 3.0]),
+        ("emission", 1e300),
+    ],
+)
+def test_properties_of_another_type_are_refused(name, value):
+    """Python makes something of most of them: "false" is true, and 3 the name of a file. What
+    Mitsuba reads itself it refuses in its own words.
+    """
+    said = rf'(?s)irrcache: {name} is .*; it must be|"{name}" has the wrong type'
+    with pytest.raises((IrrcacheError, RuntimeError), match=said):
+        built = scene(SETTINGS | {name: value}, Matter())
+        built.integrator().prepare(built)
+
+
+@pytest.mark.parametrize("solver", ["sweep", "path"])
+@pytest.mark.parametrize("depth", [2, -1])
+def test_light_beyond_single_precision_is_refused_by_name(solver, depth):
+    """Each time, not only the first."""
+    sky = {"type": "constant", "radiance": 1e38}
+    built = scene(SETTINGS | {"solver": solver, "max_depth": depth}, Matter(2.0), sky)
+    for _ in range(2):
+        with pytest.raises(IrrcacheError, match="not finite in single precision; lower the radia"):
+            built.integrator().prepare(built)
+
+
+def test_any_number_of_orders_ends():
+    """2^31 - 1 orders by `sweep`: as soon as there is no light in them; on average the same as all
+    orders, to the error that these are solved for with.
+    """
+
+    def light(depth: int) -> np.ndarray:
+        built = scene(SETTINGS | {"solver": "sweep", "max_depth": depth}, Matter(3.0))
+        built.integrator().prepare(built)
+        return np.array(built.integrator().cache.irradiance)
+
+    found, expected = light(2**31 - 1), light(-1)
+    assert abs(found.mean() / expected.mean() - 1) < 2e-3
+    assert light(12).mean() < 0.997 * found.mean()
 
 
 def test_memory_is_predicted(tmp_path):
