@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from .errors import IrrcacheError
 from .layers import interleaved
-from .memory import available_memory
+from .memory import require_memory
 from .reconstruction import Samples, reconstructed
 
 #: Camera samples in one kernel launch: bounds the memory that they and the sampler's state take.
@@ -126,16 +126,15 @@ def check_film(film: mi.Film, spp: int, channels: int, at_once: bool = False) ->
     # The film's sums, those of a pass, and two copies while it is developed; of each sample its
     # values, its place and the sampler's state.
     needed = 4 * (4 * pixels * values + lanes * (values + 6))
-    available = available_memory()
-    if needed > available or lanes >= 2**32:
-        beside = f" with {channels} further channels" if channels else ""
-        beside += f" and {spp} samples each" if at_once else ""
-        raise IrrcacheError(
-            f"irrcache: an image of {width} x {height} pixels{beside} needs "
-            f"{needed / 2**30:.1f} GiB, and {available / 2**30:.1f} GiB are free; lower "
-            f"{'width, height or spp' if at_once else 'width and height'} of the film"
-            f"{', or ask for fewer aovs' if channels else ''}, or render it in crop windows."
-        )
+    what = f"irrcache: an image of {width} x {height} pixels"
+    what += f" with {channels} further channels" if channels else ""
+    remedy = f"lower width{', height or spp' if at_once else ' and height'} of the film"
+    remedy += ", ask for fewer aovs" if channels else ""
+    what += f" and {spp} samples each" if at_once else ""
+    remedy += ", or render it in crop windows"
+    require_memory(needed, what, remedy)
+    if lanes >= 2**32:
+        raise IrrcacheError(f"{what} needs {lanes} samples at once, 2^32 or more; {remedy}.")
 
 
 def _divisor(n: int, limit: int) -> int:
