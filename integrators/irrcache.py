@@ -9,7 +9,9 @@ from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mitsuba_irrcache import given
 from mitsuba_irrcache.build import CacheBuilder, CacheSettings
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
@@ -17,7 +19,7 @@ from mitsuba_irrcache.filtering import FILTERS, filter_illumination
 from mitsuba_irrcache.layers import AOVS, Layers, parse_aovs
 from mitsuba_irrcache.progressive import Frame, Targets, frames
 from mitsuba_irrcache.projection import QUADRATURES, Projection
-from mitsuba_irrcache.rendering import fill_film, planes, render_film
+from mitsuba_irrcache.rendering import check_film, fill_film, planes, render_film
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.sight import Sight, SimpleSight, sight_of
 from mitsuba_irrcache.stopping import Stopped, Stopping
@@ -164,29 +166,32 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         require_llvm()
         check_versions()
         super().__init__(props)
-        self._hide_emitters = bool(props.get("hide_emitters", False))
-        self._filter = _choice(props, "filter", "none", FILTERS)
-        self._aovs = parse_aovs(str(props.get("aovs", "")))
+        self._hide_emitters = given.flag(props, "hide_emitters", False)
+        self._filter = given.choice(props, "filter", "none", FILTERS)
+        self._aovs = parse_aovs(given.text(props, "aovs"))
         self._settings = CacheSettings(
-            max_depth=_integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0"),
-            rr_depth=_integer(props, "rr_depth", 5, 1, "at least 1"),
-            solver=_choice(props, "solver", "auto", SOLVERS),
-            resolution=_integer(props, "resolution", 0, 0, "0 (chosen) or a number of voxels"),
-            samples=_integer(props, "cache_spp", 0, 0, "0 (chosen) or a number of samples"),
-            seed=_integer(props, "cache_seed", 0, 0, "at least 0"),
-            file=str(props.get("cache_file", "")),
+            max_depth=given.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0"),
+            rr_depth=given.integer(props, "rr_depth", 5, 1, "at least 1"),
+            solver=given.choice(props, "solver", "auto", SOLVERS),
+            resolution=given.integer(props, "resolution", 0, 0, "0 (chosen) or a number of voxels"),
+            samples=given.integer(props, "cache_spp", 0, 0, "0 (chosen) or a number of samples"),
+            seed=given.integer(props, "cache_seed", 0, 0, "at least 0"),
+            file=given.file_name(props, "cache_file"),
             with_error=self._with_error,
         )
-        self._quadrature = _choice(props, "quadrature", "exponential", QUADRATURES)
-        self._step = float(props.get("step", 1.0))
-        if not 1e-3 <= self._step <= 1e3:
-            raise IrrcacheError(
-                f"irrcache: step is {self._step:g}; it must lie between 0.001 and 1000 voxel edges."
-            )
+        self._quadrature = given.choice(props, "quadrature", "exponential", QUADRATURES)
+        self._step = given.number(
+            props, "step", 1.0, 1e-3, 1e3, "between 0.001 and 1000 voxel edges"
+        )
         self._emission = props.get("emission", None)
-        scale = float(props.get("emission_scale", 1.0))
+        largest = float(np.finfo(np.float32).max)
+        scale = given.number(
+            props, "emission_scale", 1.0, 0.0, largest, "a finite number that is not negative"
+        )
         self._builder = CacheBuilder(self._settings, self._emission, scale)
-        self._timeout = float(props.get("timeout", -1.0))
+        self._timeout = given.number(
+            props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
+        )
         self._stopping = Stopping()
         self._sight: SimpleSight | Sight | None = None
         self._revision = 0  # of the builder, when the sight was made
@@ -222,7 +227,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     @cache_spp.setter
     def cache_spp(self, samples: int) -> None:
-        self._builder.samples = _checked("cache_spp", samples, 0, "0 (chosen) or a number")
+        self._builder.samples = given.checked_integer(
+            "cache_spp", samples, 0, "0 (chosen) or a number"
+        )
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         super().traverse(callback)
@@ -323,6 +330,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     ) -> mi.TensorXf:
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
+        check_film(sensor.film(), spp, len(self.aov_names()))  # before the work of a cache
         with dr.suspend_grad():
             self.prepare(scene)
             if self._sight is None:
@@ -382,8 +390,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _render_empty(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
         """A scene without media, by volpath: all of the image is background."""
-        self._fallback().render(scene, sensor, seed, spp)
         film = sensor.film()
+        check_film(film, spp or sensor.sampler().sample_count(), 0, at_once=True)
+        self._fallback().render(scene, sensor, seed, spp)
         if self._aovs:
             colour, alpha, _ = planes(film, 0)
             channels = (colour * 3)[: dr.size_v(mi.Spectrum)]
@@ -452,25 +461,6 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             f"{self._filter},\n  aovs = {', '.join(f'{n}:{k}' for n, k in self._aovs.items())},\n"
             f'  cache_file = "{s.file}"\n]'
         )
-
-
-def _integer(props: mi.Properties, name: str, default: int, least: int, wanted: str) -> int:
-    return _checked(name, props.get(name, default), least, wanted)
-
-
-def _checked(name: str, value: object, least: int, wanted: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
-        raise IrrcacheError(f"irrcache: {name} is {value!r}; it must be {wanted}.")
-    return value
-
-
-def _choice(props: mi.Properties, name: str, default: str, choices: tuple[str, ...]) -> str:
-    value = props.get(name, default)
-    if value not in choices:
-        raise IrrcacheError(
-            f"irrcache: {name} is {value!r}; it must be one of: {', '.join(choices)}."
-        )
-    return value
 
 
 mi.register_integrator("irrcache", IrradianceCachingIntegrator)

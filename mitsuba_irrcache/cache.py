@@ -141,6 +141,14 @@ class IrradianceCache:
         scale = dr.mean(mean)[0]
         return float(dr.sqrt(dr.mean(dr.square(error)))[0] / scale) if scale > 0 else 0.0
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all light is a number in single precision."""
+        pairs = zip(self._means(0), self._means(1), strict=True)
+        finite = [dr.all(dr.isfinite(a + b)) for a, b in pairs]
+        dr.eval(finite)
+        return all(f[0] for f in finite)
+
     def _variance(self, channel: int):
         """Squared standard error of the irradiance, None before there are two batches."""
         if self.samples < 2 * self.batch:

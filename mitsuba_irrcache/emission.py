@@ -96,7 +96,7 @@ def bake_emission(value: object, scale: float) -> Emission | None:
         field = baked_field(value, "emission of the integrator", scale)
         _verify(value, field, scale)
     else:
-        field = ConstantField(_numbers(value), scale)
+        field = ConstantField(_numbers(value, scale), scale)
     return Emission(field) if field.maximum > 0 else None
 
 
@@ -120,8 +120,8 @@ def place_emission(emission: Emission | None, media: list[MediumGrid]) -> None:
         medium.emission = emission
 
 
-def _numbers(value: object) -> np.ndarray:
-    """One value, or three of a colour."""
+def _numbers(value: object, scale: float) -> np.ndarray:
+    """One value, or three of a colour; times ``scale`` they are numbers in single precision."""
     try:
         values = np.array(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
@@ -131,8 +131,13 @@ def _numbers(value: object) -> np.ndarray:
             f"irrcache: emission is {value!r}; it must be a number, a colour (rgb), or a "
             'volume of type "constvolume" or "gridvolume".'
         )
-    if not np.isfinite(values).all() or values.min() < 0:
-        raise IrrcacheError(f"irrcache: emission is {values}; it must be finite and not negative.")
+    with np.errstate(over="ignore"):
+        scaled = np.float32(values * max(scale, 1.0))
+    if not np.isfinite(scaled).all() or values.min() < 0:
+        raise IrrcacheError(
+            f"irrcache: emission is {values}, times emission_scale {scale:g}; it must be finite in "
+            "single precision and not negative."
+        )
     if values.size == 3 and mi.is_monochromatic:
         values = np.array(mi.luminance(mi.Color3f(values))).ravel()
     return values[:1] if np.ptp(values) == 0 else values

@@ -19,7 +19,7 @@ from .fingerprint import digests
 from .grid import Grid
 from .lamps import Falloff
 from .medium import MediumGrid
-from .memory import available_memory
+from .memory import require_memory
 from .solvers import path, sweep
 
 
@@ -110,6 +110,12 @@ class LitMedium:
         if self.cache is None or self.cache.samples >= self.target(samples):
             return False
         self._fill(scene, self.target(samples) - self.cache.samples, progress)
+        if not self.is_dark and not self.cache.is_finite:
+            self.cache, self._sweep = self._start_cache(scene, edited=False), None
+            raise IrrcacheError(
+                f"irrcache: {self.label}the light in the medium is not finite in single precision; "
+                "lower the radiance of the emitters, and look through sigma_t and albedo."
+            )
         return True
 
     def close(self) -> bool:
@@ -320,11 +326,7 @@ def _check_memory(
         numbers = channels * (3 * 2 + 3) + 5  # sums in float64
         numbers += channels * moments * 3
     needed = 4 * grid.voxel_count * (numbers + 8) * (2 if with_error else 1)
-    available = available_memory()
-    if needed > available or grid.voxel_count >= 2**32:
-        sides = " x ".join(map(str, grid.shape[::-1]))
-        raise IrrcacheError(
-            f"irrcache: a cache of {sides} voxels needs {needed / 2**30:.1f} GiB, and "
-            f"{available / 2**30:.1f} GiB are "
-            "free; lower resolution."
-        )
+    what = f"irrcache: a cache of {' x '.join(map(str, grid.shape[::-1]))} voxels"
+    require_memory(needed, what, "lower resolution")
+    if grid.voxel_count >= 2**32:
+        raise IrrcacheError(f"{what} has 2^32 of them or more; lower resolution.")

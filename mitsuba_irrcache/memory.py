@@ -6,6 +6,8 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from .errors import IrrcacheError
+
 
 def available_memory() -> int:
     """Bytes that a new array can take without swapping; 2^63 where the system does not say."""
@@ -16,3 +18,15 @@ def available_memory() -> int:
     with suppress(AttributeError, ValueError, OSError):
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return 2**63
+
+
+def require_memory(needed: int, what: str, remedy: str) -> None:
+    """Raises IrrcacheError where ``what``, which takes so many bytes, finds less; it names both and
+    the ``remedy``.
+    """
+    available = available_memory()
+    if needed > available:
+        raise IrrcacheError(
+            f"{what} needs {min(needed, 1 << 200) / 2**30:.1f} GiB, and {available / 2**30:.1f} "
+            f"GiB are free; {remedy}."
+        )

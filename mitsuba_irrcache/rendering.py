@@ -14,9 +14,13 @@ import mitsuba as mi
 
 from .errors import IrrcacheError
 from .layers import interleaved
+from .memory import require_memory
+from .reconstruction import Samples, reconstructed
 
-#: Camera samples in one kernel launch: bounds the memory of the sampler's state (16 bytes each).
-LANES = 1 << 24
+#: Camera samples in one kernel launch: bounds the memory that they and the sampler's state take.
+LANES = 1 << 22
+#: Samples per pixel from which on their number does not fit in 32 bits, as the sampler has it.
+TOO_MANY = 1 << 32
 
 #: (sampler, ray, the sensor's weight of it, active) -> radiance, alpha, values of the further
 #: channels; the weight is in the radiance
@@ -33,15 +37,10 @@ def render_film(
 ) -> mi.Film:
     """Renders ``radiance`` to the sensor's film, ``spp`` samples per pixel (0: the sampler's own
     count); ``channels`` names those beside radiance and alpha. Raises IrrcacheError for a film
-    without pixels.
+    without pixels, and for one that memory does not hold.
     """
     film, sampler = sensor.film(), sensor.sampler().clone()
-    if min(film.crop_size()) == 0:
-        width, height = film.crop_size()
-        raise IrrcacheError(
-            f"irrcache: the crop window of the film is {width} x {height} pixels; crop_width and "
-            "crop_height must be at least 1."
-        )
+    check_film(film, spp, len(channels))
     if spp:
         sampler.set_sample_count(spp)
     spp = sampler.sample_count()
@@ -52,21 +51,22 @@ def render_film(
     per_pass = _divisor(spp, max(1, LANES // pixels))
     sampler.set_samples_per_wavefront(per_pass)
     sampler.seed(seed, pixels * per_pass)
-    block = film.create_block()
-    block.set_offset(film.crop_offset())
-    block.set_coalesce(block.coalesce() and per_pass >= 4)
-    spread = PixelPositions(sampler, seed, spp)
+    spread, sums = PixelPositions(sampler, seed, spp), None
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
-        _splat(sensor, sampler, spread, block, size, border, per_pass, spp, radiance)
+        samples = _sampled(sensor, sampler, spread, size, border, per_pass, spp, radiance)
+        found = reconstructed(samples)
+        sums = found if sums is None else [a + b for a, b in zip(sums, found, strict=True)]
         if per_pass < spp:
             sampler.advance()
             sampler.schedule_state()
-            dr.eval(block.tensor())
+            dr.eval(sums)
             dr.sync_thread()  # else all passes are queued before anybody can stop them
         if should_stop():
             break
-    film.put_block(block)
+    *values, weights = sums
+    colours = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+    _put(film, [*values[:colours], weights, *values[colours:]])
     return film
 
 
@@ -95,10 +95,46 @@ def fill_film(
     rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
     alphas = [] if alpha is None else [alpha]
     values = [*rgb, *alphas, mi.Float(1), *channels.values()]
+    _put(film, values)
+
+
+def _put(film: mi.Film, values: list[mi.Float]) -> None:
+    """Adds sums of samples, an array for each channel, to a film that is prepared for them."""
     width, height = (int(n) for n in film.crop_size())
     flat = interleaved(values, width * height)
     tensor = mi.TensorXf(flat, (height, width, len(values)))
     film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
+
+
+def check_film(film: mi.Film, spp: int, channels: int, at_once: bool = False) -> None:
+    """Raises IrrcacheError where a film of so many ``channels`` beside radiance and alpha has no
+    pixels, or cannot be rendered in the memory there is; ``at_once``: all ``spp`` in one launch.
+    """
+    width, height = (int(n) for n in film.crop_size())
+    if min(width, height) == 0:
+        raise IrrcacheError(
+            f"irrcache: the crop window of the film is {width} x {height} pixels; crop_width and "
+            "crop_height must be at least 1."
+        )
+    if not 0 <= spp < TOO_MANY:
+        raise IrrcacheError(
+            f"irrcache: spp is {spp}; it must be 0 (the sampler's) or a number of samples per "
+            f"pixel below {TOO_MANY}."
+        )
+    pixels, values = width * height, channels + 5  # colour, alpha, weight
+    lanes = pixels * max(spp, 1) if at_once else max(pixels, min(LANES, pixels * max(spp, 1)))
+    # The film's sums, those of a pass, and two copies while it is developed; of each sample its
+    # values, its place and the sampler's state.
+    needed = 4 * (4 * pixels * values + lanes * (values + 6))
+    what = f"irrcache: an image of {width} x {height} pixels"
+    what += f" with {channels} further channels" if channels else ""
+    remedy = f"lower width{', height or spp' if at_once else ' and height'} of the film"
+    remedy += ", ask for fewer aovs" if channels else ""
+    what += f" and {spp} samples each" if at_once else ""
+    remedy += ", or render it in crop windows"
+    require_memory(needed, what, remedy)
+    if lanes >= 2**32:
+        raise IrrcacheError(f"{what} needs {lanes} samples at once, 2^32 or more; {remedy}.")
 
 
 def _divisor(n: int, limit: int) -> int:
@@ -163,17 +199,17 @@ def camera_ray(
     return sensor.sample_ray_differential(time, 0, on_film, aperture)
 
 
-def _splat(
+def _sampled(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
     spread: PixelPositions,
-    block: mi.ImageBlock,
     size: mi.ScalarVector2u,
     border: int,
     per_pass: int,
     spp: int,
     radiance: RadianceFunction,
-) -> None:
+) -> Samples:
+    """The samples of a pass."""
     film = sensor.film()
     lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
     index = lane // dr.opaque(mi.UInt32, per_pass)
@@ -185,8 +221,4 @@ def _splat(
     value, alpha, further = radiance(sampler, ray, weight, mi.Bool(True))
     rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
     alphas = [alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
-    # With a box filter the sample's place in the pixel does not matter; its rounding would.
-    block.put(
-        pixel if film.rfilter().is_box_filter() else position,
-        [*rgb, *alphas, mi.Float(1), *further],
-    )
+    return Samples(film, border, per_pass, position, [*rgb, *alphas, *further])

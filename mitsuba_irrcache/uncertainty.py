@@ -97,16 +97,19 @@ def _everywhere(cache: IrradianceCache, values: mi.Float) -> mi.Float:
 
 def _at_half_resolution(cache: IrradianceCache, root: mi.Float) -> mi.Float:
     """The root of the irradiance at the active voxels, from its averages over 2^3 of them."""
-    halves = tuple(-(-n // 2) for n in cache.grid.shape)
-    x, y, z = cache.grid.places(cache.active)
-    parent = ((z // 2) * halves[1] + y // 2) * halves[2] + x // 2
-    count = int(np.prod(halves))
-    total, members = dr.zeros(mi.Float, count), dr.zeros(mi.Float, count)
-    dr.scatter_reduce(dr.ReduceOp.Add, total, root, parent)
-    dr.scatter_reduce(dr.ReduceOp.Add, members, mi.Float(1), parent)
+    halves = Grid(tuple(-(-n // 2) for n in cache.grid.shape), np.eye(4))
+    corner = halves.places(dr.arange(mi.UInt32, halves.voxel_count))
+    nx, ny, nz = (mi.UInt32(n) for n in cache.grid.sides)
+    values, ones = _everywhere(cache, root), _everywhere(cache, mi.Float(1))
+    total, members = mi.Float(0), mi.Float(0)
+    # Gathered, in this order: atomic sums would be other bits each time.
+    for steps in np.ndindex(2, 2, 2):
+        x, y, z = (2 * c + s for c, s in zip(corner, steps, strict=True))
+        inside, voxel = (x < nx) & (y < ny) & (z < nz), cache.grid.index(x, y, z)
+        total += dr.gather(mi.Float, values, voxel, inside)
+        members += dr.gather(mi.Float, ones, voxel, inside)
     known = dr.select(members > 0, mi.Float(1), 0)
     # Cells without a voxel have no value: they count with weight 0.
-    grid = Grid(halves, np.eye(4))
-    roots, weights = (GridField(grid, v, 1) for v in (total / dr.maximum(members, 1), known))
-    u = mi.Point3f(x, y, z) * 0.5 + 0.25
+    roots, weights = (GridField(halves, v, 1) for v in (total / dr.maximum(members, 1), known))
+    u = mi.Point3f(*cache.grid.places(cache.active)) * 0.5 + 0.25
     return roots.at(u) / weights.at(u)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import SimpleITK
 
+from experiments.faults import commands, properties
 from experiments.faults.fuzz import lying_cache, mutated
 from mitsuba_irrcache.volumes.mitsuba_vol import write_vol
 from mitsuba_irrcache.volumes.readers import read_volume
@@ -103,4 +104,11 @@ FORMATS = (
     Format("a.vol", _write_vol, read_volume),
     Format("slice.dcm", _write_dicom, read_series),
     Format("transfer.json", _write_transfer_function, load_transfer_function),
+    Format(
+        "properties.json",
+        properties.write_valid,
+        properties.render_case,
+        properties.mutated_properties,
+    ),
+    Format("command.json", commands.write_valid, commands.run_case, commands.mutated_command),
 )

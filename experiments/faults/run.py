@@ -1,4 +1,5 @@
-"""Faults from outside: kills while caches are written, and files that were tampered with.
+"""Faults from outside: kills while caches are written, files that were tampered with, properties
+of scenes and command lines that nobody should write.
 
     python -m experiments.faults.run [--kills 60] [--files 1000] [-o output]      (make stress)
 
@@ -30,7 +31,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--kills", type=int, default=60)
-    parser.add_argument("--files", type=int, default=1000, help="of each format")
+    parser.add_argument("--files", type=int, default=1000, help="of each format, cases included")
     parser.add_argument("--only", action="append", default=[], help="a format; repeatable")
     parser.add_argument("-o", "--output", type=Path, default=Path("output"))
     args = parser.parse_args()
@@ -83,7 +84,7 @@ def tabulated(tallies: dict[str, Tally]) -> Table:
         for name, t in tallies.items()
     ]  # fmt: skip
     head = ["format", "tried", "read", "refused", "crashes", "hangs", "other errors", "peak MB"]
-    return Table("Files that were tampered with", head, rows)
+    return Table("Files, scenes and command lines that were tampered with", head, rows)
 
 
 if __name__ == "__main__":

@@ -82,6 +82,20 @@ MUTANTS = (
         (SWEEP,),
     ),
     Mutant(
+        "every other pair of directions forgotten (sweep)",
+        "solvers/lattice.py",
+        "place += step",
+        "place += 2 * step",
+        ("tests/unit/test_lattice.py",),
+    ),
+    Mutant(
+        "samples on the wrong side of their pixel's row (film)",
+        "reconstruction.py",
+        "(dr.opaque(mi.Int32, samples.border) - down)",
+        "(dr.opaque(mi.Int32, samples.border) + down)",
+        ("tests/unit/test_reconstruction.py",),
+    ),
+    Mutant(
         "sharpening with the wrong sign (sweep)",
         "solvers/lattice.py",
         "2 * here - below - above, 0)",

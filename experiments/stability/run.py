@@ -18,7 +18,8 @@ from pathlib import Path
 import mitsuba as mi
 from tqdm import tqdm
 
-from experiments.stability.hazards import Case, cases, clear
+from experiments.stability.case import Case, clear
+from experiments.stability.hazards import cases
 from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import essence

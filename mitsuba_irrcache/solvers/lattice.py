@@ -38,8 +38,11 @@ LEVELS = (1 << 16) - 1
 #: What lines leave in a voxel is a mean over its cross section: smoothing of variance 1/12 along
 #: both axes across, half of which is to be taken back (`sharpened`).
 RECEIVED = 1 / 24
-#: Below so many voxels one launch takes all directions and adds atomically.
+#: Up to so many voxels one launch takes all directions, each into a copy of the volume of its own,
+#: which are added up in a fixed order: atomic sums would be other bits each time.
 SMALL = 40**3
+#: Voxels of all copies together, at most: 64 MB where light is scattered.
+COPIES = 1 << 22
 
 #: Axes of an array from the fastest to the slowest, unless they are laid out by slices.
 STANDARD = (0, 1, 2)
@@ -164,7 +167,7 @@ class Lattice:
         total = dr.opaque(mi.Float, 0, dr.width(self._wanted))
         for axis, pairs in table.by_axis:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
-            self._launch(volume, None, table, axis, pairs)
+            self._launch(volume, False, table, axis, pairs)
             total += sharpened(volume, self.grid, *box, axis, self._wanted)
             dr.eval(total)
         return total
@@ -178,42 +181,49 @@ class Lattice:
         loss / W, is the mean radiance *of collisions*: what is scattered from it is neither more
         nor less than what has collided.
         """
-        source = volume
-        if self.together:
-            index = dr.arange(mi.UInt32, self.grid.voxel_count) * 4
-            source = dr.gather(mi.Float, volume, index)
-            dr.eval(source)
         for axis, pairs in table.by_axis:
-            self._launch(volume, source, table, axis, pairs)
+            self._launch(volume, True, table, axis, pairs)
 
     def _launch(
-        self, volume: mi.Float, source: mi.Float | None, table: Table, axis: int, pairs: list[int]
+        self, volume: mi.Float, scatters: bool, table: Table, axis: int, pairs: list[int]
     ) -> None:
         """Follows the ``pairs`` of ``table``, all of which have the dominant ``axis``."""
         if self.together:
-            lanes = dr.arange(mi.UInt32, self._lines * len(pairs))
-            lines = dr.opaque(mi.UInt32, self._lines)
-            row = lanes // lines
-            first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
-            which = dr.gather(mi.UInt32, table.ordered, first + row)
-            lane = lanes - row * lines
-            corners = self._all_corners[axis]
-            _sweep(
-                corners, self._own, None, volume, source, table, table.entering, which, lane, True
-            )
-            dr.eval(volume)
-            self.pause()
+            most = max(1, COPIES // self.grid.voxel_count)
+            for start in range(0, len(pairs), most):
+                self._launch_together(volume, scatters, table, axis, pairs[start : start + most])
             return
         corners = self._corners_across(axis)  # one set at a time is kept
         dr.eval(corners)
-        empty = self._empty.slices if self._empty and source is None else None
+        empty = self._empty.slices if self._empty and not scatters else None
+        source = volume if scatters else None
         for i in pairs:
             _sweep(
-                corners, self._own, empty, volume, source, table, table.entering, table.places[i],
-                self._lanes, False,
+                corners, self._own, empty, volume, source, table, table.places[i],
+                self._lanes, dr.opaque(mi.UInt32, 0),
             )  # fmt: skip
             dr.eval(volume)
             self.pause()
+
+    def _launch_together(
+        self, volume: mi.Float, scatters: bool, table: Table, axis: int, pairs: list[int]
+    ) -> None:
+        """The same in one launch; the ``pairs`` follow each other in the table's order."""
+        voxels, count = self.grid.voxel_count, len(pairs)
+        lines = dr.opaque(mi.UInt32, self._lines)
+        lanes = dr.arange(mi.UInt32, self._lines * count)
+        row = lanes // lines
+        first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
+        which = dr.gather(mi.UInt32, table.ordered, first + row)
+        copies = dr.opaque(mi.Float, 0, dr.width(volume) * count)
+        _sweep(
+            self._all_corners[axis], self._own, None, copies, volume if scatters else None, table,
+            which, lanes - row * lines, row * dr.opaque(mi.UInt32, voxels),
+        )  # fmt: skip
+        dr.eval(copies)
+        _add(volume, copies, voxels, count, mi.Vector4f if scatters else mi.Float)
+        dr.eval(volume)
+        self.pause()
 
     def _slices(self, axis: int) -> np.ndarray:
         """Values of the extinction along x, y, z: a slice for each of the grid's along ``axis``."""
@@ -463,14 +473,15 @@ def _sweep(
     volume: mi.Float,
     source: mi.Float | None,
     table: Table,
-    entering: Entering | None,
     which: mi.UInt32,
     lanes: mi.UInt32,
-    together: bool,
+    copy: mi.UInt32,
 ):
-    """Follows a pair of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
-    ``together``: lanes of all pairs at once, with a ``source`` of its own.
+    """Follows pairs of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
+    ``source``: what `Lattice.scatter` calls volume, None if voxels send no light; may be ``volume``
+    itself, where the light is left, from voxel ``copy`` on.
     """
+    entering, apart = table.entering, source is not volume
     row = [dr.gather(mi.Int32, table.integers, which * _INTEGERS + i) for i in range(_INTEGERS)]
     nb, nc, na, sb, sc, sa, base, tb, tc, ta, shift, mb, fb, eb, gb, mc, fc, ec, gc = row[:19]
     cells = row[19:]
@@ -518,6 +529,7 @@ def _sweep(
             k_back = k
         index = mi.UInt32(ib * sb + ic * sc + off)
         index_back = mi.UInt32(kb * sb + kc * sc + off_back)
+        place, place_back = index + copy, index_back + copy
         # Of the half before the middle of the slice, and of the half behind it.
         s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, needed)
         s_next_back, s_back = _levels(
@@ -536,42 +548,30 @@ def _sweep(
         if dr.hint(source is None, mode="scalar"):
             L *= _passed(since, s0, s, scale)
             L_back *= _passed(since_back, s0_back, s_back, scale)
-            if dr.hint(together, mode="scalar"):
-                dr.scatter_reduce(dr.ReduceOp.Add, volume, L, index, active)
-                dr.scatter_reduce(dr.ReduceOp.Add, volume, L_back, index_back, active)
-            else:
-                before = dr.gather(mi.Float, volume, index, needed)
-                before_back = dr.gather(mi.Float, volume, index_back, needed_back)
-                dr.scatter(volume, before + L + dr.select(middle, L_back, 0), index, needed)
-                dr.scatter(volume, before_back + L_back, index_back, needed_back & ~middle)
+            before = dr.gather(mi.Float, volume, place, needed)
+            before_back = dr.gather(mi.Float, volume, place_back, needed_back)
+            dr.scatter(volume, before + L + dr.select(middle, L_back, 0), place, needed)
+            dr.scatter(volume, before_back + L_back, place_back, needed_back & ~middle)
         else:
-            if dr.hint(together, mode="scalar"):
-                voxel, voxel_back = mi.Vector4f(0), mi.Vector4f(0)
-                voxel.x = dr.gather(mi.Float, source, index, active)
-                voxel_back.x = dr.gather(mi.Float, source, index_back, active)
-            else:
-                voxel = dr.gather(mi.Vector4f, volume, index, active)
-                voxel_back = dr.gather(mi.Vector4f, volume, index_back, active)
-            L, tally = _crossed(L, voxel.x * weight, s * scale, s_next * scale, since, weight, area)
+            voxel = dr.gather(mi.Vector4f, volume, place, active)
+            voxel_back = dr.gather(mi.Vector4f, volume, place_back, active)
+            sent, sent_back = voxel.x, voxel_back.x
+            if dr.hint(apart, mode="scalar"):
+                sent = dr.gather(mi.Float, source, index * 4, active)
+                sent_back = dr.gather(mi.Float, source, index_back * 4, active)
+            L, tally = _crossed(L, sent * weight, s * scale, s_next * scale, since, weight, area)
             L_back, tally_back = _crossed(
                 L_back,
-                voxel_back.x * weight,
+                sent_back * weight,
                 s_back * scale,
                 s_next_back * scale,
                 since_back,
                 weight,
                 area,
             )
-            if dr.hint(together, mode="scalar"):
-                for i in range(1, 4):
-                    dr.scatter_reduce(dr.ReduceOp.Add, volume, tally[i], index * 4 + i, active)
-                    dr.scatter_reduce(
-                        dr.ReduceOp.Add, volume, tally_back[i], index_back * 4 + i, active
-                    )
-            else:
-                tally += dr.select(middle, tally_back, 0)
-                dr.scatter(volume, voxel + tally, index, active)
-                dr.scatter(volume, voxel_back + tally_back, index_back, active & ~middle)
+            tally += dr.select(middle, tally_back, 0)
+            dr.scatter(volume, voxel + tally, place, active)
+            dr.scatter(volume, voxel_back + tally_back, place_back, active & ~middle)
         s0, s0_back = s_next, s_next_back
         ib, fb, since = there_b.advance(ib, fb, ahead)
         ic, fc, near = there_c.advance(ic, fc, ahead)
@@ -588,6 +588,20 @@ def _sweep(
         if dr.hint(empty is not None, mode="scalar"):
             k_back += ahead_back
             active_back &= k_back < na
+
+
+@dr.syntax
+def _add(volume: mi.Float, copies: mi.Float, voxels: int, count: int, kind: type) -> None:
+    """Adds to the ``voxels`` of ``volume``, values of this ``kind``, those of ``count`` copies, one
+    after the other.
+    """
+    index = dr.arange(mi.UInt32, voxels)
+    step, end = dr.opaque(mi.UInt32, voxels), dr.opaque(mi.UInt32, voxels * count)
+    total, place = dr.gather(kind, volume, index), mi.UInt32(index)
+    while dr.hint(place < end, label="copies"):
+        total += dr.gather(kind, copies, place)
+        place += step
+    dr.scatter(volume, total, index)
 
 
 def _slices(empty, strides, b, c, a, active) -> mi.Int32:

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grid import Grid, GridField
 from mitsuba_irrcache.solvers.lattice import Lattice, Table
 
@@ -183,6 +184,12 @@ class Level:
             history.append((phi, image))
             history = history[-6:]
             residual = image - phi
+            if not np.isfinite(residual).all():
+                raise IrrcacheError(
+                    "irrcache: the light in the medium is not finite in single precision; lower "
+                    f"the radiance of the emitters (light of the first order: {scale:.1e} on "
+                    "average)."
+                )
             if np.abs(residual).mean() <= COARSE_TOLERANCE * scale:
                 break
             phi = _mixed(history)

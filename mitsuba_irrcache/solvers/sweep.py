@@ -33,6 +33,9 @@ BATCH, LARGE_BATCH = 32, 64
 #: Directions of a pass, of which a batch is made where light is scattered more than once: the
 #: orders before the last are solved for with one such set.
 DIRECTIONS = 16
+#: An order of scattering that changes the light by less is one too many, as single precision has
+#: it; looked at every so many orders.
+NO_LIGHT, CHECKED = 1e-7, 8
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
 #: Values of the extinction along each axis of a voxel that lines see, about.
@@ -201,8 +204,11 @@ class Sweep:
         phi = self._with_near_light(phi, light)
         if self.cache.max_depth < 0:
             return first.solve(level, phi)
-        for _ in range(self.cache.max_depth - 3):
-            phi = self._with_near_light(first.scatter(level, phi)[1], light)
+        for order in range(self.cache.max_depth - 3):
+            before, phi = phi, self._with_near_light(first.scatter(level, phi)[1], light)
+            # However many are asked for: once there is no light in them, they need no sweeps.
+            if order % CHECKED == CHECKED - 1 and _changed_by(before, phi) < NO_LIGHT:
+                break
         return phi
 
     def _with_near_light(self, volume: mi.Float, channel: int) -> mi.Float:
@@ -212,6 +218,13 @@ class Sweep:
             dr.scatter_reduce(dr.ReduceOp.Add, volume, light, self.cache.active)
         dr.eval(volume)
         return volume
+
+
+def _changed_by(before: mi.Float, after: mi.Float) -> float:
+    """The mean change of light, relative to its mean."""
+    change, scale = dr.sum(dr.abs(after - before)), dr.sum(dr.abs(after))
+    dr.eval(change, scale)
+    return float(change[0]) / max(float(scale[0]), 1e-30)
 
 
 def _detail(medium: MediumGrid, grid: Grid) -> Grid:

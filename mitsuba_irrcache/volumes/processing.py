@@ -10,12 +10,16 @@ from scipy import ndimage
 from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.memory import require_memory
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 
 Size = tuple[int, int, int]
 # Voxels eroded before objects are told apart: a mattress is thicker than that, noise is not.
 _BRIDGE = 2
+#: Bytes per voxel, at most about: values, smoothed and interpolated; and with them extinction,
+#: albedo and what a transfer function computes them from.
+RESAMPLED, BAKED = 12, 60
 
 
 def crop(volume: VolumeData, ranges: Sequence[tuple[int | None, int | None]]) -> VolumeData:
@@ -111,9 +115,10 @@ def size_for_voxel(volume: VolumeData, voxel_size: float) -> Size:
     Raises:
         IrrcacheError: a voxel size that is not positive.
     """
-    if not (np.isfinite(voxel_size) and voxel_size > 0):
+    counts = [length / voxel_size if voxel_size else np.inf for length in volume.physical_size]
+    if not (np.isfinite([voxel_size, *counts]).all() and voxel_size > 0):
         raise IrrcacheError(f"voxel size {voxel_size}: give a positive length")
-    x, y, z = (max(1, round(length / voxel_size)) for length in volume.physical_size)
+    x, y, z = (max(1, round(count)) for count in counts)
     return x, y, z
 
 
@@ -135,10 +140,11 @@ def resample(volume: VolumeData, size: Size) -> VolumeData:
     up. (Cubic interpolation would ring below zero next to bone.)
 
     Raises:
-        IrrcacheError: a size with a side below 1.
+        IrrcacheError: a size with a side below 1, or of more voxels than memory holds.
     """
     if min(size) < 1:
         raise IrrcacheError(f"size {size}: give at least 1 voxel along x, y and z")
+    _check_memory(size, RESAMPLED)
     smooth = _antialiased(volume.values, size)
     spacing = np.array(volume.physical_size) / size
     # The box stays; the centre of its first voxel is half a new voxel from the corner.
@@ -170,10 +176,11 @@ def bake(
         float32 ``(z, y, x)`` in 1/world unit, and albedo float32 ``(z, y, x, 3)``.
 
     Raises:
-        IrrcacheError: ``supersample`` below 1.
+        IrrcacheError: ``supersample`` below 1, or more voxels than memory holds.
     """
     if supersample < 1:
         raise IrrcacheError(f"supersample {supersample}: give at least 1")
+    _check_memory(size, BAKED, supersample)
     resampled = volume if size == volume.size else resample(volume, size)
     if supersample == 1:
         return resampled, *mapping.apply(resampled.values)
@@ -187,6 +194,18 @@ def bake(
         part = _sample_slices(smooth, fine, k * supersample, (k + 1) * supersample)
         sigma_t[k], albedo[k] = _average_blocks(*fitted.map(part), supersample)
     return resampled, sigma_t, albedo
+
+
+def _check_memory(size: Size, bytes_per_voxel: int, supersample: int = 1) -> None:
+    """Refuses grids of so many voxels before they are made, with the slab that is finer."""
+    x, y, z = size
+    slab = x * y * supersample**3 if supersample > 1 else 0
+    finer = f" in blocks of {supersample}^3" if slab else ""
+    require_memory(
+        (x * y * z + slab) * bytes_per_voxel,
+        f"a volume of {x} x {y} x {z} voxels{finer}",
+        "ask for fewer (--voxel-size, --longest, --crop" + (", --supersample)" if slab else ")"),
+    )
 
 
 def _antialiased(values: np.ndarray, size: Size) -> np.ndarray:

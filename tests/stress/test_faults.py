@@ -18,8 +18,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.faults import formats, run
-from experiments.stability.worlds import Matter, scene
+from experiments.faults import commands, formats, properties, run
+from experiments.stability.worlds import Camera, Matter, scene
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.files import ABANDONED, atomic_write
@@ -84,7 +84,7 @@ CROWDED = """
 import os, resource, sys
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from experiments.stability.worlds import Matter, scene
+from experiments.stability.worlds import Camera, Matter, scene
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 settings = {"solver": "path", "resolution": 4, "cache_spp": 8, "max_depth": 2}
 built = scene(settings | {"cache_file": sys.argv[1] + "/light.cache"}, Matter())
@@ -207,11 +207,133 @@ def test_caches_that_were_tampered_with(tmp_path):
     assert 30 < refused <= 60
 
 
+def tried(case: Path, run_case, mutate, count: int) -> int:
+    """Tries so many mutants of a case in this process; how many of them are refused by name."""
+    content, refused = case.read_bytes(), 0
+    for index in range(count):
+        case.write_bytes(mutate(content, np.random.default_rng((3, index))))
+        try:
+            run_case(case)
+        except IrrcacheError:
+            refused += 1
+    return refused
+
+
+def test_properties_that_nobody_should_write(tmp_path):
+    """Each of 50 scenes is rendered, or refused by a message that names what is wrong."""
+    case = tmp_path / "properties.json"
+    properties.write_valid(case)
+    properties.render_case(case)
+    refused = tried(case, properties.render_case, properties.mutated_properties, 50)
+    assert 25 < refused < 49
+
+
+def test_command_lines_that_nobody_should_type(tmp_path):
+    """Each of 30 does its work, or prints an error and leaves nothing behind."""
+    case = tmp_path / "command.json"
+    commands.write_valid(case)
+    commands.run_case(case)
+    refused = tried(case, commands.run_case, commands.mutated_command, 30)
+    assert 18 < refused < 30
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["render", "none.xml", "-o", "\udc80.exr"], ["import", "\udc80", "--density", "-o", "x"]],
+    ids=["render", "import"],
+)
+def test_arguments_that_are_no_text_are_refused_without_a_traceback(tmp_path, arguments):
+    """In a process of its own: what is printed has to be encoded."""
+    command = [sys.executable, "-m", "mitsuba_irrcache", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=60)
+    assert done.returncode == 1 and b"Traceback" not in done.stderr
+    assert done.stderr.startswith(b"irrcache: error: ") and not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("hide_emitters", "false"),
+        ("aovs", 1),
+        ("cache_file", 3),
+        ("cache_file", "."),
+        ("timeout", float("nan")),
+        ("timeout", "1"),
+        ("step", True),
+        ("emission_scale", [1.0, 2.0, 3.0]),
+        ("filter", [1.0, 2.0, 3.0]),
+        ("emission", 1e300),
+    ],
+)
+def test_properties_of_another_type_are_refused(name, value):
+    """Python makes something of most of them: "false" is true, and 3 the name of a file. What
+    Mitsuba reads itself it refuses in its own words.
+    """
+    said = rf'(?s)irrcache: {name} is .*; it must be|"{name}" has the wrong type'
+    with pytest.raises((IrrcacheError, RuntimeError), match=said):
+        built = scene(SETTINGS | {name: value}, Matter())
+        built.integrator().prepare(built)
+
+
+@pytest.mark.parametrize("solver", ["sweep", "path"])
+@pytest.mark.parametrize("depth", [2, -1])
+def test_light_beyond_single_precision_is_refused_by_name(solver, depth):
+    """Each time, not only the first."""
+    sky = {"type": "constant", "radiance": 1e38}
+    built = scene(SETTINGS | {"solver": solver, "max_depth": depth}, Matter(2.0), sky)
+    for _ in range(2):
+        with pytest.raises(IrrcacheError, match="not finite in single precision; lower the radia"):
+            built.integrator().prepare(built)
+
+
+def test_any_number_of_orders_ends():
+    """2^31 - 1 orders by `sweep`: as soon as there is no light in them; on average the same as all
+    orders, to the error that these are solved for with.
+    """
+
+    def light(depth: int) -> np.ndarray:
+        built = scene(SETTINGS | {"solver": "sweep", "max_depth": depth}, Matter(3.0))
+        built.integrator().prepare(built)
+        return np.array(built.integrator().cache.irradiance)
+
+    found, expected = light(2**31 - 1), light(-1)
+    assert abs(found.mean() / expected.mean() - 1) < 2e-3
+    assert light(12).mean() < 0.997 * found.mean()
+
+
 def test_memory_is_predicted(tmp_path):
     """What a cache takes is said before it is taken, in bytes, with the remedy."""
     too_large = scene({"solver": "sweep", "resolution": 5000}, Matter())
     with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB.*are free; lower resolution"):
         too_large.integrator().prepare(too_large)
+
+
+@pytest.mark.parametrize("matter", [Matter(), None], ids=["a medium", "none"])
+@pytest.mark.parametrize(
+    ("film", "spp", "said"),
+    [
+        (
+            {"width": 10**6, "height": 10**5},
+            1,
+            r"1000000 x 100000 pixels needs \d+\.\d GiB.*lower",
+        ),
+        ({"width": 4, "height": 4}, 2**32, r"spp is 4294967296"),
+        ({"width": 4, "height": 4}, -1, r"spp is -1; it must be"),
+    ],
+    ids=["pixels", "samples", "negative"],
+)
+def test_absurd_images_are_refused_before_anything_is_computed(matter, film, spp, said):
+    built = scene(SETTINGS, matter, camera=Camera(film=film))
+    with pytest.raises(IrrcacheError, match=said):
+        built.integrator().render(built, spp=spp)
+    assert built.integrator().cache is None
+
+
+def test_absurd_numbers_of_samples_of_an_empty_scene_are_refused():
+    """They would all be in one launch; with a medium they are rendered in passes."""
+    empty = scene(SETTINGS, None, camera=Camera(film={"width": 4096, "height": 4096}))
+    with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB.*lower width, height or spp"):
+        empty.integrator().render(empty, spp=1 << 20)
 
 
 def test_another_variant_in_the_middle():

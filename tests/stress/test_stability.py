@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiments.stability import properties as p
-from experiments.stability.hazards import SETTINGS, Case, cases
+from experiments.stability.case import SETTINGS, Case
+from experiments.stability.hazards import cases
 from experiments.stability.run import described, run_case
 from experiments.stability.worlds import Camera, Matter, World, scene
 

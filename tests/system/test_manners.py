@@ -196,15 +196,15 @@ def test_cancelled_while_the_image_is_rendered(scenes, monkeypatch):
     monkeypatch.setattr(rendering, "LANES", SIZE**2 * 4)
     scene, passes = scenes.load(ours(), cloud(scenes), SIZE), []
     integrator = scene.integrator()
-    splat = rendering._splat
+    sampled = rendering._sampled
 
     def counted(*args):
         passes.append(args)
         if len(passes) == 2:
             integrator.cancel()
-        return splat(*args)
+        return sampled(*args)
 
-    monkeypatch.setattr(rendering, "_splat", counted)
+    monkeypatch.setattr(rendering, "_sampled", counted)
     stopped = scenes.image(scene, spp=32)
     assert len(passes) == 2
     whole = scenes.image(scene, spp=32)

@@ -183,8 +183,9 @@ def light_named(name: str) -> dict:
     return {"type": "spot", "to_world": place, "intensity": 40.0, "cutoff_angle": 35.0}
 
 
-@pytest.mark.parametrize("max_depth", [3, -1])
-@pytest.mark.parametrize("name", LIGHTS)
+@pytest.mark.parametrize(
+    ("name", "max_depth"), [*((name, -1) for name in LIGHTS), ("sky", 3), ("environment", 3)]
+)
 def test_scattered_light_is_paths(scenes, name, max_depth):
     """The sum over all voxels of a smooth medium, layer by layer: the solver path's within 4
     standard errors and 1 % of discretisation. Light that collides where a line is long counts for

@@ -163,3 +163,19 @@ def test_bake_returns_the_grid_it_is_for():
         assert sigma_t.shape == resampled.values.shape and albedo.shape == (*sigma_t.shape, 3)
     with pytest.raises(IrrcacheError, match="supersample 0"):
         processing.bake(source, DensityMapping(), source.size, 0)
+
+
+@pytest.mark.parametrize("supersample", [1, 10**20])
+def test_more_voxels_than_memory_holds_are_refused(supersample):
+    """In bytes and with the remedy, before anything is made of them; of any number of digits."""
+    volume = VolumeData(np.ones((4, 4, 4), np.float32), (1.0, 1.0, 1.0))
+    size = (4, 4, 4) if supersample > 1 else (10**6, 10**6, 10**6)
+    with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB, and \d+\.\d GiB are free; ask"):
+        processing.bake(volume, DensityMapping(1.0), size, supersample)
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf, 5e-324])
+def test_voxels_of_no_size_are_refused(size):
+    volume = VolumeData(np.ones((4, 4, 4), np.float32), (1.0, 1.0, 1.0))
+    with pytest.raises(IrrcacheError, match="give a positive length"):
+        processing.size_for_voxel(volume, size)
