@@ -372,7 +372,7 @@ def test_more_batches_compile_nothing(scenes, kernels, monkeypatch, max_depth, s
         filled(scenes, shape, **settings, **batches(count, max_depth))
 
     known = {k["hash"] for k in kernels(lambda: fill(1, 3))}
-    for seed in (2, 4, 5):
+    for seed in (2, 5):
         found = {k["hash"] for k in kernels(lambda s=seed: fill(s, 4))}
         assert found and found <= known
 
