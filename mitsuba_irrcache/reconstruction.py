@@ -16,8 +16,8 @@ class Samples:
     """What camera samples have seen, ``per_pixel`` of each pixel, one after the other, row by row;
     of the crop window, and of ``border`` pixels around it.
 
-    The values of a sample, and unless the filter is a box its place on the film, lie side by side,
-    in packets of four: these are read far faster than single numbers.
+    The place of a sample on the film and its values lie side by side, in packets of four: these are
+    read far faster than single numbers.
     """
 
     def __init__(
@@ -32,9 +32,7 @@ class Samples:
         self.channels = len(values)
         width, height = (int(n) + 2 * border for n in film.crop_size())
         index = dr.arange(mi.UInt32, width * height * per_pixel)
-        #: with a box, samples count for their own pixel, whatever the rounding of their places
-        self.box = film.rfilter().is_box_filter()
-        numbers = [*values] if self.box else [*position, *values]
+        numbers = [*position, *values]
         numbers += [mi.Float(0)] * (-len(numbers) % 4)
         self.packets = []
         for start in range(0, len(numbers), 4):
@@ -47,17 +45,36 @@ class Samples:
         """The numbers of samples."""
         packets = [dr.gather(mi.Vector4f, packet, index, active) for packet in self.packets]
         numbers = [number for packet in packets for number in packet]
-        return numbers[: self.channels + (0 if self.box else 2)]
+        return numbers[: self.channels + 2]
 
 
-def reconstructed(samples: Samples) -> list[mi.Float]:
+def reconstructed(
+    film: mi.Film,
+    border: int,
+    per_pixel: int,
+    position: mi.Point2f,
+    values: Sequence[mi.Float],
+) -> list[mi.Float]:
     """Sums over the samples around each pixel of the crop window, row by row: of the filter's
-    weights times the values, an array for each channel, and of the weights.
+    weights times the values, an array for each channel, and of the weights. The samples are told
+    as in `Samples`.
     """
+    if not film.rfilter().is_box_filter():
+        return _gathered(Samples(film, border, per_pixel, position, values))
+    # Samples count for their own pixel, whatever the rounding of their places.
+    pixels = int(film.crop_size().x) * int(film.crop_size().y)
+    everywhere = dr.zeros(mi.Float, pixels * per_pixel)
+    sums = [value + everywhere for value in values]
+    if per_pixel > 1:
+        dr.eval(sums)
+        sums = [dr.block_sum(value, per_pixel) for value in sums]
+    return [*sums, dr.full(mi.Float, per_pixel, pixels)]
+
+
+def _gathered(samples: Samples) -> list[mi.Float]:
+    """The sums of `reconstructed`."""
     film, reach = samples.film, int(samples.film.rfilter().border_size())
     parts = _columns(samples, reach)
-    if reach == 0:
-        return parts[0]
     dr.eval(parts)
     width, height = (int(n) for n in film.crop_size())
     pixel, wide = dr.arange(mi.Int32, width * height), dr.opaque(mi.Int32, width)
@@ -106,20 +123,15 @@ def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
         at = column + edge + dx
         inside = (at >= 0) & (at < wide)
         values = samples.read(mi.UInt32((row * wide + at) * count + k), inside)
-        if dr.hint(samples.box, mode="scalar"):
+        away, down = values[0] - x, values[1] - y
+        inside &= dr.abs(away) <= radius
+        along = dr.select(inside, filter_.eval(away), 0)
+        for j in range(rows):
+            below = down - (j - reach)
+            weight = dr.select(dr.abs(below) <= radius, along * filter_.eval(below), 0)
             for i in range(samples.channels):
-                sums[0][i] += values[i]
-            sums[0][samples.channels] += 1
-        else:
-            away, down = values[0] - x, values[1] - y
-            inside &= dr.abs(away) <= radius
-            along = dr.select(inside, filter_.eval(away), 0)
-            for j in range(rows):
-                below = down - (j - reach)
-                weight = dr.select(dr.abs(below) <= radius, along * filter_.eval(below), 0)
-                for i in range(samples.channels):
-                    sums[j][i] = dr.fma(values[i + 2], weight, sums[j][i])
-                sums[j][samples.channels] += weight
+                sums[j][i] = dr.fma(values[i + 2], weight, sums[j][i])
+            sums[j][samples.channels] += weight
         k += 1
         ended = k == count
         k, dx = dr.select(ended, 0, k), dr.select(ended, dx + 1, dx)

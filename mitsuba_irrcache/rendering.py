@@ -15,7 +15,7 @@ import mitsuba as mi
 from .errors import IrrcacheError
 from .layers import interleaved
 from .memory import require_memory
-from .reconstruction import Samples, reconstructed
+from .reconstruction import reconstructed
 
 #: Camera samples in one kernel launch: bounds the memory that they and the sampler's state take.
 LANES = 1 << 22
@@ -55,7 +55,7 @@ def render_film(
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
         samples = _sampled(sensor, sampler, spread, size, border, per_pass, spp, radiance)
-        found = reconstructed(samples)
+        found = reconstructed(film, border, per_pass, *samples)
         sums = found if sums is None else [a + b for a, b in zip(sums, found, strict=True)]
         if per_pass < spp:
             sampler.advance()
@@ -208,8 +208,8 @@ def _sampled(
     per_pass: int,
     spp: int,
     radiance: RadianceFunction,
-) -> Samples:
-    """The samples of a pass."""
+) -> tuple[mi.Point2f, list[mi.Float]]:
+    """The samples of a pass: their places on the film, and the values of their channels."""
     film = sensor.film()
     lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
     index = lane // dr.opaque(mi.UInt32, per_pass)
@@ -221,4 +221,4 @@ def _sampled(
     value, alpha, further = radiance(sampler, ray, weight, mi.Bool(True))
     rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
     alphas = [alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
-    return Samples(film, border, per_pass, position, [*rgb, *alphas, *further])
+    return position, [*rgb, *alphas, *further]

@@ -24,7 +24,7 @@ def film_of(name: str, **properties) -> mi.Film:
 @pytest.mark.parametrize("per_pixel", [1, 3])
 def test_sums_are_those_of_mitsuba(name, crop, per_pixel):
     """All of Mitsuba's filters, within rounding: 1e-5 of the largest."""
-    from mitsuba_irrcache.reconstruction import Samples, reconstructed
+    from mitsuba_irrcache.reconstruction import reconstructed
 
     film = film_of(name, **crop)
     border = film.rfilter().border_size() if film.sample_border() else 0
@@ -42,7 +42,7 @@ def test_sums_are_those_of_mitsuba(name, crop, per_pixel):
     film.put_block(block)
     developed = np.array(film.develop())
 
-    sums = reconstructed(Samples(film, border, per_pixel, position, values))
+    sums = reconstructed(film, border, per_pixel, position, values)
     assert len(sums) == 7 and all(dr.width(s) == np.prod(film.crop_size()) for s in sums)
     found = np.array([np.array(s) for s in sums], dtype=np.float64)
     means = (found[:6] / found[6]).T.reshape(*np.array(film.crop_size())[::-1], 6)
