@@ -65,8 +65,8 @@ def reconstructed(
     pixels = int(film.crop_size().x) * int(film.crop_size().y)
     everywhere = dr.zeros(mi.Float, pixels * per_pixel)
     sums = [value + everywhere for value in values]
+    dr.eval(sums)
     if per_pixel > 1:
-        dr.eval(sums)
         sums = [dr.block_sum(value, per_pixel) for value in sums]
     return [*sums, dr.full(mi.Float, per_pixel, pixels)]
 

@@ -8,7 +8,8 @@ import pytest
 
 from mitsuba_irrcache.grid import Grid, GridField
 from mitsuba_irrcache.solvers import lattice
-from mitsuba_irrcache.solvers.lattice import ONE, Lattice, sharpened
+from mitsuba_irrcache.solvers.lattice import Lattice, sharpened
+from mitsuba_irrcache.solvers.lines import ONE
 
 SHAPES = [(8, 8, 8), (7, 12, 5), (1, 6, 9), (5, 1, 1), (9, 4, 1)]
 #: Along axes, edges and diagonals, almost along them, and between.

@@ -1,0 +1,120 @@
+"""The extinction as lines read it: in 16 bits, with the neighbours of each value beside it."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.solvers.layout import flat, places_of, slicewise, strides_of
+
+#: Extinction is kept in 16 bits, rounded at random, between 0 and the largest there is, at most
+#: this optical depth of a voxel.
+OPAQUE = 16.0
+LEVELS = (1 << 16) - 1
+
+
+class Extinction:
+    """``sigma_t`` [1/scene unit] at all voxels of ``detail``, for lines through the voxels of
+    ``grid``, over the same box.
+
+    Values are ``quantum`` times integers below 2^16.
+    """
+
+    def __init__(self, grid: Grid, detail: Grid, sigma_t: mi.Float) -> None:
+        self.grid, self.detail = grid, detail
+        #: whether each voxel has a value of its own
+        self.own = detail.shape == grid.shape
+        opaque = OPAQUE * np.linalg.norm(grid.coordinates.matrix[:3, :3], axis=1).max()
+        top = float(min(dr.max(sigma_t)[0], opaque))
+        self.quantum = top / LEVELS
+        levels = sigma_t * dr.opaque(mi.Float, LEVELS / top if top else 0)
+        self._levels = _packed(_rounded(dr.minimum(levels, LEVELS)))
+        self._halves: dict[int, mi.UInt32] = {}  # of slices along axes
+
+    def sides(self, axis: int) -> np.ndarray:
+        """Values along x, y, z: a slice for each of the grid's along ``axis``."""
+        sides = self.detail.resolution.copy()
+        sides[axis] = self.grid.resolution[axis]
+        return sides
+
+    def corners(self, axis: int) -> mi.UInt32:
+        """For each value of the extinction in all slices along ``axis`` those of four, from it on
+        along both other axes: flat, two words of two values each, or four words of the means over
+        both halves of a slice, unless voxels have their own values.
+        """
+        sides = self.sides(axis)
+        if self.own:
+            values = None
+        elif axis in self._halves:
+            values = self._halves[axis]
+        else:
+            count = int(sides[axis])
+            values = self._halves[axis] = _halved(self._levels, self.detail, count, axis)
+        at = places_of(sides, slicewise(axis))
+        index, strides = flat(at, strides_of(sides)), strides_of(sides)
+        steps = []
+        for k in range(3):
+            if k != axis:
+                last = dr.opaque(mi.UInt32, int(sides[k]) - 1)
+                steps.append(dr.select(at[k] < last, dr.opaque(mi.UInt32, strides[k]), 0))
+        places = [row + step for row in (index, index + steps[1]) for step in (0, steps[0])]
+        if values is not None:
+            return dr.ravel(mi.Array4u([dr.gather(mi.UInt32, values, p) for p in places]))
+        words = [_level(self._levels, place) for place in places]
+        return dr.ravel(mi.Vector2u(words[0] | words[1] << 16, words[2] | words[3] << 16))
+
+
+def _packed(values: mi.UInt32) -> mi.UInt32:
+    """Two integers below 2^16 in each word: the first half of them, and the second one."""
+    dr.eval(values)
+    half = (dr.width(values) + 1) // 2
+    index = dr.arange(mi.UInt32, half)
+    later = index + dr.opaque(mi.UInt32, half)
+    upper = dr.gather(mi.UInt32, values, later, later < dr.width(values))
+    words = dr.gather(mi.UInt32, values, index) | upper << 16
+    dr.eval(words)
+    return words
+
+
+def _level(words: mi.UInt32, index: mi.UInt32) -> mi.UInt32:
+    """One of the integers."""
+    half = dr.opaque(mi.UInt32, dr.width(words))
+    later = index >= half
+    word = dr.gather(mi.UInt32, words, dr.select(later, index - half, index))
+    return dr.select(later, word >> 16, word & 0xFFFF)
+
+
+def _rounded(values: mi.Float, shift: float = 0.0) -> mi.UInt32:
+    """Integers, up or down by the golden ratio: right on average over any few neighbours."""
+    place = dr.arange(mi.UInt32, dr.width(values))
+    dither = mi.Float((place * 2654435769 + int(shift * 2**32)) >> 8) * 2**-24
+    return mi.UInt32(dr.minimum(values + dither, LEVELS))
+
+
+def _halved(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
+    """``levels`` of the voxels of ``grid`` in ``count`` slices along ``axis`` instead: means over
+    the first half of their thickness, and over the second one in the upper 16 bits.
+    """
+    sides, strides = grid.resolution.copy(), strides_of(grid.resolution)
+    before, sides[axis] = int(sides[axis]), count
+    at = places_of(sides)
+    begin, at[axis] = mi.Float(at[axis]), mi.UInt32(0)
+    rest, stride = flat(at, strides), dr.opaque(mi.UInt32, strides[axis])
+    ratio, last = dr.opaque(mi.Float, before / count), dr.opaque(mi.Float, before - 1)
+    step = dr.select(last > 0, stride, 0)
+    halves = []
+    for half in range(2):
+        total = 0.0
+        # Two points: exact where kinks, the centres of voxels, lie between them or at the ends.
+        for point in (0.125, 0.375):
+            u = dr.clip((begin + (0.5 * half + point)) * ratio - 0.5, 0, last)
+            lower = mi.UInt32(dr.minimum(u, dr.maximum(last - 1, 0)))
+            place = rest + lower * stride
+            low, high = (_level(levels, i) for i in (place, place + step))
+            total += dr.lerp(mi.Float(low), mi.Float(high), u - mi.Float(lower))
+        halves.append(_rounded(0.5 * total, 0.5 * half))
+    result = halves[0] | halves[1] << 16
+    dr.eval(result)
+    return result

@@ -1,0 +1,43 @@
+"""Where the values of a volume lie in memory: along x, y, z, or slice by slice across an axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Axes of an array from the fastest to the slowest, unless they are laid out by slices.
+STANDARD = (0, 1, 2)
+
+
+def slicewise(axis: int) -> tuple[int, int, int]:
+    """The axes from the fastest to the slowest, such that neighbours across ``axis`` are near each
+    other in memory. Slices along y and z are so as they are.
+    """
+    return (1, 2, 0) if axis == 0 else STANDARD
+
+
+def strides_of(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> tuple[int, int, int]:
+    """Steps of the flat index along x, y, z."""
+    steps, step = [0, 0, 0], 1
+    for axis in layout:
+        steps[axis] = step
+        step *= int(sides[axis])
+    return tuple(steps)
+
+
+def places_of(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> list[mi.UInt32]:
+    """Places along x, y, z of all values in the order of their memory."""
+    index = dr.arange(mi.UInt32, int(np.prod(sides)))
+    first, second = (dr.opaque(mi.UInt32, int(sides[axis])) for axis in layout[:2])
+    row = index // first
+    places = index - row * first, row % second, row // second
+    return [place for _, place in sorted(zip(layout, places, strict=True), key=lambda p: p[0])]
+
+
+def flat(places: Sequence[mi.UInt32], strides: tuple[int, ...]) -> mi.UInt32:
+    """Flat indices of places along x, y, z."""
+    x, y, z = (p * dr.opaque(mi.UInt32, n) for p, n in zip(places, strides, strict=True))
+    return x + y + z

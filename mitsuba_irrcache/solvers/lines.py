@@ -1,0 +1,246 @@
+"""Lines in a kernel: how they go on from slice to slice, and what they take and leave there."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.solvers.empty import CELL
+
+#: Positions within a voxel are integers below this: lines can be followed back without rounding.
+ONE = 1 << 24
+#: Parameters of a pair of directions.
+INTEGERS, NUMBERS = 22, 11
+
+
+class _Across:
+    """One way along the lines, and one of the axes across: its constants."""
+
+    def __init__(self, sides: mi.Int32, slope: mi.Int32, detail: tuple) -> None:
+        self.sides, self.slope = sides, slope
+        self.stride, self.ratio, self.origin, self.last = detail
+        forward = slope > 0
+        self.entry = dr.select(forward, 0, sides - 1)
+        # Distance to the side of entry, in slices: (zero + sign * position) * scale.
+        self.zero = dr.select(forward, mi.Float(0), mi.Float(1))
+        self.sign = dr.select(forward, mi.Float(1), mi.Float(-1)) * (1 / ONE)
+        self.scale = ONE / mi.Float(dr.abs(slope))
+
+    def since(self, position: mi.Int32) -> mi.Float:
+        """Slices since the face of entry, in the voxel that adjoins it."""
+        return dr.fma(mi.Float(position), self.sign, self.zero) * self.scale
+
+    def start(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
+        """Slices since entry in the first slice: half of one, or less through a side."""
+        near = self.since(position)
+        return dr.select(voxel == self.entry, dr.minimum(near, 0.5), 0.5)
+
+    def advance(self, voxel: mi.Int32, position: mi.Int32, slices: mi.Int32 | int = 1) -> tuple:
+        """Voxel and position some ``slices`` on, and the slices since entry: 1 unless it is new."""
+        moved = position + self.slope * slices
+        position = moved & (ONE - 1)
+        voxel = voxel + (moved >> 24)
+        outside = mi.UInt32(voxel) >= mi.UInt32(self.sides)
+        voxel = dr.select(outside, self.entry, voxel)
+        return voxel, position, dr.select(outside, self.since(position), 1.0)
+
+    def lower(self, voxel: mi.Int32, position: mi.Int32, own: bool) -> tuple:
+        """Of the two values of the extinction around the line, where the lower one is, and the
+        weight of the upper one. ``own``: each voxel has its own value.
+        """
+        if own:
+            before = position < ONE // 2
+            weight = dr.fma(mi.Float(position), 1 / ONE, dr.select(before, 0.5, -0.5))
+            lower = dr.maximum(voxel - dr.select(before, 1, 0), 0)
+            return lower * self.stride, dr.select(before & (voxel == 0), 0, weight)
+        place = dr.fma(mi.Float(position), 1 / ONE, mi.Float(voxel))
+        u = dr.clip(dr.fma(place, self.ratio, self.origin), 0, self.last)
+        lower = mi.Int32(u)
+        return lower * self.stride, u - mi.Float(lower)
+
+
+@dr.syntax
+def follow(
+    corners: mi.UInt32,
+    own: bool,
+    empty: mi.UInt32 | None,
+    volume: mi.Float,
+    source: mi.Float | None,
+    table,
+    which: mi.UInt32,
+    lanes: mi.UInt32,
+    copy: mi.UInt32,
+):
+    """Follows pairs of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
+    ``source``: what `Lattice.scatter` calls volume, None if voxels send no light; may be ``volume``
+    itself, where the light is left, from voxel ``copy`` on.
+    """
+    entering, apart = table.entering, source is not volume
+    row = [dr.gather(mi.Int32, table.integers, which * INTEGERS + i) for i in range(INTEGERS)]
+    nb, nc, na, sb, sc, sa, base, tb, tc, ta, shift, mb, fb, eb, gb, mc, fc, ec, gc = row[:19]
+    cells = row[19:]
+    length, light, light_back, weight, quantum, *detail = (
+        dr.gather(mi.Float, table.numbers, which * NUMBERS + i) for i in range(NUMBERS)
+    )
+    detail_b, detail_c = (tb, *detail[:3]), (tc, *detail[3:])
+    lane = mi.Int32(lanes)
+    jc = lane // dr.maximum(nb, 1)  # 0 where a vector of lanes is not filled
+    jb = lane - jc * nb
+    active = (jc < nc) & (na > 0)
+    there_b, there_c = _Across(nb, mb, detail_b), _Across(nc, mc, detail_c)
+    back_b, back_c = _Across(nb, -mb, detail_b), _Across(nc, -mc, detail_c)
+    # The state of both ways: voxel and position along both axes across, offset of the slice, slices
+    # since entry (1: not new), radiance, and depth and source in the slice before.
+    width = 0 * lane
+    ib, ic, fb, fc, off = mi.Int32(jb), mi.Int32(jc), fb + width, fc + width, base + width
+    since = dr.minimum(there_b.start(ib, fb), there_c.start(ic, fc))
+    kb, kc, gb, gc, off_back = (
+        jb + eb,
+        jc + ec,
+        gb + width,
+        gc + width,
+        base + sa * (na - 1) + width,
+    )
+    kb, kc = dr.select(kb >= nb, kb - nb, kb), dr.select(kc >= nc, kc - nc, kc)
+    since_back = dr.minimum(back_b.start(kb, gb), back_c.start(kc, gc))
+    slice_, slice_back = shift + width, shift + ta * (na - 1) + width
+    L, L_back, s0, s0_back = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
+    scale, area = quantum * length, dr.rcp(length)
+    # Slices behind, of both ways; where they skip some, each is in a slice of its own.
+    k, k_back, active_back = mi.Int32(0), mi.Int32(0), mi.Bool(active)
+    ahead, ahead_back = mi.Int32(1), mi.Int32(1)
+    needed, needed_back = mi.Bool(active), mi.Bool(active)
+    if dr.hint(entering is not None, mode="scalar"):
+        pair = entering.pair(which)
+    while dr.hint(active | active_back, label="slices"):
+        if dr.hint(empty is not None, mode="scalar"):
+            ahead = _slices(empty, cells, ib, ic, k, active)
+            ahead_back = _slices(empty, cells, kb, kc, na - 1 - k_back, active_back)
+            needed, needed_back = active & (ahead == 0), active_back & (ahead_back == 0)
+            ahead, ahead_back = dr.maximum(ahead, 1), dr.maximum(ahead_back, 1)
+        else:
+            active_back = needed = needed_back = active
+            k_back = k
+        index = mi.UInt32(ib * sb + ic * sc + off)
+        index_back = mi.UInt32(kb * sb + kc * sc + off_back)
+        place, place_back = index + copy, index_back + copy
+        # Of the half before the middle of the slice, and of the half behind it.
+        s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, needed)
+        s_next_back, s_back = _levels(
+            corners, own, slice_back, back_b, back_c, kb, gb, kc, gc, needed_back
+        )
+        if dr.hint(entering is not None, mode="scalar"):
+            new, new_back = active & (since < 1), active_back & (since_back < 1)
+            found = entering.at(pair, 0, k, ib, fb, ic, fc, new)
+            found_back = entering.at(pair, 1, na - 1 - k_back, kb, gb, kc, gc, new_back)
+            L, L_back = dr.select(new, found, L), dr.select(new_back, found_back, L_back)
+        else:
+            L = dr.select(since < 1, light, L)
+            L_back = dr.select(since_back < 1, light_back, L_back)
+        # In the middle slice both ways are in the same voxel: the first to write writes for both.
+        middle = off == off_back
+        if dr.hint(source is None, mode="scalar"):
+            L *= _passed(since, s0, s, scale)
+            L_back *= _passed(since_back, s0_back, s_back, scale)
+            before = dr.gather(mi.Float, volume, place, needed)
+            before_back = dr.gather(mi.Float, volume, place_back, needed_back)
+            dr.scatter(volume, before + L + dr.select(middle, L_back, 0), place, needed)
+            dr.scatter(volume, before_back + L_back, place_back, needed_back & ~middle)
+        else:
+            voxel = dr.gather(mi.Vector4f, volume, place, active)
+            voxel_back = dr.gather(mi.Vector4f, volume, place_back, active)
+            sent, sent_back = voxel.x, voxel_back.x
+            if dr.hint(apart, mode="scalar"):
+                sent = dr.gather(mi.Float, source, index * 4, active)
+                sent_back = dr.gather(mi.Float, source, index_back * 4, active)
+            L, tally = _crossed(L, sent * weight, s * scale, s_next * scale, since, weight, area)
+            L_back, tally_back = _crossed(
+                L_back,
+                sent_back * weight,
+                s_back * scale,
+                s_next_back * scale,
+                since_back,
+                weight,
+                area,
+            )
+            tally += dr.select(middle, tally_back, 0)
+            dr.scatter(volume, voxel + tally, place, active)
+            dr.scatter(volume, voxel_back + tally_back, place_back, active & ~middle)
+        s0, s0_back = s_next, s_next_back
+        ib, fb, since = there_b.advance(ib, fb, ahead)
+        ic, fc, near = there_c.advance(ic, fc, ahead)
+        since = dr.minimum(near, since)
+        kb, gb, since_back = back_b.advance(kb, gb, ahead_back)
+        kc, gc, near_back = back_c.advance(kc, gc, ahead_back)
+        since_back = dr.minimum(near_back, since_back)
+        off += sa * ahead
+        off_back -= sa * ahead_back
+        slice_ += ta * ahead
+        slice_back -= ta * ahead_back
+        k += ahead
+        active &= k < na
+        if dr.hint(empty is not None, mode="scalar"):
+            k_back += ahead_back
+            active_back &= k_back < na
+
+
+@dr.syntax
+def add_copies(volume: mi.Float, copies: mi.Float, voxels: int, count: int, kind: type) -> None:
+    """Adds to the ``voxels`` of ``volume``, values of this ``kind``, those of ``count`` copies, one
+    after the other.
+    """
+    index = dr.arange(mi.UInt32, voxels)
+    step, end = dr.opaque(mi.UInt32, voxels), dr.opaque(mi.UInt32, voxels * count)
+    total, place = dr.gather(kind, volume, index), mi.UInt32(index)
+    while dr.hint(place < end, label="copies"):
+        total += dr.gather(kind, copies, place)
+        place += step
+    dr.scatter(volume, total, index)
+
+
+def _slices(empty, strides, b, c, a, active) -> mi.Int32:
+    """Slices that a line may skip from voxel (b, c) of slice ``a``, 0 where it is needed."""
+    cell = sum(n * mi.Int32(mi.UInt32(i) // CELL) for n, i in zip(strides, (b, c, a), strict=True))
+    return mi.Int32(dr.gather(mi.UInt32, empty, mi.UInt32(cell), active))
+
+
+def _levels(corners, own, slice_, across_b, across_c, ib, fb, ic, fc, active) -> tuple:
+    """Extinction of a line in both halves of a slice, bilinear, in units of the quantum."""
+    place_b, weight_b = across_b.lower(ib, fb, own)
+    place_c, weight_c = across_c.lower(ic, fc, own)
+
+    def bilinear(v00, v10, v01, v11):
+        rows = [dr.fma(high - low, weight_b, low) for low, high in ((v00, v10), (v01, v11))]
+        return dr.fma(rows[1] - rows[0], weight_c, rows[0])
+
+    place = mi.UInt32(slice_ + place_b + place_c)
+    if own:
+        words = dr.gather(mi.Vector2u, corners, place, active)
+        value = bilinear(*(mi.Float(v) for w in words for v in (w & 0xFFFF, w >> 16)))
+        return value, value
+    words = dr.gather(mi.Array4u, corners, place, active)
+    first, second = ([mi.Float(w & 0xFFFF) for w in words], [mi.Float(w >> 16) for w in words])
+    return bilinear(*first), bilinear(*second)
+
+
+def _passed(since, before, here, scale) -> mi.Float:
+    """Transmittance from the slice before: half of it and half of this one, or what of this one
+    lies behind the entry.
+    """
+    return dr.exp(-dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
+
+
+def _crossed(L, source, first, second, since, weight, area) -> tuple:
+    """Radiance behind a slice, and what its voxel tallies, for a source that is constant in it.
+    ``first`` and ``second`` are the slice's optical depths, were it all like that half.
+
+    A line stands for an ``area`` across it that is the less the longer it stays in a voxel.
+    """
+    to_middle = dr.select(since < 1, since, 0.5) * first
+    tau = dr.fma(second, 0.5, to_middle)
+    passed = dr.exp(-tau)
+    # Thin voxels lose little, but what they scatter is known from just that.
+    lost = (L - source) * dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
+    half = dr.sqrt(passed) if first is second else dr.exp(-to_middle)
+    middle = dr.fma(L - source, half, source)
+    return L - lost, mi.Vector4f(0, middle, lost * area, weight * tau * area)
