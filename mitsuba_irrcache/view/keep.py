@@ -9,7 +9,8 @@ from mitsuba_irrcache import __version__
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.images import write_image, write_pixels
 from mitsuba_irrcache.view.picture import Samples
-from mitsuba_irrcache.view.session import SAMPLES, Session, View
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import SAMPLES, View
 
 #: Layers in the EXR beside the image.
 LAYERS = ("colour", "illumination", "background", "transmittance", "depth", "noise", "bias")

@@ -13,7 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import monotonic, perf_counter
 
 import drjit as dr
@@ -24,23 +24,12 @@ from mitsuba_irrcache.errors import IrrcacheError, essence
 from mitsuba_irrcache.view.camera import Camera, Placement, camera_of, sensors_of
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.light import Light
-from mitsuba_irrcache.view.picture import Look, Samples
+from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 
 LOG = logging.getLogger(__name__)
 
-#: A camera rests when it has not moved for so long.
-REST_SECONDS = 0.12
-#: A picture of a moving camera should take so long.
-MOVING_SECONDS = 0.05
-#: Side of the pictures of moving cameras, as a part of the window's, and length of their steps: the
-#: one that is quick enough is taken.
-LEVELS = ((1.0, 1.0), (0.71, 1.0), (0.5, 1.0), (0.5, 2.0), (0.35, 2.0), (0.25, 2.0), (0.18, 3.0))
-#: Samples per pixel of a picture at rest.
-SAMPLES = 16
 #: Samples per voxel that make new pictures worth while, over those that are shown.
 GROWTH = 1.25
-#: Windows are not rendered larger than this.
-MOST_PIXELS = 1 << 22
 #: Relative standard error of the light at which it is good enough, unless told otherwise.
 TARGET_ERROR = 0.005
 #: Seconds between two checks for cameras that have moved, while a solver is at work.
@@ -49,28 +38,6 @@ CHECK_SECONDS = 0.02
 
 class Superseded(Exception):  # noqa: N818 (no error: the user wants it)
     """Ends a pass of the solver whose light nobody will see."""
-
-
-@dataclass(frozen=True)
-class View:
-    """What a window wants to see: a camera and the window's (width, height) in pixels."""
-
-    camera: Camera
-    size: tuple[int, int]
-    look: Look = field(default_factory=Look)
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """What a window gets: ``pixels`` uint8 (height, width, 3), of which ``view``, with how many
-    samples per pixel; whether the camera is ``moving``, and whether nothing better will follow.
-    """
-
-    pixels: np.ndarray
-    view: View
-    samples: int
-    moving: bool
-    final: bool
 
 
 @dataclass(frozen=True)
@@ -83,25 +50,6 @@ class Status:
     solver: str = ""
     improving: bool = True
     message: str = ""
-
-
-class Window:
-    """One who looks. ``show`` is called with every `Picture`, in the session's thread."""
-
-    def __init__(self, show: Callable[[Picture], None]) -> None:
-        self.show = show
-        self.view: View | None = None
-        self.moved = -np.inf  # when the camera moved last
-        self.fresh = False  # whether the view has not been shown at all
-        self.level = len(LEVELS) // 2
-        self.revision = -1  # of the light in `samples`
-        self.light: Light | None = None  # that light
-        self.samples: Samples | None = None
-        self.resting: View | None = None  # what `samples` are of
-
-    @property
-    def is_moving(self) -> bool:
-        return monotonic() - self.moved < REST_SECONDS
 
 
 class Session:
@@ -164,17 +112,9 @@ class Session:
 
     def look(self, window: Window, view: View) -> None:
         """What ``window`` wants to see from now on. Another camera or size moves it."""
-        width, height = (max(int(n), 1) for n in view.size)
-        shrunk = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5)
-        view = View(view.camera, (int(width * shrunk) or 1, int(height * shrunk) or 1), view.look)
         with self._news:
-            old = window.view
-            if view == old:
-                return
-            if old is not None and (view.camera, view.size) != (old.camera, old.size):
-                window.moved = monotonic()
-            window.view, window.fresh = view, True
-            self._news.notify_all()
+            if window.want(view):
+                self._news.notify_all()
 
     def edit(self, change: Callable[[Document], None]) -> None:
         """Changes the document, and with it the light; raises IrrcacheError if it cannot be."""
@@ -240,7 +180,7 @@ class Session:
         if self._light is not None and self._light.failed:
             self._light = None
         for window in self._windows:
-            window.view, window.fresh, window.resting = None, False, None
+            window.forget()
         self._say(message=essence(error))
 
     def _begin(self) -> None:
@@ -376,81 +316,33 @@ class Session:
         if not waiting or self._shown is None:
             return False
         window = min(waiting, key=lambda w: w.moved)
-        with self._news:
-            view, window.fresh = window.view, False
-        share, stride = LEVELS[window.level]
-        size = tuple(max(round(n * share), 1) for n in view.size)
+        view = self._taken(window)
         with self._noted("moving"):
-            started = perf_counter()
-            # Errors are not projected, nor is anything filtered, while there is no time for it.
-            seen = self._shown.seen(view.look.kind != "image", view.look.kind == "error bar")
-            seen.stride(stride)
-            try:
-                samples = Samples(seen, view.camera, size)
-                samples.add(1)
-                pixels = samples.picture(self._unfiltered(view.look), self.extent(view.camera))
-            finally:
-                seen.stride(1.0)
-            window.level = _adapted(window.level, perf_counter() - started)
-        window.show(Picture(pixels, view, 1, True, False))
+            picture = window.quick(self._shown, view, self.extent(view.camera))
+        window.show(picture)
         return True
 
     def _show_resting(self, first: bool) -> bool:
         """A sample more for the picture of a window at rest that lacks most; only pictures that
         are not there at all where ``first``.
         """
-        lacking = [w for w in self._windows if w.view is not None and self._lacks(w, first)]
-        if not lacking or self._shown is None:
+        light, revision = self._shown, self._revision
+        lacking = [w for w in self._windows if w.lacks(light, revision, first)]
+        if not lacking or light is None:
             return False
         window = min(lacking, key=lambda w: w.samples.count if w.samples else 0)
-        with self._news:
-            view, window.fresh = window.view, False
+        view = self._taken(window)
         with self._noted("resting"):
-            look = view.look
-            seen = self._shown.seen(look.layered, look.with_error)
-            same = self._is_same(window, view)
-            alone = not same or window.samples.seen is not seen
-            if alone:
-                window.samples = Samples(seen, view.camera, view.size)
-                window.resting, window.revision = view, self._revision
-                window.light = self._shown
-                window.samples.add(1)
-            elif window.resting != view:
-                window.resting = view  # another look at the same samples
-            else:
-                if window.samples.count == 1:  # the one in the pixel's centre is not one of many
-                    window.samples = Samples(seen, view.camera, view.size)
-                    window.samples.add(SAMPLES)
-                window.samples.add(SAMPLES)
-            pixels = window.samples.picture(look, self.extent(view.camera))
-        count = window.samples.count
-        final = count >= SAMPLES and not self._wants_light
-        window.show(Picture(pixels, view, count, False, final))
+            extent = self.extent(view.camera)
+            picture = window.refined(light, revision, view, extent, self._wants_light)
+        window.show(picture)
         return True
 
-    def _is_same(self, window: Window, view: View) -> bool:
-        """Whether the samples that a window has can show ``view``."""
-        old = window.resting
-        return (
-            old is not None
-            and window.samples is not None
-            and window.revision == self._revision
-            and (old.camera, old.size) == (view.camera, view.size)
-        )
-
-    def _lacks(self, window: Window, first: bool) -> bool:
-        old, view = window.resting, window.view
-        if window.fresh or old is None or (old.camera, old.size) != (view.camera, view.size):
-            return True
-        if window.light is not self._shown:
-            return True
-        if first:
-            return False
-        return window.revision != self._revision or window.samples.count < SAMPLES
-
-    @staticmethod
-    def _unfiltered(look: Look) -> Look:
-        return Look(look.kind, look.exposure, look.tone)
+    def _taken(self, window: Window) -> View:
+        """What a window wants to see, which is not new any more."""
+        with self._news:
+            window.fresh = False
+            return window.view
 
     def extent(self, camera: Camera) -> tuple[float, float]:
         """Distances between which a camera may see the medium."""
@@ -473,15 +365,3 @@ class _Noted:
 
     def __exit__(self, *_: object) -> None:
         self.history.append((self.what, self.started, monotonic()))
-
-
-def _adapted(level: int, seconds: float) -> int:
-    """The level for the next picture, where this one took so long."""
-    if seconds > MOVING_SECONDS:
-        return min(level + 1, len(LEVELS) - 1)
-    if level == 0:
-        return 0
-    share, stride = LEVELS[level]
-    better, shorter = LEVELS[level - 1]
-    growth = (better / share) ** 2 * stride / shorter
-    return level - 1 if seconds * growth < 0.8 * MOVING_SECONDS else level

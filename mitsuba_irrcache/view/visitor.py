@@ -19,7 +19,8 @@ from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
 from mitsuba_irrcache.view.editing import Editing
 from mitsuba_irrcache.view.keep import checked_name, keep
 from mitsuba_irrcache.view.picture import KINDS, TONES, Look
-from mitsuba_irrcache.view.session import Picture, Session, View
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import Picture, View
 
 #: Quality of JPEGs of moving cameras, and of pictures that better ones will follow.
 MOVING_QUALITY, RESTING_QUALITY = 80, 95

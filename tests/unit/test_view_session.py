@@ -15,12 +15,13 @@ import pytest
 from mitsuba_irrcache.cli import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.images import read_image
-from mitsuba_irrcache.view import session as module
+from mitsuba_irrcache.view import window as module
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.keep import keep
-from mitsuba_irrcache.view.picture import KINDS, Look
-from mitsuba_irrcache.view.session import Picture, Session, View
+from mitsuba_irrcache.view.picture import KINDS, Look, Samples
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import Picture, View
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -179,7 +180,7 @@ def test_no_kernel_is_compiled_for_another_camera_or_size(session, kernels):
 
     def pictures(size, degrees):
         seen = session.light.seen(False, False)
-        samples = module.Samples(seen, turned(front(session), degrees), size)
+        samples = Samples(seen, turned(front(session), degrees), size)
         samples.add(1)
         samples.picture(Look(exposure=degrees), (0, 1))
         dr.sync_thread()
