@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.viewer.browser import Browser, Window, viewer
+from experiments.viewer.load import processor_seconds
 
 
 def main() -> None:
@@ -46,21 +47,27 @@ def main() -> None:
 
 def orbiting(window: Window, repeats: int) -> dict[str, float]:
     """Pictures per second while the mouse is dragged as fast as the page takes it."""
-    rates, sizes = [], []
+    rates, sizes, loads = [], [], []
     for _ in range(repeats):
-        before = len(window.shown())
+        before, load = len(window.shown()), processor_seconds()
         began = time.time()
-        window.orbit(60, 3, 0.005)
+        window.orbit(120, 3, 0.005)
         ended = time.time()
+        now = processor_seconds()
+        loads.append({name: (now[name] - load.get(name, 0)) / (ended - began) for name in now})
         seen = [s for s in window.shown()[before:] if began + 0.2 <= s["at"] <= ended]
         rates.append((len(seen) - 1) / (seen[-1]["at"] - seen[0]["at"]))
         sizes += [s["width"] for s in seen]
         time.sleep(1)
+    users = {
+        f"  processors busy with: {name}": float(np.median([load.get(name, 0) for load in loads]))
+        for name in loads[-1]
+    }
     return {
-        "orbiting: pictures per second": float(np.mean(rates)),
+        "orbiting: pictures per second, median": float(np.median(rates)),
         "  slowest drag": float(np.min(rates)),
         "  width of pictures, median": float(np.median(sizes)),
-    }
+    } | {name: value for name, value in users.items() if value >= 0.005}
 
 
 def latency(window: Window, repeats: int) -> dict[str, float]:

@@ -37,7 +37,7 @@ CHECK_SECONDS = 0.02
 
 
 class Superseded(Exception):  # noqa: N818 (no error: the user wants it)
-    """Ends a pass of the solver whose light nobody will see."""
+    """Ends a pass of the solver, or a picture, that nobody will see."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,9 @@ class Session:
         self._shown_samples = 0
         self._revision = 0  # of all that is shown, across lights
         self._checked = 0.0
-        self._resting_turn = False
+        # what there is to do while no camera moves, in turn
+        self._chores = deque((self._refine_picture, self._improve, self._compare))
+        self._comparisons = 0
         self._ready = threading.Event()
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="irrcache view", daemon=True)
@@ -237,14 +239,13 @@ class Session:
             return False
         if self._show_resting(first=True):
             return True
-        improving = self._wants_light
-        awaited = self._light is not None and self._light is not self._shown
-        self._resting_turn = not self._resting_turn and not awaited
-        if (self._resting_turn or not improving) and self._show_resting(first=False):
-            return True
-        if improving:
-            self._improve()
-        return improving
+        if self._light is not None and self._light is not self._shown:
+            return self._improve()  # somebody waits for it
+        for _ in range(len(self._chores)):
+            self._chores.rotate()
+            if self._chores[0]():
+                return True
+        return False
 
     @property
     def _wants_light(self) -> bool:
@@ -257,11 +258,15 @@ class Session:
             return False
         return light.samples < 1 or not light.error <= self.target_error
 
-    def _improve(self) -> None:
+    def _improve(self) -> bool:
+        """A pass of the solver, if it is wanted."""
+        if not self._wants_light:
+            return False
         with self._noted("solver"):
             self._light.refine()
             dr.sync_thread()
         self._adopt()
+        return True
 
     def _adopt(self) -> None:
         """Shows the light that has improved, if that is worth new pictures."""
@@ -334,8 +339,35 @@ class Session:
         view = self._taken(window)
         with self._noted("resting"):
             extent = self.extent(view.camera)
-            picture = window.refined(light, revision, view, extent, self._wants_light)
+            wanted, pause = self._wants_light, self._give_way
+            try:
+                picture = window.refined(light, revision, view, extent, wanted, pause)
+            except Superseded:  # the picture is, not the solver's pass that it may interrupt
+                return True
         window.show(picture)
+        return True
+
+    def _give_way(self) -> None:
+        """Between bands of a picture at rest: cameras that move come first."""
+        if self._stopped or any(w.fresh and w.is_moving for w in self._windows):
+            raise Superseded
+
+    def _refine_picture(self) -> bool:
+        return self._show_resting(first=False)
+
+    def _compare(self) -> bool:
+        """Some more of the reference of one window, in turn."""
+        light, revision = self._shown, self._revision
+        comparing = [w for w in self._windows if w.is_comparing(light, revision)]
+        if not comparing:
+            return False
+        self._comparisons += 1
+        window = comparing[self._comparisons % len(comparing)]
+        with self._noted("reference"):
+            extent = self.extent(window.view.camera)
+            picture = window.compared(light, window.view, extent, self._wants_light)
+        if picture is not None:
+            window.show(picture)
         return True
 
     def _taken(self, window: Window) -> View:

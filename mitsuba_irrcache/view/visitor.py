@@ -69,6 +69,9 @@ class Visitor:
             self._filter = gui.add_checkbox(
                 "filter", False, hint="of the illumination; fades as the light improves"
             )
+            self._compare = gui.add_checkbox(
+                "compare with volpath", False, hint="beside it, slowly, while nothing moves"
+            )
         with gui.add_folder("Keep", order=5, expand_by_default=False):
             self._name = gui.add_text("name", "view")
             self._cache = gui.add_checkbox("with the cache", False)
@@ -77,7 +80,7 @@ class Visitor:
                 hint="PNG, EXR with layers, and a scene for irrcache render",
             )
             self._saved = gui.add_markdown("")
-        for handle in (self._kind, self._exposure, self._tone, self._filter):
+        for handle in (self._kind, self._exposure, self._tone, self._filter, self._compare):
             self.editing.bind(handle, lambda _: self._set_look())
         self.editing.bind(self._sensor, lambda name: self._go_to(name))
         self.editing.bind(self._fov, self._set_fov)
@@ -134,7 +137,8 @@ class Visitor:
         numbers = (*seen.position, *seen.target, *seen.up)
         if not np.isfinite(numbers).all() or seen.distance == 0 or not any(seen.up):
             return  # nothing that a camera could be
-        self._view = View(seen, (camera.image_width, camera.image_height), self._look)
+        size = camera.image_width, camera.image_height
+        self._view = View(seen, size, self._look, bool(self._compare.value))
         self.session.look(self.window, self._view)
 
     def _show(self, picture: Picture) -> None:
@@ -154,6 +158,8 @@ class Visitor:
             state = "moving" if picture.moving else "final" if picture.final else "at rest"
             samples = "1 sample" if picture.samples == 1 else f"{picture.samples} samples"
             self._note.content = f"{state}: {width} x {height}, {samples} per pixel"
+            if picture.comparison:
+                self._note.content += f"; on the right {picture.comparison}"
         self.client.flush()
 
     # ------------------------------------------------------------------ keeping
@@ -162,7 +168,7 @@ class Visitor:
         name = checked_name(self._name.value)
         if self._view is None:
             return
-        view = replace(self._view, look=self._look)
+        view = replace(self._view, look=self._look, compared=False)
         self._saved.content = "saving ..."
         try:
             if self.folder is not None:

@@ -10,10 +10,11 @@ import numpy as np
 
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Light
-from mitsuba_irrcache.view.picture import Look, Samples
+from mitsuba_irrcache.view.picture import Look, Samples, displayed
+from mitsuba_irrcache.view.reference import Reference
 
 #: A camera rests when it has not moved for so long.
-REST_SECONDS = 0.12
+REST_SECONDS = 0.15
 #: A picture of a moving camera should take so long.
 MOVING_SECONDS = 0.05
 #: Side of the pictures of moving cameras, as a part of the window's, and length of their steps: the
@@ -27,11 +28,19 @@ MOST_PIXELS = 1 << 22
 
 @dataclass(frozen=True)
 class View:
-    """What a window wants to see: a camera and the window's (width, height) in pixels."""
+    """What a window wants to see: a camera, and the window's (width, height) in pixels, of which
+    half is for volpath's picture where that is ``compared``.
+    """
 
     camera: Camera
     size: tuple[int, int]
     look: Look = field(default_factory=Look)
+    compared: bool = False
+
+    @property
+    def part(self) -> tuple[int, int]:
+        """(width, height) of the picture by irrcache."""
+        return (max(self.size[0] // 2, 1), self.size[1]) if self.compared else self.size
 
     def bounded(self) -> View:
         """The same with at least one pixel, and at most `MOST_PIXELS`."""
@@ -41,13 +50,14 @@ class View:
 
     def shows_place_of(self, other: View | None) -> bool:
         """Whether ``other`` is seen by the same camera, at the same size."""
-        return other is not None and (self.camera, self.size) == (other.camera, other.size)
+        return other is not None and (self.camera, self.part) == (other.camera, other.part)
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """What a window gets: ``pixels`` uint8 (height, width, 3), of which ``view``, with how many
     samples per pixel; whether the camera is ``moving``, and whether nothing better will follow.
+    What is on its right by volpath, and how far it is from that, is told by ``comparison``.
     """
 
     pixels: np.ndarray
@@ -55,6 +65,7 @@ class Picture:
     samples: int
     moving: bool
     final: bool
+    comparison: str = ""
 
 
 class Window:
@@ -70,6 +81,7 @@ class Window:
         self._resting: View | None = None  # what `samples` are of
         self._light: Light | None = None  # and of which light
         self._revision = -1
+        self._reference: Reference | None = None
 
     @property
     def is_moving(self) -> bool:
@@ -89,7 +101,7 @@ class Window:
 
     def forget(self) -> None:
         """Shows nothing until there is another view."""
-        self.view, self.fresh, self._resting = None, False, None
+        self.view, self.fresh, self._resting, self._reference = None, False, None, None
 
     def lacks(self, light: Light, revision: int, first: bool) -> bool:
         """Whether a picture at rest could be better; or where ``first``, whether there is none."""
@@ -102,7 +114,7 @@ class Window:
     def quick(self, light: Light, view: View, extent: tuple[float, float]) -> Picture:
         """Of a camera that moves: as coarse as time wants it."""
         share, stride = LEVELS[self.level]
-        size = tuple(max(round(n * share), 1) for n in view.size)
+        size = tuple(max(round(n * share), 1) for n in view.part)
         started, look = perf_counter(), view.look
         # Errors are not projected, nor is anything filtered, while there is no time for it.
         seen = light.seen(look.kind != "image", look.kind == "error bar")
@@ -114,30 +126,80 @@ class Window:
         finally:
             seen.stride(1.0)
         self.level = _adapted(self.level, perf_counter() - started)
+        if view.compared:
+            pixels = np.concatenate([pixels, np.zeros_like(pixels)], axis=1)
         return Picture(pixels, view, 1, True, False)
 
     def refined(
-        self, light: Light, revision: int, view: View, extent: tuple[float, float], improving: bool
+        self,
+        light: Light,
+        revision: int,
+        view: View,
+        extent: tuple[float, float],
+        improving: bool,
+        pause: Callable[[], None],
     ) -> Picture:
         """Of a camera at rest: a sample per pixel more than before, of the ``light`` as it is at
-        this ``revision``, which may be ``improving`` still.
+        this ``revision``, which may be ``improving`` still. Where ``pause`` raises something, all
+        is as it was.
         """
         look = view.look
         seen = light.seen(look.layered, look.with_error)
-        known = self.samples is not None and self._revision == revision
-        if not (known and view.shows_place_of(self._resting) and self.samples.seen is seen):
-            self.samples = Samples(seen, view.camera, view.size)
-            self._revision, self._light = revision, light
-            self.samples.add(1)
+        samples = self.samples
+        known = samples is not None and self._revision == revision
+        if not (known and view.shows_place_of(self._resting) and samples.seen is seen):
+            samples = Samples(seen, view.camera, view.part)
+            samples.add(1, pause)
         elif self._resting == view:  # not only another look at the same samples
-            if self.samples.count == 1:  # the one in the pixel's centre is not one of many
-                self.samples = Samples(seen, view.camera, view.size)
-                self.samples.add(SAMPLES)
-            self.samples.add(SAMPLES)
-        self._resting = view
+            if samples.count == 1:  # the one in the pixel's centre is not one of many
+                samples = Samples(seen, view.camera, view.part)
+                samples.add(SAMPLES, pause)
+            samples.add(SAMPLES, pause)
+        self.samples, self._resting = samples, view
+        self._revision, self._light = revision, light
+        return self._picture(view, extent, improving)
+
+    def is_comparing(self, light: Light, revision: int) -> bool:
+        """Whether there is something to compare with, that could be better."""
+        if self.view is None or not self.view.compared or self.lacks(light, revision, True):
+            return False
+        known = self._reference_of(light, self.view)
+        return known is None or not known.is_done
+
+    def compared(
+        self, light: Light, view: View, extent: tuple[float, float], improving: bool
+    ) -> Picture | None:
+        """Some more of the reference; a picture if all of it has changed, or it is new."""
+        known = self._reference_of(light, view)
+        if known is None:
+            self._reference = known = Reference(light, view.camera, view.part)
+        return self._picture(view, extent, improving) if known.refine() else None
+
+    def _reference_of(self, light: Light, view: View) -> Reference | None:
+        """The reference for this scene as it is and this view, if there is one."""
+        known = self._reference
+        if known is None or (known.light, known.camera, known.size) != (
+            light,
+            view.camera,
+            view.part,
+        ):
+            return None
+        return known
+
+    def _picture(self, view: View, extent: tuple[float, float], improving: bool) -> Picture:
+        """What `samples` show."""
         count = self.samples.count
+        pixels = self.samples.picture(view.look, extent)
         final = count >= SAMPLES and not improving
-        return Picture(self.samples.picture(look, extent), view, count, False, final)
+        if not view.compared:
+            return Picture(pixels, view, count, False, final)
+        known, other, told = self._reference_of(self._light, view), np.zeros_like(pixels), ""
+        if known is not None:
+            other = displayed(known.radiance(), replace(view.look, kind="image"))
+            told = known.comparison(self.samples.image(view.look.filtered))
+            final &= known.is_done
+        beside = np.concatenate([pixels, other], axis=1)
+        return Picture(beside, view, count, False, final and known is not None, told)
 
 
 def _adapted(level: int, seconds: float) -> int:

@@ -1,0 +1,34 @@
+"""Pictures in pieces, so that who is at work can stop when a camera moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from time import perf_counter
+
+#: Seconds that a band should take: a mouse that begins to move waits for so long.
+SECONDS = 0.06
+#: Pixels of the first band, and of the smallest one.
+FIRST, SMALLEST = 1 << 14, 1 << 11
+
+
+class Bands:
+    """How many pixels are computed at once, learned from the time that the last ones took."""
+
+    def __init__(self) -> None:
+        self._count = FIRST
+
+    def over(self, pixels: int, first: int = 0) -> Iterator[range]:
+        """Ranges that make up ``pixels`` from ``first`` on. What is done with one must be finished
+        when the next one is asked for.
+        """
+        while first < pixels:
+            band = range(first, min(first + self._count, pixels))
+            started = perf_counter()
+            yield band
+            self._learn(len(band), perf_counter() - started)
+            first = band.stop
+
+    def _learn(self, count: int, seconds: float) -> None:
+        """Makes the next band as large as time wants it, but no more than twice as large."""
+        wanted = int(count * SECONDS / max(seconds, 1e-4))
+        self._count = max(min(wanted, 2 * self._count), SMALLEST)
