@@ -203,6 +203,7 @@ class Session:
         if not self.cameras:
             away = centre + radius * np.array([0.0, -4.0, 1.0])
             self.cameras = {"front": Camera(tuple(away), tuple(centre), (0.0, 0.0, 1.0), 30.0)}
+        self.document.orient(next(iter(self.cameras.values())).up)
 
     def _light_of(self, scene: mi.Scene) -> Light:
         document = self.document

@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import math
 import tempfile
+import threading
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
@@ -16,7 +18,7 @@ import viser
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
-from mitsuba_irrcache.view.editing import Editing
+from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.keep import checked_name, keep
 from mitsuba_irrcache.view.picture import KINDS, TONES, Look
 from mitsuba_irrcache.view.session import Session
@@ -36,6 +38,8 @@ class Visitor:
     def __init__(self, client: viser.ClientHandle, session: Session, folder: Path | None) -> None:
         self.client, self.session, self.folder = client, session, folder
         self._encoder = ThreadPoolExecutor(1)
+        self._lock = threading.Lock()
+        self._waiting: Picture | None = None
         self._noted = 0.0
         self._view: View | None = None
         self._look = Look()
@@ -115,7 +119,7 @@ class Visitor:
         self._look_again()
 
     def _refuse(self, reason: str) -> None:
-        self._refusal.content = f"**Refused:** {reason}" if reason else ""
+        self._refusal.content = f"**Refused:** {plain(reason)}" if reason else ""
         self._refusal.visible = bool(reason)
 
     # ------------------------------------------------------------------ to the session and back
@@ -143,12 +147,16 @@ class Visitor:
 
     def _show(self, picture: Picture) -> None:
         """In the session's thread: hands on, so that it can go on rendering."""
-        try:
-            self._encoder.submit(self._send, picture)
-        except RuntimeError:  # the browser has just gone
-            return
+        with self._lock:
+            busy, self._waiting = self._waiting is not None, picture
+        if not busy:
+            with suppress(RuntimeError):  # the browser has just gone
+                self._encoder.submit(self._send)
 
-    def _send(self, picture: Picture) -> None:
+    def _send(self) -> None:
+        """Sends the newest picture; older ones that were not sent yet never are."""
+        with self._lock:
+            picture, self._waiting = self._waiting, None
         quality = MOVING_QUALITY if picture.moving else RESTING_QUALITY
         kind = "png" if picture.final else "jpeg"
         self.client.scene.set_background_image(picture.pixels, kind, jpeg_quality=quality)
