@@ -119,6 +119,12 @@ class Window:
         pattern = re.compile(rf"^{re.escape(option)}")
         self.page.get_by_role("option", name=pattern).filter(visible=True).first.click()
 
+    def tick(self, label: str) -> None:
+        """Sets or clears a check box."""
+        self.page.get_by_text(label, exact=True).locator(
+            "xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]//input"
+        ).first.click()
+
     def orbit(self, steps: int, pixels: float, pause: float, first: float = 60.0) -> None:
         """Drags the mouse from ``first`` on, in ``steps`` of so many pixels."""
         mouse, height = self.page.mouse, self.page.viewport_size["height"]

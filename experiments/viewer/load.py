@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
 _TICK = 1 / os.sysconf("SC_CLK_TCK")
@@ -16,11 +17,9 @@ def processor_seconds() -> dict[str, float]:
     found: dict[str, float] = {}
     for pid in _descendants():
         try:
-            line = (Path("/proc") / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ")
-            seconds = _seconds(pid)
+            name, seconds = _name(_words(pid)), _seconds(pid)
         except (FileNotFoundError, ProcessLookupError):  # it has just ended
             continue
-        name = _name(line.decode(errors="replace").split())
         found[name] = found.get(name, 0.0) + seconds
     columns = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
     idle = int(columns[3]) + int(columns[4])
@@ -29,10 +28,15 @@ def processor_seconds() -> dict[str, float]:
     return found
 
 
-def memory(pid: int) -> float:
-    """Resident memory of a process in MB."""
-    text = (Path("/proc") / str(pid) / "status").read_text()
-    return int(re.search(r"VmRSS:\s+(\d+)", text).group(1)) / 1024
+def viewer_memory() -> float:
+    """Resident memory of the viewers that this program has started, MB."""
+    total = 0.0
+    for pid in _descendants():
+        with suppress(FileNotFoundError, ProcessLookupError, AttributeError):
+            if _name(_words(pid)) == "viewer":
+                text = (Path("/proc") / str(pid) / "status").read_text()
+                total += int(re.search(r"VmRSS:\s+(\d+)", text).group(1)) / 1024
+    return total
 
 
 def _descendants() -> list[int]:
@@ -48,6 +52,12 @@ def _descendants() -> list[int]:
         level = {pid for pid, parent in parents.items() if parent in level}
         found += level
     return found
+
+
+def _words(pid: int) -> list[str]:
+    """Its command line; Chromium puts spaces between words."""
+    line = (Path("/proc") / str(pid) / "cmdline").read_bytes()
+    return line.replace(b"\0", b" ").decode(errors="replace").split()
 
 
 def _seconds(pid: int) -> float:
@@ -66,4 +76,4 @@ def _name(words: list[str]) -> str:
     kind = next((w.partition("=")[2] for w in words if w.startswith("--type=")), None)
     if kind is not None:
         return f"browser, {kind}"
-    return "browser" if "chrom" in words[0] else "driver"
+    return "browser" if words and "chrom" in words[0] else "driver"
