@@ -70,9 +70,15 @@ class Document:
         return cls(scene_text(path, parameters, integrator), path.parent)
 
     @classmethod
-    def of_text(cls, text: str, volumes: dict[str, np.ndarray]) -> Document:
+    def of_text(
+        cls,
+        text: str,
+        volumes: dict[str, np.ndarray],
+        parameters: dict[str, str] | None = None,
+        integrator: str = "irrcache",
+    ) -> Document:
         """Of the XML of a scene with $parameters, whose only files are ``volumes``."""
-        return cls(filled(text, "irrcache"), ".", volumes)
+        return cls(filled(text, integrator, parameters), ".", volumes)
 
     # ------------------------------------------------------------------ what it says
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from time import monotonic, perf_counter
 
@@ -383,18 +383,11 @@ class Session:
         radius = self.placement.radius
         return max(distance - radius, 0.0), distance + radius
 
-    def _noted(self, what: str) -> _Noted:
-        return _Noted(self.history, what)
-
-
-class _Noted:
-    """Notes when a block began and ended."""
-
-    def __init__(self, history: deque, what: str) -> None:
-        self.history, self.what = history, what
-
-    def __enter__(self) -> None:
-        self.started = monotonic()
-
-    def __exit__(self, *_: object) -> None:
-        self.history.append((self.what, self.started, monotonic()))
+    @contextmanager
+    def _noted(self, what: str) -> Iterator[None]:
+        """Notes when a block began and ended."""
+        started = monotonic()
+        try:
+            yield
+        finally:
+            self.history.append((what, started, monotonic()))

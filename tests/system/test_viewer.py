@@ -57,9 +57,10 @@ def settled(window: Window) -> np.ndarray:
     return screen(window)
 
 
-def screen(window: Window) -> np.ndarray:
+def screen(window: Window, width: int = CLEAR) -> np.ndarray:
+    """So many columns of what is on the screen."""
     shot = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
-    return np.asarray(shot, dtype=float)[:, :CLEAR]
+    return np.asarray(shot, dtype=float)[:, :width]
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> float:
