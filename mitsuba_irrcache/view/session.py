@@ -21,9 +21,10 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError, essence
-from mitsuba_irrcache.view.camera import Camera, Placement, camera_of, sensors_of
+from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
-from mitsuba_irrcache.view.light import Light
+from mitsuba_irrcache.view.light import Light, Seen
+from mitsuba_irrcache.view.picture import Samples
 from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 
 LOG = logging.getLogger(__name__)
@@ -78,7 +79,8 @@ class Session:
         self._checked = 0.0
         # what there is to do while no camera moves, in turn
         self._chores = deque((self._refine_picture, self._improve, self._compare))
-        self._comparisons = 0
+        self._comparisons = self._reserved = 0
+        self._pass_seconds = 0.0
         self._ready = threading.Event()
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="irrcache view", daemon=True)
@@ -146,10 +148,23 @@ class Session:
             raise result["error"]
         return result.get("value")
 
+    @contextmanager
+    def reserved(self) -> Iterator[None]:
+        """Within, the thread does what it is called for, and shows new views, but nothing else."""
+        self.call(lambda: self._reserve(1))
+        try:
+            yield
+        finally:
+            self.call(lambda: self._reserve(-1))
+
     @property
     def light(self) -> Light:
         """The light that is seen; in the session's thread only."""
         return self._shown
+
+    def complete(self, seen: Seen, view: View) -> Samples | None:
+        """All samples of ``view`` that a window has of ``seen``; in the session's thread only."""
+        return next((w.samples for w in self._windows if w.is_complete(seen, view)), None)
 
     # ------------------------------------------------------------------ the thread
 
@@ -192,17 +207,8 @@ class Session:
         with self._noted("solver"):
             self._light.refine()
         self._adopt()
-        frame = self._shown.parts[0].medium.frame
-        corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
-        world = frame[:3, :3] @ corners + frame[:3, 3:]
-        centre = world.mean(axis=1)
-        radius = float(np.linalg.norm(world - centre[:, None], axis=0).max())
-        self.placement = Placement(centre, radius)
-        sensors = sensors_of(scene)
-        self.cameras = {name: camera_of(sensor, centre) for name, sensor in sensors.items()}
-        if not self.cameras:
-            away = centre + radius * np.array([0.0, -4.0, 1.0])
-            self.cameras = {"front": Camera(tuple(away), tuple(centre), (0.0, 0.0, 1.0), 30.0)}
+        self.placement = Placement.around(self._shown.parts[0].medium.frame)
+        self.cameras = cameras_of(scene, self.placement)
         self.document.orient(next(iter(self.cameras.values())).up)
 
     def _light_of(self, scene: mi.Scene) -> Light:
@@ -230,6 +236,9 @@ class Session:
         waits = [w.moved + REST_SECONDS - monotonic() for w in self._windows if w.is_moving]
         return max(min(waits), 1e-3) if waits else None
 
+    def _reserve(self, change: int) -> None:
+        self._reserved += change
+
     def _step(self) -> bool:
         """Does what is most urgent; whether there was anything to do."""
         while self._tasks:
@@ -240,6 +249,8 @@ class Session:
             return False
         if self._show_resting(first=True):
             return True
+        if self._reserved:
+            return False
         if self._light is not None and self._light is not self._shown:
             return self._improve()  # somebody waits for it
         for _ in range(len(self._chores)):
@@ -266,6 +277,7 @@ class Session:
         with self._noted("solver"):
             self._light.refine()
             dr.sync_thread()
+        self._pass_seconds = self.history[-1][2] - self.history[-1][1]
         self._adopt()
         return True
 
@@ -364,12 +376,15 @@ class Session:
             return False
         self._comparisons += 1
         window = comparing[self._comparisons % len(comparing)]
+        view, until = window.view, monotonic() + self._pass_seconds  # as long as the solver
         with self._noted("reference"):
-            extent = self.extent(window.view.camera)
-            picture = window.compared(light, window.view, extent, self._wants_light)
-        if picture is not None:
-            window.show(picture)
-        return True
+            extent = self.extent(view.camera)
+            while True:
+                picture = window.compared(light, view, extent, self._wants_light)
+                if picture is not None:
+                    window.show(picture)
+                if monotonic() > until or self._tasks or self._stopped or self._is_work_waiting:
+                    return True
 
     def _taken(self, window: Window) -> View:
         """What a window wants to see, which is not new any more."""

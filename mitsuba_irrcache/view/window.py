@@ -9,7 +9,7 @@ from time import monotonic, perf_counter
 import numpy as np
 
 from mitsuba_irrcache.view.camera import Camera
-from mitsuba_irrcache.view.light import Light
+from mitsuba_irrcache.view.light import Light, Seen
 from mitsuba_irrcache.view.picture import Look, Samples, displayed
 from mitsuba_irrcache.view.reference import Reference
 
@@ -110,6 +110,15 @@ class Window:
         if self.fresh or not self.view.shows_place_of(self._resting) or self._light is not light:
             return True
         return not first and (self._revision != revision or self.samples.count < SAMPLES)
+
+    def is_complete(self, seen: Seen, view: View) -> bool:
+        """Whether it has all samples of ``seen`` that a picture of ``view`` at rest has."""
+        had = self.samples
+        return (
+            had is not None
+            and had.count >= SAMPLES
+            and (had.seen, had.camera, had.size) == (seen, view.camera, view.size)
+        )
 
     def quick(self, light: Light, view: View, extent: tuple[float, float]) -> Picture:
         """Of a camera that moves: as coarse as time wants it."""
