@@ -23,6 +23,8 @@ from mitsuba_irrcache.view.picture import KINDS
 #: Windows at once, at most.
 MOST_WINDOWS = 3
 SIZE = (512, 384)
+#: Seconds to wait for what should have come by then, on a machine that others use too.
+PATIENCE = 240
 
 
 @dataclass
@@ -52,7 +54,7 @@ class User:
         self._browser, self._address, self._rng = browser, address, rng
         self.usage = Usage()
         self.windows = [browser.open(address, SIZE)]
-        self.windows[0].wait_for("per pixel", 60)
+        self.windows[0].wait_for("per pixel", PATIENCE)
         self._actions = {
             self.drag: 8, self.zoom: 4, self.opacity: 4, self.density: 2, self.sun: 2,
             self.kind: 2, self.compare: 1, self.preset: 1, self.save: 1, self.reload: 1,
@@ -72,7 +74,7 @@ class User:
         steps = int(self._rng.integers(3, 20))
         window.orbit(steps, float(self._rng.uniform(-4, 4)), 0.02, SIZE[0] / 3)
         if self._rng.random() < 0.3:
-            window.wait_for("at rest|final", 60)
+            window.wait_for("at rest|final", PATIENCE)
 
     def zoom(self, window: Window) -> None:
         """In or out; as far in as into the medium."""
@@ -109,18 +111,20 @@ class User:
         if not name.is_visible():
             window.page.get_by_text("Keep", exact=True).click()
         name.click()
-        window.page.get_by_text(re.compile("^(saved|downloaded) ")).first.wait_for(timeout=120000)
+        window.page.get_by_text(re.compile("^(saved|downloaded) ")).first.wait_for(
+            timeout=1000 * PATIENCE
+        )
 
     def reload(self, window: Window) -> None:
         """The page, anew."""
         window.page.reload()
-        window.wait_for("per pixel", 60)
+        window.wait_for("per pixel", PATIENCE)
 
     def open(self, _: Window) -> None:
         """One window more."""
         if len(self.windows) < MOST_WINDOWS:
             self.windows.append(self._browser.open(self._address, SIZE))
-            self.windows[-1].wait_for("per pixel", 60)
+            self.windows[-1].wait_for("per pixel", PATIENCE)
 
     def close(self, window: Window) -> None:
         """One window less, but never none."""

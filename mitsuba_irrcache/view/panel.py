@@ -10,7 +10,8 @@ import viser
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.document import Document, Lighting
 from mitsuba_irrcache.view.editing import Editing, plain
-from mitsuba_irrcache.view.session import Session, Status
+from mitsuba_irrcache.view.light import Status
+from mitsuba_irrcache.view.session import Session
 
 
 class LightPanel:

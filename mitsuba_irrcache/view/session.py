@@ -13,7 +13,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from time import monotonic, perf_counter
 
 import drjit as dr
@@ -23,7 +22,7 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError, essence
 from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
-from mitsuba_irrcache.view.light import Light, Seen
+from mitsuba_irrcache.view.light import Light, Seen, Status
 from mitsuba_irrcache.view.picture import Samples
 from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 
@@ -39,18 +38,6 @@ CHECK_SECONDS = 0.02
 
 class Superseded(Exception):  # noqa: N818 (no error: the user wants it)
     """Ends a pass of the solver, or a picture, that nobody will see."""
-
-
-@dataclass(frozen=True)
-class Status:
-    """How far the light is."""
-
-    samples: int = 0
-    error: float = float("nan")
-    seconds: float = 0.0
-    solver: str = ""
-    improving: bool = True
-    message: str = ""
 
 
 class Session:
@@ -293,15 +280,7 @@ class Session:
         self._say()
 
     def _say(self, message: str = "") -> None:
-        light = self._light or self._shown
-        self.status = Status(
-            light.samples if light else 0,
-            light.error if light and light.samples else float("nan"),
-            light.seconds if light else 0.0,
-            light.solver if light else "",
-            self._wants_light,
-            message,
-        )
+        self.status = Status.of(self._light or self._shown, self._wants_light, message)
         self.on_status(self.status)
 
     def _pause(self) -> None:
