@@ -100,6 +100,14 @@ class Window:
         pattern = re.compile(note)
         self.page.get_by_text(pattern).first.wait_for(state="attached", timeout=1000 * seconds)
 
+    def wait_for_picture(self, after: int, width: int = 0, seconds: float = 60.0) -> None:
+        """Until a picture was shown beyond the first ``after``; of this width, if one is given."""
+        self.page.wait_for_function(
+            "([n, w]) => __shown.slice(n).some(e => e.at > 0 && (w == 0 || e.width == w))",
+            arg=[after, width],
+            timeout=1000 * seconds,
+        )
+
     def field(self, label: str) -> Locator:
         """The input of the control with this label."""
         row = "ancestor::div[contains(@class, 'mantine-Flex-root')][1]"

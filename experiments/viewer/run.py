@@ -88,10 +88,10 @@ def stopping(window: Window, repeats: int) -> dict[str, float]:
     """From the last mouse event of a drag to a picture of full resolution."""
     found, size = [], window.page.viewport_size["width"]
     for _ in range(repeats):
-        shown = len(window.shown())
+        window.wait_for("at rest|final", 60)
         window.orbit(20, 4, 0.03)
-        last = window.moves()[-1]
-        time.sleep(3)
+        last, shown = window.moves()[-1], len(window.shown())
+        window.wait_for_picture(shown, size)
         full = [s["at"] for s in window.shown()[shown:] if s["width"] == size and s["at"] > last]
         found.append(min(full) - last)
     return {
@@ -114,7 +114,7 @@ def editing(window: Window, repeats: int) -> dict[str, float]:
         shown = len(window.shown())
         began = time.time()
         window.enter(label, round(0.2 + 0.05 * number, 2))
-        time.sleep(4)
+        window.wait_for_picture(shown)
         after = [s["at"] for s in window.shown()[shown:] if s["at"] > began]
         found.append(min(after) - began)
     return {

@@ -85,8 +85,9 @@ def test_transfer_functions_and_archives_come_and_go(browser, tmp_path):
 
         other = tmp_path / "bone.json"
         other.write_text(load_preset("ct-bone").to_json())
+        count = len(window.shown())
         load(other)
-        window.page.wait_for_function(f"window.__shown.length > {len(window.shown())}")
+        window.wait_for_picture(count)
         assert difference(settled(window), first) > 3
         broken = tmp_path / "<b>broken.json"
         broken.write_text('{"opacity": 3}')
@@ -134,8 +135,9 @@ def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
         assert difference(inside, front) > 3
         window.choose("camera", "front")
         assert difference(settled(window), front) < 2
+        count = len(window.shown())
         window.enter("rotation", 120)
-        window.page.wait_for_function(f"window.__shown.length > {len(window.shown())}")
+        window.wait_for_picture(count)
         turned = settled(window)
         assert difference(turned, front) > 3
         window.tick("compare with volpath")

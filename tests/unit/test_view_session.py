@@ -16,6 +16,7 @@ from mitsuba_irrcache.cli import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.images import read_image
 from mitsuba_irrcache.view import window as module
+from mitsuba_irrcache.view.bands import Bands
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.keep import keep
@@ -158,6 +159,31 @@ def test_no_solver_works_while_a_camera_moves(session):
         assert overlap <= max(inside, 0) + 0.05
     time.sleep(0.5)
     assert session.status.samples > before
+
+
+def test_a_picture_at_rest_gives_way_to_a_camera_that_moves(session, monkeypatch):
+    """It is begun in bands, and left when the mouse moves again; in the end it is there."""
+    narrow = Bands()
+    monkeypatch.setattr(narrow, "_count", 64)
+    monkeypatch.setattr(narrow, "_learn", lambda *_: None)
+    monkeypatch.setattr(Samples, "bands", narrow)
+    traced: list[Camera] = []
+    screen, original = Screen(), Samples._trace
+    window = session.open(screen.show)
+    still = View(front(session), SIZE)
+
+    def trace(samples: Samples, band: range, total: int) -> list:
+        if len(band) == 64 and samples.camera == still.camera:
+            traced.append(samples.camera)
+            session.look(window, View(turned(front(session), len(traced)), SIZE))
+        return original(samples, band, total)
+
+    monkeypatch.setattr(Samples, "_trace", trace)
+    session.look(window, still)
+    last = screen.wait(lambda p: not p.moving)
+    assert 1 <= len(traced) < SIZE[0] * SIZE[1] // 64
+    assert last.view.camera == turned(front(session), len(traced))
+    assert any(p.moving for p in screen.pictures)
 
 
 def test_moving_pictures_are_smaller_where_time_is_short(session, monkeypatch):
