@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
@@ -18,7 +19,7 @@ from mitsuba_irrcache.images import read_image
 from mitsuba_irrcache.volumes.transfer import load_preset
 
 pytest.importorskip("playwright")
-from experiments.viewer.browser import Browser, chromium, viewer
+from experiments.viewer.browser import Browser, Window, chromium, viewer
 from experiments.viewer.usage import use
 from tests.system.test_viewer import SIZE, difference, screen, settled
 
@@ -85,17 +86,13 @@ def test_transfer_functions_and_archives_come_and_go(browser, tmp_path):
 
         other = tmp_path / "bone.json"
         other.write_text(load_preset("ct-bone").to_json())
-        count = len(window.shown())
-        load(other)
-        window.wait_for_picture(count)
-        assert difference(settled(window), first) > 3
+        assert difference(after(window, lambda: load(other)), first) > 3
         broken = tmp_path / "<b>broken.json"
         broken.write_text('{"opacity": 3}')
         load(broken)
         page.get_by_text("Refused:").first.wait_for()
-        load(saved)
+        back = after(window, lambda: load(saved))
         page.get_by_text("Refused:").first.wait_for(state="hidden")
-        back = settled(window)
         assert difference(back, first) < 1.5
 
         page.get_by_text("Keep", exact=True).click()
@@ -130,15 +127,11 @@ def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
         window.enter("target error %", 20)
         front = settled(window)
         assert front.std() > 10
-        window.choose("camera", "inside")
-        inside = settled(window)
+        inside = after(window, lambda: window.choose("camera", "inside"))
         assert difference(inside, front) > 3
-        window.choose("camera", "front")
-        assert difference(settled(window), front) < 2
-        count = len(window.shown())
-        window.enter("rotation", 120)
-        window.wait_for_picture(count)
-        turned = settled(window)
+        back = after(window, lambda: window.choose("camera", "front"))
+        assert difference(back, front) < 2
+        turned = after(window, lambda: window.enter("rotation", 120))
         assert difference(turned, front) > 3
         window.tick("compare with volpath")
         window.wait_for(r"volpath, \d+ samples per pixel; RMSE", 60)
@@ -148,6 +141,14 @@ def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
         assert window.errors == []
     log = (tmp_path / "log.txt").read_text()
     assert "Traceback" not in log, log
+
+
+def after(window: Window, act: Callable[[], None]) -> np.ndarray:
+    """What is on the screen in the end, once ``act`` has changed it."""
+    count = len(window.shown())
+    act()
+    window.wait_for_picture(count)
+    return settled(window)
 
 
 @pytest.mark.slow
