@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from time import perf_counter
 
 #: Seconds that a band should take: a mouse that begins to move waits for so long.
@@ -17,16 +18,16 @@ class Bands:
     def __init__(self) -> None:
         self._count = FIRST
 
-    def over(self, pixels: int, first: int = 0) -> Iterator[range]:
-        """Ranges that make up ``pixels`` from ``first`` on. What is done with one must be finished
-        when the next one is asked for.
-        """
-        while first < pixels:
-            band = range(first, min(first + self._count, pixels))
-            started = perf_counter()
-            yield band
-            self._learn(len(band), perf_counter() - started)
-            first = band.stop
+    def at(self, first: int, pixels: int) -> range:
+        """The band that begins at ``first``, of so many ``pixels``."""
+        return range(first, min(first + self._count, pixels))
+
+    @contextmanager
+    def timed(self, band: range) -> Iterator[None]:
+        """Learns from a block that computes ``band``, and has done so when it ends."""
+        started = perf_counter()
+        yield
+        self._learn(len(band), perf_counter() - started)
 
     def _learn(self, count: int, seconds: float) -> None:
         """Makes the next band as large as time wants it, but no more than twice as large."""

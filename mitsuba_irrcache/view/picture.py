@@ -66,15 +66,16 @@ class Samples:
         """One sample more for each pixel, where there are to be ``total``. It is traced in bands
         with a ``pause`` between them, which may raise something: then there is no more sample.
         """
-        pixels = self.size[0] * self.size[1]
-        bands = [range(pixels)] if pause is None else self.bands.over(pixels)
-        found = []
-        for band in bands:
-            found.append(self._trace(band, total))
-            dr.eval(found[-1])
-            if pause is not None:
+        pixels, first, found = self.size[0] * self.size[1], 0, []
+        while pause is not None and first < pixels:
+            band = self.bands.at(first, pixels)
+            with self.bands.timed(band):
+                found.append(self._trace(band, total))
+                dr.eval(found[-1])
                 dr.sync_thread()
-                pause()
+            pause()
+            first = band.stop
+        found = found or [self._trace(range(pixels), total)]
         values = [dr.concat(parts) for parts in zip(*found, strict=True)]
         if self.count:
             values = [a + b for a, b in zip(self._sums, values, strict=True)]

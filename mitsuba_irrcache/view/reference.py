@@ -41,7 +41,8 @@ class Reference:
         self._inside = _medium_at(light.scene, camera)
         self._sums = np.zeros((2, self._pixels, 3))
         self._counts = np.zeros((2, self._pixels), dtype=np.int64)
-        self._bands, self._rest = Bands(), iter(())
+        self._bands = Bands()
+        self._first = 0  # pixel that is next
         self._passes = 0
 
     @property
@@ -55,14 +56,13 @@ class Reference:
 
     def refine(self) -> bool:
         """A sample more for each pixel of a band; whether all pixels have as many now."""
-        band = next(self._rest, None)
-        if band is None:
-            self._rest = self._bands.over(self._pixels)
-            band = next(self._rest)
+        band = self._bands.at(self._first, self._pixels)
         half, place = self._passes % 2, slice(band.start, band.stop)
-        self._sums[half, place] += self._trace(band)
+        with self._bands.timed(band):
+            self._sums[half, place] += self._trace(band)
         self._counts[half, place] += 1
         complete = band.stop == self._pixels
+        self._first = 0 if complete else band.stop
         self._passes += complete
         return complete
 
