@@ -258,8 +258,8 @@ class Session:
         return light.samples < 1 or not light.error <= self.target_error
 
     def _improve(self) -> bool:
-        """A pass of the solver, if it is wanted."""
-        if not self._wants_light:
+        """A pass of the solver, if it is wanted; light that is new is shown, be it dark."""
+        if self._light in (None, self._shown) and not self._wants_light:
             return False
         with self._noted("solver"):
             self._light.refine()
