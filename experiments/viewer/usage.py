@@ -139,10 +139,10 @@ class User:
         window.page.close()
 
 
-def use(view: list[str], seconds: float, seed: int, log: Path) -> Usage:
+def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path) -> Usage:
     """Uses ``irrcache view`` with these arguments for so long; what it prints goes to ``log``."""
     rng = np.random.default_rng(seed)
-    with viewer(view, log) as address, Browser() as browser:
+    with viewer(view, log) as address:
         user = User(browser, address, rng)
         usage, began = user.usage, time.monotonic()
         while (passed := time.monotonic() - began) < seconds:
@@ -164,7 +164,9 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("output/viewer"))
     args, view = parser.parse_known_args()
     args.output.mkdir(parents=True, exist_ok=True)
-    usage = use(view, args.seconds, args.seed, args.output / f"usage{args.seed}.log")
+    log = args.output / f"usage{args.seed}.log"
+    with Browser() as browser:
+        usage = use(browser, view, args.seconds, args.seed, log)
     sizes = [size for _, size in usage.memory]
     print(", ".join(f"{count} x {name}" for name, count in sorted(usage.done.items())))
     print(f"{usage.pictures} pictures were shown in {usage.memory[-1][0]:.0f} s")

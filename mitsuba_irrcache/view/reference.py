@@ -116,7 +116,7 @@ class Reference:
 
 def _medium_at(scene: mi.Scene, camera: Camera) -> mi.Medium | None:
     """The medium in which the camera is, as `Seen.medium_at` finds it."""
-    return probe(scene, mi.Point3f(camera.position), mi.Vector3f(0.48, 0.64, 0.6))[0]
+    return probe(scene, mi.Point3f(np.array(camera.position)), mi.Vector3f(0.48, 0.64, 0.6))[0]
 
 
 def _seed(number: int, first: int) -> int:

@@ -51,7 +51,7 @@ def settled(window: Window) -> np.ndarray:
     """
     count = -1
     while count != len(window.shown()):
-        window.wait_for("^final")
+        window.wait_for("^final", 90)
         count = len(window.shown())
         time.sleep(0.5)
     return screen(window)

@@ -152,9 +152,9 @@ def after(window: Window, act: Callable[[], None]) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_half_a_minute_of_everything(tmp_path):
+def test_half_a_minute_of_everything(browser, tmp_path):
     """At random: nothing goes wrong, and every kind of picture was shown."""
-    usage = use([*CHEST, "--port", "8730"], 30, 5, tmp_path / "log.txt")
+    usage = use(browser, [*CHEST, "--port", "8730"], 30, 5, tmp_path / "log.txt")
     assert usage.errors == []
     assert sum(usage.done.values()) >= 10 and usage.pictures > 50
     assert re.search("http://", (tmp_path / "log.txt").read_text())
