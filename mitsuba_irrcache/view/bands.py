@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from time import perf_counter
 
 #: Seconds that a band should take: a mouse that begins to move waits for so long.
-SECONDS = 0.06
-#: Pixels of the first band, and of the smallest one.
-FIRST, SMALLEST = 1 << 14, 1 << 11
+SECONDS = 0.1
+#: Pixels of the first band, and of the smallest one: each costs some 10 ms, however small.
+FIRST, SMALLEST = 1 << 15, 1 << 14
 
 
 class Bands:
