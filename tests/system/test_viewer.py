@@ -50,7 +50,7 @@ def settled(window: Window) -> np.ndarray:
     what the panel may cover.
     """
     count = -1
-    while count != len(window.shown()):
+    while count != len(window.shown()) or not window.note().startswith("final"):
         window.wait_for("^final", 90)
         count = len(window.shown())
         time.sleep(0.5)

@@ -147,7 +147,7 @@ def after(window: Window, act: Callable[[], None]) -> np.ndarray:
     """What is on the screen in the end, once ``act`` has changed it."""
     count = len(window.shown())
     act()
-    window.wait_for_picture(count)
+    window.wait_for_picture(count, SIZE[0])
     return settled(window)
 
 
