@@ -12,7 +12,6 @@ import numpy as np
 from mitsuba_irrcache.filtering import filter_illumination
 from mitsuba_irrcache.layers import AOVS, Layers, luminance
 from mitsuba_irrcache.rendering import PixelPositions, pixel_of
-from mitsuba_irrcache.view.bands import Bands
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seen
 
@@ -26,6 +25,8 @@ TONES: dict[str, Callable] = {
     "Reinhard": lambda c: c / (1 + dr.maximum(c, 0)),
     "filmic": lambda c: _filmic(dr.maximum(c, 0)),
 }
+#: Pixels that are traced at once. All of their random numbers depend on it: it is the same for all.
+BAND = 1 << 15
 #: Luminance is enough of one random number per sample: streams of passes are this far apart.
 STREAM = 0x9E3779B9
 
@@ -54,9 +55,6 @@ class Look:
 class Samples:
     """Camera samples of one view of one light, added up: ``size`` is (width, height)."""
 
-    #: learns how quick this machine is
-    bands = Bands()
-
     def __init__(self, seen: Seen, camera: Camera, size: tuple[int, int], seed: int = 0) -> None:
         self.seen, self.camera, self.size, self.seed = seen, camera, size, seed
         self.count = 0
@@ -67,15 +65,14 @@ class Samples:
         with a ``pause`` between them, which may raise something: then there is no more sample.
         """
         pixels, first, found = self.size[0] * self.size[1], 0, []
-        while pause is not None and first < pixels:
-            band = self.bands.at(first, pixels)
-            with self.bands.timed(band):
-                found.append(self._trace(band, total))
+        while first < pixels:
+            band = range(first, min(first + BAND, pixels))
+            found.append(self._trace(band, total))
+            if pause is not None:
                 dr.eval(found[-1])
                 dr.sync_thread()
-            pause()
+                pause()
             first = band.stop
-        found = found or [self._trace(range(pixels), total)]
         values = [dr.concat(parts) for parts in zip(*found, strict=True)]
         if self.count:
             values = [a + b for a, b in zip(self._sums, values, strict=True)]

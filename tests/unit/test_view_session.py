@@ -15,8 +15,8 @@ import pytest
 from mitsuba_irrcache.cli import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.images import read_image
+from mitsuba_irrcache.view import picture
 from mitsuba_irrcache.view import window as module
-from mitsuba_irrcache.view.bands import Bands
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.keep import keep
@@ -163,10 +163,7 @@ def test_no_solver_works_while_a_camera_moves(session):
 
 def test_a_picture_at_rest_gives_way_to_a_camera_that_moves(session, monkeypatch):
     """It is begun in bands, and left when the mouse moves again; in the end it is there."""
-    narrow = Bands()
-    monkeypatch.setattr(narrow, "_count", 64)
-    monkeypatch.setattr(narrow, "_learn", lambda *_: None)
-    monkeypatch.setattr(Samples, "bands", narrow)
+    monkeypatch.setattr(picture, "BAND", 64)
     traced: list[Camera] = []
     screen, original = Screen(), Samples._trace
     window = session.open(screen.show)
