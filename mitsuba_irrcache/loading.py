@@ -57,9 +57,10 @@ def scene_text(
     return ElementTree.tostring(scene_element(state), encoding="unicode")
 
 
-def filled(text: str, integrator: str) -> str:
+def filled(text: str, integrator: str, parameters: dict[str, str] | None = None) -> str:
     """An XML text as `scene_text` makes it of a file."""
-    state = mi.parser.parse_string(mi.parser.ParserConfig(mi.variant()), text)
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_string(config, text, **(parameters or {}))
     _replace_integrator(state, integrator, Path("scene.xml"))
     return ElementTree.tostring(scene_element(state), encoding="unicode")
 

@@ -100,6 +100,14 @@ class Window:
         pattern = re.compile(note)
         self.page.get_by_text(pattern).first.wait_for(state="attached", timeout=1000 * seconds)
 
+    def wait_for_picture(self, after: int, width: int = 0, seconds: float = 60.0) -> None:
+        """Until a picture was shown beyond the first ``after``; of this width, if one is given."""
+        self.page.wait_for_function(
+            "([n, w]) => __shown.slice(n).some(e => e.at > 0 && (w == 0 || e.width == w))",
+            arg=[after, width],
+            timeout=1000 * seconds,
+        )
+
     def field(self, label: str) -> Locator:
         """The input of the control with this label."""
         row = "ancestor::div[contains(@class, 'mantine-Flex-root')][1]"
@@ -118,6 +126,12 @@ class Window:
         self.field(label).click()
         pattern = re.compile(rf"^{re.escape(option)}")
         self.page.get_by_role("option", name=pattern).filter(visible=True).first.click()
+
+    def tick(self, label: str) -> None:
+        """Sets or clears a check box."""
+        self.page.get_by_text(label, exact=True).locator(
+            "xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]//input"
+        ).first.click()
 
     def orbit(self, steps: int, pixels: float, pause: float, first: float = 60.0) -> None:
         """Drags the mouse from ``first`` on, in ``steps`` of so many pixels."""

@@ -14,6 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from experiments.viewer.browser import Browser, Window, viewer
+from experiments.viewer.load import processor_seconds
+
+#: Error of the light, percent, at which nothing goes on while an edit is waited for.
+ENOUGH = 50
 
 
 def main() -> None:
@@ -46,21 +50,27 @@ def main() -> None:
 
 def orbiting(window: Window, repeats: int) -> dict[str, float]:
     """Pictures per second while the mouse is dragged as fast as the page takes it."""
-    rates, sizes = [], []
+    rates, sizes, loads = [], [], []
     for _ in range(repeats):
-        before = len(window.shown())
+        before, load = len(window.shown()), processor_seconds()
         began = time.time()
-        window.orbit(60, 3, 0.005)
+        window.orbit(120, 3, 0.005)
         ended = time.time()
+        now = processor_seconds()
+        loads.append({name: (now[name] - load.get(name, 0)) / (ended - began) for name in now})
         seen = [s for s in window.shown()[before:] if began + 0.2 <= s["at"] <= ended]
         rates.append((len(seen) - 1) / (seen[-1]["at"] - seen[0]["at"]))
         sizes += [s["width"] for s in seen]
         time.sleep(1)
+    users = {
+        f"  processors busy with: {name}": float(np.median([load.get(name, 0) for load in loads]))
+        for name in loads[-1]
+    }
     return {
-        "orbiting: pictures per second": float(np.mean(rates)),
+        "orbiting: pictures per second, median": float(np.median(rates)),
         "  slowest drag": float(np.min(rates)),
         "  width of pictures, median": float(np.median(sizes)),
-    }
+    } | {name: value for name, value in users.items() if value >= 0.005}
 
 
 def latency(window: Window, repeats: int) -> dict[str, float]:
@@ -81,10 +91,10 @@ def stopping(window: Window, repeats: int) -> dict[str, float]:
     """From the last mouse event of a drag to a picture of full resolution."""
     found, size = [], window.page.viewport_size["width"]
     for _ in range(repeats):
-        shown = len(window.shown())
+        window.wait_for("at rest|final", 60)
         window.orbit(20, 4, 0.03)
-        last = window.moves()[-1]
-        time.sleep(3)
+        last, shown = window.moves()[-1], len(window.shown())
+        window.wait_for_picture(shown, size)
         full = [s["at"] for s in window.shown()[shown:] if s["width"] == size and s["at"] > last]
         found.append(min(full) - last)
     return {
@@ -101,13 +111,13 @@ def editing(window: Window, repeats: int) -> dict[str, float]:
     label = "opacity" if window.field("opacity").count() else "density"
     if label == "opacity":
         window.choose("point", "4")
+    window.enter("target error %", ENOUGH)
     for number in range(repeats):
-        window.wait_for("at rest|final")
-        time.sleep(1)
+        window.wait_for("^final", 60)  # nothing else is shown from now on
         shown = len(window.shown())
         began = time.time()
         window.enter(label, round(0.2 + 0.05 * number, 2))
-        time.sleep(4)
+        window.wait_for_picture(shown)
         after = [s["at"] for s in window.shown()[shown:] if s["at"] > began]
         found.append(min(after) - began)
     return {

@@ -45,11 +45,19 @@ class Appearance:
             raise IrrcacheError("all of the volume would be transparent; raise an opacity.")
         return {SIGMA_T_FILE: sigma_t, ALBEDO_FILE: np.ascontiguousarray(albedo)}
 
-    def document(self, settings: SceneSettings) -> Document:
-        """The scene around the medium, as ``irrcache import`` makes it."""
+    def document(
+        self,
+        settings: SceneSettings,
+        parameters: dict[str, str] | None = None,
+        integrator: str | None = None,
+    ) -> Document:
+        """The scene around the medium, as ``irrcache import`` makes it, with its ``parameters``,
+        and an ``integrator`` such as ``irrcache{step=0.5}``.
+        """
         grids = self.grids(self.mapping)
         view = camera(self.volume, grids[SIGMA_T_FILE], settings.up)
-        return Document.of_text(scene_xml(self.volume.to_world, view, settings), grids)
+        text = scene_xml(self.volume.to_world, view, settings)
+        return Document.of_text(text, grids, parameters, integrator or "irrcache")
 
 
 def with_opacity(

@@ -109,6 +109,14 @@ class Placement:
     centre: np.ndarray
     radius: float
 
+    @classmethod
+    def around(cls, frame: np.ndarray) -> Placement:
+        """Of the unit cube that ``frame`` (4, 4) places."""
+        corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
+        world = frame[:3, :3] @ corners + frame[:3, 3:]
+        centre = world.mean(axis=1)
+        return cls(centre, float(np.linalg.norm(world - centre[:, None], axis=0).max()))
+
     def to_browser(self, point: np.ndarray) -> np.ndarray:
         """Of a point in scene units."""
         return (np.asarray(point) - self.centre) / self.radius
@@ -116,6 +124,18 @@ class Placement:
     def to_scene(self, point: np.ndarray) -> np.ndarray:
         """The inverse of `to_browser`."""
         return np.asarray(point, dtype=np.float64) * self.radius + self.centre
+
+
+def cameras_of(scene: mi.Scene, placement: Placement) -> dict[str, Camera]:
+    """The cameras at the places of the scene's sensors, by name; one in front where there are
+    none.
+    """
+    centre = placement.centre
+    found = {name: camera_of(sensor, centre) for name, sensor in sensors_of(scene).items()}
+    if found:
+        return found
+    away = centre + placement.radius * np.array([0.0, -4.0, 1.0])
+    return {"front": Camera(tuple(away), tuple(centre), (0.0, 0.0, 1.0), 30.0)}
 
 
 def _upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:

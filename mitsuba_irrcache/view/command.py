@@ -85,11 +85,10 @@ def _document(args: argparse.Namespace) -> tuple:
     from mitsuba_irrcache.view.appearance import Appearance
     from mitsuba_irrcache.view.document import Document
 
-    path = Path(args.input[0])
+    path, parameters = Path(args.input[0]), parse_parameters(args.define)
     if path.suffix.lower() == ".xml":
         if importer.has_appearance(args):
             raise IrrcacheError("a scene has its medium: --preset and the like are for volumes.")
-        parameters = parse_parameters(args.define)
         integrator = args.integrator
         if integrator is None and integrator_of(path, parameters) in REPLACED:
             integrator = "irrcache"
@@ -99,7 +98,7 @@ def _document(args: argparse.Namespace) -> tuple:
     settings = SceneSettings(
         integrator="irrcache", max_depth=args.max_depth, up=importer.up_axis(args)
     )
-    return appearance.document(settings), appearance
+    return appearance.document(settings, parameters, args.integrator), appearance
 
 
 def _wait() -> None:

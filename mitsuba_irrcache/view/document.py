@@ -60,7 +60,7 @@ class Document:
         if self._integrator is None or self._integrator.get("type") != "irrcache":
             raise IrrcacheError("view: the scene's integrator is not irrcache.")
         self._original = ElementTree.fromstring(text)
-        self.lighting = self._lighting()
+        self.orient((0.0, 0.0, 1.0))
 
     @classmethod
     def load(
@@ -70,9 +70,15 @@ class Document:
         return cls(scene_text(path, parameters, integrator), path.parent)
 
     @classmethod
-    def of_text(cls, text: str, volumes: dict[str, np.ndarray]) -> Document:
+    def of_text(
+        cls,
+        text: str,
+        volumes: dict[str, np.ndarray],
+        parameters: dict[str, str] | None = None,
+        integrator: str = "irrcache",
+    ) -> Document:
         """Of the XML of a scene with $parameters, whose only files are ``volumes``."""
-        return cls(filled(text, "irrcache"), ".", volumes)
+        return cls(filled(text, integrator, parameters), ".", volumes)
 
     # ------------------------------------------------------------------ what it says
 
@@ -141,12 +147,17 @@ class Document:
         for number, medium in enumerate(self._scaled()):
             _set(medium, "float", "scale", repr(self._original_scale(number) * factor))
 
-    def set_lighting(self, lighting: Lighting, up: Sequence[float]) -> None:
-        """Changes environment and sun; ``up`` is the upward axis."""
+    def orient(self, up: Sequence[float]) -> None:
+        """Tells the upward axis, which angles of the light are about; undoes its changes."""
+        self.up = _unit(up)
+        self.lighting = self._lighting()
+
+    def set_lighting(self, lighting: Lighting) -> None:
+        """Changes environment and sun."""
         if not lighting.environment >= 0 or not lighting.sun >= 0:
             raise IrrcacheError("light cannot be negative; give 0 for none.")
-        self._set_environment(lighting, up)
-        self._set_sun(lighting, up)
+        self._set_environment(lighting)
+        self._set_sun(lighting)
         self.lighting = lighting
 
     # ------------------------------------------------------------------ saving
@@ -240,17 +251,21 @@ class Document:
         return Lighting(sun=float(np.mean(colour)), **self._sun_angles(sun))
 
     def _sun_angles(self, sun: ElementTree.Element) -> dict[str, float]:
-        vector = sun.find("vector[@name='direction']")
-        if vector is None:
-            return {}
-        towards = -np.array([float(vector.get(axis)) for axis in "xyz"])
-        towards /= np.linalg.norm(towards)
+        vector, matrix = sun.find("vector[@name='direction']"), sun.find("transform/matrix")
+        if vector is not None:
+            direction = [float(vector.get(axis)) for axis in "xyz"]
+        elif matrix is not None:
+            direction = np.reshape(_numbers(matrix, ()), (4, 4))[:3, 2]
+        else:
+            direction = (0.0, 0.0, 1.0)  # Mitsuba's own
+        towards = -_unit(direction)
+        x, y = (np.dot(towards, axis) for axis in _horizon(self.up))
         return {
-            "azimuth": float(np.degrees(np.arctan2(towards[1], towards[0]))),
-            "elevation": float(np.degrees(np.arcsin(np.clip(towards[2], -1, 1)))),
+            "azimuth": float(np.degrees(np.arctan2(y, x))),
+            "elevation": float(np.degrees(np.arcsin(np.clip(np.dot(towards, self.up), -1, 1)))),
         }
 
-    def _set_environment(self, lighting: Lighting, up: Sequence[float]) -> None:
+    def _set_environment(self, lighting: Lighting) -> None:
         node, original = self._environment(self._root), self._environment(self._original)
         if node is None:
             return
@@ -265,10 +280,10 @@ class Document:
         given = original.find("transform")
         turned = ElementTree.SubElement(node, "transform", name="to_world")
         turned.extend([] if given is None else list(given))
-        x, y, z = (repr(float(c)) for c in up)
+        x, y, z = (repr(float(c)) for c in self.up)
         ElementTree.SubElement(turned, "rotate", x=x, y=y, z=z, angle=repr(lighting.rotation))
 
-    def _set_sun(self, lighting: Lighting, up: Sequence[float]) -> None:
+    def _set_sun(self, lighting: Lighting) -> None:
         node, original = self._sun(self._root), self._sun(self._original)
         if node is not None and lighting.sun == 0:
             self._root.remove(node)
@@ -280,7 +295,7 @@ class Document:
         for child in list(node):
             if child.tag == "transform" or child.get("name") in ("direction", "to_world"):
                 node.remove(child)
-        direction = -_towards(lighting.azimuth, lighting.elevation, up)
+        direction = -_towards(lighting.azimuth, lighting.elevation, self.up)
         vector = dict(zip("xyz", (repr(float(c)) for c in direction), strict=True))
         ElementTree.SubElement(node, "vector", name="direction", **vector)
         factor, mean = lighting.sun, 1.0
@@ -314,15 +329,22 @@ def _scale_colour(
     _set(node, "rgb", name, " ".join(repr(c * factor) for c in colour))
 
 
-def _towards(azimuth: float, elevation: float, up: Sequence[float]) -> np.ndarray:
-    """The direction in which a sun stands; azimuth 0 is along x, or along y where x is up."""
-    axis = np.array(up, dtype=np.float64) / np.linalg.norm(up)
-    start = np.eye(3)[0] if abs(axis[0]) < 0.9 else np.eye(3)[1]
-    first = start - np.dot(start, axis) * axis
-    first /= np.linalg.norm(first)
+def _horizon(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions at azimuth 0 and 90 degrees; 0 is along x, or along y where x is up."""
+    start = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
+    first = _unit(start - np.dot(start, up) * up)
+    return first, np.cross(up, first)
+
+
+def _towards(azimuth: float, elevation: float, up: np.ndarray) -> np.ndarray:
+    """The direction in which a sun stands."""
     a, e = np.radians((azimuth, elevation))
-    horizontal = np.cos(a) * first + np.sin(a) * np.cross(axis, first)
-    return np.cos(e) * horizontal + np.sin(e) * axis
+    first, second = _horizon(up)
+    return np.cos(e) * (np.cos(a) * first + np.sin(a) * second) + np.sin(e) * up
+
+
+def _unit(vector: Sequence[float]) -> np.ndarray:
+    return np.asarray(vector, dtype=np.float64) / np.linalg.norm(vector)
 
 
 def _sensor(camera: Camera, size: tuple[int, int]) -> ElementTree.Element:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import logging
+import re
 import threading
 from collections.abc import Callable
 
@@ -11,6 +13,13 @@ from viser import GuiEvent, GuiInputHandle
 from mitsuba_irrcache.errors import IrrcacheError
 
 LOG = logging.getLogger(__name__)
+
+
+def plain(text: str) -> str:
+    """Markdown that shows ``text`` as it is: part of it may come from any window, and browsers run
+    what is HTML.
+    """
+    return re.sub(r"([\\`*_{}\[\]()#+\-!|~.:])", r"\\\1", html.escape(text))
 
 
 class Editing:

@@ -9,7 +9,8 @@ from mitsuba_irrcache import __version__
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.images import write_image, write_pixels
 from mitsuba_irrcache.view.picture import Samples
-from mitsuba_irrcache.view.session import SAMPLES, Session, View
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import SAMPLES, View
 
 #: Layers in the EXR beside the image.
 LAYERS = ("colour", "illumination", "background", "transmittance", "depth", "noise", "bias")
@@ -38,8 +39,9 @@ def keep(
     path = Path(folder) / checked_name(name)
     if not path.parent.is_dir():
         raise IrrcacheError(f'cannot write to "{folder}": there is no such folder.')
-    samples = _samples(session, view, layered=True)
-    plain = _samples(session, view, layered=False) if not view.look.layered else samples
+    with session.reserved():
+        samples = _samples(session, view, layered=True)
+        plain = _samples(session, view, layered=False) if not view.look.layered else samples
     exr, png, xml = (path.with_name(f"{name}.{kind}") for kind in ("exr", "png", "xml"))
 
     def write() -> list[Path]:
@@ -60,13 +62,16 @@ def keep(
 
 
 def _samples(session: Session, view: View, layered: bool) -> Samples:
-    """As many samples as a picture at rest has, one by one: others may be shown in between."""
+    """As many samples as a picture at rest has, those that are shown if they will do; else one by
+    one: others may be shown in between.
+    """
 
     def begin() -> Samples:
-        return Samples(session.light.seen(layered, layered), view.camera, view.size)
+        seen = session.light.seen(layered, layered)
+        return session.complete(seen, view) or Samples(seen, view.camera, view.size)
 
     samples = session.call(begin)
-    for _ in range(SAMPLES):
+    while samples.count < SAMPLES:
         session.call(lambda: samples.add(SAMPLES))
     return samples
 

@@ -175,3 +175,23 @@ class Light:
                 Seen(self.scene, parts, sight, layered),
             )
         return known[1]
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a light is."""
+
+    samples: int = 0
+    error: float = float("nan")
+    seconds: float = 0.0
+    solver: str = ""
+    improving: bool = True
+    message: str = ""
+
+    @classmethod
+    def of(cls, light: Light | None, improving: bool, message: str) -> Status:
+        """Of ``light``, if there is one."""
+        if light is None:
+            return cls(improving=improving, message=message)
+        error = light.error if light.samples else float("nan")
+        return cls(light.samples, error, light.seconds, light.solver, improving, message)

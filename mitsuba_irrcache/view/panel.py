@@ -9,15 +9,16 @@ import viser
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.document import Document, Lighting
-from mitsuba_irrcache.view.editing import Editing
-from mitsuba_irrcache.view.session import Session, Status
+from mitsuba_irrcache.view.editing import Editing, plain
+from mitsuba_irrcache.view.light import Status
+from mitsuba_irrcache.view.session import Session
 
 
 class LightPanel:
     """Shows how far the light of ``session`` is, and changes it."""
 
-    def __init__(self, server: viser.ViserServer, session: Session, up: tuple) -> None:
-        self._session, self._up = session, up
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
         gui, document = server.gui, session.document
         lighting = document.lighting
         with gui.add_folder("Light", order=2):
@@ -60,7 +61,7 @@ class LightPanel:
 
     def refuse(self, reason: str) -> None:
         """Says why a change was not made."""
-        self._refusal.content = f"**Refused:** {reason}" if reason else ""
+        self._refusal.content = f"**Refused:** {plain(reason)}" if reason else ""
         self._refusal.visible = bool(reason)
 
     def _light(
@@ -83,7 +84,7 @@ class LightPanel:
     def _edit_light(self, name: str, value: float) -> None:
         def change(document: Document) -> None:
             lighting: Lighting = replace(document.lighting, **{name: value})
-            document.set_lighting(lighting, self._up)
+            document.set_lighting(lighting)
 
         self._session.edit(change)
 

@@ -25,6 +25,8 @@ TONES: dict[str, Callable] = {
     "Reinhard": lambda c: c / (1 + dr.maximum(c, 0)),
     "filmic": lambda c: _filmic(dr.maximum(c, 0)),
 }
+#: Pixels that are traced at once. All of their random numbers depend on it: it is the same for all.
+BAND = 1 << 15
 #: Luminance is enough of one random number per sample: streams of passes are this far apart.
 STREAM = 0x9E3779B9
 
@@ -58,9 +60,20 @@ class Samples:
         self.count = 0
         self._sums: list[mi.Float] = []
 
-    def add(self, total: int) -> None:
-        """One sample more for each pixel, where there are to be ``total``."""
-        values = _trace(self.seen, self.camera, self.size, self.seed, self.count, total)
+    def add(self, total: int, pause: Callable[[], None] | None = None) -> None:
+        """One sample more for each pixel, where there are to be ``total``. It is traced in bands
+        with a ``pause`` between them, which may raise something: then there is no more sample.
+        """
+        pixels, first, found = self.size[0] * self.size[1], 0, []
+        while first < pixels:
+            band = range(first, min(first + BAND, pixels))
+            found.append(self._trace(band, total))
+            if pause is not None:
+                dr.eval(found[-1])
+                dr.sync_thread()
+                pause()
+            first = band.stop
+        values = [dr.concat(parts) for parts in zip(*found, strict=True)]
         if self.count:
             values = [a + b for a, b in zip(self._sums, values, strict=True)]
         self._sums = values
@@ -83,6 +96,12 @@ class Samples:
         kind = "bilateral" if filtered and self.seen.layered else "none"
         return layers.radiance(filter_illumination(kind, layers, self.size))
 
+    def image(self, filtered: bool = False) -> np.ndarray:
+        """`radiance` as float32 (height, width, 3)."""
+        radiance = self.radiance(filtered)
+        rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
+        return self._array(list(rgb))
+
     def picture(self, look: Look, extent: tuple[float, float]) -> np.ndarray:
         """What a display shows, uint8 (height, width, 3). ``extent`` are the distances at which a
         depth image is black and white.
@@ -91,16 +110,39 @@ class Samples:
 
     def channels(self, aovs: tuple[str, ...], filtered: bool = False) -> tuple[np.ndarray, list]:
         """The image with further layers, float32 (height, width, channel), and their names."""
-        layers, radiance = self.layers, self.radiance(filtered)
-        rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
-        planes, names = list(rgb), []
+        image, layers = self.image(filtered), self.layers
+        planes, names = [], []
         for kind in aovs:
             planes += layers.aov(kind)
             names += [f"{kind}.{channel}" for channel in AOVS[kind]]
+        return np.concatenate([image, self._array(planes)], axis=-1), names
+
+    def _trace(self, band: range, total: int) -> list[mi.Float]:
+        """The next sample of some pixels: radiance, or all of its layers."""
+        seen, (width, height) = self.seen, self.size
+        sampler = mi.load_dict({"type": "independent"})
+        # Lanes of all bands and passes have streams of their own.
+        sampler.seed((self.seed + self.count * STREAM + band.start) & 0xFFFFFFFF, len(band))
+        spread = PixelPositions(sampler, self.seed, total)
+        spread.first = dr.opaque(mi.UInt32, self.count)
+        index = dr.arange(mi.UInt32, len(band)) + dr.opaque(mi.UInt32, band.start)
+        at = mi.Point2f(pixel_of(index, width)) + spread.next(index, mi.UInt32(0))
+        scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in self.size))
+        ray = self.camera.rays(at * scale, width / height)
+        medium = seen.medium_at(np.array(self.camera.position))
+        view = seen.sight.look(seen.scene, sampler, ray, medium, mi.Bool(True))
+        if seen.layered:
+            parts = view.scattered, view.transmittance, view.gathered, view.background
+            values = seen.sight.projection.layers(*parts, mi.Spectrum(1)).channels()
+        else:
+            values = list(view.scattered + view.background)
+        return [value + dr.zeros(mi.Float, len(band)) for value in values]
+
+    def _array(self, planes: list[mi.Float]) -> np.ndarray:
+        """Float32 (height, width, plane)."""
         width, height = self.size
-        arrays = [np.array(p) for p in planes]
-        flat = [np.broadcast_to(a, width * height) for a in arrays]
-        return np.stack(flat, axis=-1).reshape(height, width, len(flat)), names
+        flat = [np.broadcast_to(np.array(p), width * height) for p in planes]
+        return np.stack(flat, axis=-1).reshape(height, width, len(flat))
 
     def _shown(self, look: Look, extent: tuple[float, float]) -> mi.Color3f:
         if look.kind == "image":
@@ -121,25 +163,10 @@ class Samples:
         return mi.Color3f(*layers.aov(look.kind))
 
 
-def _trace(
-    seen: Seen, camera: Camera, size: tuple[int, int], seed: int, number: int, total: int
-) -> list[mi.Float]:
-    """Sample ``number`` of each pixel: radiance, or all of its layers."""
-    width, height = size
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed((seed + number * STREAM) & 0xFFFFFFFF, width * height)
-    spread = PixelPositions(sampler, seed, total)
-    spread.first = dr.opaque(mi.UInt32, number)
-    index = dr.arange(mi.UInt32, width * height)
-    at = mi.Point2f(pixel_of(index, width)) + spread.next(index, mi.UInt32(0))
-    scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in size))
-    ray = camera.rays(at * scale, width / height)
-    medium = seen.medium_at(np.array(camera.position))
-    view = seen.sight.look(seen.scene, sampler, ray, medium, mi.Bool(True))
-    if not seen.layered:
-        return list(view.scattered + view.background)
-    parts = view.scattered, view.transmittance, view.gathered, view.background
-    return seen.sight.projection.layers(*parts, mi.Spectrum(1)).channels()
+def displayed(image: np.ndarray, look: Look) -> np.ndarray:
+    """What a display shows, uint8 (height, width, 3), of radiance of this shape."""
+    planes = (mi.Float(p) for p in image.reshape(-1, 3).T.astype(np.float32))
+    return _display(mi.Color3f(*planes), look, image.shape[1::-1])
 
 
 def _display(colour: mi.Color3f, look: Look, size: tuple[int, int]) -> np.ndarray:

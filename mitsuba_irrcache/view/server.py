@@ -52,8 +52,7 @@ class Server:
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
         self._set_first_camera()
-        camera = next(iter(session.cameras.values()))
-        self.panel = LightPanel(server, session, camera.up)
+        self.panel = LightPanel(server, session)
         if appearance is not None and appearance.is_editable:
             TransferPanel(server, session, appearance, self.panel.editing)
         session.on_status = self.panel.show

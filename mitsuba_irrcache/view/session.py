@@ -11,9 +11,8 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from time import monotonic, perf_counter
 
 import drjit as dr
@@ -21,26 +20,16 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError, essence
-from mitsuba_irrcache.view.camera import Camera, Placement, camera_of, sensors_of
+from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
-from mitsuba_irrcache.view.light import Light
-from mitsuba_irrcache.view.picture import Look, Samples
+from mitsuba_irrcache.view.light import Light, Seen, Status
+from mitsuba_irrcache.view.picture import Samples
+from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 
 LOG = logging.getLogger(__name__)
 
-#: A camera rests when it has not moved for so long.
-REST_SECONDS = 0.12
-#: A picture of a moving camera should take so long.
-MOVING_SECONDS = 0.05
-#: Side of the pictures of moving cameras, as a part of the window's, and length of their steps: the
-#: one that is quick enough is taken.
-LEVELS = ((1.0, 1.0), (0.71, 1.0), (0.5, 1.0), (0.5, 2.0), (0.35, 2.0), (0.25, 2.0), (0.18, 3.0))
-#: Samples per pixel of a picture at rest.
-SAMPLES = 16
 #: Samples per voxel that make new pictures worth while, over those that are shown.
 GROWTH = 1.25
-#: Windows are not rendered larger than this.
-MOST_PIXELS = 1 << 22
 #: Relative standard error of the light at which it is good enough, unless told otherwise.
 TARGET_ERROR = 0.005
 #: Seconds between two checks for cameras that have moved, while a solver is at work.
@@ -48,60 +37,7 @@ CHECK_SECONDS = 0.02
 
 
 class Superseded(Exception):  # noqa: N818 (no error: the user wants it)
-    """Ends a pass of the solver whose light nobody will see."""
-
-
-@dataclass(frozen=True)
-class View:
-    """What a window wants to see: a camera and the window's (width, height) in pixels."""
-
-    camera: Camera
-    size: tuple[int, int]
-    look: Look = field(default_factory=Look)
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """What a window gets: ``pixels`` uint8 (height, width, 3), of which ``view``, with how many
-    samples per pixel; whether the camera is ``moving``, and whether nothing better will follow.
-    """
-
-    pixels: np.ndarray
-    view: View
-    samples: int
-    moving: bool
-    final: bool
-
-
-@dataclass(frozen=True)
-class Status:
-    """How far the light is."""
-
-    samples: int = 0
-    error: float = float("nan")
-    seconds: float = 0.0
-    solver: str = ""
-    improving: bool = True
-    message: str = ""
-
-
-class Window:
-    """One who looks. ``show`` is called with every `Picture`, in the session's thread."""
-
-    def __init__(self, show: Callable[[Picture], None]) -> None:
-        self.show = show
-        self.view: View | None = None
-        self.moved = -np.inf  # when the camera moved last
-        self.fresh = False  # whether the view has not been shown at all
-        self.level = len(LEVELS) // 2
-        self.revision = -1  # of the light in `samples`
-        self.light: Light | None = None  # that light
-        self.samples: Samples | None = None
-        self.resting: View | None = None  # what `samples` are of
-
-    @property
-    def is_moving(self) -> bool:
-        return monotonic() - self.moved < REST_SECONDS
+    """Ends a pass of the solver, or a picture, that nobody will see."""
 
 
 class Session:
@@ -128,7 +64,10 @@ class Session:
         self._shown_samples = 0
         self._revision = 0  # of all that is shown, across lights
         self._checked = 0.0
-        self._resting_turn = False
+        # what there is to do while no camera moves, in turn
+        self._chores = deque((self._refine_picture, self._improve, self._compare))
+        self._comparisons = self._reserved = 0
+        self._pass_seconds = 0.0
         self._ready = threading.Event()
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="irrcache view", daemon=True)
@@ -164,17 +103,9 @@ class Session:
 
     def look(self, window: Window, view: View) -> None:
         """What ``window`` wants to see from now on. Another camera or size moves it."""
-        width, height = (max(int(n), 1) for n in view.size)
-        shrunk = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5)
-        view = View(view.camera, (int(width * shrunk) or 1, int(height * shrunk) or 1), view.look)
         with self._news:
-            old = window.view
-            if view == old:
-                return
-            if old is not None and (view.camera, view.size) != (old.camera, old.size):
-                window.moved = monotonic()
-            window.view, window.fresh = view, True
-            self._news.notify_all()
+            if window.want(view):
+                self._news.notify_all()
 
     def edit(self, change: Callable[[Document], None]) -> None:
         """Changes the document, and with it the light; raises IrrcacheError if it cannot be."""
@@ -204,10 +135,23 @@ class Session:
             raise result["error"]
         return result.get("value")
 
+    @contextmanager
+    def reserved(self) -> Iterator[None]:
+        """Within, the thread does what it is called for, and shows new views, but nothing else."""
+        self.call(lambda: self._reserve(1))
+        try:
+            yield
+        finally:
+            self.call(lambda: self._reserve(-1))
+
     @property
     def light(self) -> Light:
         """The light that is seen; in the session's thread only."""
         return self._shown
+
+    def complete(self, seen: Seen, view: View) -> Samples | None:
+        """All samples of ``view`` that a window has of ``seen``; in the session's thread only."""
+        return next((w.samples for w in self._windows if w.is_complete(seen, view)), None)
 
     # ------------------------------------------------------------------ the thread
 
@@ -240,7 +184,7 @@ class Session:
         if self._light is not None and self._light.failed:
             self._light = None
         for window in self._windows:
-            window.view, window.fresh, window.resting = None, False, None
+            window.forget()
         self._say(message=essence(error))
 
     def _begin(self) -> None:
@@ -250,17 +194,9 @@ class Session:
         with self._noted("solver"):
             self._light.refine()
         self._adopt()
-        frame = self._shown.parts[0].medium.frame
-        corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
-        world = frame[:3, :3] @ corners + frame[:3, 3:]
-        centre = world.mean(axis=1)
-        radius = float(np.linalg.norm(world - centre[:, None], axis=0).max())
-        self.placement = Placement(centre, radius)
-        sensors = sensors_of(scene)
-        self.cameras = {name: camera_of(sensor, centre) for name, sensor in sensors.items()}
-        if not self.cameras:
-            away = centre + radius * np.array([0.0, -4.0, 1.0])
-            self.cameras = {"front": Camera(tuple(away), tuple(centre), (0.0, 0.0, 1.0), 30.0)}
+        self.placement = Placement.around(self._shown.parts[0].medium.frame)
+        self.cameras = cameras_of(scene, self.placement)
+        self.document.orient(next(iter(self.cameras.values())).up)
 
     def _light_of(self, scene: mi.Scene) -> Light:
         document = self.document
@@ -287,6 +223,9 @@ class Session:
         waits = [w.moved + REST_SECONDS - monotonic() for w in self._windows if w.is_moving]
         return max(min(waits), 1e-3) if waits else None
 
+    def _reserve(self, change: int) -> None:
+        self._reserved += change
+
     def _step(self) -> bool:
         """Does what is most urgent; whether there was anything to do."""
         while self._tasks:
@@ -297,14 +236,15 @@ class Session:
             return False
         if self._show_resting(first=True):
             return True
-        improving = self._wants_light
-        awaited = self._light is not None and self._light is not self._shown
-        self._resting_turn = not self._resting_turn and not awaited
-        if (self._resting_turn or not improving) and self._show_resting(first=False):
-            return True
-        if improving:
-            self._improve()
-        return improving
+        if self._reserved:
+            return False
+        if self._light is not None and self._light is not self._shown:
+            return self._improve()  # somebody waits for it
+        for _ in range(len(self._chores)):
+            self._chores.rotate()
+            if self._chores[0]():
+                return True
+        return False
 
     @property
     def _wants_light(self) -> bool:
@@ -317,11 +257,16 @@ class Session:
             return False
         return light.samples < 1 or not light.error <= self.target_error
 
-    def _improve(self) -> None:
+    def _improve(self) -> bool:
+        """A pass of the solver, if it is wanted; light that is new is shown, be it dark."""
+        if self._light in (None, self._shown) and not self._wants_light:
+            return False
         with self._noted("solver"):
             self._light.refine()
             dr.sync_thread()
+        self._pass_seconds = self.history[-1][2] - self.history[-1][1]
         self._adopt()
+        return True
 
     def _adopt(self) -> None:
         """Shows the light that has improved, if that is worth new pictures."""
@@ -335,15 +280,7 @@ class Session:
         self._say()
 
     def _say(self, message: str = "") -> None:
-        light = self._light or self._shown
-        self.status = Status(
-            light.samples if light else 0,
-            light.error if light and light.samples else float("nan"),
-            light.seconds if light else 0.0,
-            light.solver if light else "",
-            self._wants_light,
-            message,
-        )
+        self.status = Status.of(self._light or self._shown, self._wants_light, message)
         self.on_status(self.status)
 
     def _pause(self) -> None:
@@ -376,81 +313,63 @@ class Session:
         if not waiting or self._shown is None:
             return False
         window = min(waiting, key=lambda w: w.moved)
-        with self._news:
-            view, window.fresh = window.view, False
-        share, stride = LEVELS[window.level]
-        size = tuple(max(round(n * share), 1) for n in view.size)
+        view = self._taken(window)
         with self._noted("moving"):
-            started = perf_counter()
-            # Errors are not projected, nor is anything filtered, while there is no time for it.
-            seen = self._shown.seen(view.look.kind != "image", view.look.kind == "error bar")
-            seen.stride(stride)
-            try:
-                samples = Samples(seen, view.camera, size)
-                samples.add(1)
-                pixels = samples.picture(self._unfiltered(view.look), self.extent(view.camera))
-            finally:
-                seen.stride(1.0)
-            window.level = _adapted(window.level, perf_counter() - started)
-        window.show(Picture(pixels, view, 1, True, False))
+            picture = window.quick(self._shown, view, self.extent(view.camera))
+        window.show(picture)
         return True
 
     def _show_resting(self, first: bool) -> bool:
         """A sample more for the picture of a window at rest that lacks most; only pictures that
         are not there at all where ``first``.
         """
-        lacking = [w for w in self._windows if w.view is not None and self._lacks(w, first)]
-        if not lacking or self._shown is None:
+        light, revision = self._shown, self._revision
+        lacking = [w for w in self._windows if w.lacks(light, revision, first)]
+        if not lacking or light is None:
             return False
         window = min(lacking, key=lambda w: w.samples.count if w.samples else 0)
-        with self._news:
-            view, window.fresh = window.view, False
+        view = self._taken(window)
         with self._noted("resting"):
-            look = view.look
-            seen = self._shown.seen(look.layered, look.with_error)
-            same = self._is_same(window, view)
-            alone = not same or window.samples.seen is not seen
-            if alone:
-                window.samples = Samples(seen, view.camera, view.size)
-                window.resting, window.revision = view, self._revision
-                window.light = self._shown
-                window.samples.add(1)
-            elif window.resting != view:
-                window.resting = view  # another look at the same samples
-            else:
-                if window.samples.count == 1:  # the one in the pixel's centre is not one of many
-                    window.samples = Samples(seen, view.camera, view.size)
-                    window.samples.add(SAMPLES)
-                window.samples.add(SAMPLES)
-            pixels = window.samples.picture(look, self.extent(view.camera))
-        count = window.samples.count
-        final = count >= SAMPLES and not self._wants_light
-        window.show(Picture(pixels, view, count, False, final))
+            extent = self.extent(view.camera)
+            wanted, pause = self._wants_light, self._give_way
+            try:
+                picture = window.refined(light, revision, view, extent, wanted, pause)
+            except Superseded:  # the picture is, not the solver's pass that it may interrupt
+                return True
+        window.show(picture)
         return True
 
-    def _is_same(self, window: Window, view: View) -> bool:
-        """Whether the samples that a window has can show ``view``."""
-        old = window.resting
-        return (
-            old is not None
-            and window.samples is not None
-            and window.revision == self._revision
-            and (old.camera, old.size) == (view.camera, view.size)
-        )
+    def _give_way(self) -> None:
+        """Between bands of a picture at rest: cameras that move come first."""
+        if self._stopped or any(w.fresh and w.is_moving for w in self._windows):
+            raise Superseded
 
-    def _lacks(self, window: Window, first: bool) -> bool:
-        old, view = window.resting, window.view
-        if window.fresh or old is None or (old.camera, old.size) != (view.camera, view.size):
-            return True
-        if window.light is not self._shown:
-            return True
-        if first:
+    def _refine_picture(self) -> bool:
+        return self._show_resting(first=False)
+
+    def _compare(self) -> bool:
+        """Some more of the reference of one window, in turn."""
+        light, revision = self._shown, self._revision
+        comparing = [w for w in self._windows if w.is_comparing(light, revision)]
+        if not comparing:
             return False
-        return window.revision != self._revision or window.samples.count < SAMPLES
+        self._comparisons += 1
+        window = comparing[self._comparisons % len(comparing)]
+        view, until = window.view, monotonic() + self._pass_seconds  # as long as the solver
+        with self._noted("reference"):
+            extent = self.extent(view.camera)
+            while True:
+                picture = window.compared(light, view, extent, self._wants_light)
+                if picture is not None:
+                    window.show(picture)
+                if monotonic() > until or self._tasks or self._stopped or self._is_work_waiting:
+                    return True
 
-    @staticmethod
-    def _unfiltered(look: Look) -> Look:
-        return Look(look.kind, look.exposure, look.tone)
+    def _taken(self, window: Window) -> View:
+        """What a window wants to see, which is not new any more."""
+        with self._news:
+            window.fresh = False
+            return window.view
 
     def extent(self, camera: Camera) -> tuple[float, float]:
         """Distances between which a camera may see the medium."""
@@ -458,30 +377,11 @@ class Session:
         radius = self.placement.radius
         return max(distance - radius, 0.0), distance + radius
 
-    def _noted(self, what: str) -> _Noted:
-        return _Noted(self.history, what)
-
-
-class _Noted:
-    """Notes when a block began and ended."""
-
-    def __init__(self, history: deque, what: str) -> None:
-        self.history, self.what = history, what
-
-    def __enter__(self) -> None:
-        self.started = monotonic()
-
-    def __exit__(self, *_: object) -> None:
-        self.history.append((self.what, self.started, monotonic()))
-
-
-def _adapted(level: int, seconds: float) -> int:
-    """The level for the next picture, where this one took so long."""
-    if seconds > MOVING_SECONDS:
-        return min(level + 1, len(LEVELS) - 1)
-    if level == 0:
-        return 0
-    share, stride = LEVELS[level]
-    better, shorter = LEVELS[level - 1]
-    growth = (better / share) ** 2 * stride / shorter
-    return level - 1 if seconds * growth < 0.8 * MOVING_SECONDS else level
+    @contextmanager
+    def _noted(self, what: str) -> Iterator[None]:
+        """Notes when a block began and ended."""
+        started = monotonic()
+        try:
+            yield
+        finally:
+            self.history.append((what, started, monotonic()))

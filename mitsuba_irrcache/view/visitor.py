@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import math
 import tempfile
+import threading
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
@@ -16,10 +18,11 @@ import viser
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
-from mitsuba_irrcache.view.editing import Editing
+from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.keep import checked_name, keep
 from mitsuba_irrcache.view.picture import KINDS, TONES, Look
-from mitsuba_irrcache.view.session import Picture, Session, View
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import Picture, View
 
 #: Quality of JPEGs of moving cameras, and of pictures that better ones will follow.
 MOVING_QUALITY, RESTING_QUALITY = 80, 95
@@ -35,6 +38,8 @@ class Visitor:
     def __init__(self, client: viser.ClientHandle, session: Session, folder: Path | None) -> None:
         self.client, self.session, self.folder = client, session, folder
         self._encoder = ThreadPoolExecutor(1)
+        self._lock = threading.Lock()
+        self._waiting: Picture | None = None
         self._noted = 0.0
         self._view: View | None = None
         self._look = Look()
@@ -68,6 +73,9 @@ class Visitor:
             self._filter = gui.add_checkbox(
                 "filter", False, hint="of the illumination; fades as the light improves"
             )
+            self._compare = gui.add_checkbox(
+                "compare with volpath", False, hint="beside it, slowly, while nothing moves"
+            )
         with gui.add_folder("Keep", order=5, expand_by_default=False):
             self._name = gui.add_text("name", "view")
             self._cache = gui.add_checkbox("with the cache", False)
@@ -76,7 +84,7 @@ class Visitor:
                 hint="PNG, EXR with layers, and a scene for irrcache render",
             )
             self._saved = gui.add_markdown("")
-        for handle in (self._kind, self._exposure, self._tone, self._filter):
+        for handle in (self._kind, self._exposure, self._tone, self._filter, self._compare):
             self.editing.bind(handle, lambda _: self._set_look())
         self.editing.bind(self._sensor, lambda name: self._go_to(name))
         self.editing.bind(self._fov, self._set_fov)
@@ -111,7 +119,7 @@ class Visitor:
         self._look_again()
 
     def _refuse(self, reason: str) -> None:
-        self._refusal.content = f"**Refused:** {reason}" if reason else ""
+        self._refusal.content = f"**Refused:** {plain(reason)}" if reason else ""
         self._refusal.visible = bool(reason)
 
     # ------------------------------------------------------------------ to the session and back
@@ -133,17 +141,22 @@ class Visitor:
         numbers = (*seen.position, *seen.target, *seen.up)
         if not np.isfinite(numbers).all() or seen.distance == 0 or not any(seen.up):
             return  # nothing that a camera could be
-        self._view = View(seen, (camera.image_width, camera.image_height), self._look)
+        size = camera.image_width, camera.image_height
+        self._view = View(seen, size, self._look, bool(self._compare.value))
         self.session.look(self.window, self._view)
 
     def _show(self, picture: Picture) -> None:
         """In the session's thread: hands on, so that it can go on rendering."""
-        try:
-            self._encoder.submit(self._send, picture)
-        except RuntimeError:  # the browser has just gone
-            return
+        with self._lock:
+            busy, self._waiting = self._waiting is not None, picture
+        if not busy:
+            with suppress(RuntimeError):  # the browser has just gone
+                self._encoder.submit(self._send)
 
-    def _send(self, picture: Picture) -> None:
+    def _send(self) -> None:
+        """Sends the newest picture; older ones that were not sent yet never are."""
+        with self._lock:
+            picture, self._waiting = self._waiting, None
         quality = MOVING_QUALITY if picture.moving else RESTING_QUALITY
         kind = "png" if picture.final else "jpeg"
         self.client.scene.set_background_image(picture.pixels, kind, jpeg_quality=quality)
@@ -153,6 +166,8 @@ class Visitor:
             state = "moving" if picture.moving else "final" if picture.final else "at rest"
             samples = "1 sample" if picture.samples == 1 else f"{picture.samples} samples"
             self._note.content = f"{state}: {width} x {height}, {samples} per pixel"
+            if picture.comparison:
+                self._note.content += f"; on the right {picture.comparison}"
         self.client.flush()
 
     # ------------------------------------------------------------------ keeping
@@ -161,7 +176,7 @@ class Visitor:
         name = checked_name(self._name.value)
         if self._view is None:
             return
-        view = replace(self._view, look=self._look)
+        view = replace(self._view, look=self._look, compared=False)
         self._saved.content = "saving ..."
         try:
             if self.folder is not None:

@@ -50,16 +50,17 @@ def settled(window: Window) -> np.ndarray:
     what the panel may cover.
     """
     count = -1
-    while count != len(window.shown()):
-        window.wait_for("^final")
+    while count != len(window.shown()) or not window.note().startswith("final"):
+        window.wait_for("^final", 90)
         count = len(window.shown())
         time.sleep(0.5)
     return screen(window)
 
 
-def screen(window: Window) -> np.ndarray:
+def screen(window: Window, width: int = CLEAR) -> np.ndarray:
+    """So many columns of what is on the screen."""
     shot = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
-    return np.asarray(shot, dtype=float)[:, :CLEAR]
+    return np.asarray(shot, dtype=float)[:, :width]
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -75,7 +76,7 @@ def test_edits(path):
     before = document.state()
     document.set_density(2)
     document.set_max_depth(-1)
-    document.set_lighting(Lighting(environment=3, sun=4, azimuth=90, elevation=0), (0, 0, 1))
+    document.set_lighting(Lighting(environment=3, sun=4, azimuth=90, elevation=0))
     params = mi.traverse(document.scene())
     numbers = {k: params[k] for k in params.keys()}
     sun = next(e for e in document.scene().emitters() if "Directional" in e.class_name())
@@ -95,10 +96,38 @@ def test_edits(path):
 def test_a_sun_comes_and_goes(path):
     document = Document.load(path, {}, "irrcache")
     count = len(document.scene().emitters())
-    document.set_lighting(Lighting(sun=0), (0, 0, 1))
+    document.set_lighting(Lighting(sun=0))
     assert len(document.scene().emitters()) == count - 1
-    document.set_lighting(Lighting(sun=1), (0, 0, 1))
+    document.set_lighting(Lighting(sun=1))
     assert len(document.scene().emitters()) == count
+
+
+SUNS = {
+    "direction": '<vector name="direction" x="1" y="2" z="-3"/>',
+    "transform": '<transform name="to_world"> <lookat origin="0, 0, 0" target="1, 2, -3"'
+    ' up="0, 0, 1"/> </transform>',
+}
+
+
+@pytest.mark.parametrize("given", SUNS)
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, -1, 0), (0.3, 0.2, 1)])
+def test_the_sun_stays_where_it_is(path, given, up):
+    """Whatever axis is up, and however its direction is told, its angles are those it has; and it
+    rises towards the upward axis.
+    """
+    path.write_text(SCENE.replace(SUNS["direction"], SUNS[given]))
+    document = Document.load(path, {}, "irrcache")
+    document.orient(up)
+
+    def direction() -> np.ndarray:
+        sun = next(e for e in document.scene().emitters() if "Directional" in e.class_name())
+        return np.array(mi.traverse(sun)["to_world"].matrix).reshape(4, 4)[:3, 2]
+
+    before = direction()
+    document.set_lighting(replace(document.lighting, sun=5))
+    np.testing.assert_allclose(direction(), before, atol=1e-6)
+    document.set_lighting(replace(document.lighting, elevation=90))
+    np.testing.assert_allclose(direction(), -np.array(up) / np.linalg.norm(up), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -107,8 +136,8 @@ def test_a_sun_comes_and_goes(path):
         lambda d: d.set_density(0),
         lambda d: d.set_density(float("nan")),
         lambda d: d.set_max_depth(-2),
-        lambda d: d.set_lighting(Lighting(sun=-1), (0, 0, 1)),
-        lambda d: d.set_lighting(Lighting(environment=float("nan")), (0, 0, 1)),
+        lambda d: d.set_lighting(Lighting(sun=-1)),
+        lambda d: d.set_lighting(Lighting(environment=float("nan"))),
     ],
 )
 def test_impossible_values_are_refused(path, change):

@@ -15,12 +15,14 @@ import pytest
 from mitsuba_irrcache.cli import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.images import read_image
-from mitsuba_irrcache.view import session as module
+from mitsuba_irrcache.view import picture
+from mitsuba_irrcache.view import window as module
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.keep import keep
-from mitsuba_irrcache.view.picture import KINDS, Look
-from mitsuba_irrcache.view.session import Picture, Session, View
+from mitsuba_irrcache.view.picture import KINDS, Look, Samples
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import Picture, View
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -159,6 +161,28 @@ def test_no_solver_works_while_a_camera_moves(session):
     assert session.status.samples > before
 
 
+def test_a_picture_at_rest_gives_way_to_a_camera_that_moves(session, monkeypatch):
+    """It is begun in bands, and left when the mouse moves again; in the end it is there."""
+    monkeypatch.setattr(picture, "BAND", 64)
+    traced: list[Camera] = []
+    screen, original = Screen(), Samples._trace
+    window = session.open(screen.show)
+    still = View(front(session), SIZE)
+
+    def trace(samples: Samples, band: range, total: int) -> list:
+        if len(band) == 64 and samples.camera == still.camera:
+            traced.append(samples.camera)
+            session.look(window, View(turned(front(session), len(traced)), SIZE))
+        return original(samples, band, total)
+
+    monkeypatch.setattr(Samples, "_trace", trace)
+    session.look(window, still)
+    last = screen.wait(lambda p: not p.moving)
+    assert 1 <= len(traced) < SIZE[0] * SIZE[1] // 64
+    assert last.view.camera == turned(front(session), len(traced))
+    assert any(p.moving for p in screen.pictures)
+
+
 def test_moving_pictures_are_smaller_where_time_is_short(session, monkeypatch):
     monkeypatch.setattr(module, "MOVING_SECONDS", 1e-6)
     screen = Screen()
@@ -179,7 +203,7 @@ def test_no_kernel_is_compiled_for_another_camera_or_size(session, kernels):
 
     def pictures(size, degrees):
         seen = session.light.seen(False, False)
-        samples = module.Samples(seen, turned(front(session), degrees), size)
+        samples = Samples(seen, turned(front(session), degrees), size)
         samples.add(1)
         samples.picture(Look(exposure=degrees), (0, 1))
         dr.sync_thread()
@@ -204,6 +228,25 @@ def test_an_edit_shows_new_light_and_never_black(session):
     low, high = sorted((before, means[-1]))
     assert high - low > 2
     assert min(means) > low - 1 and max(means) < high + 1
+
+
+def test_light_that_is_put_out_is_out(path):
+    """There is nothing to improve then, but something to show."""
+    sky = '<emitter type="constant"> <rgb name="radiance" value="0.3, 0.4, 0.5"/> </emitter>'
+    assert sky in SCENE
+    path.write_text(SCENE.replace(sky, ""))
+    session = Session(Document.load(path))
+    session.target_error = 0.02
+    session.start()
+    try:
+        screen = Screen()
+        session.look(session.open(screen.show), View(front(session), SIZE))
+        assert screen.wait(final).pixels.mean() > 1
+        dark = replace(session.document.lighting, sun=0.0)
+        session.edit(lambda document: document.set_lighting(dark))
+        assert screen.wait(lambda p: p.final and not p.pixels.any()).pixels.max() == 0
+    finally:
+        session.stop()
 
 
 def test_a_refused_edit_changes_nothing(session):

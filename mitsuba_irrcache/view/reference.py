@@ -1,0 +1,124 @@
+"""What ``volpath`` makes of the view of a window, slowly, and how far ours is from it.
+
+The samples go to two halves in turn. With ``x`` our image and ``a``, ``b`` the means of the halves,
+whose noise is independent, the mean of ``(x - a) (x - b)`` is the mean squared error of ``x``
+without the reference's own noise.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.rendering import pixel_of
+from mitsuba_irrcache.surroundings import probe
+from mitsuba_irrcache.view.bands import Bands
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.light import Light
+
+#: Samples per pixel at which it is good enough.
+MOST_SAMPLES = 4096
+
+
+class Reference:
+    """Samples by ``volpath`` of the scene of a ``light``, with its depth and seen by ``camera``:
+    ``size`` is (width, height).
+    """
+
+    def __init__(self, light: Light, camera: Camera, size: tuple[int, int]) -> None:
+        self.light, self.camera, self.size = light, camera, size
+        self._pixels = size[0] * size[1]
+        settings = light.settings
+        self._integrator = mi.load_dict(
+            {
+                "type": "volpath",
+                "max_depth": settings.max_depth,
+                "rr_depth": settings.rr_depth,
+                "hide_emitters": light.seeing.hide_emitters,
+            }
+        )
+        self._inside = _medium_at(light.scene, camera)
+        self._sums = np.zeros((2, self._pixels, 3))
+        self._counts = np.zeros((2, self._pixels), dtype=np.int64)
+        self._bands = Bands()
+        self._first = 0  # pixel that is next
+        self._passes = 0
+
+    @property
+    def samples(self) -> int:
+        """Per pixel, all over the picture."""
+        return self._passes
+
+    @property
+    def is_done(self) -> bool:
+        return self._passes >= MOST_SAMPLES
+
+    def refine(self) -> bool:
+        """A sample more for each pixel of a band; whether all pixels have as many now."""
+        band = self._bands.at(self._first, self._pixels)
+        half, place = self._passes % 2, slice(band.start, band.stop)
+        with self._bands.timed(band):
+            self._sums[half, place] += self._trace(band)
+        self._counts[half, place] += 1
+        complete = band.stop == self._pixels
+        self._first = 0 if complete else band.stop
+        self._passes += complete
+        return complete
+
+    def radiance(self) -> np.ndarray:
+        """What is known (height, width, 3); black where nothing is."""
+        counts = np.maximum(self._counts.sum(axis=0), 1)
+        return (self._sums.sum(axis=0) / counts[:, None]).reshape(*self.size[::-1], 3)
+
+    def error_of(self, image: np.ndarray) -> tuple[float, float] | None:
+        """RMSE of ``image`` (height, width, 3) in units of the mean radiance, without the noise of
+        the reference, and the least of it that could be told from none yet; None before both halves
+        have samples all over, and where all is black.
+        """
+        if self._passes < 2:
+            return None
+        a, b = self._sums / self._counts[..., None]
+        mean = 0.5 * float((a + b).mean())
+        if not mean > 0:
+            return None
+        apart = image.reshape(-1, 3)
+        square = float(((apart - a) * (apart - b)).mean())
+        # The mean of products of independent noise is off by about its variance over root n.
+        noise = float(((a - b) ** 2).mean()) / 2
+        resolved = np.sqrt(noise * np.sqrt(2 / a.size))
+        return float(np.sqrt(max(square, 0.0))) / mean, float(resolved) / mean
+
+    def comparison(self, image: np.ndarray) -> str:
+        """How far ``image`` (height, width, 3) is from it, in words."""
+        found = self.error_of(image)
+        told = f"volpath, {self.samples} samples per pixel"
+        if found is None:
+            return told
+        error, resolved = found
+        amount = f"{error:.2%}" if error > resolved else f"below {resolved:.2%}"
+        return f"{told}; RMSE {amount} of the mean, its noise taken out"
+
+    def _trace(self, band: range) -> np.ndarray:
+        """Colours (pixels of the band, 3)."""
+        count = len(band)
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(_seed(self._passes, band.start), count)
+        width, height = self.size
+        index = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, band.start)
+        scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in self.size))
+        at = mi.Point2f(pixel_of(index, width)) + sampler.next_2d()
+        ray = mi.RayDifferential3f(self.camera.rays(at * scale, width / height))
+        colour, _, _ = self._integrator.sample(self.light.scene, sampler, ray, self._inside)
+        planes = mi.Color3f(colour.x) if mi.is_monochromatic else mi.Color3f(colour)
+        return np.stack([np.broadcast_to(np.array(p), count) for p in planes], axis=-1)
+
+
+def _medium_at(scene: mi.Scene, camera: Camera) -> mi.Medium | None:
+    """The medium in which the camera is, as `Seen.medium_at` finds it."""
+    return probe(scene, mi.Point3f(np.array(camera.position)), mi.Vector3f(0.48, 0.64, 0.6))[0]
+
+
+def _seed(number: int, first: int) -> int:
+    """Of a band's random numbers: hashed, since neighbouring seeds are correlated."""
+    return mi.sample_tea_32(mi.UInt32(number), mi.UInt32(first))[0][0]
