@@ -275,6 +275,8 @@ class Session:
         if other or not light.samples or light.samples >= GROWTH * self._shown_samples:
             self._revision += 1
             self._shown, self._shown_samples = light, light.samples
+            if other:
+                dr.flush_malloc_cache()  # of arrays as large as those of the light before
         elif not self._wants_light:
             self._revision += 1
         self._say()
