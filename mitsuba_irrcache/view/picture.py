@@ -26,7 +26,7 @@ TONES: dict[str, Callable] = {
     "filmic": lambda c: _filmic(dr.maximum(c, 0)),
 }
 #: Pixels that are traced at once. All of their random numbers depend on it: it is the same for all.
-BAND = 1 << 15
+BAND = 1 << 16
 #: Luminance is enough of one random number per sample: streams of passes are this far apart.
 STREAM = 0x9E3779B9
 
