@@ -214,4 +214,18 @@ MUTANTS = (
         "(n * more / (n + more + 1))",
         (CACHE,),
     ),
+    Mutant(
+        "the ends of a segment exchanged (falloff of lamps)",
+        "lamps.py",
+        "angle = dr.atan2(q * length, dr.fma(x, y, q * q)) / q",
+        "x, y = -y, -x; angle = dr.atan2(q * length, dr.fma(x, y, q * q)) / q",
+        ("tests/unit/test_lamps.py",),
+    ),
+    Mutant(
+        "light in the voxel of a lamp as in its middle (sweep)",
+        "solvers/sweep.py",
+        "light[channel] * self._spread for light",
+        "light[channel] for light",
+        ("tests/system/test_lamps.py",),
+    ),
 )
