@@ -18,8 +18,8 @@ demo: setup ## render a chest with irrcache and compare it with volpath
 paper: setup ## compute the paper's figures and tables, 20 minutes; FULL=1: the paper's sizes
 	$(BIN)/python -m experiments.paper.run $(if $(FULL),--full)
 
-test: setup ## run the tests
-	$(BIN)/python -m pytest
+test: setup ## run the tests, two at a time: much of each is Python's
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 stress: setup ## try every hazard and fault, 15 minutes; ends with tables of what held
 	$(BIN)/python -m experiments.stability.run
