@@ -68,7 +68,7 @@ def reconstructed(
     dr.eval(sums)
     if per_pixel > 1:
         sums = [dr.block_sum(value, per_pixel) for value in sums]
-    return [*sums, dr.full(mi.Float, per_pixel, pixels)]
+    return [*sums, dr.opaque(mi.Float, per_pixel, pixels)]
 
 
 def _gathered(samples: Samples) -> list[mi.Float]:

@@ -103,7 +103,7 @@ def test_finished_measurements_are_kept(report):
         assert all(measurement[start] for start in ("cold", "warm", "again", "memory"))
     assert "SIGKILL" in killed["error"]
     assert [s["budget"] for s in killed["snapshots"]] == [0.1]
-    assert "mortal{lives=20} did not finish" in (report / "report.html").read_text()
+    assert "mortal{lives=20} did not finish" in (report / "report.html").read_text(encoding="utf-8")
 
 
 def test_stages(report):
@@ -168,7 +168,7 @@ def test_the_report_is_self_contained(report):
         def handle_endtag(self, tag):
             assert self.open.pop() == tag
 
-    text = (report / "report.html").read_text()
+    text = (report / "report.html").read_text(encoding="utf-8")
     page = Page()
     page.feed(text)
     assert not page.open
@@ -240,7 +240,7 @@ def test_integrators_are_known_by_name_only():
     shared = {"cli", "doctor", "errors", "files", "filtering", "images", "loading", "runtime"}
     shared |= {"versions"}
     for file in Path(mitsuba_irrcache.compare.__file__).parent.glob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and not node.level:
                 package, _, rest = node.module.partition(".")
                 names = {rest.split(".")[0]} if rest else {alias.name for alias in node.names}

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -57,6 +58,14 @@ def settled(window: Window) -> np.ndarray:
     return screen(window)
 
 
+def after(window: Window, act: Callable[[], None]) -> np.ndarray:
+    """What is on the screen in the end, once ``act`` has changed it."""
+    count = len(window.shown())
+    act()
+    window.wait_for_picture(count, SIZE[0])
+    return settled(window)
+
+
 def screen(window: Window, width: int = CLEAR) -> np.ndarray:
     """So many columns of what is on the screen."""
     shot = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
@@ -80,14 +89,12 @@ def test_looking_around(browser, started):
 
     # A drag turns the camera, the wheel brings it closer; both show smaller pictures meanwhile.
     count = len(window.shown())
-    window.orbit(12, 8, 0.02)
-    turned = settled(window)
+    turned = after(window, lambda: window.orbit(12, 8, 0.02))
     assert difference(turned, first) > 3
     sizes = [s["width"] for s in window.shown()[count:]]
     assert min(sizes) < SIZE[0] and sizes[-1] == SIZE[0]
     window.page.mouse.move(200, 200)
-    window.zoom(-3)
-    closer = settled(window)
+    closer = after(window, lambda: window.zoom(-3))
     assert difference(closer, turned) > 3
 
     # What is kept renders to what is on the screen.
@@ -104,8 +111,7 @@ def test_looking_around(browser, started):
 
     # An edit of the transfer function: other matter, and it is saved as such.
     window.choose("point", "4")
-    window.enter("opacity", 0.6)
-    denser = settled(window)
+    denser = after(window, lambda: window.enter("opacity", 0.6))
     assert difference(denser, closer) > 2
 
     # A second window has its own camera, the first one's stays; bad input is refused in place.
