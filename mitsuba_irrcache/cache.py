@@ -85,6 +85,11 @@ class IrradianceCache:
         # Sums of batch means for each moment and channel, in float32.
         self._moments: list = [None] * (moments * channels)
 
+    def lie_like(self, other: IrradianceCache) -> None:
+        """Takes over what is known of the place of ``other``, another cache of the same medium."""
+        self.directional, self.survey = other.directional, other.survey
+        self.falloff = other.falloff
+
     # ------------------------------------------------------------------ statistics
 
     @property

@@ -181,7 +181,7 @@ def _of_point(emitter: mi.Emitter, grid: Grid) -> list[tuple[np.ndarray, float, 
     if _edges_away(position[:, None], grid) > REACH:
         return []
     rng = np.random.default_rng(1)
-    p = grid.world.point(mi.Point3f((rng.random((3, POSITIONS)).T * grid.resolution).T))
+    p = grid.world.point(mi.Point3f(rng.random((3, POSITIONS)) * grid.resolution[:, None]))
     at = dr.zeros(mi.Interaction3f, POSITIONS)
     at.p = p
     record, light = emitter.sample_direction(at, mi.Point2f(0.5))

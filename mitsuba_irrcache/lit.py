@@ -191,8 +191,7 @@ class LitMedium:
             _check_like(cache, stored, file)
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
-            stored.survey, stored.directional = cache.survey, cache.directional
-            stored.falloff = cache.falloff
+            stored.lie_like(cache)
             return stored
         if edited:
             mi.Log(
@@ -237,8 +236,7 @@ class LitMedium:
                 batch=size,
                 moments=cache.moments,
             )
-            self._preview.survey, self._preview.directional = cache.survey, cache.directional
-            self._preview.falloff = cache.falloff
+            self._preview.lie_like(cache)
             self._opening.fill(self._preview)
         return True
 

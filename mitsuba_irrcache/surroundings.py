@@ -77,6 +77,11 @@ def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
     return [*votes, within, backs]
 
 
+def medium_at(scene: mi.Scene, position: np.ndarray) -> mi.MediumPtr:
+    """The medium that a world position (3) is in, found along a direction of no axis."""
+    return probe(scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
+
+
 @dr.syntax
 def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
     """The medium at ``p``, as the first shape along ``direction`` tells that has a medium; none

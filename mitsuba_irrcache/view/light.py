@@ -15,7 +15,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.lit import LitMedium
 from mitsuba_irrcache.progressive import FIRST, OPENING
 from mitsuba_irrcache.sight import Sight, SimpleSight, sight_of
-from mitsuba_irrcache.surroundings import probe
+from mitsuba_irrcache.surroundings import medium_at
 
 #: Caches with more voxels than this are preceded by one of `COARSE` voxels along its longest side,
 #: so that new light is there at once.
@@ -58,7 +58,7 @@ class Seen:
         medium = self._parts[0].medium
         if medium.surroundings is None:
             return medium if medium.boundary.contains(position) else None
-        pointer = probe(self.scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
+        pointer = medium_at(self.scene, position)
         return None if (pointer == None)[0] else pointer  # noqa: E711
 
 

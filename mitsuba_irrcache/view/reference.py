@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.rendering import pixel_of
-from mitsuba_irrcache.surroundings import probe
+from mitsuba_irrcache.surroundings import medium_at
 from mitsuba_irrcache.view.bands import Bands
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Light
@@ -38,7 +38,7 @@ class Reference:
                 "hide_emitters": light.seeing.hide_emitters,
             }
         )
-        self._inside = _medium_at(light.scene, camera)
+        self._inside = medium_at(light.scene, np.array(camera.position))[0]
         self._sums = np.zeros((2, self._pixels, 3))
         self._counts = np.zeros((2, self._pixels), dtype=np.int64)
         self._bands = Bands()
@@ -112,11 +112,6 @@ class Reference:
         colour, _, _ = self._integrator.sample(self.light.scene, sampler, ray, self._inside)
         planes = mi.Color3f(colour.x) if mi.is_monochromatic else mi.Color3f(colour)
         return np.stack([np.broadcast_to(np.array(p), count) for p in planes], axis=-1)
-
-
-def _medium_at(scene: mi.Scene, camera: Camera) -> mi.Medium | None:
-    """The medium in which the camera is, as `Seen.medium_at` finds it."""
-    return probe(scene, mi.Point3f(np.array(camera.position)), mi.Vector3f(0.48, 0.64, 0.6))[0]
 
 
 def _seed(number: int, first: int) -> int:
