@@ -52,7 +52,7 @@ def choose_solver(
         return "path", reason
     if solver == "sweep":
         return solver, "as told"
-    if medium.surroundings is None:
+    if medium.alone:
         return "sweep", "all light comes from far away or from points"
     return "sweep", "no surface and no other medium is among the voxels"
 
@@ -66,10 +66,12 @@ def _why_not_sweep(
         if not sweep.takes(emitter):
             kind = f'"{emitter.id()}" ({emitter.class_name()})'
             return f"emitter {kind} is neither far away nor a point nor an even area"
-    if medium.surroundings is None:
+    if medium.phase is not None and medium.emission is not None:
+        return f"{name} shines, and does not scatter alike to all sides"
+    if medium.alone:
         return None
     if not medium.surroundings.media.isotropic:
-        return "a phase function is not isotropic"
+        return "a phase function is not isotropic, and there is more than its medium"
     for shining in medium.surroundings.media.grids:
         if shining.emission is not None:
             return f'medium "{shining.name}" shines among surfaces'
@@ -114,7 +116,7 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
         sides, reason = _finer(medium.sigma_t), "of the medium"
         if (sides > data.resolution).any():
             reason = "finer than those of the medium, which is dense"
-        if medium.surroundings is not None and sides.max() < AMONG_SURFACES[0]:
+        if not medium.alone and sides.max() < AMONG_SURFACES[0]:
             sides = np.ceil(sides * (AMONG_SURFACES[0] / sides.max())).astype(int)
             reason = f"finer than those of the medium, {AMONG_SURFACES[0]} among surfaces"
         grid = Grid(tuple(int(n) for n in sides[::-1]), frame)

@@ -45,6 +45,7 @@ class Source:
 
     def __init__(self, place: np.ndarray, size: float, far: bool) -> None:
         self.far = far
+        self._direction, self._cosine = np.array(place), np.cos(size)
         #: whether it is so narrow that nothing of its light has to be in the moments
         self.sharp = far or not size
         self.place = mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in place))
@@ -61,6 +62,10 @@ class Source:
         sine = dr.maximum(self._size / distance, NARROWEST)
         cosine = dr.select(sine < float(np.sin(WIDEST)), dr.sqrt(1 - dr.square(sine)), 2)
         return way / distance, cosine
+
+    def covers(self, directions: np.ndarray) -> np.ndarray:
+        """Whether light from each of ``directions`` (..., 3) is its own; it is ``far``."""
+        return directions @ self._direction >= self._cosine
 
 
 class Directional:

@@ -20,7 +20,10 @@ from .grid import Grid
 from .lamps import Falloff
 from .medium import MediumGrid
 from .memory import require_memory
-from .solvers import path, sweep
+from .solvers import path
+from .solvers.directional_sweep import BATCH as DIRECTIONAL_BATCH
+from .solvers.directional_sweep import DirectionalSweep
+from .solvers.sweep import Sweep, batch_of
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class LitMedium:
         self.solver, self._reason = solver
         self._opening: path.Opening | None = None
         self._preview: IrradianceCache | None = None
-        self._sweep: sweep.Sweep | None = None
+        self._sweep: Sweep | None = None
         self.cache: IrradianceCache | None = None
         if settings.max_depth not in (0, 1):
             self.cache = self._start_cache(scene, edited)
@@ -148,7 +151,10 @@ class LitMedium:
         )
         channels = 1 if mi.is_monochromatic else 3
         swept, depth = self.solver == "sweep", settings.max_depth
-        batch = sweep.batch_of(settings.samples or SINGLE, depth) if swept else BATCH
+        batch = BATCH
+        if swept:
+            isotropic = medium.phase is None
+            batch = batch_of(settings.samples or SINGLE, depth) if isotropic else DIRECTIONAL_BATCH
         cache = IrradianceCache(
             grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
         )
@@ -245,7 +251,8 @@ class LitMedium:
         if self.solver == "sweep":
             if self._sweep is None:
                 arguments = settings.seed, settings.rr_depth, self._pause
-                self._sweep = sweep.Sweep(scene, self.medium, cache, *arguments)
+                kind = Sweep if cache.directional is None else DirectionalSweep
+                self._sweep = kind(scene, self.medium, cache, *arguments)
             self._sweep.refine(missing, progress)
         else:
             path.refine(

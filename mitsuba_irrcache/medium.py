@@ -42,9 +42,11 @@ class MediumGrid:
         #: what it is called among others
         self.name = ""
         #: Mitsuba's medium, as rays carry it, and what else there is in the scene; None where
-        #: this medium in its boundary is all
+        #: this medium in its boundary is all, and it is isotropic
         self.pointer: mi.MediumPtr | None = None
         self.surroundings: object | None = None
+        #: whether this medium in its boundary is all, and the light around it
+        self.alone = True
         self.macrocells = Macrocells.build(sigma_t, boundary)
         if bbox is not None:
             corners = [mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in p)) for p in bbox]

@@ -46,11 +46,13 @@ def bake_media(scene: mi.Scene, emission: Emission | None = None) -> list[Medium
             finest = (upper - lower).max() / STEPS_OF_A_SIDE
             _check_distance(medium.id(), np.abs([lower, upper]).max(), finest)
     boundary = simple_boundary(scene)
-    if boundary is None:
-        grids = bake_general(scene, emission)
-    else:
+    if boundary is not None and _is_isotropic(*media):
         grids = [_bake_simple(scene, boundary)]
         place_emission(emission, grids)
+    else:
+        grids = bake_general(scene, emission)
+        for grid in grids:
+            grid.alone = boundary is not None
     for grid in grids:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
@@ -92,7 +94,7 @@ def simple_boundary(scene: mi.Scene) -> Boundary | None:
     """The boundary of the one medium in a scene that has no surface besides; None for others."""
     media = media_of(scene)
     bounded = [s for s in scene.shapes() if s.interior_medium() is not None]
-    if len(media) != 1 or len(bounded) != 1 or not _is_isotropic(*media):
+    if len(media) != 1 or len(bounded) != 1:
         return None
     for shape in scene.shapes():
         surface = not is_null(_flags(shape)) or shape.is_emitter() or shape.is_sensor()

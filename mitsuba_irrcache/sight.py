@@ -54,11 +54,11 @@ def sight_of(
         return projection
 
     projections = [project(part.medium, part.shown) for part in parts]
-    surroundings = parts[0].medium.surroundings
-    if surroundings is None:
+    medium = parts[0].medium
+    if medium.alone:
         return SimpleSight(projections[0], settings.max_depth, hide_emitters)
     depths = settings.max_depth, settings.rr_depth
-    return Sight(surroundings, projections, *depths, hide_emitters)
+    return Sight(medium.surroundings, projections, *depths, hide_emitters)
 
 
 class View:

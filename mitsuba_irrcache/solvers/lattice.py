@@ -20,7 +20,7 @@ arithmetic, and the odd part of what is integrated over directions cancels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import drjit as dr
 import mitsuba as mi
@@ -30,7 +30,15 @@ from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.solvers.empty import Emptiness
 from mitsuba_irrcache.solvers.extinction import Extinction
 from mitsuba_irrcache.solvers.layout import STANDARD, flat, slicewise, strides_of
-from mitsuba_irrcache.solvers.lines import INTEGERS, NUMBERS, ONE, add_copies, follow
+from mitsuba_irrcache.solvers.lines import (
+    DIRECTION,
+    INTEGERS,
+    NUMBERS,
+    ONE,
+    WEIGHT,
+    add_copies,
+    follow,
+)
 
 #: What lines leave in a voxel is a mean over its cross section: smoothing of variance 1/12 along
 #: both axes across, half of which is to be taken back (`sharpened`).
@@ -73,10 +81,10 @@ class Lattice:
         dr.eval(self._lanes)
         self.together = grid.voxel_count <= SMALL
         self._extinction = Extinction(grid, self.detail, sigma_t)
-        self._wanted = dr.arange(mi.UInt32, grid.voxel_count) if wanted is None else wanted
+        self.wanted = dr.arange(mi.UInt32, grid.voxel_count) if wanted is None else wanted
         self._empty: Emptiness | None = None
         if sparse and not self.together:
-            self._empty = Emptiness.find(grid, self._wanted, lower, upper)
+            self._empty = Emptiness.find(grid, self.wanted, lower, upper)
         if self.together:
             self._all_corners = [self._extinction.corners(axis) for axis in range(3)]
             dr.eval(self._all_corners)
@@ -130,7 +138,8 @@ class Lattice:
             row += [self._empty.strides[k] for k in order] if self._empty else [0, 0, 0]
             integers[i] = row
             numbers[i, :5] = [1 / abs(velocity[axis]), *ways, weights[i], self._extinction.quantum]
-            numbers[i, 5:] = [
+            numbers[i, DIRECTION:] = directions[i] * np.sign(velocity[axis])
+            numbers[i, 5:DIRECTION] = [
                 x
                 for k in across
                 for x in (ratio[k], self.lower[k] * ratio[k] - 0.5, self.detail.resolution[k] - 1)
@@ -152,11 +161,11 @@ class Lattice:
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
         table.entering = entering(table) if entering is not None else None
         box = self.lower, self.lower + self.sides
-        total = dr.opaque(mi.Float, 0, dr.width(self._wanted))
+        total = dr.opaque(mi.Float, 0, dr.width(self.wanted))
         for axis, pairs in table.by_axis:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
             self._launch(volume, False, table, axis, pairs)
-            light = sharpened(volume, self.grid, *box, axis, self._wanted)
+            light = sharpened(volume, self.grid, *box, axis, self.wanted)
             # In place: a sum would be a second array.
             dr.scatter_add(total, light, dr.arange(mi.UInt32, dr.width(total)))
             dr.eval(total)
@@ -174,6 +183,47 @@ class Lattice:
         for axis, pairs in table.by_axis:
             self._launch(volume, True, table, axis, pairs)
 
+    def apart(
+        self, table: Table, sent: Callable[[Group], mi.Float] | None = None
+    ) -> Iterator[tuple[Group, mi.Float]]:
+        """Follows the pairs of ``table``, some at a time, and tells what the lines of each leave:
+        volumes one after the other, two for each pair, of light along the axis and against it.
+
+        Where ``sent`` tells what voxels send out, likewise, of four values for each voxel, those of
+        `scatter`; else of the light that enters, laid out by slices.
+        """
+        voxels = self.grid.voxel_count
+        most = max(1, COPIES // (2 * voxels))
+        for axis, pairs in table.by_axis:
+            corners = self._corners(axis)
+            for start in range(0, len(pairs), most):
+                group = Group(table, axis, pairs[start : start + most])
+                lanes, row = self._lanes_of(len(group))
+                copies = dr.opaque(mi.Float, 0, 2 * len(group) * voxels * (4 if sent else 1))
+                begin = row * dr.opaque(mi.UInt32, 2 * voxels)
+                empty = self._empty.slices if self._empty and not sent else None
+                follow(
+                    corners, self._extinction.own, empty, copies, sent(group) if sent else None,
+                    table, group.pair(row), lanes, begin, begin + dr.opaque(mi.UInt32, voxels),
+                )  # fmt: skip
+                dr.eval(copies)
+                self.pause()
+                yield group, copies
+
+    def _corners(self, axis: int) -> mi.UInt32:
+        if self.together:
+            return self._all_corners[axis]
+        corners = self._extinction.corners(axis)
+        dr.eval(corners)
+        return corners
+
+    def _lanes_of(self, count: int) -> tuple[mi.UInt32, mi.UInt32]:
+        """Of each line of ``count`` pairs its number, and the pair's."""
+        lines = dr.opaque(mi.UInt32, self._lines)
+        lanes = dr.arange(mi.UInt32, self._lines * count)
+        row = lanes // lines
+        return lanes - row * lines, row
+
     def _launch(
         self, volume: mi.Float, scatters: bool, table: Table, axis: int, pairs: list[int]
     ) -> None:
@@ -183,8 +233,7 @@ class Lattice:
             for start in range(0, len(pairs), most):
                 self._launch_together(volume, scatters, table, axis, pairs[start : start + most])
             return
-        corners = self._extinction.corners(axis)  # one set at a time is kept
-        dr.eval(corners)
+        corners = self._corners(axis)  # one set at a time is kept
         empty = self._empty.slices if self._empty and not scatters else None
         source = volume if scatters else None
         for i in pairs:
@@ -200,16 +249,12 @@ class Lattice:
     ) -> None:
         """The same in one launch; the ``pairs`` follow each other in the table's order."""
         voxels, count = self.grid.voxel_count, len(pairs)
-        lines = dr.opaque(mi.UInt32, self._lines)
-        lanes = dr.arange(mi.UInt32, self._lines * count)
-        row = lanes // lines
-        first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
-        which = dr.gather(mi.UInt32, table.ordered, first + row)
+        lanes, row = self._lanes_of(count)
         copies = dr.opaque(mi.Float, 0, dr.width(volume) * count)
         source = volume if scatters else None
         follow(
-            self._all_corners[axis], self._extinction.own, None, copies, source, table, which,
-            lanes - row * lines, row * dr.opaque(mi.UInt32, voxels),
+            self._all_corners[axis], self._extinction.own, None, copies, source, table,
+            Group(table, axis, pairs).pair(row), lanes, row * dr.opaque(mi.UInt32, voxels),
         )  # fmt: skip
         dr.eval(copies)
         add_copies(volume, copies, voxels, count, mi.Vector4f if scatters else mi.Float)
@@ -224,14 +269,15 @@ def sharpened(
     upper: np.ndarray,
     axis: int,
     index: mi.UInt32,
+    begin: mi.UInt32 | int = 0,
 ) -> mi.Float:
     """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z),
-    given means over the cross sections of all voxels across ``axis``, ``values``, laid out by
-    slices: second differences along both other axes take back what the mean has smoothed. Never
-    negative.
+    given means over the cross sections of all voxels across ``axis``, ``values`` from ``begin`` on,
+    laid out by slices: second differences along both other axes take back what the mean has
+    smoothed. Never negative.
     """
     places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
-    place = flat(places, strides)
+    place = flat(places, strides) + begin
     value, change = dr.gather(mi.Float, values, place), mi.Float(0)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
         if k == axis or upper[k] - lower[k] < 3:
@@ -263,6 +309,31 @@ class Table:
         self.order = [i for _, pairs in self.by_axis for i in pairs]
         # One more, since kernels that read an array of a single value are different ones.
         self.ordered = mi.UInt32([*self.order, 0, 1])
+
+
+class Group:
+    """Pairs of a table that follow each other there, all of the same dominant ``axis``."""
+
+    def __init__(self, table: Table, axis: int, pairs: list[int]) -> None:
+        self.table, self.axis, self._pairs = table, axis, pairs
+        self._first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
+        self.count = dr.opaque(mi.UInt32, len(pairs))
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def pair(self, number: mi.UInt32) -> mi.UInt32:
+        """Of a number in the group the number in the table."""
+        return dr.gather(mi.UInt32, self.table.ordered, self._first + number)
+
+    def weight(self, number: mi.UInt32) -> mi.Float:
+        """Its solid angle for light from the voxels."""
+        return dr.gather(mi.Float, self.table.numbers, self.pair(number) * NUMBERS + WEIGHT)
+
+    def direction(self, number: mi.UInt32) -> mi.Vector3f:
+        """Where its light along the axis goes to, world space."""
+        place = self.pair(number) * NUMBERS + DIRECTION
+        return mi.Vector3f(*(dr.gather(mi.Float, self.table.numbers, place + i) for i in range(3)))
 
 
 class Rows:

@@ -10,7 +10,9 @@ from mitsuba_irrcache.solvers.empty import CELL
 #: Positions within a voxel are integers below this: lines can be followed back without rounding.
 ONE = 1 << 24
 #: Parameters of a pair of directions.
-INTEGERS, NUMBERS = 22, 11
+INTEGERS, NUMBERS = 22, 14
+#: Of these, the solid angle, and the last three: where light along the axis goes to, world space.
+WEIGHT, DIRECTION = 3, 11
 
 
 class _Across:
@@ -70,17 +72,22 @@ def follow(
     which: mi.UInt32,
     lanes: mi.UInt32,
     copy: mi.UInt32,
+    copy_back: mi.UInt32 | None = None,
 ):
     """Follows pairs of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
     ``source``: what `Lattice.scatter` calls volume, None if voxels send no light; may be ``volume``
-    itself, where the light is left, from voxel ``copy`` on.
+    itself, where the light is added, from voxel ``copy`` on.
+
+    With ``copy_back`` both ways are told apart: the light of opposite directions is left from that
+    voxel on, nothing is added to anything, ``source`` holds what voxels send in both ways at the
+    same places, one value each, and depths are not times solid angles.
     """
-    entering, apart = table.entering, source is not volume
+    entering, elsewhere, apart = table.entering, source is not volume, copy_back is not None
     row = [dr.gather(mi.Int32, table.integers, which * INTEGERS + i) for i in range(INTEGERS)]
     nb, nc, na, sb, sc, sa, base, tb, tc, ta, shift, mb, fb, eb, gb, mc, fc, ec, gc = row[:19]
     cells = row[19:]
     length, light, light_back, weight, quantum, *detail = (
-        dr.gather(mi.Float, table.numbers, which * NUMBERS + i) for i in range(NUMBERS)
+        dr.gather(mi.Float, table.numbers, which * NUMBERS + i) for i in range(DIRECTION)
     )
     detail_b, detail_c = (tb, *detail[:3]), (tc, *detail[3:])
     lane = mi.Int32(lanes)
@@ -106,6 +113,7 @@ def follow(
     slice_, slice_back = shift + width, shift + ta * (na - 1) + width
     L, L_back, s0, s0_back = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
     scale, area = quantum * length, dr.rcp(length)
+    count = mi.Float(1) if apart else weight  # what depths are times
     # Slices behind, of both ways; where they skip some, each is in a slice of its own.
     k, k_back, active_back = mi.Int32(0), mi.Int32(0), mi.Bool(active)
     ahead, ahead_back = mi.Int32(1), mi.Int32(1)
@@ -123,7 +131,7 @@ def follow(
             k_back = k
         index = mi.UInt32(ib * sb + ic * sc + off)
         index_back = mi.UInt32(kb * sb + kc * sc + off_back)
-        place, place_back = index + copy, index_back + copy
+        place, place_back = index + copy, index_back + (copy_back if apart else copy)
         # Of the half before the middle of the slice, and of the half behind it.
         s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, needed)
         s_next_back, s_back = _levels(
@@ -142,30 +150,42 @@ def follow(
         if dr.hint(source is None, mode="scalar"):
             L *= _passed(since, s0, s, scale)
             L_back *= _passed(since_back, s0_back, s_back, scale)
-            before = dr.gather(mi.Float, volume, place, needed)
-            before_back = dr.gather(mi.Float, volume, place_back, needed_back)
-            dr.scatter(volume, before + L + dr.select(middle, L_back, 0), place, needed)
-            dr.scatter(volume, before_back + L_back, place_back, needed_back & ~middle)
-        else:
-            voxel = dr.gather(mi.Vector4f, volume, place, active)
-            voxel_back = dr.gather(mi.Vector4f, volume, place_back, active)
-            sent, sent_back = voxel.x, voxel_back.x
             if dr.hint(apart, mode="scalar"):
-                sent = dr.gather(mi.Float, source, index * 4, active)
-                sent_back = dr.gather(mi.Float, source, index_back * 4, active)
-            L, tally = _crossed(L, sent * weight, s * scale, s_next * scale, since, weight, area)
+                dr.scatter(volume, L, place, needed)
+                dr.scatter(volume, L_back, place_back, needed_back)
+            else:
+                before = dr.gather(mi.Float, volume, place, needed)
+                before_back = dr.gather(mi.Float, volume, place_back, needed_back)
+                dr.scatter(volume, before + L + dr.select(middle, L_back, 0), place, needed)
+                dr.scatter(volume, before_back + L_back, place_back, needed_back & ~middle)
+        else:
+            if dr.hint(apart, mode="scalar"):
+                sent = dr.gather(mi.Float, source, place, active)
+                sent_back = dr.gather(mi.Float, source, place_back, active)
+            else:
+                voxel = dr.gather(mi.Vector4f, volume, place, active)
+                voxel_back = dr.gather(mi.Vector4f, volume, place_back, active)
+                sent, sent_back = voxel.x, voxel_back.x
+                if dr.hint(elsewhere, mode="scalar"):
+                    sent = dr.gather(mi.Float, source, index * 4, active)
+                    sent_back = dr.gather(mi.Float, source, index_back * 4, active)
+            L, tally = _crossed(L, sent * weight, s * scale, s_next * scale, since, count, area)
             L_back, tally_back = _crossed(
                 L_back,
                 sent_back * weight,
                 s_back * scale,
                 s_next_back * scale,
                 since_back,
-                weight,
+                count,
                 area,
             )
-            tally += dr.select(middle, tally_back, 0)
-            dr.scatter(volume, voxel + tally, place, active)
-            dr.scatter(volume, voxel_back + tally_back, place_back, active & ~middle)
+            if dr.hint(apart, mode="scalar"):
+                dr.scatter(volume, tally, place, active)
+                dr.scatter(volume, tally_back, place_back, active)
+            else:
+                tally += dr.select(middle, tally_back, 0)
+                dr.scatter(volume, voxel + tally, place, active)
+                dr.scatter(volume, voxel_back + tally_back, place_back, active & ~middle)
         s0, s0_back = s_next, s_next_back
         ib, fb, since = there_b.advance(ib, fb, ahead)
         ic, fc, near = there_c.advance(ic, fc, ahead)
@@ -230,7 +250,7 @@ def _passed(since, before, here, scale) -> mi.Float:
     return dr.exp(-dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
 
 
-def _crossed(L, source, first, second, since, weight, area) -> tuple:
+def _crossed(L, source, first, second, since, count, area) -> tuple:
     """Radiance behind a slice, and what its voxel tallies, for a source that is constant in it.
     ``first`` and ``second`` are the slice's optical depths, were it all like that half.
 
@@ -243,4 +263,4 @@ def _crossed(L, source, first, second, since, weight, area) -> tuple:
     lost = (L - source) * dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
     half = dr.sqrt(passed) if first is second else dr.exp(-to_middle)
     middle = dr.fma(L - source, half, source)
-    return L - lost, mi.Vector4f(0, middle, lost * area, weight * tau * area)
+    return L - lost, mi.Vector4f(0, middle, lost * area, count * tau * area)

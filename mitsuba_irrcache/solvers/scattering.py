@@ -71,8 +71,11 @@ class Level:
             box = np.zeros(3, int), grid.resolution
             lattice = Lattice(grid, sigma_t, *box, pause=self.lattice.pause)
             albedo = self.restrict(self.albedo)
-            self._coarser = Level(grid, sigma_t, albedo, lattice, self.evenly)
+            self._coarser = self._coarse(grid, sigma_t, albedo, lattice)
         return self._coarser
+
+    def _coarse(self, grid: Grid, sigma_t: mi.Float, albedo: mi.Float, lattice: Lattice) -> Level:
+        return Level(grid, sigma_t, albedo, lattice, self.evenly)
 
     def restrict(self, values: mi.Float) -> mi.Float:
         """Means over the voxels of the coarser level, weighted by extinction."""
@@ -82,10 +85,14 @@ class Level:
 
     def prolong(self, values: mi.Float) -> mi.Float:
         """Values of the coarser level at the voxels of this one, trilinear."""
-        at = self.grid.places(dr.arange(mi.UInt32, self.grid.voxel_count))
-        share = [dr.opaque(mi.Float, 1 / int(n)) for n in self._ratio]
-        u = mi.Point3f(*((mi.Float(a) + 0.5) * s for a, s in zip(at, share, strict=True)))
+        u = self.above(dr.arange(mi.UInt32, self.grid.voxel_count))
         return GridField(self.coarser.grid, values, 1).at(u)
+
+    def above(self, voxel: mi.UInt32) -> mi.Point3f:
+        """The centres of voxels in the coarser level, in its voxels."""
+        share = [dr.opaque(mi.Float, 1 / int(n)) for n in self._ratio]
+        at = zip(self.grid.places(voxel), share, strict=True)
+        return mi.Point3f(*((mi.Float(a) + 0.5) * s for a, s in at))
 
     def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
         """A phi plus the light that enters along ``table``: irradiance, and the mean of it where it

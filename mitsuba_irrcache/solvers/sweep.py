@@ -10,12 +10,13 @@ share.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache import IrradianceCache
+from mitsuba_irrcache.cache import LAYERS, IrradianceCache
 from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
@@ -55,12 +56,15 @@ def takes(emitter: mi.Emitter) -> bool:
 
 
 def batch_of(samples: int, max_depth: int) -> int:
-    """The directions of a batch of a cache of so many."""
+    """The directions of a batch of a cache of so many, in an isotropic medium."""
     return LARGE_BATCH if max_depth == 2 and samples >= LARGE_BATCH else BATCH
 
 
 class Sweep:
     """Fills ``cache``, which lies over ``medium``."""
+
+    #: of a pass, where light is scattered more than once
+    directions = DIRECTIONS
 
     def __init__(
         self,
@@ -90,17 +94,14 @@ class Sweep:
         if cache.max_depth != 2:
             sigma_t = extinction if detail is grid else baked(medium, medium.sigma_t, grid)
             albedo = baked(medium, medium.albedo, grid, masked=False)
-            self._levels = [
-                Level(
-                    grid,
-                    sigma_t[min(c, len(sigma_t) - 1)],
-                    albedo[min(c, len(albedo) - 1)],
-                    self._lattices[min(c, len(sigma_t) - 1)],
-                    evenly=medium.surroundings is not None,  # as `arrivals` takes for granted
-                )
-                for c in range(max(len(albedo), len(sigma_t)))
-            ]
+            for c in range(max(len(albedo), len(sigma_t))):
+                of_channel = [field[min(c, len(field) - 1)] for field in (sigma_t, albedo)]
+                arguments = grid, *of_channel, self._lattices[min(c, len(sigma_t) - 1)]
+                # Evenly: as `arrivals` takes for granted.
+                self._levels.append(self._level(*arguments, not medium.alone))
         self._medium, self._places = medium, Places(scene, grid).of(cache.active)
+        #: where in the light of a level that of the active voxels is
+        self._where = cache.active
         # What is scattered near a lamp is what a voxel gets on average, not in its middle.
         self._spread = mi.Float(1)
         if cache.falloff is not None and self._levels:
@@ -108,7 +109,7 @@ class Sweep:
             dr.eval(self._spread)
         self._emitted: list[mi.Spectrum] = []  # of a batch
         self._around: Around | None = None
-        if medium.surroundings is None:
+        if medium.alone:
             self._direct = self._sky.near_light(medium, self._places)
             return
         small, large = split(scene, grid, *box)
@@ -132,14 +133,17 @@ class Sweep:
                 done = (number - first + 1) * cache.batch
                 progress(done * cache.active_count, samples * cache.active_count)
 
+    def _level(self, *arguments: object) -> Level:
+        return Level(*arguments)
+
     def _batch(self, number: int) -> tuple:
-        """Irradiance of both layers in all channels at the active voxels, as `IrradianceCache.add`
-        wants it.
+        """Irradiance of both layers in all channels at the active voxels, and the moments if there
+        are any, as `IrradianceCache.add` wants it.
         """
         cache = self.cache
         pairs, passes = cache.batch // 2, 1
         if self._levels:  # one pass more tells what is scattered again
-            pairs, passes = DIRECTIONS // 2, cache.batch // DIRECTIONS + 1
+            pairs, passes = self.directions // 2, cache.batch // self.directions + 1
         rng = np.random.default_rng((self.seed, number))
         if self._medium.emission is not None:
             light = emitted_light(self._medium, self._places, cache.batch, self.seed, number)
@@ -155,7 +159,7 @@ class Sweep:
             if is_grey([*kinds, *self._direct]):
                 by_channel = by_channel[:1]
         found: dict[tuple[int, int], tuple] = {}
-        layers = [], []
+        layers: list[list] = [[] for _ in range(len(LAYERS) + cache.moments)]
         for c in range(cache.channels):
             # Channels that differ by a factor only are computed once.
             key = min(c, len(by_channel) - 1), min(c, len(self._levels or self._lattices) - 1)
@@ -164,28 +168,41 @@ class Sweep:
             for layer, phi in zip(layers, found[key], strict=True):
                 layer.append(phi if phi is None else phi * dr.opaque(mi.Float, colour[c]))
         dr.eval(layers)
-        return (*layers[0], *layers[1]), (None,) * cache.channels
+        light, moments = layers[: len(LAYERS)], layers[len(LAYERS) :]
+        parts = [tuple(chain(*light)), (None,) * cache.channels]
+        return (*parts, tuple(chain(*moments))) if moments else tuple(parts)
 
     def _solved(self, passes: list[Pass] | list[ArrivingPass], light: int, medium: int) -> tuple:
-        """Irradiance at the active voxels: straight from the emitters, and scattered, if wanted."""
+        """Irradiance at the active voxels: straight from the emitters, and scattered, if wanted;
+        then moments, if there are any.
+        """
         if not self._levels:
             return self._uncollided(self._lattices[medium], passes, light)[1], None
-        level, (first, *passes) = self._levels[medium], passes
-        swept, uncollided = self._uncollided(level.lattice, passes, light)
-        total = 0 * swept
+        level = self._levels[medium]
+        swept, uncollided = self._uncollided(level.lattice, passes[1:], light)
+        # Both layers with the same directions: under a white sky the sum has no noise.
+        scattered = dr.maximum(self._received(level, passes, light) - swept, 0)
+        dr.eval(scattered)
+        return uncollided, scattered
+
+    def _received(
+        self, level: Level, passes: list[Pass] | list[ArrivingPass], light: int
+    ) -> mi.Float:
+        """Light of all orders wanted along lines at the active voxels, on average over all passes
+        but the first one.
+        """
+        first, *passes = passes
+        total: mi.Float = 0
         phi = self._collided(level, first, light)
         for known, each in enumerate(passes, 1):
             received, again = each.scatter(level, phi)
-            total = total + dr.gather(mi.Float, received, self.cache.active)
+            total = total + dr.gather(mi.Float, received, self._where)
             if self.cache.max_depth < 0:
                 # Of all orders there is now another estimate: on average they have less noise.
                 old, new = (dr.opaque(mi.Float, n / (known + 1)) for n in (known, 1))
                 phi = phi * old + self._with_near_light(again, light) * new
             dr.eval(total, phi)
-        # Both layers with the same directions: under a white sky the sum has no noise.
-        scattered = dr.maximum(total * dr.opaque(mi.Float, 1 / len(passes)) - swept, 0)
-        dr.eval(scattered)
-        return uncollided, scattered
+        return total * dr.opaque(mi.Float, 1 / len(passes))
 
     def _uncollided(
         self, lattice: Lattice, passes: list[Pass] | list[ArrivingPass], light: int
@@ -212,12 +229,16 @@ class Sweep:
         return phi
 
     def _with_near_light(self, volume: mi.Float, channel: int) -> mi.Float:
-        near = [light[channel] * self._spread for light in self._direct]
-        for light in (*near, *(light[channel] for light in self._emitted)):
+        for light in self._near_light(channel):
             dr.eval(volume)
-            dr.scatter_reduce(dr.ReduceOp.Add, volume, light, self.cache.active)
+            dr.scatter_reduce(dr.ReduceOp.Add, volume, light, self._where)
         dr.eval(volume)
         return volume
+
+    def _near_light(self, channel: int) -> list[mi.Float]:
+        """Light at the active voxels that does not come along lines, on average over each."""
+        near = [light[channel] * self._spread for light in self._direct]
+        return near + [light[channel] for light in self._emitted]
 
 
 def _changed_by(before: mi.Float, after: mi.Float) -> float:

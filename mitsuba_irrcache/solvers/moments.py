@@ -1,0 +1,262 @@
+"""Light by its direction, as the lines of the solver ``sweep`` tell it.
+
+Where a medium does not scatter alike to all sides, what is solved for is not the irradiance alone,
+but all coefficients of the radiance in spherical harmonics that the phase function asks for: as
+many times the voxels in one array, degree by degree. The first of them is the irradiance itself;
+L_lm is multiplied by g_l wherever light is scattered (see `phase`).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.directional import Directional
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.solvers.lattice import Group, Lattice, Table, sharpened
+from mitsuba_irrcache.solvers.passes import Pass, joined
+from mitsuba_irrcache.solvers.scattering import Level
+
+#: Highest degree of what is corrected on coarser grids.
+SMOOTH = 1
+
+
+class Moments:
+    """Those of a ``directional`` medium."""
+
+    def __init__(self, directional: Directional, order: int | None = None) -> None:
+        """Up to ``order`` (None: all that there are)."""
+        self.directional = directional
+        self.order = directional.order if order is None else order
+        #: their degrees
+        self.degrees = [n for n in range(self.order + 1) for _ in range(2 * n + 1)]
+        factors = [directional.phase.moments[n] for n in self.degrees]
+        #: by how much each of them is less once light is scattered
+        self.factors = mi.Float([float(g) for g in factors])
+
+    @property
+    def count(self) -> int:
+        return len(self.degrees)
+
+    def basis(self, direction: mi.Vector3f) -> list[mi.Float]:
+        """What light that comes from ``direction`` adds to each for an irradiance of 1."""
+        return [mi.Float(1), *dr.sh_eval(direction, self.order)[1:]]
+
+    def of(self, light: mi.Float, direction: mi.Vector3f) -> mi.Float:
+        """Moments of the irradiance ``light`` from ``direction``, at each place."""
+        return _one_after_another([light * y for y in self.basis(direction)])
+
+    def places(self, index: mi.UInt32, voxels: int) -> mi.UInt32:
+        """Where the moments at the voxels ``index`` are among those of all ``voxels``."""
+        moment, place = _apart(self.count, dr.width(index))
+        found = dr.gather(mi.UInt32, index, place) + moment * dr.opaque(mi.UInt32, voxels)
+        dr.eval(found)
+        return found
+
+    def part(self, values: mi.Float, number: int) -> mi.Float:
+        """One of the moments at all places."""
+        width = dr.width(values) // self.count
+        index = dr.arange(mi.UInt32, width) + number * dr.opaque(mi.UInt32, width)
+        return dr.gather(mi.Float, values, index)
+
+    def carry(self, lattice: Lattice, rows: tuple[np.ndarray, ...]) -> mi.Float:
+        """As `Lattice.carry`, for ``rows`` as `Lattice.table` wants them: moments of the light that
+        enters along them, at the wanted voxels.
+        """
+        table = lattice.table(*rows, by_slice=True)
+        wanted = lattice.wanted
+        sums = self.nothing(dr.width(wanted))
+        box = lattice.lower, lattice.lower + lattice.sides
+        for group, copies in lattice.apart(table):
+            sums = _with_light(self, sums, copies, group, lattice.grid, *box, wanted)
+            dr.eval(sums)
+        return _one_after_another(sums)
+
+    def nothing(self, width: int) -> list[mi.Float]:
+        """No light, at so many places."""
+        return [dr.opaque(mi.Float, 0, width) for _ in range(self.count)]
+
+    def uncollided(self, passes: list[Pass], lattice: Lattice) -> tuple[mi.Float, list[mi.Float]]:
+        """Moments of the light from far away at the wanted voxels, the sum of all ``passes``, but
+        for that of narrow lights; and those of each narrow light (none where it is not far away).
+        """
+        directions, light, weights, offsets = joined([p.rows for p in passes])
+        apart = []
+        for source in self.directional.sources:
+            own = np.zeros_like(light)
+            if source.far:
+                own = light * source.covers(np.stack([-directions, directions], axis=1))
+                light = light - own
+            apart.append(own)
+        found = []
+        for part in (light, *apart):
+            lit = part.any(axis=1)
+            rows = directions[lit], part[lit], weights[lit], offsets[lit]
+            found.append(self.carry(lattice, rows) if lit.any() else None)
+        smooth = dr.opaque(mi.Float, 0, self.count * dr.width(lattice.wanted))
+        return (smooth if found[0] is None else found[0]), found[1:]
+
+
+class DirectionalLevel(Level):
+    """A `Level` whose light are the ``moments``, one after the other."""
+
+    def __init__(
+        self,
+        grid: Grid,
+        sigma_t: mi.Float,
+        albedo: mi.Float,
+        lattice: Lattice,
+        moments: Moments,
+    ) -> None:
+        super().__init__(grid, sigma_t, albedo, lattice)
+        self.moments = moments
+
+    def _coarse(
+        self, grid: Grid, sigma_t: mi.Float, albedo: mi.Float, lattice: Lattice
+    ) -> DirectionalLevel:
+        # What is slow to converge is smooth, and so are its directions.
+        smooth = Moments(self.moments.directional, min(self.moments.order, SMOOTH))
+        return DirectionalLevel(grid, sigma_t, albedo, lattice, smooth)
+
+    def restrict(self, values: mi.Float) -> mi.Float:
+        if dr.width(values) == self.grid.voxel_count:  # of a field that has but one value
+            return super().restrict(values)
+        coarser = self.coarser
+        moment, place = _apart(coarser.moments.count, coarser.grid.voxel_count)
+        begin, result = moment * dr.opaque(mi.UInt32, self.grid.voxel_count), mi.Float(0)
+        for child, weight in self._children:
+            voxel = begin + dr.gather(mi.UInt32, child, place)
+            result += dr.gather(mi.Float, values, voxel) * dr.gather(mi.Float, weight, place)
+        dr.eval(result)
+        return result
+
+    def prolong(self, values: mi.Float) -> mi.Float:
+        """As of `Level`; moments that the coarser one does not have are 0."""
+        grid, moments = self.coarser.grid, self.coarser.moments
+        moment, place = _apart(self.moments.count, self.grid.voxel_count)
+        known = moment < dr.opaque(mi.UInt32, moments.count)
+        begin, result = moment * dr.opaque(mi.UInt32, grid.voxel_count), mi.Float(0)
+        for voxel, weight in grid.corners(self.above(place)):
+            result += dr.gather(mi.Float, values, begin + voxel, known) * weight
+        return result
+
+    def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
+        """As of `Level`, all moments of it."""
+        moments, voxels = self.moments, self.grid.voxel_count
+        received, lost = (moments.nothing(voxels) for _ in range(2))
+        depth = dr.opaque(mi.Float, 0, voxels)
+        scattered = None if phi is None else self._scattered(phi)
+
+        def sent(group: Group) -> mi.Float:
+            source = dr.opaque(mi.Float, 0, 2 * len(group) * voxels)
+            if scattered is not None:
+                _send_out(moments, source, scattered, group, voxels)
+                dr.eval(source)
+            return source
+
+        for group, copies in self.lattice.apart(table, sent):
+            found = _with_collisions(moments, received, lost, depth, copies, group)
+            dr.eval(found)
+            received, lost, depth = found
+        # Weighted by their depths, what lines lose lets as much be scattered as collides.
+        collided = [4 * dr.pi * lost[0] / dr.select(depth > 0, depth, 1), *lost[1:]]
+        if scattered is not None:
+            collided = [mean + moments.part(scattered, k) for k, mean in enumerate(collided)]
+        pairs = zip(collided, received, strict=True)
+        collided = [dr.select(depth > 0, mean, light) for mean, light in pairs]
+        return _one_after_another(received), _one_after_another(collided)
+
+    def _scattered(self, phi: mi.Float) -> mi.Float:
+        """Moments of the light that is sent out, per optical depth."""
+        moment, place = _apart(self.moments.count, self.grid.voxel_count)
+        factor = dr.gather(mi.Float, self.moments.factors, moment)
+        scattered = phi * factor * dr.gather(mi.Float, self.albedo, place)
+        dr.eval(scattered)
+        return scattered
+
+
+def _apart(count: int, width: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """The moment and the place of all values of an array of ``count`` moments at so many places."""
+    lane, step = dr.arange(mi.UInt32, count * width), dr.opaque(mi.UInt32, width)
+    moment = lane // step
+    return moment, lane - moment * step
+
+
+def _one_after_another(parts: list[mi.Float]) -> mi.Float:
+    width = dr.width(parts[0])
+    result = dr.opaque(mi.Float, 0, len(parts) * width)
+    index, step = dr.arange(mi.UInt32, width), dr.opaque(mi.UInt32, width)
+    for k, part in enumerate(parts):
+        dr.scatter(result, part, index + step * k)
+    dr.eval(result)
+    return result
+
+
+@dr.syntax
+def _with_light(moments, sums: list, copies, group, grid, lower, upper, wanted):
+    """``sums`` and the moments of the light that lines of a group have left."""
+    voxels = dr.opaque(mi.UInt32, grid.voxel_count)
+    k, begin = mi.UInt32(0), mi.UInt32(0)
+    while dr.hint(k < group.count, label="light of pairs"):
+        there = sharpened(copies, grid, lower, upper, group.axis, wanted, begin)
+        back = sharpened(copies, grid, lower, upper, group.axis, wanted, begin + voxels)
+        basis = moments.basis(-group.direction(k))
+        sums = _with_both(moments, sums, basis, there, back)
+        k += 1
+        begin += 2 * voxels
+    return sums
+
+
+@dr.syntax
+def _with_collisions(moments, received: list, lost: list, depth, copies, group):
+    """Moments of the light in all voxels; what lines lose there, and moments of this per depth; the
+    ``depth`` of these times solid angles: each with those of a group.
+    """
+    voxels = dr.width(depth)
+    step = dr.opaque(mi.UInt32, voxels)
+    k, place = mi.UInt32(0), dr.arange(mi.UInt32, voxels)
+    while dr.hint(k < group.count, label="collisions of pairs"):
+        there = dr.gather(mi.Vector4f, copies, place)
+        back = dr.gather(mi.Vector4f, copies, place + step)
+        basis = moments.basis(-group.direction(k))
+        received = _with_both(moments, received, basis, there.y, back.y)
+        # Of their own depth: in a voxel that few of them find matter in, the others would be
+        # missing from the integral over directions, which then has a norm above 1.
+        per_depth = [dr.select(v.w > 0, v.z / v.w, 0) for v in (there, back)]
+        lost = [lost[0] + there.z + back.z, *_with_both(moments, lost, basis, *per_depth)[1:]]
+        depth = depth + group.weight(k) * (there.w + back.w)
+        k += 1
+        place += 2 * step
+    return received, lost, depth
+
+
+def _with_both(moments: Moments, sums: list, basis: list, there: mi.Float, back: mi.Float) -> list:
+    """Sums with light from the directions of ``basis`` and their opposites."""
+    even, odd = there + back, there - back
+    return [
+        dr.fma(y, odd if degree % 2 else even, value)
+        for degree, y, value in zip(moments.degrees, basis, sums, strict=True)
+    ]
+
+
+@dr.syntax
+def _send_out(moments, source, scattered, group, voxels: int):
+    """Writes the radiance per optical depth that all voxels send along the lines of a group, and
+    against them.
+    """
+    parts = [moments.part(scattered, i) for i in range(moments.count)]
+    index, step = dr.arange(mi.UInt32, voxels), dr.opaque(mi.UInt32, voxels)
+    k, place = mi.UInt32(0), mi.UInt32(index)
+    while dr.hint(k < group.count, label="light of voxels"):
+        even, odd = parts[0] * dr.inv_four_pi, mi.Float(0)
+        basis = moments.basis(-group.direction(k))
+        for i in range(1, moments.count):
+            if dr.hint(moments.degrees[i] % 2 == 1, mode="scalar"):
+                odd = dr.fma(basis[i], parts[i], odd)
+            else:
+                even = dr.fma(basis[i], parts[i], even)
+        dr.scatter(source, even + odd, place)
+        dr.scatter(source, even - odd, place + step)
+        k += 1
+        place += 2 * step
