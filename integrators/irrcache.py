@@ -135,17 +135,17 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     closed shapes with a null BSDF, apart, touching or nested; each has a cache of its own. Surfaces
     and area emitters may be anywhere. What is seen on them is path traced, by as many paths as
     there are samples per pixel, and is ``background``. Where there is no more than one medium in a
-    box or sphere, and light from far away or from points outside of it, nothing has to be ray
-    traced. The solver ``sweep`` can be used for isotropic media in boxes or spheres with neither
-    surfaces nor other media among their voxels; where there are surfaces, with ``max_depth`` 2 or
-    -1. Point-like emitters in a medium, media without
-    bounds and sharp phase functions are refused by name. What glass encloses is rendered as
-    ``volpath`` does, and so is a scene without media.
+    box or sphere, and light from far away or from points, nothing has to be ray traced. The
+    solver ``sweep`` can be used for media in boxes or spheres with neither surfaces nor other media
+    among their voxels; where there are surfaces, for isotropic ones, with ``max_depth`` 2 or -1.
+    Media without bounds and sharp phase functions are refused by name. What glass encloses is
+    rendered as ``volpath`` does, and so is a scene without media.
 
     Phase functions may be ``isotropic``, ``hg`` with |g| up to 0.58, ``rayleigh``, or others that
     depend on the scattering angle alone and are as broad. Where one is not isotropic, the cache
     holds spherical harmonics of the radiance up to degree 4 beside the irradiance, and the light
-    of suns, points and lamps apart, whose direction is known; the solver is ``path``.
+    of suns, points and lamps apart, whose direction is known. Such a medium is swept where it is
+    all there is to the scene and does not shine itself.
 
     .. tabs::
         .. code-tab:: xml

@@ -12,7 +12,7 @@ from mitsuba_irrcache.solvers.passes import Pass
 from mitsuba_irrcache.solvers.scattering import Level
 from mitsuba_irrcache.solvers.sweep import Sweep
 
-#: Directions of a pass, and of a batch: twice those of isotropic media, since they have to integrate
+#: Directions of a pass, and of a batch: twice those of isotropic media, for they have to integrate
 #: products of spherical harmonics. Under a sun and with g = .5, 16 left twice the error.
 DIRECTIONS, BATCH = 32, 64
 

@@ -35,25 +35,31 @@ SCENES = {
     "rayleigh, point": (RAYLEIGH, 3, {"emitter": POINT, "sun": None}, {"tolerance": 0.04}),
     "hg 0.5, sun of an envmap": (hg(0.5), -1, "envmap", {"tolerance": 0.03}),
 }
+BY_PATH = "hg 0.3, single", "hg 0.5, sun of an envmap"
+CASES = [("sweep", name) for name in SCENES] + [("path", name) for name in BY_PATH]
 
 
-@pytest.mark.parametrize(("phase", "depth", "lights", "bounds"), SCENES.values(), ids=SCENES)
-def test_phase_functions(scenes, phase, depth, lights, bounds):
+@pytest.mark.parametrize(("solver", "name"), CASES)
+def test_phase_functions(scenes, solver, name):
+    phase, depth, lights, bounds = SCENES[name]
     lights = envmap(800.0) if lights == "envmap" else lights
     medium = scenes.medium((1.0, 1.2, 1.4), (0.9, 0.8, 0.95)) | {"phase": phase}
     objects = {"cloud": scenes.boundary(medium)} | lights
-    depths = {"max_depth": depth, "rr_depth": 1000}
-    check(*images(scenes, objects, {"cache_spp": 128}, depths, (64, 512)), **bounds)
+    depths, ours = {"max_depth": depth, "rr_depth": 1000}, {"cache_spp": 128, "solver": solver}
+    check(*images(scenes, objects, ours, depths, (64, 512)), **bounds)
 
 
-def test_two_media_of_two_kinds(scenes):
-    objects = {
+def two_kinds(scenes) -> dict:
+    return {
         "a": scenes.boundary(fog(), scenes.placement((0.9, 1.6, 1.6), center=(-0.5, 0, 0))),
         "b": scenes.boundary(
             fog() | {"phase": hg(0.5)}, scenes.placement((0.9, 1.6, 1.6), center=(0.5, 0, 0))
         ),
     }
-    check(*images(scenes, objects, {}, {"max_depth": -1, "rr_depth": 50}, (64, 256)))
+
+
+def test_two_media_of_two_kinds(scenes):
+    check(*images(scenes, two_kinds(scenes), {}, {"max_depth": -1, "rr_depth": 50}, (64, 256)))
 
 
 @pytest.mark.parametrize("g", [0.5, -0.4])
@@ -109,8 +115,19 @@ def test_files(scenes, tmp_path):
         foreign.integrator().prepare(foreign)
 
 
-def test_sweep_is_refused(scenes):
-    scene = loaded(scenes, hg(0.4), solver="sweep")
+@pytest.mark.parametrize(("more", "solver"), [({}, "sweep"), ({"emission": 0.1}, "path")])
+def test_choice_of_solver(scenes, more, solver):
+    """A medium that is alone is swept, unless it shines."""
+    scene = loaded(scenes, hg(0.4), solver="auto", **more)
+    scene.integrator().prepare(scene)
+    assert scene.integrator()._builder.solver == solver
+
+
+def test_sweep_is_refused_among_others(scenes):
+    integrator = {"type": "irrcache", "solver": "sweep"}
+    null = {"bsdf": {"type": "null"}, "type": "cube"}
+    parts = {name: null | shape for name, shape in two_kinds(scenes).items()}
+    scene = scenes.load(integrator, parts.pop("a"), 8, **parts)
     with pytest.raises(IrrcacheError, match=r"isotropic.*path.*auto"):
         scene.integrator().prepare(scene)
 

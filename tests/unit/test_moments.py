@@ -1,0 +1,147 @@
+"""Moments of the radiance along lines of sweeps: one direction, furnaces, the operator's norm."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.directional import Directional
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.phase import Phase
+from mitsuba_irrcache.solvers import lattice
+from mitsuba_irrcache.solvers.directions import spread
+from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.moments import DirectionalLevel, Moments
+from mitsuba_irrcache.solvers.scattering import Level
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SIDES = (6, 9, 7)
+
+
+@pytest.fixture(params=["together", "apart"], autouse=True)
+def mode(request, monkeypatch):
+    """All pairs of directions in one launch, or one in each."""
+    if request.param == "apart":
+        monkeypatch.setattr(lattice, "SMALL", 0)
+        monkeypatch.setattr(lattice, "COPIES", 1)
+
+
+def moments_of(g: float, order: int) -> Moments:
+    phase = Phase(None, g ** np.arange(32), 1.0)
+    return Moments(Directional(phase, []), order)
+
+
+def values(flat: mi.Float, count: int) -> np.ndarray:
+    return np.array(flat, dtype=np.float64).reshape(count, -1)
+
+
+def matter(seed: int = 0, empty: float = 0.0) -> np.ndarray:
+    """Extinction (z, y, x), some voxels without any."""
+    rng = np.random.default_rng(seed)
+    sigma_t = rng.uniform(0.5, 8.0, SIDES)
+    return np.float32(np.where(rng.random(SIDES) < empty, 0, sigma_t))
+
+
+def lines(sigma_t: np.ndarray) -> Lattice:
+    grid = Grid(sigma_t.shape, np.diag([1.4, 1.8, 1.2, 1]))
+    return Lattice(grid, mi.Float(sigma_t.ravel().tolist()), np.zeros(3, int), grid.resolution)
+
+
+def level(sigma_t: np.ndarray, albedo: float, moments: Moments | None) -> Level:
+    of_matter = lines(sigma_t)
+    number = of_matter.grid.voxel_count
+    fields = (mi.Float(v.ravel().tolist()) for v in (sigma_t, np.full(number, albedo)))
+    arguments = of_matter.grid, *fields, of_matter
+    return Level(*arguments) if moments is None else DirectionalLevel(*arguments, moments)
+
+
+def rows(pairs: int, light: float = 0.0, seed: int = 1) -> tuple[np.ndarray, ...]:
+    """Even directions; the same radiance enters along all of them."""
+    rng = np.random.default_rng(seed)
+    directions, weights = spread(pairs, rng)
+    entering = np.repeat(light * weights[:, None], 2, axis=1)
+    return directions, entering, weights, rng.random((pairs, 2))
+
+
+def test_light_of_one_direction():
+    """Its moments are its irradiance times the harmonics of where it comes from."""
+    moments, of_matter = moments_of(0.5, 4), lines(matter())
+    way = np.array([[0.3, -0.5, 0.6]]) / np.sqrt(0.7)
+    offsets = np.array([[0.2, 0.7]])
+    for light, sign in (([1.0, 0.0], -1), ([0.0, 1.0], 1)):
+        pair = way, np.array([light]), np.zeros(1), offsets
+        found = values(moments.carry(of_matter, pair), moments.count)
+        irradiance = np.array(of_matter.carry(way, np.array([light]), offsets))
+        basis = np.ravel(
+            [np.array(y) for y in moments.basis(mi.Vector3f((sign * way[0]).tolist()))]
+        )
+        np.testing.assert_allclose(found, basis[:, None] * irradiance, atol=2e-6)
+
+
+def test_isotropic_scattering_is_that_of_levels():
+    """Without further moments, light is scattered as `Level` has it."""
+    sigma_t, none = matter(empty=0.3), moments_of(0.0, 1)
+    isotropic, directional = level(sigma_t, 0.8, None), level(sigma_t, 0.8, none)
+    rng = np.random.default_rng(4)
+    phi = rng.uniform(0, 1, sigma_t.size)
+    table = rows(12, 1.0)
+    expected = isotropic.scatter(mi.Float(phi.tolist()), isotropic.lattice.table(*table))
+    several = np.concatenate([phi, rng.normal(size=3 * sigma_t.size)])
+    found = directional.scatter(mi.Float(several.tolist()), directional.lattice.table(*table))
+    for a, b in zip(expected, found, strict=True):
+        np.testing.assert_allclose(values(b, 4)[0], np.array(a), rtol=2e-5)
+
+
+@pytest.mark.parametrize("order", [1, 3])
+@pytest.mark.parametrize("scale", [0.1, 5.0, 100.0])
+def test_furnace(order, scale):
+    """Where nothing absorbs and light is the same from all sides, it stays so: irradiance 4 pi, no
+    moments, of light received and of collisions.
+    """
+    moments = moments_of(0.5, order)
+    white = level(matter() * np.float32(scale), 1.0, moments)
+    phi = np.zeros((moments.count, white.grid.voxel_count))
+    phi[0] = 4 * np.pi
+    table = white.lattice.table(*rows(16, 1.0))
+    for found in white.scatter(mi.Float(phi.ravel().tolist()), table):
+        np.testing.assert_allclose(
+            values(found, moments.count) / (4 * np.pi), phi / (4 * np.pi), atol=2e-3
+        )
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_white_matter_is_no_source(order):
+    """Light that is scattered again and again, among voxels many of which are empty, fades: lines
+    that find no matter where others do must not weigh on it.
+    """
+    moments = moments_of(0.58, order)
+    white = level(matter(seed=2, empty=0.6), 1.0, moments)
+    table = white.lattice.table(*rows(16))
+    phi = np.random.default_rng(5).normal(size=(moments.count, white.grid.voxel_count))
+    sizes = []
+    for _ in range(40):
+        phi = values(white.scatter(mi.Float(phi.ravel().tolist()), table)[1], moments.count)
+        sizes.append(np.linalg.norm(phi))
+    assert sizes[-1] / sizes[-2] < 0.97
+
+
+def test_solution():
+    """What the hierarchy of grids finds solves phi = A phi + b."""
+    rng = np.random.default_rng(7)
+    grid = Grid((24, 24, 24), np.diag([1.0, 1, 1, 1]))
+    sigma_t = mi.Float(rng.uniform(0, 40, grid.voxel_count).tolist())
+    box = Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
+    moments = moments_of(0.5, 2)
+    white = DirectionalLevel(grid, sigma_t, dr.full(mi.Float, 0.99, grid.voxel_count), box, moments)
+    table = rows(16, 1.0)
+    _, b = white.scatter(None, box.table(*table))
+    directions, _, weights, offsets = table
+    phi = white.solve(b, directions, weights, offsets)
+    dark = np.zeros((16, 2))
+    image = white.scatter(phi, box.table(directions, dark, weights, offsets))[1] + b
+    phi, image = np.array(phi), np.array(image)
+    assert np.abs(image - phi).mean() < 2e-3 * np.abs(phi).mean()
+    assert phi[: grid.voxel_count].mean() > 2 * np.array(b)[: grid.voxel_count].mean()
