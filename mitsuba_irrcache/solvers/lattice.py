@@ -72,13 +72,21 @@ class Lattice:
         self._lanes = dr.arange(mi.UInt32, self._lines)
         dr.eval(self._lanes)
         self.together = grid.voxel_count <= SMALL
+        voxels = grid.voxel_count
+        #: where further channels begin in a volume of several
+        self._layers = [dr.opaque(mi.UInt32, i * voxels) for i in range(1, dr.size_v(mi.Spectrum))]
         self._extinction = Extinction(grid, self.detail, sigma_t)
         self._wanted = dr.arange(mi.UInt32, grid.voxel_count) if wanted is None else wanted
         self._empty: Emptiness | None = None
         if sparse and not self.together:
             self._empty = Emptiness.find(grid, self._wanted, lower, upper)
+        #: where the corners of each axis begin among all that are kept
+        self._first_corner = [0, 0, 0]
         if self.together:
-            self._all_corners = [self._extinction.corners(axis) for axis in range(3)]
+            corners = [self._extinction.corners(axis) for axis in range(3)]
+            sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
+            self._first_corner = np.cumsum([0, *sizes[:2]]).tolist()
+            self._all_corners = dr.concat(corners)
             dr.eval(self._all_corners)
 
     def table(
@@ -114,13 +122,12 @@ class Lattice:
             places = strides_of(self._extinction.sides(axis), layout)
             row = [*(int(self.sides[k]) for k in order), *(strides[k] for k in order)]
             row += [int(np.dot(self.lower, strides)), *(places[k] for k in order)]
-            row += [
-                int(
-                    np.dot(self.lower, places)
-                    if self._extinction.own
-                    else self.lower[axis] * places[axis]
-                )
-            ]
+            corner = (
+                np.dot(self.lower, places)
+                if self._extinction.own
+                else self.lower[axis] * places[axis]
+            )
+            row += [int(corner) + self._first_corner[axis]]
             for k, offset in zip(across, offsets[i], strict=True):
                 slope = round(velocity[k] / velocity[axis] * ONE)
                 slope = slope or 1  # lines never stay in a face
@@ -147,18 +154,24 @@ class Lattice:
     ) -> mi.Float:
         """Irradiance at the centres of the wanted voxels: the light that enters along pairs of
         directions, told as in `table`; instead of that ``light``, line by line, if a function of
-        the table is given that makes `Entering`.
+        the table is given that makes `Entering`, of all channels of which one follows the other.
         """
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
         table.entering = entering(table) if entering is not None else None
         box = self.lower, self.lower + self.sides
-        total = dr.opaque(mi.Float, 0, dr.width(self._wanted))
+        channels = 1 if table.entering is None else table.entering.channels
+        wanted = dr.width(self._wanted)
+        total = dr.opaque(mi.Float, 0, wanted * channels)
+        places = dr.arange(mi.UInt32, wanted)
         for axis, pairs in table.by_axis:
-            volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
+            volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)
             self._launch(volume, False, table, axis, pairs)
-            light = sharpened(volume, self.grid, *box, axis, self._wanted)
-            # In place: a sum would be a second array.
-            dr.scatter_add(total, light, dr.arange(mi.UInt32, dr.width(total)))
+            for c in range(channels):
+                layer = self._layers[c - 1] if c else None
+                light = sharpened(volume, self.grid, *box, axis, self._wanted, layer)
+                place = places + dr.opaque(mi.UInt32, wanted * c) if c else places
+                # In place: a sum would be a second array.
+                dr.scatter_add(total, light, place)
             dr.eval(total)
         return total
 
@@ -169,8 +182,11 @@ class Lattice:
         out, S, and three that are added to: its irradiance; what lines lose in it, the integral of
         L - S over optical depth and directions; and the integral of 1, W. So S plus the mean loss,
         loss / W, is the mean radiance *of collisions*: what is scattered from it is neither more
-        nor less than what has collided.
+        nor less than what has collided. Those of further channels follow that of the first.
         """
+        if self.together:
+            self._launch_together(volume, True, table, table.order)
+            return
         for axis, pairs in table.by_axis:
             self._launch(volume, True, table, axis, pairs)
 
@@ -179,42 +195,51 @@ class Lattice:
     ) -> None:
         """Follows the ``pairs`` of ``table``, all of which have the dominant ``axis``."""
         if self.together:
-            most = max(1, COPIES // self.grid.voxel_count)
-            for start in range(0, len(pairs), most):
-                self._launch_together(volume, scatters, table, axis, pairs[start : start + most])
+            self._launch_together(volume, scatters, table, pairs)
             return
         corners = self._extinction.corners(axis)  # one set at a time is kept
         dr.eval(corners)
         empty = self._empty.slices if self._empty and not scatters else None
         source = volume if scatters else None
+        layers = self._further(volume, scatters)
         for i in pairs:
             follow(
                 corners, self._extinction.own, empty, volume, source, table, table.places[i],
-                self._lanes, dr.opaque(mi.UInt32, 0),
+                self._lanes, dr.opaque(mi.UInt32, 0), layers,
             )  # fmt: skip
             dr.eval(volume)
             self.pause()
 
     def _launch_together(
-        self, volume: mi.Float, scatters: bool, table: Table, axis: int, pairs: list[int]
+        self, volume: mi.Float, scatters: bool, table: Table, pairs: list[int]
     ) -> None:
-        """The same in one launch; the ``pairs`` follow each other in the table's order."""
-        voxels, count = self.grid.voxel_count, len(pairs)
-        lines = dr.opaque(mi.UInt32, self._lines)
-        lanes = dr.arange(mi.UInt32, self._lines * count)
-        row = lanes // lines
-        first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
-        which = dr.gather(mi.UInt32, table.ordered, first + row)
-        copies = dr.opaque(mi.Float, 0, dr.width(volume) * count)
-        source = volume if scatters else None
-        follow(
-            self._all_corners[axis], self._extinction.own, None, copies, source, table, which,
-            lanes - row * lines, row * dr.opaque(mi.UInt32, voxels),
-        )  # fmt: skip
-        dr.eval(copies)
-        add_copies(volume, copies, voxels, count, mi.Vector4f if scatters else mi.Float)
-        dr.eval(volume)
-        self.pause()
+        """The same in one launch, or few; the ``pairs``, of any axes, follow each other in the
+        table's order.
+        """
+        lines, kind = dr.opaque(mi.UInt32, self._lines), mi.Vector4f if scatters else mi.Float
+        voxels = dr.width(volume) // dr.size_v(kind)  # of all channels
+        most = max(1, COPIES // voxels)
+        for start in range(0, len(pairs), most):
+            count = len(pairs[start : start + most])
+            lanes = dr.arange(mi.UInt32, self._lines * count)
+            row = lanes // lines
+            first = dr.opaque(mi.UInt32, table.order.index(pairs[start]))
+            which = dr.gather(mi.UInt32, table.ordered, first + row)
+            copies = dr.opaque(mi.Float, 0, dr.width(volume) * count)
+            follow(
+                self._all_corners, self._extinction.own, None, copies, volume if scatters else None,
+                table, which, lanes - row * lines, row * dr.opaque(mi.UInt32, voxels),
+                self._further(volume, scatters),
+            )  # fmt: skip
+            dr.eval(copies)
+            add_copies(volume, copies, voxels, count, kind)
+            dr.eval(volume)
+            self.pause()
+
+    def _further(self, volume: mi.Float, scatters: bool) -> list[mi.UInt32]:
+        """Where the channels of a volume begin, but for the first."""
+        count = dr.width(volume) // (self.grid.voxel_count * (4 if scatters else 1))
+        return self._layers[: count - 1]
 
 
 def sharpened(
@@ -224,14 +249,17 @@ def sharpened(
     upper: np.ndarray,
     axis: int,
     index: mi.UInt32,
+    layer: mi.UInt32 | None = None,
 ) -> mi.Float:
     """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z),
     given means over the cross sections of all voxels across ``axis``, ``values``, laid out by
-    slices: second differences along both other axes take back what the mean has smoothed. Never
-    negative.
+    slices, from ``layer`` on: second differences along both other axes take back what the mean has
+    smoothed. Never negative.
     """
     places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
     place = flat(places, strides)
+    if layer is not None:
+        place += layer
     value, change = dr.gather(mi.Float, values, place), mi.Float(0)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
         if k == axis or upper[k] - lower[k] < 3:
@@ -283,25 +311,37 @@ class Entering:
 
     The lines of a pair are told apart by where they pass the first slice, or would if they did not
     enter the box behind it. A scale times these two coordinates, moved, is a place among cells,
-    each of which has two of the ``values``: along the axis, and against it.
+    each of which has two of the ``values``: along the axis, and against it. The values of all
+    ``channels`` follow each other.
     """
 
     def __init__(
-        self, places: np.ndarray, cells: np.ndarray, values: mi.Float | None = None
+        self,
+        places: np.ndarray,
+        cells: np.ndarray,
+        values: mi.Float | None = None,
+        channels: int = 1,
     ) -> None:
         """``places``: for each pair scale, moves (2) and slopes (2) of the lines; ``cells``: the
         first value, and the cells along both axes.
         """
         self._places = mi.Float(places.ravel().tolist())
         self._cells = mi.UInt32(cells.ravel().tolist())
-        self.values = values
+        self.values, self.channels = values, channels
 
     def pair(self, which: mi.UInt32) -> list:
         """What `at` has to know of pairs."""
         places = [dr.gather(mi.Float, self._places, which * 5 + i) for i in range(5)]
         return places + [dr.gather(mi.UInt32, self._cells, which * 3 + i) for i in range(3)]
 
-    def at(self, pair: list, way: int, slice_, ib, fb, ic, fc, active) -> mi.Float:
+    def layers(self) -> list[mi.UInt32]:
+        """Where the values of the channels begin, but for the first."""
+        count = dr.width(self.values) // self.channels
+        return [dr.opaque(mi.UInt32, c * count) for c in range(1, self.channels)]
+
+    def at(
+        self, pair: list, layers: list, way: int, slice_, ib, fb, ic, fc, active
+    ) -> list[mi.Float]:
         """The light of lines that are at these voxels, and positions in them, in a slice."""
         scale, move_b, move_c, slope_b, slope_c, first, nb, nc = pair
         k = mi.Float(slice_)
@@ -310,4 +350,5 @@ class Entering:
         b, c = (mi.Int32(dr.floor(dr.fma(x, scale, m))) for x, m in ((b, move_b), (c, move_c)))
         active = active & (b >= 0) & (c >= 0) & (b < mi.Int32(nb)) & (c < mi.Int32(nc))
         place = first + (mi.UInt32(c) * nb + mi.UInt32(b)) * 2 + way
-        return dr.gather(mi.Float, self.values, place, active)
+        places = [place, *(place + layer for layer in layers)]
+        return [dr.gather(mi.Float, self.values, p, active) for p in places]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
@@ -70,10 +72,12 @@ def follow(
     which: mi.UInt32,
     lanes: mi.UInt32,
     copy: mi.UInt32,
+    layers: Sequence[mi.UInt32] = (),
 ):
     """Follows pairs of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
     ``source``: what `Lattice.scatter` calls volume, None if voxels send no light; may be ``volume``
-    itself, where the light is left, from voxel ``copy`` on.
+    itself, where the light is left, from voxel ``copy`` on. Light of further channels goes the same
+    way: their ``layers`` of the volume begin so many voxels behind that of the first.
     """
     entering, apart = table.entering, source is not volume
     row = [dr.gather(mi.Int32, table.integers, which * INTEGERS + i) for i in range(INTEGERS)]
@@ -104,14 +108,15 @@ def follow(
     kb, kc = dr.select(kb >= nb, kb - nb, kb), dr.select(kc >= nc, kc - nc, kc)
     since_back = dr.minimum(back_b.start(kb, gb), back_c.start(kc, gc))
     slice_, slice_back = shift + width, shift + ta * (na - 1) + width
-    L, L_back, s0, s0_back = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
+    L, L_back = ([mi.Float(0) for _ in range(len(layers) + 1)] for _ in range(2))
+    s0, s0_back = mi.Float(0), mi.Float(0)
     scale, area = quantum * length, dr.rcp(length)
     # Slices behind, of both ways; where they skip some, each is in a slice of its own.
     k, k_back, active_back = mi.Int32(0), mi.Int32(0), mi.Bool(active)
     ahead, ahead_back = mi.Int32(1), mi.Int32(1)
     needed, needed_back = mi.Bool(active), mi.Bool(active)
     if dr.hint(entering is not None, mode="scalar"):
-        pair = entering.pair(which)
+        pair, arriving = entering.pair(which), entering.layers()
     while dr.hint(active | active_back, label="slices"):
         if dr.hint(empty is not None, mode="scalar"):
             ahead = _slices(empty, cells, ib, ic, k, active)
@@ -131,41 +136,37 @@ def follow(
         )
         if dr.hint(entering is not None, mode="scalar"):
             new, new_back = active & (since < 1), active_back & (since_back < 1)
-            found = entering.at(pair, 0, k, ib, fb, ic, fc, new)
-            found_back = entering.at(pair, 1, na - 1 - k_back, kb, gb, kc, gc, new_back)
-            L, L_back = dr.select(new, found, L), dr.select(new_back, found_back, L_back)
+            found = entering.at(pair, arriving, 0, k, ib, fb, ic, fc, new)
+            found_back = entering.at(pair, arriving, 1, na - 1 - k_back, kb, gb, kc, gc, new_back)
+            L, L_back = _chosen(new, found, L), _chosen(new_back, found_back, L_back)
         else:
-            L = dr.select(since < 1, light, L)
-            L_back = dr.select(since_back < 1, light_back, L_back)
+            L = _chosen(since < 1, len(L) * [light], L)
+            L_back = _chosen(since_back < 1, len(L) * [light_back], L_back)
         # In the middle slice both ways are in the same voxel: the first to write writes for both.
         middle = off == off_back
         if dr.hint(source is None, mode="scalar"):
-            L *= _passed(since, s0, s, scale)
-            L_back *= _passed(since_back, s0_back, s_back, scale)
-            before = dr.gather(mi.Float, volume, place, needed)
-            before_back = dr.gather(mi.Float, volume, place_back, needed_back)
-            dr.scatter(volume, before + L + dr.select(middle, L_back, 0), place, needed)
-            dr.scatter(volume, before_back + L_back, place_back, needed_back & ~middle)
+            L = _times(L, _passed(since, s0, s, scale))
+            L_back = _times(L_back, _passed(since_back, s0_back, s_back, scale))
+            before = _read(mi.Float, volume, place, layers, needed)
+            before_back = _read(mi.Float, volume, place_back, layers, needed_back)
+            both = _sum(_sum(before, L), _chosen(middle, L_back, len(L) * [0]))
+            _write(volume, both, place, layers, needed)
+            _write(volume, _sum(before_back, L_back), place_back, layers, needed_back & ~middle)
         else:
-            voxel = dr.gather(mi.Vector4f, volume, place, active)
-            voxel_back = dr.gather(mi.Vector4f, volume, place_back, active)
-            sent, sent_back = voxel.x, voxel_back.x
+            voxel = _read(mi.Vector4f, volume, place, layers, active)
+            voxel_back = _read(mi.Vector4f, volume, place_back, layers, active)
+            sent, sent_back = _sent(voxel), _sent(voxel_back)
             if dr.hint(apart, mode="scalar"):
-                sent = dr.gather(mi.Float, source, index * 4, active)
-                sent_back = dr.gather(mi.Float, source, index_back * 4, active)
-            L, tally = _crossed(L, sent * weight, s * scale, s_next * scale, since, weight, area)
+                sent = _sources(source, index, layers, active)
+                sent_back = _sources(source, index_back, layers, active)
+            sent, sent_back = _times(sent, weight), _times(sent_back, weight)
+            L, tally = _crossed(L, sent, s * scale, s_next * scale, since, weight, area)
             L_back, tally_back = _crossed(
-                L_back,
-                sent_back * weight,
-                s_back * scale,
-                s_next_back * scale,
-                since_back,
-                weight,
-                area,
+                L_back, sent_back, s_back * scale, s_next_back * scale, since_back, weight, area
             )
-            tally += dr.select(middle, tally_back, 0)
-            dr.scatter(volume, voxel + tally, place, active)
-            dr.scatter(volume, voxel_back + tally_back, place_back, active & ~middle)
+            tally = _sum(tally, _chosen(middle, tally_back, len(L) * [0]))
+            _write(volume, _sum(voxel, tally), place, layers, active)
+            _write(volume, _sum(voxel_back, tally_back), place_back, layers, active & ~middle)
         s0, s0_back = s_next, s_next_back
         ib, fb, since = there_b.advance(ib, fb, ahead)
         ic, fc, near = there_c.advance(ic, fc, ahead)
@@ -230,7 +231,7 @@ def _passed(since, before, here, scale) -> mi.Float:
     return dr.exp(-dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
 
 
-def _crossed(L, source, first, second, since, weight, area) -> tuple:
+def _crossed(L: list, source: list, first, second, since, weight, area) -> tuple[list, list]:
     """Radiance behind a slice, and what its voxel tallies, for a source that is constant in it.
     ``first`` and ``second`` are the slice's optical depths, were it all like that half.
 
@@ -240,7 +241,47 @@ def _crossed(L, source, first, second, since, weight, area) -> tuple:
     tau = dr.fma(second, 0.5, to_middle)
     passed = dr.exp(-tau)
     # Thin voxels lose little, but what they scatter is known from just that.
-    lost = (L - source) * dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
+    share = dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
     half = dr.sqrt(passed) if first is second else dr.exp(-to_middle)
-    middle = dr.fma(L - source, half, source)
-    return L - lost, mi.Vector4f(0, middle, lost * area, weight * tau * area)
+    left, tally = [], []
+    for x, sent in zip(L, source, strict=True):
+        lost, middle = (x - sent) * share, dr.fma(x - sent, half, sent)
+        left.append(x - lost)
+        tally.append(mi.Vector4f(0, middle, lost * area, weight * tau * area))
+    return left, tally
+
+
+# Of all channels
+
+
+def _places(place: mi.UInt32, layers: Sequence[mi.UInt32]) -> list[mi.UInt32]:
+    return [place, *(place + layer for layer in layers)]
+
+
+def _read(kind: type, volume: mi.Float, place: mi.UInt32, layers, active: mi.Bool) -> list:
+    return [dr.gather(kind, volume, p, active) for p in _places(place, layers)]
+
+
+def _write(volume: mi.Float, values: list, place: mi.UInt32, layers, active: mi.Bool) -> None:
+    for value, p in zip(values, _places(place, layers), strict=True):
+        dr.scatter(volume, value, p, active)
+
+
+def _chosen(first: mi.Bool, values: list, others: list) -> list:
+    return [dr.select(first, a, b) for a, b in zip(values, others, strict=True)]
+
+
+def _sum(first: list, second: list) -> list:
+    return [a + b for a, b in zip(first, second, strict=True)]
+
+
+def _times(values: list, factor: mi.Float) -> list:
+    return [value * factor for value in values]
+
+
+def _sources(source: mi.Float, voxel: mi.UInt32, layers, active: mi.Bool) -> list[mi.Float]:
+    return [dr.gather(mi.Float, source, p * 4, active) for p in _places(voxel, layers)]
+
+
+def _sent(voxels: list[mi.Vector4f]) -> list[mi.Float]:
+    return [voxel.x for voxel in voxels]
