@@ -72,9 +72,6 @@ class Lattice:
         self._lanes = dr.arange(mi.UInt32, self._lines)
         dr.eval(self._lanes)
         self.together = grid.voxel_count <= SMALL
-        voxels = grid.voxel_count
-        #: where further channels begin in a volume of several
-        self._layers = [dr.opaque(mi.UInt32, i * voxels) for i in range(1, dr.size_v(mi.Spectrum))]
         self._extinction = Extinction(grid, self.detail, sigma_t)
         self._wanted = dr.arange(mi.UInt32, grid.voxel_count) if wanted is None else wanted
         self._empty: Emptiness | None = None
@@ -167,8 +164,7 @@ class Lattice:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)
             self._launch(volume, False, table, axis, pairs)
             for c in range(channels):
-                layer = self._layers[c - 1] if c else None
-                light = sharpened(volume, self.grid, *box, axis, self._wanted, layer)
+                light = sharpened(volume, self.grid, *box, axis, self._wanted, c, channels)
                 place = places + dr.opaque(mi.UInt32, wanted * c) if c else places
                 # In place: a sum would be a second array.
                 dr.scatter_add(total, light, place)
@@ -182,7 +178,8 @@ class Lattice:
         out, S, and three that are added to: its irradiance; what lines lose in it, the integral of
         L - S over optical depth and directions; and the integral of 1, W. So S plus the mean loss,
         loss / W, is the mean radiance *of collisions*: what is scattered from it is neither more
-        nor less than what has collided. Those of further channels follow that of the first.
+        nor less than what has collided. Of several channels, a voxel has those four
+        values of each in turn.
         """
         if self.together:
             self._launch_together(volume, True, table, table.order)
@@ -201,11 +198,11 @@ class Lattice:
         dr.eval(corners)
         empty = self._empty.slices if self._empty and not scatters else None
         source = volume if scatters else None
-        layers = self._further(volume, scatters)
+        channels = self._channels(volume, scatters)
         for i in pairs:
             follow(
                 corners, self._extinction.own, empty, volume, source, table, table.places[i],
-                self._lanes, dr.opaque(mi.UInt32, 0), layers,
+                self._lanes, dr.opaque(mi.UInt32, 0), channels,
             )  # fmt: skip
             dr.eval(volume)
             self.pause()
@@ -229,17 +226,16 @@ class Lattice:
             follow(
                 self._all_corners, self._extinction.own, None, copies, volume if scatters else None,
                 table, which, lanes - row * lines, row * dr.opaque(mi.UInt32, voxels),
-                self._further(volume, scatters),
+                self._channels(volume, scatters),
             )  # fmt: skip
             dr.eval(copies)
             add_copies(volume, copies, voxels, count, kind)
             dr.eval(volume)
             self.pause()
 
-    def _further(self, volume: mi.Float, scatters: bool) -> list[mi.UInt32]:
-        """Where the channels of a volume begin, but for the first."""
-        count = dr.width(volume) // (self.grid.voxel_count * (4 if scatters else 1))
-        return self._layers[: count - 1]
+    def _channels(self, volume: mi.Float, scatters: bool) -> int:
+        """How many a volume has."""
+        return dr.width(volume) // (self.grid.voxel_count * (4 if scatters else 1))
 
 
 def sharpened(
@@ -249,27 +245,28 @@ def sharpened(
     upper: np.ndarray,
     axis: int,
     index: mi.UInt32,
-    layer: mi.UInt32 | None = None,
+    channel: int = 0,
+    channels: int = 1,
 ) -> mi.Float:
     """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z),
     given means over the cross sections of all voxels across ``axis``, ``values``, laid out by
-    slices, from ``layer`` on: second differences along both other axes take back what the mean has
-    smoothed. Never negative.
+    slices: second differences along both other axes take back what the mean has smoothed. Never
+    negative. A voxel may have values of several ``channels``, of which one is taken.
     """
     places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
     place = flat(places, strides)
-    if layer is not None:
-        place += layer
-    value, change = dr.gather(mi.Float, values, place), mi.Float(0)
+
+    def read(i: mi.UInt32) -> mi.Float:
+        return dr.gather(mi.Float, values, i if channels == 1 else i * channels + channel)
+
+    value, change = read(place), mi.Float(0)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
         if k == axis or upper[k] - lower[k] < 3:
             continue
         stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))
         # At a border, the second difference of the voxel next to it.
         centre = place + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
-        here, below, above = (
-            dr.gather(mi.Float, values, i) for i in (centre, centre - stride, centre + stride)
-        )
+        here, below, above = (read(i) for i in (centre, centre - stride, centre + stride))
         # Where no line has left anything, nothing is known.
         change += dr.select((below > 0) & (above > 0), 2 * here - below - above, 0)
     return dr.maximum(dr.fma(change, dr.opaque(mi.Float, RECEIVED), value), 0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import drjit as dr
 import mitsuba as mi
 
@@ -72,12 +70,12 @@ def follow(
     which: mi.UInt32,
     lanes: mi.UInt32,
     copy: mi.UInt32,
-    layers: Sequence[mi.UInt32] = (),
+    channels: int = 1,
 ):
     """Follows pairs of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
     ``source``: what `Lattice.scatter` calls volume, None if voxels send no light; may be ``volume``
-    itself, where the light is left, from voxel ``copy`` on. Light of further channels goes the same
-    way: their ``layers`` of the volume begin so many voxels behind that of the first.
+    itself, where the light is left, from voxel ``copy`` on. Light of several ``channels`` goes the
+    same way; a voxel has those of all of them next to each other.
     """
     entering, apart = table.entering, source is not volume
     row = [dr.gather(mi.Int32, table.integers, which * INTEGERS + i) for i in range(INTEGERS)]
@@ -108,7 +106,7 @@ def follow(
     kb, kc = dr.select(kb >= nb, kb - nb, kb), dr.select(kc >= nc, kc - nc, kc)
     since_back = dr.minimum(back_b.start(kb, gb), back_c.start(kc, gc))
     slice_, slice_back = shift + width, shift + ta * (na - 1) + width
-    L, L_back = ([mi.Float(0) for _ in range(len(layers) + 1)] for _ in range(2))
+    L, L_back = ([mi.Float(0) for _ in range(channels)] for _ in range(2))
     s0, s0_back = mi.Float(0), mi.Float(0)
     scale, area = quantum * length, dr.rcp(length)
     # Slices behind, of both ways; where they skip some, each is in a slice of its own.
@@ -128,6 +126,8 @@ def follow(
             k_back = k
         index = mi.UInt32(ib * sb + ic * sc + off)
         index_back = mi.UInt32(kb * sb + kc * sc + off_back)
+        if dr.hint(channels > 1, mode="scalar"):
+            index, index_back = index * channels, index_back * channels
         place, place_back = index + copy, index_back + copy
         # Of the half before the middle of the slice, and of the half behind it.
         s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, needed)
@@ -147,26 +147,26 @@ def follow(
         if dr.hint(source is None, mode="scalar"):
             L = _times(L, _passed(since, s0, s, scale))
             L_back = _times(L_back, _passed(since_back, s0_back, s_back, scale))
-            before = _read(mi.Float, volume, place, layers, needed)
-            before_back = _read(mi.Float, volume, place_back, layers, needed_back)
+            before = _read(mi.Float, volume, place, channels, needed)
+            before_back = _read(mi.Float, volume, place_back, channels, needed_back)
             both = _sum(_sum(before, L), _chosen(middle, L_back, len(L) * [0]))
-            _write(volume, both, place, layers, needed)
-            _write(volume, _sum(before_back, L_back), place_back, layers, needed_back & ~middle)
+            _write(volume, both, place, needed)
+            _write(volume, _sum(before_back, L_back), place_back, needed_back & ~middle)
         else:
-            voxel = _read(mi.Vector4f, volume, place, layers, active)
-            voxel_back = _read(mi.Vector4f, volume, place_back, layers, active)
+            voxel = _read(mi.Vector4f, volume, place, channels, active)
+            voxel_back = _read(mi.Vector4f, volume, place_back, channels, active)
             sent, sent_back = _sent(voxel), _sent(voxel_back)
             if dr.hint(apart, mode="scalar"):
-                sent = _sources(source, index, layers, active)
-                sent_back = _sources(source, index_back, layers, active)
+                sent = _sources(source, index, channels, active)
+                sent_back = _sources(source, index_back, channels, active)
             sent, sent_back = _times(sent, weight), _times(sent_back, weight)
             L, tally = _crossed(L, sent, s * scale, s_next * scale, since, weight, area)
             L_back, tally_back = _crossed(
                 L_back, sent_back, s_back * scale, s_next_back * scale, since_back, weight, area
             )
             tally = _sum(tally, _chosen(middle, tally_back, len(L) * [0]))
-            _write(volume, _sum(voxel, tally), place, layers, active)
-            _write(volume, _sum(voxel_back, tally_back), place_back, layers, active & ~middle)
+            _write(volume, _sum(voxel, tally), place, active)
+            _write(volume, _sum(voxel_back, tally_back), place_back, active & ~middle)
         s0, s0_back = s_next, s_next_back
         ib, fb, since = there_b.advance(ib, fb, ahead)
         ic, fc, near = there_c.advance(ic, fc, ahead)
@@ -254,16 +254,16 @@ def _crossed(L: list, source: list, first, second, since, weight, area) -> tuple
 # Of all channels
 
 
-def _places(place: mi.UInt32, layers: Sequence[mi.UInt32]) -> list[mi.UInt32]:
-    return [place, *(place + layer for layer in layers)]
+def _places(place: mi.UInt32, channels: int) -> list[mi.UInt32]:
+    return [place, *(place + c for c in range(1, channels))]
 
 
-def _read(kind: type, volume: mi.Float, place: mi.UInt32, layers, active: mi.Bool) -> list:
-    return [dr.gather(kind, volume, p, active) for p in _places(place, layers)]
+def _read(kind: type, volume: mi.Float, place: mi.UInt32, channels: int, active: mi.Bool) -> list:
+    return [dr.gather(kind, volume, p, active) for p in _places(place, channels)]
 
 
-def _write(volume: mi.Float, values: list, place: mi.UInt32, layers, active: mi.Bool) -> None:
-    for value, p in zip(values, _places(place, layers), strict=True):
+def _write(volume: mi.Float, values: list, place: mi.UInt32, active: mi.Bool) -> None:
+    for value, p in zip(values, _places(place, len(values)), strict=True):
         dr.scatter(volume, value, p, active)
 
 
@@ -279,8 +279,8 @@ def _times(values: list, factor: mi.Float) -> list:
     return [value * factor for value in values]
 
 
-def _sources(source: mi.Float, voxel: mi.UInt32, layers, active: mi.Bool) -> list[mi.Float]:
-    return [dr.gather(mi.Float, source, p * 4, active) for p in _places(voxel, layers)]
+def _sources(source: mi.Float, place: mi.UInt32, channels: int, active: mi.Bool) -> list:
+    return [dr.gather(mi.Float, source, p * 4, active) for p in _places(place, channels)]
 
 
 def _sent(voxels: list[mi.Vector4f]) -> list[mi.Float]:
