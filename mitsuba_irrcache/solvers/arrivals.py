@@ -28,7 +28,7 @@ from mitsuba_irrcache.transport import Start, out_of, trace
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
 #: find what is in the way of an emitter's light are cheaper. What comes from surfaces differs more
 #: from one direction to the next than between lines next to each other.
-CELLS, LIT_CELLS = 1 << 12, 1 << 16
+CELLS, LIT_CELLS = 1 << 11, 1 << 16
 #: Paths begin so far within the box [voxels]: surfaces may lie on its faces.
 WITHIN = 1e-3
 _NUMBERS = 12

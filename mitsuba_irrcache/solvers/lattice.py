@@ -213,8 +213,9 @@ class Lattice:
         """The same in one launch, or few; the ``pairs``, of any axes, follow each other in the
         table's order.
         """
-        lines, kind = dr.opaque(mi.UInt32, self._lines), mi.Vector4f if scatters else mi.Float
-        voxels = dr.width(volume) // dr.size_v(kind)  # of all channels
+        lines = dr.opaque(mi.UInt32, self._lines)
+        kind, size = (mi.Vector4f, 4) if scatters else (mi.Float, 1)
+        voxels = dr.width(volume) // size  # of all channels
         most = max(1, COPIES // voxels)
         for start in range(0, len(pairs), most):
             count = len(pairs[start : start + most])

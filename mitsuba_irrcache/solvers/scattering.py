@@ -23,9 +23,10 @@ from mitsuba_irrcache.solvers.lattice import Lattice, Table
 COARSEST = 20
 #: Corrections on the finest grid, at most; there is one on the others.
 CORRECTIONS = 12
-#: Relative error of the finest solution that is left, and change of the coarsest one.
+#: Relative error of the finest solution that is left, and change of the coarsest one; if ``evenly``
+#: of one that only corrects finer ones, whose error is looked at in any case.
 TOLERANCE = 1e-3
-COARSE_TOLERANCE = 2e-4
+COARSE_TOLERANCE, EVEN_TOLERANCE = 2e-4, 1e-2
 #: Below all light.
 TINY = 1e-300
 
@@ -60,6 +61,7 @@ class Level:
         dr.eval(self._stacked, self._interleaved)
         self._ratio = np.array([2, 2, 2]) if evenly else _ratio(grid)  # to the next level: x, y, z
         self._coarser: Level | None = None
+        self._tolerance = COARSE_TOLERANCE
         self._children: list[tuple[mi.UInt32, mi.Float]] = []
 
     @property
@@ -85,6 +87,8 @@ class Level:
             lattice = Lattice(grid, sigma_t, *box, pause=self.lattice.pause)
             albedo = self.restrict(self.albedo)
             self._coarser = Level(grid, sigma_t, albedo, lattice, self.evenly)
+            if self.evenly:
+                self._coarser._tolerance = EVEN_TOLERANCE
         return self._coarser
 
     def restrict(self, values: mi.Float) -> mi.Float:
@@ -238,7 +242,7 @@ class Level:
                     "the radiance of the emitters (light of the first order: "
                     f"{scale.max():.1e} on average)."
                 )
-            if (np.abs(residual).mean(axis=1) <= COARSE_TOLERANCE * scale).all():
+            if (np.abs(residual).mean(axis=1) <= self._tolerance * scale).all():
                 break
             phi = np.array([_mixed(history, c) for c in range(self.channels)])
         return mi.Float(image.ravel().tolist())
