@@ -159,13 +159,13 @@ class Lattice:
         channels = 1 if table.entering is None else table.entering.channels
         wanted = dr.width(self._wanted)
         total = dr.opaque(mi.Float, 0, wanted * channels)
-        places = dr.arange(mi.UInt32, wanted)
         for axis, pairs in table.by_axis:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)
             self._launch(volume, False, table, axis, pairs)
             for c in range(channels):
                 light = sharpened(volume, self.grid, *box, axis, self._wanted, c, channels)
-                place = places + dr.opaque(mi.UInt32, wanted * c) if c else places
+                place = dr.arange(mi.UInt32, wanted)
+                place = place + dr.opaque(mi.UInt32, wanted * c) if c else place
                 # In place: a sum would be a second array.
                 dr.scatter_add(total, light, place)
             dr.eval(total)
