@@ -22,6 +22,7 @@ import numpy as np
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.lattice import Entering, Lattice, Table
+from mitsuba_irrcache.solvers.layout import joined
 from mitsuba_irrcache.surroundings import probe
 from mitsuba_irrcache.transport import Start, out_of, trace
 
@@ -254,11 +255,6 @@ class Returning(Entering):
             light = self._returned * dr.gather(mi.Float, phi, self._voxel)
         self.values = light if self._emitted is None else light + self._emitted
         dr.eval(self.values)
-
-
-def joined(channels: Sequence[mi.Float | mi.UInt32]) -> mi.Float | mi.UInt32:
-    """Values of all channels, one after the other."""
-    return channels[0] if len(channels) == 1 else dr.concat(channels)
 
 
 def _coarser(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:

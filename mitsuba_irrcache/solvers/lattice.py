@@ -29,7 +29,7 @@ import numpy as np
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.solvers.empty import Emptiness
 from mitsuba_irrcache.solvers.extinction import Extinction
-from mitsuba_irrcache.solvers.layout import STANDARD, flat, slicewise, strides_of
+from mitsuba_irrcache.solvers.layout import STANDARD, flat, joined, slicewise, strides_of
 from mitsuba_irrcache.solvers.lines import INTEGERS, NUMBERS, ONE, add_copies, follow
 
 #: What lines leave in a voxel is a mean over its cross section: smoothing of variance 1/12 along
@@ -83,8 +83,7 @@ class Lattice:
             corners = [self._extinction.corners(axis) for axis in range(3)]
             sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
             self._first_corner = np.cumsum([0, *sizes[:2]]).tolist()
-            self._all_corners = dr.concat(corners)
-            dr.eval(self._all_corners)
+            self._all_corners = joined(corners)
 
     def table(
         self,

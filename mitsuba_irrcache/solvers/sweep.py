@@ -19,11 +19,12 @@ from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.solvers.arrivals import Around, joined
+from mitsuba_irrcache.solvers.arrivals import Around
 from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.glow import emitted_light
 from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp, split
 from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.layout import joined
 from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass, arriving
 from mitsuba_irrcache.solvers.scattering import Level
 
