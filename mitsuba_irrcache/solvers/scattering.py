@@ -52,13 +52,6 @@ class Level:
         self.grid, self.sigma_t, self.albedo, self.lattice = grid, sigma_t, albedo, lattice
         self.evenly = evenly
         self.channels = dr.width(albedo) // grid.voxel_count
-        # Where a voxel's channels in a volume are among all of one after the other, and back.
-        index, count = dr.arange(mi.UInt32, dr.width(albedo)), dr.opaque(mi.UInt32, self.channels)
-        voxel = index // count
-        self._stacked = (index - voxel * count) * dr.opaque(mi.UInt32, grid.voxel_count) + voxel
-        layer, voxel = _layers(grid.voxel_count, self.channels)
-        self._interleaved = voxel * count + layer
-        dr.eval(self._stacked, self._interleaved)
         self._ratio = np.array([2, 2, 2]) if evenly else _ratio(grid)  # to the next level: x, y, z
         self._coarser: Level | None = None
         self._tolerance = COARSE_TOLERANCE
@@ -135,13 +128,22 @@ class Level:
         nothing = dr.zeros(mi.Float, count)
         sent = nothing if phi is None else phi * self.albedo * dr.inv_four_pi
         if self.channels > 1:
-            sent = dr.gather(mi.Float, sent, self._stacked)
+            # The channels of a voxel next to each other, and back below.
+            index = dr.arange(mi.UInt32, count)
+            voxel = index // self.channels
+            layer = index - voxel * self.channels
+            dr.eval(sent)
+            place = layer * dr.opaque(mi.UInt32, self.grid.voxel_count) + voxel
+            sent = dr.gather(mi.Float, sent, place)
         volume = dr.ravel(mi.Vector4f(sent, nothing, nothing, nothing))
         dr.eval(volume)
         if table.entering is not None and phi is not None:
             table.entering.receive(phi)
         self.lattice.scatter(volume, table)
-        index = dr.arange(mi.UInt32, count) if self.channels == 1 else self._interleaved
+        index = dr.arange(mi.UInt32, count)
+        if self.channels > 1:
+            layer, voxel = _layers(self.grid.voxel_count, self.channels)
+            index = voxel * self.channels + layer
         source, phi, lost, depth = dr.gather(mi.Vector4f, volume, index)
         # Radiance of collisions times 4 pi, which is what 1 is, integrated over directions.
         collided = 4 * dr.pi * (source + lost / dr.select(depth > 0, depth, 1))
