@@ -134,7 +134,8 @@ class LitMedium:
         if medium.phase is not None:
             directional = Directional(medium.phase, sources_of(scene))
         moments = directional.count if directional is not None else 0
-        _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments)
+        together = medium.surroundings is not None
+        _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments, together)
         warn_of_dense_border(medium, grid)
         active, survey = active_voxels(medium, grid), None
         if medium.surroundings is not None and self.solver == "path":  # else nothing is among them
@@ -317,16 +318,23 @@ def _marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
 
 
 def _check_memory(
-    grid: Grid, solver: str, max_depth: int, with_error: bool, moments: int = 0
+    grid: Grid,
+    solver: str,
+    max_depth: int,
+    with_error: bool,
+    moments: int = 0,
+    together: bool = False,
 ) -> None:
     """Refuses a cache that cannot be held, with what it takes to make it and to look it up; for the
-    field of its errors as much again (experiments/memory).
+    field of its errors as much again (experiments/memory). ``together``: all channels are swept at
+    once.
     """
     channels = 1 if mi.is_monochromatic else 3
     if solver == "sweep":
         # Extinction with its neighbours, the light that lines carry, sums and spreads; and where
         # light is scattered again, the voxels' own and what is kept between sweeps.
-        numbers = 5 + 2 * channels + (0 if max_depth == 2 else 12 + 3 * channels)
+        sets = channels if together else 1
+        numbers = 5 + 2 * channels + (0 if max_depth == 2 else 12 * sets + 3 * channels)
     else:
         numbers = channels * (3 * 2 + 3) + 5  # sums in float64
         numbers += channels * moments * 3

@@ -22,13 +22,14 @@ import numpy as np
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.lattice import Entering, Lattice, Table
+from mitsuba_irrcache.solvers.layout import joined
 from mitsuba_irrcache.surroundings import probe
 from mitsuba_irrcache.transport import Start, out_of, trace
 
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
 #: find what is in the way of an emitter's light are cheaper. What comes from surfaces differs more
 #: from one direction to the next than between lines next to each other.
-CELLS, LIT_CELLS = 1 << 12, 1 << 16
+CELLS, LIT_CELLS = 1 << 11, 1 << 16
 #: Paths begin so far within the box [voxels]: surfaces may lie on its faces.
 WITHIN = 1e-3
 _NUMBERS = 12
@@ -82,14 +83,20 @@ class Arrivals:
         """All that has channels."""
         return self.straight, self.emitted, self.returned
 
-    def directly(self, channel: int, table: Table, rows: np.ndarray) -> Entering:
+    def directly(self, channels: Sequence[int], table: Table, rows: np.ndarray) -> Entering:
         """Light straight from emitters, along the lines of a ``table`` of the same lattice for
         these ``rows``.
         """
-        return Entering(*self._placed(self.lattice, table, rows), self.straight[channel])
+        light = joined([self.straight[c] for c in channels])
+        return Entering(*self._placed(self.lattice, table, rows), light, len(channels))
 
     def returning(
-        self, channel: int, lattice: Lattice, table: Table, rows: np.ndarray, emitted: bool
+        self,
+        channels: Sequence[int],
+        lattice: Lattice,
+        table: Table,
+        rows: np.ndarray,
+        emitted: bool,
     ) -> Returning:
         """Light along the lines of a ``table`` for these ``rows``, which follow each other, of the
         same lattice or that of a coarser grid; without what is ``emitted`` unless that is wanted.
@@ -101,11 +108,15 @@ class Arrivals:
         start, count = int(cells[0, 0]), int(self._ends[rows[-1]] - cells[0, 0])
         cells[:, 0] -= start
         here = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
-        sources = [self.returned[channel], *([self.emitted[channel]] if emitted else [])]
-        values = [dr.gather(mi.Float, source, here) for source in sources]
+        values = [
+            joined([dr.gather(mi.Float, kind[c], here) for c in channels])
+            for kind in (self.returned, *([self.emitted] if emitted else []))
+        ]
         voxel = dr.gather(mi.UInt32, self._voxels[grid.shape], here)
-        dr.eval(values, voxel)
-        return Returning(places, cells, voxel, *values)
+        layers = [dr.opaque(mi.UInt32, i * grid.voxel_count) for i in range(1, len(channels))]
+        voxels = joined([voxel, *(voxel + layer for layer in layers)])
+        dr.eval(values, voxels)
+        return Returning(len(channels), places, cells, voxels, *values)
 
     def _cells(self, most: np.ndarray) -> None:
         """Lays out cells: blocks of lines, so many along an edge that there are not too ``many``
@@ -227,13 +238,14 @@ class Returning(Entering):
 
     def __init__(
         self,
+        channels: int,
         places: np.ndarray,
         cells: np.ndarray,
         voxel: mi.UInt32,
         returned: mi.Float,
         emitted: mi.Float | None = None,
     ) -> None:
-        super().__init__(places, cells)
+        super().__init__(places, cells, None, channels)
         self._voxel, self._returned, self._emitted = voxel, returned, emitted
 
     def receive(self, phi: mi.Float | None) -> None:

@@ -29,39 +29,45 @@ class DirectionalSweep(Sweep):
         super().__init__(scene, medium, cache, *rest)
         if not cache.active_count:
             return
-        self._where = self._moments.places(cache.active, cache.grid.voxel_count)
+        self._places_of_moments = self._moments.places(cache.active, cache.grid.voxel_count)
         # Point-like lights, in the order of `Sky.near`.
         self._towards = [s.seen_from(self._places)[0] for s in sources if not s.far]
 
-    def _level(self, *arguments: object) -> Level:
-        *arguments, _ = arguments
+    def _active(self, layer: int) -> mi.UInt32:
+        return self._places_of_moments
+
+    def _new_level(self, *arguments: object) -> Level:
         return DirectionalLevel(*arguments, self._moments)
 
-    def _solved(self, passes: list[Pass], light: int, medium: int) -> tuple:
+    def _solved(
+        self, passes: list[Pass], light: tuple[int, ...], medium: tuple[int, ...]
+    ) -> list[tuple]:
         """As of `Sweep`; narrow lights are not in the moments of the light straight from emitters,
         but beside them.
         """
-        lattice, moments = self._lattices[medium], self._moments
-        arriving = passes[1:] if self._levels else passes
+        moments, several = self._moments, self.cache.max_depth != 2
+        lattice = self._lattices[min(medium[0], len(self._lattices) - 1)]
+        arriving = passes[1:] if several else passes
         scale = dr.opaque(mi.Float, 1 / len(arriving))
         smooth, own = moments.uncollided(arriving, lattice)
         swept = sum((light for light in own if light is not None), smooth) * scale
         smooth *= scale
         none = dr.zeros(mi.Float, self.cache.active_count)
-        near = iter(emitted[light] for emitted in self._direct)
+        direct = [emitted[light[0]] for emitted in self._direct]
+        near = iter(direct)
         narrow = [
             next(near) if not source.far else none if n is None else moments.part(n, 0) * scale
             for source, n in zip(self.cache.directional.sources, own, strict=True)
         ]
-        uncollided = moments.part(swept, 0) + sum(e[light] for e in self._direct)
+        uncollided = moments.part(swept, 0) + sum(direct)
         scattered = None
-        if self._levels:
-            scattered = self._received(self._levels[medium], passes, light) - swept
+        if several:
+            scattered = self._received(self._level(medium), passes, light) - swept
             smooth = smooth + scattered
             scattered = dr.maximum(moments.part(scattered, 0), 0)
         further = [moments.part(smooth, k) for k in range(1, moments.count)]
         dr.eval(uncollided, scattered, further, narrow)
-        return uncollided, scattered, *further, *narrow
+        return [(uncollided, scattered, *further, *narrow)]
 
     def _near_light(self, channel: int) -> list[mi.Float]:
         """As of `Sweep`, its moments."""

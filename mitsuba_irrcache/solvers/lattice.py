@@ -29,7 +29,7 @@ import numpy as np
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.solvers.empty import Emptiness
 from mitsuba_irrcache.solvers.extinction import Extinction
-from mitsuba_irrcache.solvers.layout import STANDARD, flat, slicewise, strides_of
+from mitsuba_irrcache.solvers.layout import STANDARD, flat, joined, slicewise, strides_of
 from mitsuba_irrcache.solvers.lines import (
     DIRECTION,
     INTEGERS,
@@ -85,9 +85,13 @@ class Lattice:
         self._empty: Emptiness | None = None
         if sparse and not self.together:
             self._empty = Emptiness.find(grid, self.wanted, lower, upper)
+        #: where the corners of each axis begin among all that are kept
+        self._first_corner = [0, 0, 0]
         if self.together:
-            self._all_corners = [self._extinction.corners(axis) for axis in range(3)]
-            dr.eval(self._all_corners)
+            corners = [self._extinction.corners(axis) for axis in range(3)]
+            sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
+            self._first_corner = np.cumsum([0, *sizes[:2]]).tolist()
+            self._all_corners = joined(corners)
 
     def table(
         self,
@@ -122,13 +126,12 @@ class Lattice:
             places = strides_of(self._extinction.sides(axis), layout)
             row = [*(int(self.sides[k]) for k in order), *(strides[k] for k in order)]
             row += [int(np.dot(self.lower, strides)), *(places[k] for k in order)]
-            row += [
-                int(
-                    np.dot(self.lower, places)
-                    if self._extinction.own
-                    else self.lower[axis] * places[axis]
-                )
-            ]
+            corner = (
+                np.dot(self.lower, places)
+                if self._extinction.own
+                else self.lower[axis] * places[axis]
+            )
+            row += [int(corner) + self._first_corner[axis]]
             for k, offset in zip(across, offsets[i], strict=True):
                 slope = round(velocity[k] / velocity[axis] * ONE)
                 slope = slope or 1  # lines never stay in a face
@@ -156,18 +159,23 @@ class Lattice:
     ) -> mi.Float:
         """Irradiance at the centres of the wanted voxels: the light that enters along pairs of
         directions, told as in `table`; instead of that ``light``, line by line, if a function of
-        the table is given that makes `Entering`.
+        the table is given that makes `Entering`, of all channels of which one follows the other.
         """
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
         table.entering = entering(table) if entering is not None else None
         box = self.lower, self.lower + self.sides
-        total = dr.opaque(mi.Float, 0, dr.width(self.wanted))
+        channels = 1 if table.entering is None else table.entering.channels
+        wanted = dr.width(self.wanted)
+        total = dr.opaque(mi.Float, 0, wanted * channels)
         for axis, pairs in table.by_axis:
-            volume = dr.opaque(mi.Float, 0, self.grid.voxel_count)
+            volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)
             self._launch(volume, False, table, axis, pairs)
-            light = sharpened(volume, self.grid, *box, axis, self.wanted)
-            # In place: a sum would be a second array.
-            dr.scatter_add(total, light, dr.arange(mi.UInt32, dr.width(total)))
+            for c in range(channels):
+                light = sharpened(volume, self.grid, *box, axis, self.wanted, c, channels)
+                place = dr.arange(mi.UInt32, wanted)
+                place = place + dr.opaque(mi.UInt32, wanted * c) if c else place
+                # In place: a sum would be a second array.
+                dr.scatter_add(total, light, place)
             dr.eval(total)
         return total
 
@@ -178,16 +186,21 @@ class Lattice:
         out, S, and three that are added to: its irradiance; what lines lose in it, the integral of
         L - S over optical depth and directions; and the integral of 1, W. So S plus the mean loss,
         loss / W, is the mean radiance *of collisions*: what is scattered from it is neither more
-        nor less than what has collided.
+        nor less than what has collided. Of several channels, a voxel has those four
+        values of each in turn.
         """
+        if self.together:
+            self._launch_together(volume, True, table, table.order)
+            return
         for axis, pairs in table.by_axis:
             self._launch(volume, True, table, axis, pairs)
 
     def apart(
         self, table: Table, sent: Callable[[Group], mi.Float] | None = None
-    ) -> Iterator[tuple[Group, mi.Float]]:
-        """Follows the pairs of ``table``, some at a time, and tells what the lines of each leave:
-        volumes one after the other, two for each pair, of light along the axis and against it.
+    ) -> Iterator[tuple[int, Group, mi.Float]]:
+        """Follows the pairs of ``table``, some at a time, and tells their axis and what their lines
+        leave: volumes one after the other, two for each pair, of light along the axis and against
+        it.
 
         Where ``sent`` tells what voxels send out, likewise, of four values for each voxel, those of
         `scatter`; else of the light that enters, laid out by slices.
@@ -197,22 +210,23 @@ class Lattice:
         for axis, pairs in table.by_axis:
             corners = self._corners(axis)
             for start in range(0, len(pairs), most):
-                group = Group(table, axis, pairs[start : start + most])
+                group = Group(table, pairs[start : start + most])
                 lanes, row = self._lanes_of(len(group))
                 copies = dr.opaque(mi.Float, 0, 2 * len(group) * voxels * (4 if sent else 1))
                 begin = row * dr.opaque(mi.UInt32, 2 * voxels)
                 empty = self._empty.slices if self._empty and not sent else None
                 follow(
                     corners, self._extinction.own, empty, copies, sent(group) if sent else None,
-                    table, group.pair(row), lanes, begin, begin + dr.opaque(mi.UInt32, voxels),
+                    table, group.pair(row), lanes, begin,
+                    copy_back=begin + dr.opaque(mi.UInt32, voxels),
                 )  # fmt: skip
                 dr.eval(copies)
                 self.pause()
-                yield group, copies
+                yield axis, group, copies
 
     def _corners(self, axis: int) -> mi.UInt32:
         if self.together:
-            return self._all_corners[axis]
+            return self._all_corners
         corners = self._extinction.corners(axis)
         dr.eval(corners)
         return corners
@@ -229,37 +243,46 @@ class Lattice:
     ) -> None:
         """Follows the ``pairs`` of ``table``, all of which have the dominant ``axis``."""
         if self.together:
-            most = max(1, COPIES // self.grid.voxel_count)
-            for start in range(0, len(pairs), most):
-                self._launch_together(volume, scatters, table, axis, pairs[start : start + most])
+            self._launch_together(volume, scatters, table, pairs)
             return
         corners = self._corners(axis)  # one set at a time is kept
         empty = self._empty.slices if self._empty and not scatters else None
         source = volume if scatters else None
+        channels = self._channels(volume, scatters)
         for i in pairs:
             follow(
                 corners, self._extinction.own, empty, volume, source, table, table.places[i],
-                self._lanes, dr.opaque(mi.UInt32, 0),
+                self._lanes, dr.opaque(mi.UInt32, 0), channels,
             )  # fmt: skip
             dr.eval(volume)
             self.pause()
 
     def _launch_together(
-        self, volume: mi.Float, scatters: bool, table: Table, axis: int, pairs: list[int]
+        self, volume: mi.Float, scatters: bool, table: Table, pairs: list[int]
     ) -> None:
-        """The same in one launch; the ``pairs`` follow each other in the table's order."""
-        voxels, count = self.grid.voxel_count, len(pairs)
-        lanes, row = self._lanes_of(count)
-        copies = dr.opaque(mi.Float, 0, dr.width(volume) * count)
-        source = volume if scatters else None
-        follow(
-            self._all_corners[axis], self._extinction.own, None, copies, source, table,
-            Group(table, axis, pairs).pair(row), lanes, row * dr.opaque(mi.UInt32, voxels),
-        )  # fmt: skip
-        dr.eval(copies)
-        add_copies(volume, copies, voxels, count, mi.Vector4f if scatters else mi.Float)
-        dr.eval(volume)
-        self.pause()
+        """The same in one launch, or few; the ``pairs``, of any axes, follow each other in the
+        table's order.
+        """
+        kind, size = (mi.Vector4f, 4) if scatters else (mi.Float, 1)
+        voxels = dr.width(volume) // size  # of all channels
+        most = max(1, COPIES // voxels)
+        for start in range(0, len(pairs), most):
+            group = Group(table, pairs[start : start + most])
+            lanes, row = self._lanes_of(len(group))
+            copies = dr.opaque(mi.Float, 0, dr.width(volume) * len(group))
+            follow(
+                self._all_corners, self._extinction.own, None, copies, volume if scatters else None,
+                table, group.pair(row), lanes, row * dr.opaque(mi.UInt32, voxels),
+                self._channels(volume, scatters),
+            )  # fmt: skip
+            dr.eval(copies)
+            add_copies(volume, copies, voxels, len(group), kind)
+            dr.eval(volume)
+            self.pause()
+
+    def _channels(self, volume: mi.Float, scatters: bool) -> int:
+        """How many a volume has."""
+        return dr.width(volume) // (self.grid.voxel_count * (4 if scatters else 1))
 
 
 def sharpened(
@@ -269,25 +292,30 @@ def sharpened(
     upper: np.ndarray,
     axis: int,
     index: mi.UInt32,
+    channel: int = 0,
+    channels: int = 1,
     begin: mi.UInt32 | int = 0,
 ) -> mi.Float:
     """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z),
     given means over the cross sections of all voxels across ``axis``, ``values`` from ``begin`` on,
     laid out by slices: second differences along both other axes take back what the mean has
-    smoothed. Never negative.
+    smoothed. Never negative. A voxel may have values of several ``channels``, of which one is
+    taken.
     """
     places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
     place = flat(places, strides) + begin
-    value, change = dr.gather(mi.Float, values, place), mi.Float(0)
+
+    def read(i: mi.UInt32) -> mi.Float:
+        return dr.gather(mi.Float, values, i if channels == 1 else i * channels + channel)
+
+    value, change = read(place), mi.Float(0)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
         if k == axis or upper[k] - lower[k] < 3:
             continue
         stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))
         # At a border, the second difference of the voxel next to it.
         centre = place + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
-        here, below, above = (
-            dr.gather(mi.Float, values, i) for i in (centre, centre - stride, centre + stride)
-        )
+        here, below, above = (read(i) for i in (centre, centre - stride, centre + stride))
         # Where no line has left anything, nothing is known.
         change += dr.select((below > 0) & (above > 0), 2 * here - below - above, 0)
     return dr.maximum(dr.fma(change, dr.opaque(mi.Float, RECEIVED), value), 0)
@@ -312,10 +340,10 @@ class Table:
 
 
 class Group:
-    """Pairs of a table that follow each other there, all of the same dominant ``axis``."""
+    """Pairs of a ``table`` that follow each other there."""
 
-    def __init__(self, table: Table, axis: int, pairs: list[int]) -> None:
-        self.table, self.axis, self._pairs = table, axis, pairs
+    def __init__(self, table: Table, pairs: list[int]) -> None:
+        self.table, self._pairs = table, pairs
         self._first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
         self.count = dr.opaque(mi.UInt32, len(pairs))
 
@@ -354,25 +382,37 @@ class Entering:
 
     The lines of a pair are told apart by where they pass the first slice, or would if they did not
     enter the box behind it. A scale times these two coordinates, moved, is a place among cells,
-    each of which has two of the ``values``: along the axis, and against it.
+    each of which has two of the ``values``: along the axis, and against it. The values of all
+    ``channels`` follow each other.
     """
 
     def __init__(
-        self, places: np.ndarray, cells: np.ndarray, values: mi.Float | None = None
+        self,
+        places: np.ndarray,
+        cells: np.ndarray,
+        values: mi.Float | None = None,
+        channels: int = 1,
     ) -> None:
         """``places``: for each pair scale, moves (2) and slopes (2) of the lines; ``cells``: the
         first value, and the cells along both axes.
         """
         self._places = mi.Float(places.ravel().tolist())
         self._cells = mi.UInt32(cells.ravel().tolist())
-        self.values = values
+        self.values, self.channels = values, channels
 
     def pair(self, which: mi.UInt32) -> list:
         """What `at` has to know of pairs."""
         places = [dr.gather(mi.Float, self._places, which * 5 + i) for i in range(5)]
         return places + [dr.gather(mi.UInt32, self._cells, which * 3 + i) for i in range(3)]
 
-    def at(self, pair: list, way: int, slice_, ib, fb, ic, fc, active) -> mi.Float:
+    def layers(self) -> list[mi.UInt32]:
+        """Where the values of the channels begin, but for the first."""
+        count = dr.width(self.values) // self.channels
+        return [dr.opaque(mi.UInt32, c * count) for c in range(1, self.channels)]
+
+    def at(
+        self, pair: list, layers: list, way: int, slice_, ib, fb, ic, fc, active
+    ) -> list[mi.Float]:
         """The light of lines that are at these voxels, and positions in them, in a slice."""
         scale, move_b, move_c, slope_b, slope_c, first, nb, nc = pair
         k = mi.Float(slice_)
@@ -381,4 +421,5 @@ class Entering:
         b, c = (mi.Int32(dr.floor(dr.fma(x, scale, m))) for x, m in ((b, move_b), (c, move_c)))
         active = active & (b >= 0) & (c >= 0) & (b < mi.Int32(nb)) & (c < mi.Int32(nc))
         place = first + (mi.UInt32(c) * nb + mi.UInt32(b)) * 2 + way
-        return dr.gather(mi.Float, self.values, place, active)
+        places = [place, *(place + layer for layer in layers)]
+        return [dr.gather(mi.Float, self.values, p, active) for p in places]

@@ -41,3 +41,18 @@ def flat(places: Sequence[mi.UInt32], strides: tuple[int, ...]) -> mi.UInt32:
     """Flat indices of places along x, y, z."""
     x, y, z = (p * dr.opaque(mi.UInt32, n) for p, n in zip(places, strides, strict=True))
     return x + y + z
+
+
+def joined(parts: Sequence[mi.Float | mi.UInt32]) -> mi.Float | mi.UInt32:
+    """Arrays one after the other, by kernels that do not differ with their widths, as those of
+    ``dr.concat`` do.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    result = dr.empty(type(parts[0]), sum(dr.width(part) for part in parts))
+    start = 0
+    for part in parts:
+        dr.scatter(result, part, dr.arange(mi.UInt32, dr.width(part)) + dr.opaque(mi.UInt32, start))
+        start += dr.width(part)
+    dr.eval(result)
+    return result

@@ -72,11 +72,13 @@ def follow(
     which: mi.UInt32,
     lanes: mi.UInt32,
     copy: mi.UInt32,
+    channels: int = 1,
     copy_back: mi.UInt32 | None = None,
 ):
     """Follows pairs of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
     ``source``: what `Lattice.scatter` calls volume, None if voxels send no light; may be ``volume``
-    itself, where the light is added, from voxel ``copy`` on.
+    itself, where the light is added, from voxel ``copy`` on. Light of several ``channels`` goes the
+    same way; a voxel has those of all of them next to each other.
 
     With ``copy_back`` both ways are told apart: the light of opposite directions is left from that
     voxel on, nothing is added to anything, ``source`` holds what voxels send in both ways at the
@@ -111,7 +113,8 @@ def follow(
     kb, kc = dr.select(kb >= nb, kb - nb, kb), dr.select(kc >= nc, kc - nc, kc)
     since_back = dr.minimum(back_b.start(kb, gb), back_c.start(kc, gc))
     slice_, slice_back = shift + width, shift + ta * (na - 1) + width
-    L, L_back, s0, s0_back = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
+    L, L_back = ([mi.Float(0) for _ in range(channels)] for _ in range(2))
+    s0, s0_back = mi.Float(0), mi.Float(0)
     scale, area = quantum * length, dr.rcp(length)
     count = mi.Float(1) if apart else weight  # what depths are times
     # Slices behind, of both ways; where they skip some, each is in a slice of its own.
@@ -119,7 +122,7 @@ def follow(
     ahead, ahead_back = mi.Int32(1), mi.Int32(1)
     needed, needed_back = mi.Bool(active), mi.Bool(active)
     if dr.hint(entering is not None, mode="scalar"):
-        pair = entering.pair(which)
+        pair, arriving = entering.pair(which), entering.layers()
     while dr.hint(active | active_back, label="slices"):
         if dr.hint(empty is not None, mode="scalar"):
             ahead = _slices(empty, cells, ib, ic, k, active)
@@ -131,6 +134,8 @@ def follow(
             k_back = k
         index = mi.UInt32(ib * sb + ic * sc + off)
         index_back = mi.UInt32(kb * sb + kc * sc + off_back)
+        if dr.hint(channels > 1, mode="scalar"):
+            index, index_back = index * channels, index_back * channels
         place, place_back = index + copy, index_back + (copy_back if apart else copy)
         # Of the half before the middle of the slice, and of the half behind it.
         s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, needed)
@@ -139,53 +144,49 @@ def follow(
         )
         if dr.hint(entering is not None, mode="scalar"):
             new, new_back = active & (since < 1), active_back & (since_back < 1)
-            found = entering.at(pair, 0, k, ib, fb, ic, fc, new)
-            found_back = entering.at(pair, 1, na - 1 - k_back, kb, gb, kc, gc, new_back)
-            L, L_back = dr.select(new, found, L), dr.select(new_back, found_back, L_back)
+            found = entering.at(pair, arriving, 0, k, ib, fb, ic, fc, new)
+            found_back = entering.at(pair, arriving, 1, na - 1 - k_back, kb, gb, kc, gc, new_back)
+            L, L_back = _chosen(new, found, L), _chosen(new_back, found_back, L_back)
         else:
-            L = dr.select(since < 1, light, L)
-            L_back = dr.select(since_back < 1, light_back, L_back)
+            L = _chosen(since < 1, len(L) * [light], L)
+            L_back = _chosen(since_back < 1, len(L) * [light_back], L_back)
         # In the middle slice both ways are in the same voxel: the first to write writes for both.
         middle = off == off_back
         if dr.hint(source is None, mode="scalar"):
-            L *= _passed(since, s0, s, scale)
-            L_back *= _passed(since_back, s0_back, s_back, scale)
+            L = _times(L, _passed(since, s0, s, scale))
+            L_back = _times(L_back, _passed(since_back, s0_back, s_back, scale))
             if dr.hint(apart, mode="scalar"):
-                dr.scatter(volume, L, place, needed)
-                dr.scatter(volume, L_back, place_back, needed_back)
+                _write(volume, L, place, needed)
+                _write(volume, L_back, place_back, needed_back)
             else:
-                before = dr.gather(mi.Float, volume, place, needed)
-                before_back = dr.gather(mi.Float, volume, place_back, needed_back)
-                dr.scatter(volume, before + L + dr.select(middle, L_back, 0), place, needed)
-                dr.scatter(volume, before_back + L_back, place_back, needed_back & ~middle)
+                before = _read(mi.Float, volume, place, channels, needed)
+                before_back = _read(mi.Float, volume, place_back, channels, needed_back)
+                both = _sum(_sum(before, L), _chosen(middle, L_back, len(L) * [0]))
+                _write(volume, both, place, needed)
+                _write(volume, _sum(before_back, L_back), place_back, needed_back & ~middle)
         else:
             if dr.hint(apart, mode="scalar"):
-                sent = dr.gather(mi.Float, source, place, active)
-                sent_back = dr.gather(mi.Float, source, place_back, active)
+                sent = _read(mi.Float, source, place, channels, active)
+                sent_back = _read(mi.Float, source, place_back, channels, active)
             else:
-                voxel = dr.gather(mi.Vector4f, volume, place, active)
-                voxel_back = dr.gather(mi.Vector4f, volume, place_back, active)
-                sent, sent_back = voxel.x, voxel_back.x
+                voxel = _read(mi.Vector4f, volume, place, channels, active)
+                voxel_back = _read(mi.Vector4f, volume, place_back, channels, active)
+                sent, sent_back = _sent(voxel), _sent(voxel_back)
                 if dr.hint(elsewhere, mode="scalar"):
-                    sent = dr.gather(mi.Float, source, index * 4, active)
-                    sent_back = dr.gather(mi.Float, source, index_back * 4, active)
-            L, tally = _crossed(L, sent * weight, s * scale, s_next * scale, since, count, area)
+                    sent = _sources(source, index, channels, active)
+                    sent_back = _sources(source, index_back, channels, active)
+            sent, sent_back = _times(sent, weight), _times(sent_back, weight)
+            L, tally = _crossed(L, sent, s * scale, s_next * scale, since, count, area)
             L_back, tally_back = _crossed(
-                L_back,
-                sent_back * weight,
-                s_back * scale,
-                s_next_back * scale,
-                since_back,
-                count,
-                area,
+                L_back, sent_back, s_back * scale, s_next_back * scale, since_back, count, area
             )
             if dr.hint(apart, mode="scalar"):
-                dr.scatter(volume, tally, place, active)
-                dr.scatter(volume, tally_back, place_back, active)
+                _write(volume, tally, place, active)
+                _write(volume, tally_back, place_back, active)
             else:
-                tally += dr.select(middle, tally_back, 0)
-                dr.scatter(volume, voxel + tally, place, active)
-                dr.scatter(volume, voxel_back + tally_back, place_back, active & ~middle)
+                tally = _sum(tally, _chosen(middle, tally_back, len(L) * [0]))
+                _write(volume, _sum(voxel, tally), place, active)
+                _write(volume, _sum(voxel_back, tally_back), place_back, active & ~middle)
         s0, s0_back = s_next, s_next_back
         ib, fb, since = there_b.advance(ib, fb, ahead)
         ic, fc, near = there_c.advance(ic, fc, ahead)
@@ -250,7 +251,7 @@ def _passed(since, before, here, scale) -> mi.Float:
     return dr.exp(-dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
 
 
-def _crossed(L, source, first, second, since, count, area) -> tuple:
+def _crossed(L: list, source: list, first, second, since, count, area) -> tuple[list, list]:
     """Radiance behind a slice, and what its voxel tallies, for a source that is constant in it.
     ``first`` and ``second`` are the slice's optical depths, were it all like that half.
 
@@ -260,7 +261,47 @@ def _crossed(L, source, first, second, since, count, area) -> tuple:
     tau = dr.fma(second, 0.5, to_middle)
     passed = dr.exp(-tau)
     # Thin voxels lose little, but what they scatter is known from just that.
-    lost = (L - source) * dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
+    share = dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
     half = dr.sqrt(passed) if first is second else dr.exp(-to_middle)
-    middle = dr.fma(L - source, half, source)
-    return L - lost, mi.Vector4f(0, middle, lost * area, count * tau * area)
+    left, tally = [], []
+    for x, sent in zip(L, source, strict=True):
+        lost, middle = (x - sent) * share, dr.fma(x - sent, half, sent)
+        left.append(x - lost)
+        tally.append(mi.Vector4f(0, middle, lost * area, count * tau * area))
+    return left, tally
+
+
+# Of all channels
+
+
+def _places(place: mi.UInt32, channels: int) -> list[mi.UInt32]:
+    return [place, *(place + c for c in range(1, channels))]
+
+
+def _read(kind: type, volume: mi.Float, place: mi.UInt32, channels: int, active: mi.Bool) -> list:
+    return [dr.gather(kind, volume, p, active) for p in _places(place, channels)]
+
+
+def _write(volume: mi.Float, values: list, place: mi.UInt32, active: mi.Bool) -> None:
+    for value, p in zip(values, _places(place, len(values)), strict=True):
+        dr.scatter(volume, value, p, active)
+
+
+def _chosen(first: mi.Bool, values: list, others: list) -> list:
+    return [dr.select(first, a, b) for a, b in zip(values, others, strict=True)]
+
+
+def _sum(first: list, second: list) -> list:
+    return [a + b for a, b in zip(first, second, strict=True)]
+
+
+def _times(values: list, factor: mi.Float) -> list:
+    return [value * factor for value in values]
+
+
+def _sources(source: mi.Float, place: mi.UInt32, channels: int, active: mi.Bool) -> list:
+    return [dr.gather(mi.Float, source, p * 4, active) for p in _places(place, channels)]
+
+
+def _sent(voxels: list[mi.Vector4f]) -> list[mi.Float]:
+    return [voxel.x for voxel in voxels]

@@ -68,8 +68,8 @@ class Moments:
         wanted = lattice.wanted
         sums = self.nothing(dr.width(wanted))
         box = lattice.lower, lattice.lower + lattice.sides
-        for group, copies in lattice.apart(table):
-            sums = _with_light(self, sums, copies, group, lattice.grid, *box, wanted)
+        for axis, group, copies in lattice.apart(table):
+            sums = _with_light(self, sums, copies, group, axis, lattice.grid, *box, wanted)
             dr.eval(sums)
         return _one_after_another(sums)
 
@@ -136,10 +136,8 @@ class DirectionalLevel(Level):
         grid, moments = self.coarser.grid, self.coarser.moments
         moment, place = _apart(self.moments.count, self.grid.voxel_count)
         known = moment < dr.opaque(mi.UInt32, moments.count)
-        begin, result = moment * dr.opaque(mi.UInt32, grid.voxel_count), mi.Float(0)
-        for voxel, weight in grid.corners(self.above(place)):
-            result += dr.gather(mi.Float, values, begin + voxel, known) * weight
-        return result
+        begin = dr.select(known, moment, 0) * dr.opaque(mi.UInt32, grid.voxel_count)
+        return dr.select(known, self._interpolated(values, place, begin), 0)
 
     def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
         """As of `Level`, all moments of it."""
@@ -155,7 +153,7 @@ class DirectionalLevel(Level):
                 dr.eval(source)
             return source
 
-        for group, copies in self.lattice.apart(table, sent):
+        for _, group, copies in self.lattice.apart(table, sent):
             found = _with_collisions(moments, received, lost, depth, copies, group)
             dr.eval(found)
             received, lost, depth = found
@@ -194,13 +192,13 @@ def _one_after_another(parts: list[mi.Float]) -> mi.Float:
 
 
 @dr.syntax
-def _with_light(moments, sums: list, copies, group, grid, lower, upper, wanted):
+def _with_light(moments, sums: list, copies, group, axis: int, grid, lower, upper, wanted):
     """``sums`` and the moments of the light that lines of a group have left."""
     voxels = dr.opaque(mi.UInt32, grid.voxel_count)
     k, begin = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(k < group.count, label="light of pairs"):
-        there = sharpened(copies, grid, lower, upper, group.axis, wanted, begin)
-        back = sharpened(copies, grid, lower, upper, group.axis, wanted, begin + voxels)
+        there = sharpened(copies, grid, lower, upper, axis, wanted, begin=begin)
+        back = sharpened(copies, grid, lower, upper, axis, wanted, begin=begin + voxels)
         basis = moments.basis(-group.direction(k))
         sums = _with_both(moments, sums, basis, there, back)
         k += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -52,7 +52,7 @@ class ArrivingPass:
 
     ``arrivals`` are those along the ``rows``, which are from number ``start`` on there; ``returns``
     those along the inner ones, by which light that leaves the medium comes back to it while all
-    orders are solved for, if they are in this pass. A ``channel`` is taken of both.
+    orders are solved for, if they are in this pass. Some ``channels`` are taken of both.
     """
 
     def __init__(
@@ -62,30 +62,30 @@ class ArrivingPass:
         arrivals: Arrivals,
         start: int,
         returns: Arrivals | None,
-        channel: int,
+        channels: Sequence[int],
     ) -> None:
         self.rows, self.inner = rows, inner
-        self.arrivals, self.returns, self.channel = arrivals, returns, channel
+        self.arrivals, self.returns, self.channels = arrivals, returns, channels
         self.numbers = np.arange(start, start + len(rows[0]))
 
     @staticmethod
     def uncollided(passes: Sequence[ArrivingPass], lattice: Lattice) -> mi.Float:
         """As `Pass.uncollided`."""
         directions, light, _, offsets = joined([p.rows for p in passes])
-        arrivals, channel = passes[0].arrivals, passes[0].channel
+        arrivals, channels = passes[0].arrivals, passes[0].channels
         numbers = np.concatenate([p.numbers for p in passes])
         lit = arrivals.lit[numbers]
         return lattice.carry(
             directions[lit],
             light[lit],
             offsets[lit],
-            lambda table: arrivals.directly(channel, table, numbers[lit]),
+            lambda table: arrivals.directly(channels, table, numbers[lit]),
         )
 
     def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         """As `Level.scatter`, with the light that arrives."""
         table = level.lattice.table(*self.rows)
-        of_table = self.channel, level.lattice, table, self.numbers
+        of_table = self.channels, level.lattice, table, self.numbers
         table.entering = self.arrivals.returning(*of_table, emitted=True)
         table.entering.receive(phi)
         found = level.scatter(None, table)
@@ -107,7 +107,7 @@ class ArrivingPass:
             weights,
             offsets,
             lambda *of_table: self.returns.returning(
-                self.channel, *of_table, numbers, emitted=False
+                self.channels, *of_table, numbers, emitted=False
             ),
         )
 
@@ -120,31 +120,31 @@ def arriving(
     pairs: int,
     rng: np.random.Generator,
     seed: tuple[int, int],
-) -> tuple[list[list[ArrivingPass]], list[list[mi.Float]]]:
-    """Passes among surfaces for each channel, of which the first one's orders can be solved for if
-    there are several; and what differs between channels. ``pairs`` are those between voxels.
+) -> tuple[Callable[[Sequence[int]], list[ArrivingPass]], list[list[mi.Float]]]:
+    """Passes among surfaces, made of the channels that are wanted together, of which the first
+    one's orders can be solved for if there are several; and what differs between channels.
+    ``pairs`` are those between voxels.
     """
     several = passes > 1
     rows = [sky.rows(ARRIVING // 2 if several else pairs, rng) for _ in range(passes)]
     inner = []
     for _ in range(passes):
         directions, weights = spread(pairs, rng)
-        dark = np.zeros((pairs, *rows[0][1].shape[1:]))
-        inner.append((directions, dark, weights, rng.random((pairs, 2))))
+        black = np.zeros((pairs, *rows[0][1].shape[1:]))
+        inner.append((directions, black, weights, rng.random((pairs, 2))))
     arrivals = Arrivals(around, lattice, joined(rows), several, (*seed, 0))
     returns = Arrivals(around, lattice, inner[0], several, (*seed, 1)) if several else None
     starts = np.cumsum([0] + [len(row[0]) for row in rows])
     kinds = [*arrivals.kinds, *(returns.kinds if several else ())]
-    by_channel = [
-        [
-            ArrivingPass(
-                of_channel(row, c), of_channel(own, c), arrivals, start, None if i else returns, c
-            )
-            for i, (row, own, start) in enumerate(zip(rows, inner, starts, strict=False))
+
+    def of(channels: Sequence[int]) -> list[ArrivingPass]:
+        parts = enumerate(zip(rows, inner, starts, strict=False))
+        return [
+            ArrivingPass(dark(row), dark(own), arrivals, start, None if i else returns, channels)
+            for i, (row, own, start) in parts
         ]
-        for c in range(len(kinds[0]))
-    ]
-    return by_channel, kinds
+
+    return of, kinds
 
 
 def joined(rows: Sequence[Rows]) -> tuple[np.ndarray, ...]:
@@ -152,7 +152,7 @@ def joined(rows: Sequence[Rows]) -> tuple[np.ndarray, ...]:
     return tuple(np.concatenate(parts) for parts in zip(*rows, strict=True))
 
 
-def of_channel(rows: Rows, channel: int) -> Rows:
-    """Rows with light in all channels (n, 2, channels) for one of them."""
-    directions, light, weights, offsets = rows
-    return directions, light[..., channel], weights, offsets
+def dark(rows: Rows) -> Rows:
+    """Rows for light that does not enter as tables tell."""
+    directions, _, weights, offsets = rows
+    return directions, np.zeros((len(directions), 2)), weights, offsets

@@ -25,6 +25,7 @@ from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.glow import emitted_light
 from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp, split
 from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.layout import joined
 from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass, arriving
 from mitsuba_irrcache.solvers.scattering import Level
 
@@ -90,21 +91,15 @@ class Sweep:
         rest = *box, detail, cache.active, sparse, pause
         self._lattices = [Lattice(grid, s, *rest) for s in extinction]
         # For single scattering the albedo does not matter here.
-        self._levels: list[Level] = []
+        self._levels: dict[tuple[int, ...], Level] = {}
+        self._sigma_t = self._albedo = [mi.Float(0)]
         if cache.max_depth != 2:
-            sigma_t = extinction if detail is grid else baked(medium, medium.sigma_t, grid)
-            albedo = baked(medium, medium.albedo, grid, masked=False)
-            for c in range(max(len(albedo), len(sigma_t))):
-                of_channel = [field[min(c, len(field) - 1)] for field in (sigma_t, albedo)]
-                arguments = grid, *of_channel, self._lattices[min(c, len(sigma_t) - 1)]
-                # Evenly: as `arrivals` takes for granted.
-                self._levels.append(self._level(*arguments, not medium.alone))
+            self._sigma_t = extinction if detail is grid else baked(medium, medium.sigma_t, grid)
+            self._albedo = baked(medium, medium.albedo, grid, masked=False)
         self._medium, self._places = medium, Places(scene, grid).of(cache.active)
-        #: where in the light of a level that of the active voxels is
-        self._where = cache.active
         # What is scattered near a lamp is what a voxel gets on average, not in its middle.
         self._spread = mi.Float(1)
-        if cache.falloff is not None and self._levels:
+        if cache.falloff is not None and cache.max_depth != 2:
             self._spread = cache.falloff.spread(cache.active)
             dr.eval(self._spread)
         self._emitted: list[mi.Spectrum] = []  # of a batch
@@ -133,70 +128,103 @@ class Sweep:
                 done = (number - first + 1) * cache.batch
                 progress(done * cache.active_count, samples * cache.active_count)
 
-    def _level(self, *arguments: object) -> Level:
-        return Level(*arguments)
-
     def _batch(self, number: int) -> tuple:
         """Irradiance of both layers in all channels at the active voxels, and the moments if there
         are any, as `IrradianceCache.add` wants it.
         """
         cache = self.cache
         pairs, passes = cache.batch // 2, 1
-        if self._levels:  # one pass more tells what is scattered again
+        if cache.max_depth != 2:  # one pass more tells what is scattered again
             pairs, passes = self.directions // 2, cache.batch // self.directions + 1
         rng = np.random.default_rng((self.seed, number))
         if self._medium.emission is not None:
             light = emitted_light(self._medium, self._places, cache.batch, self.seed, number)
             self._emitted = [light]
+        media = max(len(self._lattices), len(self._albedo))
         if self._around is None:
             tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
-            by_channel = [[Pass(row) for row in rows] for rows in tables]
+            # Channels that differ by a factor only are computed once.
+            keys = [((min(c, len(tables) - 1),), (min(c, media - 1),)) for c in range(len(colour))]
+
+            def passes_of(channels: Sequence[int]) -> list[Pass]:
+                return [Pass(row) for row in tables[channels[0]]]
         else:
             seed = self.seed, number
             lattice, colour = self._lattices[0], np.ones(cache.channels)
-            by_channel, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
+            passes_of, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
             self._direct = self._lamps.light(seed)
-            if is_grey([*kinds, *self._direct]):
-                by_channel = by_channel[:1]
-        found: dict[tuple[int, int], tuple] = {}
+            grey = media == 1 and is_grey([*kinds, *self._direct])
+            keys = [2 * (group,) for group in self._together(grey)]
+        found: dict[tuple, list] = {}
         layers: list[list] = [[] for _ in range(len(LAYERS) + cache.moments)]
         for c in range(cache.channels):
-            # Channels that differ by a factor only are computed once.
-            key = min(c, len(by_channel) - 1), min(c, len(self._levels or self._lattices) - 1)
+            key = keys[min(c, len(keys) - 1)]
             if key not in found:
-                found[key] = self._solved(by_channel[key[0]], *key)
-            for layer, phi in zip(layers, found[key], strict=True):
+                found[key] = self._solved(passes_of(key[0]), *key)
+            each = found[key][key[0].index(c) if c in key[0] else 0]
+            for layer, phi in zip(layers, each, strict=True):
                 layer.append(phi if phi is None else phi * dr.opaque(mi.Float, colour[c]))
         dr.eval(layers)
         light, moments = layers[: len(LAYERS)], layers[len(LAYERS) :]
         parts = [tuple(chain(*light)), (None,) * cache.channels]
         return (*parts, tuple(chain(*moments))) if moments else tuple(parts)
 
-    def _solved(self, passes: list[Pass] | list[ArrivingPass], light: int, medium: int) -> tuple:
-        """Irradiance at the active voxels: straight from the emitters, and scattered, if wanted;
-        then moments, if there are any.
+    def _together(self, grey: bool) -> list[tuple[int, ...]]:
+        """The channels whose light goes the same ways, of all or of the first one."""
+        channels = range(1 if grey else self.cache.channels)
+        if len(self._lattices) > 1:
+            return [(c,) for c in channels]
+        return [tuple(channels)]
+
+    def _level(self, channels: tuple[int, ...]) -> Level:
+        """The finest level, made when it is first asked for."""
+        if channels not in self._levels:
+            sigma_t, albedo = self._sigma_t, self._albedo
+            one = min(channels[0], len(sigma_t) - 1)
+            self._levels[channels] = self._new_level(
+                self.cache.grid,
+                sigma_t[one],
+                joined([albedo[min(c, len(albedo) - 1)] for c in channels]),
+                self._lattices[one],
+            )
+        return self._levels[channels]
+
+    def _new_level(self, *arguments: object) -> Level:
+        return Level(*arguments, evenly=not self._medium.alone)  # as `arrivals` takes for granted
+
+    def _solved(
+        self,
+        passes: list[Pass] | list[ArrivingPass],
+        light: tuple[int, ...],
+        medium: tuple[int, ...],
+    ) -> list[tuple]:
+        """For each channel the irradiance at the active voxels: straight from the emitters, and
+        scattered, if wanted; then moments, if there are any. Light of these channels is scattered
+        as by those of the medium.
         """
-        if not self._levels:
-            return self._uncollided(self._lattices[medium], passes, light)[1], None
-        level = self._levels[medium]
+        if self.cache.max_depth == 2:
+            lattice = self._lattices[min(medium[0], len(self._lattices) - 1)]
+            return [(phi, None) for phi in self._uncollided(lattice, passes, light)[1]]
+        level = self._level(medium)
         swept, uncollided = self._uncollided(level.lattice, passes[1:], light)
         # Both layers with the same directions: under a white sky the sum has no noise.
         scattered = dr.maximum(self._received(level, passes, light) - swept, 0)
         dr.eval(scattered)
-        return uncollided, scattered
+        return list(zip(uncollided, self._apart(scattered, len(light)), strict=True))
 
     def _received(
-        self, level: Level, passes: list[Pass] | list[ArrivingPass], light: int
+        self, level: Level, passes: list[Pass] | list[ArrivingPass], light: tuple[int, ...]
     ) -> mi.Float:
         """Light of all orders wanted along lines at the active voxels, on average over all passes
-        but the first one.
+        but the first one, of these channels one after the other.
         """
         first, *passes = passes
-        total: mi.Float = 0
+        active = joined([self._active(c) for c in range(len(light))])
+        total = dr.opaque(mi.Float, 0, dr.width(active))
         phi = self._collided(level, first, light)
         for known, each in enumerate(passes, 1):
             received, again = each.scatter(level, phi)
-            total = total + dr.gather(mi.Float, received, self._where)
+            total = total + dr.gather(mi.Float, received, active)
             if self.cache.max_depth < 0:
                 # Of all orders there is now another estimate: on average they have less noise.
                 old, new = (dr.opaque(mi.Float, n / (known + 1)) for n in (known, 1))
@@ -204,18 +232,38 @@ class Sweep:
             dr.eval(total, phi)
         return total * dr.opaque(mi.Float, 1 / len(passes))
 
+    def _active(self, layer: int) -> mi.UInt32:
+        """The active voxels in one of several channels that follow each other."""
+        if not layer:
+            return self.cache.active
+        return self.cache.active + dr.opaque(mi.UInt32, layer * self.cache.grid.voxel_count)
+
+    def _apart(self, values: mi.Float, channels: int) -> list[mi.Float]:
+        """The values at the active voxels of each of so many channels."""
+        if channels == 1:
+            return [values]
+        count = self.cache.active_count
+        place = dr.arange(mi.UInt32, count)
+        starts = (dr.opaque(mi.UInt32, c * count) for c in range(channels))
+        return [dr.gather(mi.Float, values, place + start) for start in starts]
+
     def _uncollided(
-        self, lattice: Lattice, passes: list[Pass] | list[ArrivingPass], light: int
-    ) -> tuple[mi.Float, mi.Float]:
-        """Irradiance straight from emitters along lines, on average over passes, and from all
-        emitters.
+        self, lattice: Lattice, passes: list[Pass] | list[ArrivingPass], light: tuple[int, ...]
+    ) -> tuple[mi.Float, list[mi.Float]]:
+        """Irradiance straight from emitters along lines, on average over passes, in all channels
+        one after the other; and that from all emitters in each.
         """
         values = passes[0].uncollided(passes, lattice)
         swept = values * dr.opaque(mi.Float, 1 / len(passes))
-        near = sum(emitted[light] for emitted in (*self._direct, *self._emitted))
-        return swept, swept + near
+        emitters = *self._direct, *self._emitted
+        return swept, [
+            phi + sum(emitted[c] for emitted in emitters)
+            for c, phi in zip(light, self._apart(swept, len(light)), strict=True)
+        ]
 
-    def _collided(self, level: Level, first: Pass | ArrivingPass, light: int) -> mi.Float:
+    def _collided(
+        self, level: Level, first: Pass | ArrivingPass, light: tuple[int, ...]
+    ) -> mi.Float:
         """Mean irradiance of collisions, of all orders but the last."""
         _, phi = first.scatter(level, None)
         phi = self._with_near_light(phi, light)
@@ -228,10 +276,11 @@ class Sweep:
                 break
         return phi
 
-    def _with_near_light(self, volume: mi.Float, channel: int) -> mi.Float:
-        for light in self._near_light(channel):
-            dr.eval(volume)
-            dr.scatter_reduce(dr.ReduceOp.Add, volume, light, self._where)
+    def _with_near_light(self, volume: mi.Float, light: tuple[int, ...]) -> mi.Float:
+        for layer, c in enumerate(light):
+            for value in self._near_light(c):
+                dr.eval(volume)
+                dr.scatter_reduce(dr.ReduceOp.Add, volume, value, self._active(layer))
         dr.eval(volume)
         return volume
 
