@@ -7,6 +7,7 @@ is counted, and the next file is tried.
 from __future__ import annotations
 
 import contextlib
+import gzip
 import io
 import json
 import multiprocessing
@@ -76,6 +77,15 @@ def mutated(content: bytes, rng: np.random.Generator) -> bytes:
         if not data:
             break
     return bytes(data)
+
+
+def mutated_gzip(content: bytes, rng: np.random.Generator) -> bytes:
+    """A compressed file that is damaged, or that was compressed after something was wrong in it:
+    of a stream that does not match its checksum nothing is read.
+    """
+    if rng.random() < 0.3:
+        return mutated(content, rng)
+    return gzip.compress(mutated(gzip.decompress(content), rng))
 
 
 def lying_cache(content: bytes, rng: np.random.Generator) -> bytes:
