@@ -18,12 +18,14 @@ demo: setup ## render a chest with irrcache and compare it with volpath
 paper: setup ## compute the paper's figures and tables, 20 minutes; FULL=1: the paper's sizes
 	$(BIN)/python -m experiments.paper.run $(if $(FULL),--full)
 
+# Files in their order: by default those of few tests come last, which are the longest ones.
 test: setup ## run the tests, two at a time: much of each is Python's
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
-stress: setup ## try every hazard and fault, 15 minutes; ends with tables of what held
-	$(BIN)/python -m experiments.stability.run
-	$(BIN)/python -m experiments.faults.run
+stress: setup ## run the slow tests, try every hazard and fault, 20 minutes; ends with tables of what held
+	@status=0; $(BIN)/python -m pytest -m slow || status=1; \
+	for part in stability faults; do $(BIN)/python -m experiments.$$part.run || status=1; done; \
+	exit $$status
 
 lint: setup ## check style and format
 	$(BIN)/ruff check

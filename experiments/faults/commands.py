@@ -10,13 +10,12 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
-import tempfile
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 
+from experiments.faults.fuzz import files_here, own_folder
 from experiments.faults.kills import SCENE
 from mitsuba_irrcache.errors import IrrcacheError
 
@@ -97,22 +96,18 @@ def run_case(path: Path) -> None:
 
     Raises IrrcacheError if it ends with one message; AssertionError for whatever is not right.
     """
-    arguments, before = json.loads(path.read_text()), Path.cwd()
-    with tempfile.TemporaryDirectory() as folder:
-        os.chdir(folder)
-        try:
-            Path("scene.xml").write_text(SCENE)
-            Path("a.raw").write_bytes(bytes(64))
-            Path("out").mkdir()
-            _run(arguments)
-        finally:
-            os.chdir(before)
+    arguments = json.loads(path.read_text())
+    with own_folder():
+        Path("scene.xml").write_text(SCENE)
+        Path("a.raw").write_bytes(bytes(64))
+        Path("out").mkdir()
+        _run(arguments)
 
 
 def _run(arguments: list[str]) -> None:
     from mitsuba_irrcache.cli import main
 
-    there, said = _files(), io.StringIO()
+    there, said = files_here(), io.StringIO()
     with _without_long_work(), contextlib.redirect_stderr(said):
         with contextlib.redirect_stdout(io.StringIO()):
             try:
@@ -121,7 +116,7 @@ def _run(arguments: list[str]) -> None:
                 status = end.code or 0
             except WorkBegins:
                 status = 0
-    message, new = said.getvalue(), _files() - there
+    message, new = said.getvalue(), files_here() - there
     about = f"{arguments}: {message[-300:]!r}"
     assert status in (0, 1, 2), f"ends with {status}: {about}"
     assert "Traceback" not in message, about
@@ -153,7 +148,3 @@ def _without_long_work():
         mock.patch("importlib.util.find_spec", lambda name: name),
     ):
         yield
-
-
-def _files() -> set[str]:
-    return {str(p) for p in Path().rglob("*") if p.is_file()}

@@ -12,7 +12,7 @@ import numpy as np
 import SimpleITK
 
 from experiments.faults import commands, properties
-from experiments.faults.fuzz import lying_cache, mutated
+from experiments.faults.fuzz import lying_cache, mutated, mutated_gzip
 from mitsuba_irrcache.volumes.mitsuba_vol import write_vol
 from mitsuba_irrcache.volumes.readers import read_volume
 from mitsuba_irrcache.volumes.transfer import load_preset, load_transfer_function
@@ -99,7 +99,7 @@ FORMATS = (
     Format("light.cache", _write_cache, read_cache, lying_cache),
     Format("a.nrrd", _write_image, read_volume),
     Format("a.nii", _write_image, read_volume),
-    Format("a.nii.gz", _write_image, read_volume),
+    Format("a.nii.gz", _write_image, read_volume, mutated_gzip),
     Format("a.mha", _write_image, read_volume),
     Format("a.vol", _write_vol, read_volume),
     Format("slice.dcm", _write_dicom, read_series),

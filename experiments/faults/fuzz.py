@@ -6,13 +6,16 @@ is counted, and the next file is tried.
 
 from __future__ import annotations
 
+import contextlib
+import gzip
 import io
 import json
 import multiprocessing
 import os
 import resource
+import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -76,6 +79,15 @@ def mutated(content: bytes, rng: np.random.Generator) -> bytes:
     return bytes(data)
 
 
+def mutated_gzip(content: bytes, rng: np.random.Generator) -> bytes:
+    """A compressed file that is damaged, or that was compressed after something was wrong in it:
+    of a stream that does not match its checksum nothing is read.
+    """
+    if rng.random() < 0.3:
+        return mutated(content, rng)
+    return gzip.compress(mutated(gzip.decompress(content), rng))
+
+
 def lying_cache(content: bytes, rng: np.random.Generator) -> bytes:
     """A cache file that is whole, but for one thing that it says."""
     if rng.random() < 0.3:
@@ -121,6 +133,23 @@ def lying_cache(content: bytes, rng: np.random.Generator) -> bytes:
                 new.writestr(name, old.read(name))
         return packed.getvalue()
     return file.getvalue()
+
+
+@contextlib.contextmanager
+def own_folder() -> Iterator[None]:
+    """An empty folder to work in; whatever a case writes under a relative name ends there."""
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            yield
+        finally:
+            os.chdir(before)
+
+
+def files_here() -> set[str]:
+    """The files in the folder that is worked in, and below it."""
+    return {str(p) for p in Path().rglob("*") if p.is_file()}
 
 
 def try_files(

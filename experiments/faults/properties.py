@@ -12,6 +12,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from experiments.faults.fuzz import files_here, own_folder
 from mitsuba_irrcache.errors import IrrcacheError, essence
 
 #: Work little and end soon, whatever else is changed.
@@ -66,11 +67,21 @@ def write_valid(path: Path) -> None:
 
 
 def render_case(path: Path) -> None:
-    """Renders the case in this file.
+    """Renders the case in this file, in a folder of its own, where its `cache_file` may appear.
 
     Raises IrrcacheError for what is refused by a message that names a property or its value; what
-    is raised otherwise, and pictures that are none, are faults.
+    is raised otherwise, pictures that are none, and other files are faults.
     """
+    case = json.loads(path.read_text())
+    with own_folder():
+        try:
+            _render(case)
+        finally:
+            strange = files_here() - {str(case["properties"].get("cache_file"))}
+            assert not strange, f"left {strange}: {case}"
+
+
+def _render(case: dict) -> None:
     import mitsuba as mi
 
     from experiments.stability.worlds import Matter, scene
@@ -78,7 +89,6 @@ def render_case(path: Path) -> None:
     if mi.variant() != "llvm_ad_rgb":
         mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    case = json.loads(path.read_text())
     properties = case["properties"]
     try:
         if case["how"] == "xml":

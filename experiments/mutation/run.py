@@ -1,5 +1,5 @@
-"""Does the test suite see faults? Each mutant in a copy of the project, against the tests that
-should catch it.
+"""Does the test suite see faults? Each mutant in a copy of the project, against those tests of
+``make test`` that should catch it.
 
     python -m experiments.mutation.run [--only PART_OF_A_NAME] [--force] [-o output]
 
@@ -56,9 +56,11 @@ def verdict(mutant: Mutant) -> dict:
         copy = copied(Path(folder))
         apply(mutant, copy / "mitsuba_irrcache")
         started = time.perf_counter()
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", *mutant.tests]
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-m", "not slow"]
         environment = os.environ | {"PYTHONPATH": str(copy)}
-        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
+        done = subprocess.run(
+            [*command, *mutant.tests], cwd=copy, env=environment, capture_output=True, text=True
+        )
     failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
     if done.returncode not in (0, 1):
         raise RuntimeError(f"the tests did not run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")

@@ -116,6 +116,37 @@ def test_a_full_disk_and_a_folder_that_is_read_only():
         assert "nothing can be written" in said.stdout and said.stdout.strip().endswith("None")
 
 
+RENDERED = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from experiments.stability.worlds import Matter, scene
+settings = {"solver": "path", "resolution": 4, "cache_spp": 8, "max_depth": 2}
+print(sum(mi.render(scene(settings, Matter()), spp=1).array))
+"""
+
+
+@pytest.mark.slow
+def test_a_corrupted_kernel_cache(tmp_path):
+    """Dr.Jit's files of compiled kernels, cut short or with 20 wrong bytes: they are compiled again
+    and the picture is the same.
+    """
+    rng, pictures = np.random.default_rng(1), []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", RENDERED], env=os.environ | {"HOME": str(tmp_path)},
+            cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=300,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        pictures.append(done.stdout.split()[-1])
+        files = sorted((tmp_path / ".drjit").glob("*.bin"))
+        assert len(files) > 10
+        for number, file in enumerate(files):
+            content = np.fromfile(file, np.uint8)
+            content[rng.integers(0, content.size, 20)] ^= 255
+            (content[: content.size // 2] if number % 2 else content).tofile(file)
+    assert pictures[0] == pictures[1] and float(pictures[0]) > 0
+
+
 def test_a_file_that_another_process_has_filled_further(tmp_path):
     """Two processes share a file: the one that has fewer samples does not overwrite the other's."""
     file = tmp_path / "light.cache"
@@ -219,13 +250,22 @@ def tried(case: Path, run_case, mutate, count: int) -> int:
     return refused
 
 
-def test_properties_that_nobody_should_write(tmp_path):
-    """Each of 50 scenes is rendered, or refused by a message that names what is wrong."""
-    case = tmp_path / "properties.json"
+def test_properties_that_nobody_should_write(tmp_path, monkeypatch):
+    """Each of 50 scenes is rendered, or refused by a message that names what is wrong; a cache file
+    of any name stays in the folder of its case.
+    """
+    here, case = tmp_path / "here", tmp_path / "properties.json"
+    here.mkdir()
+    monkeypatch.chdir(here)
     properties.write_valid(case)
-    properties.render_case(case)
     refused = tried(case, properties.render_case, properties.mutated_properties, 50)
     assert 25 < refused < 49
+    case.write_text(json.dumps({"how": "xml", "properties": properties.VALID}))
+    properties.render_case(case)
+    named = properties.VALID | {"cache_file": "False"}
+    case.write_text(json.dumps({"how": "dict", "properties": named}))
+    properties.render_case(case)
+    assert not any(here.iterdir())
 
 
 def test_command_lines_that_nobody_should_type(tmp_path):

@@ -80,6 +80,12 @@ def test_heterogeneous_cube(scenes, compare, max_depth):
         compare(shape, max_depth).check()
 
 
+def test_prbvolpath_sees_the_same(scenes, compare):
+    """The stock integrator whose derivatives users of images by ``irrcache`` are referred to."""
+    to_world = scenes.placement()
+    compare(scenes.boundary(cloud(scenes, to_world), to_world), stock="prbvolpath").check()
+
+
 PLACEMENTS = {
     "turned": {"turn": 35.0},
     "anisotropic": {"edges": (0.6, 1.2, 3.0)},
