@@ -145,7 +145,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     depend on the scattering angle alone and are as broad. Where one is not isotropic, the cache
     holds spherical harmonics of the radiance up to degree 4 beside the irradiance, and the light
     of suns, points and lamps apart, whose direction is known. Such a medium is swept where it is
-    all there is to the scene and does not shine itself.
+    all there is to the scene and does not shine itself; there, ``hg`` may have g up to 0.85 if
+    ``max_depth`` is -1. The light in a forward peak that sharp counts as not scattered, also in
+    ``transmittance`` and alpha.
 
     .. tabs::
         .. code-tab:: xml

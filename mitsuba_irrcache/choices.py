@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from .cache import IrradianceCache, active_voxels
-from .errors import IrrcacheError
+from .errors import IrrcacheError, UnsupportedSceneError
 from .grid import Grid, GridField
 from .layers import luminance
 from .medium import MediumGrid
@@ -22,8 +22,8 @@ DENSE_BORDER = 1.0
 #: detail than coarse data.
 AMONG_SURFACES = (32, 64)
 
-#: Voxels of a cache that ``resolution`` 0 leads to, at most.
-MOST_VOXELS = 1 << 25
+#: Voxels of a cache that ``resolution`` 0 leads to, at most; where light is known by its direction.
+MOST_VOXELS, MOST_DIRECTIONAL = 1 << 25, 1 << 21
 #: Optical depth of a cache voxel, where light collides, that ``resolution`` 0 keeps below by up to
 #: twice the voxels of the data along an axis: the light falls off within denser ones. On a CT head
 #: of 1.2 per voxel the error falls from 0.7 to 0.3 % of the mean.
@@ -40,9 +40,12 @@ def choose_solver(
 
     Raises IrrcacheError where ``sweep`` is told that cannot be used.
     """
+    reason = "as told" if solver == "path" else None
+    reason = reason or _why_not_sweep(scene, medium, max_depth, resolution)
+    if medium.phase is not None and medium.phase.forward:
+        _check_sharp(medium, reason, max_depth)
     if solver == "path":
-        return solver, "as told"
-    reason = _why_not_sweep(scene, medium, max_depth, resolution)
+        return solver, reason
     if reason and solver == "sweep":
         raise IrrcacheError(
             f'irrcache: solver "sweep" cannot be used in this scene, since {reason}; set solver to '
@@ -55,6 +58,25 @@ def choose_solver(
     if medium.alone:
         return "sweep", "all light comes from far away or from points"
     return "sweep", "no surface and no other medium is among the voxels"
+
+
+def _check_sharp(medium: MediumGrid, reason: str | None, max_depth: int) -> None:
+    """Refuses a medium without its forward peak where there is a ``reason`` not to sweep it, or
+    orders of scattering are told apart: those in the peak are none.
+    """
+    cosine = medium.phase.forward + (1 - medium.phase.forward) * float(medium.phase.moments[1])
+    sharp = f'irrcache: medium "{medium.name}" scatters sharply, with a mean cosine of {cosine:.2f}'
+    remedy = 'make it broader, or render this scene with "volpath".'
+    if reason:
+        raise UnsupportedSceneError(
+            f'{sharp}, too sharply for the solver "path", which is used, {reason}. Set solver to '
+            f'"auto", {remedy}'
+        )
+    if max_depth >= 0:
+        raise UnsupportedSceneError(
+            f"{sharp}: light of all orders is known, not of max_depth {max_depth}. Set max_depth "
+            f"to -1, {remedy}"
+        )
 
 
 def _why_not_sweep(
@@ -102,6 +124,7 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     data, frame = medium.sigma_t.grid, medium.frame
     longest = np.linalg.norm(frame[:3, :3], axis=0).max()
     per_path = 2 * longest * medium.sigma_t.maximum
+    voxels = MOST_VOXELS if medium.phase is None else MOST_DIRECTIONAL
     if not resolution and medium.surroundings is not None and solver == "path":
         least, most = AMONG_SURFACES
         count = np.ceil(per_path) if data is None else max(data.shape)
@@ -112,8 +135,8 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     elif data is None:
         count = np.clip(np.ceil(per_path), 32, 96)
         grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"
-    elif solver == "sweep" and data.voxel_count <= MOST_VOXELS:
-        sides, reason = _finer(medium.sigma_t), "of the medium"
+    elif solver == "sweep" and data.voxel_count <= voxels:
+        sides, reason = _finer(medium.sigma_t, voxels), "of the medium"
         if (sides > data.resolution).any():
             reason = "finer than those of the medium, which is dense"
         if not medium.alone and sides.max() < AMONG_SURFACES[0]:
@@ -121,15 +144,15 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
             reason = f"finer than those of the medium, {AMONG_SURFACES[0]} among surfaces"
         grid = Grid(tuple(int(n) for n in sides[::-1]), frame)
     else:
-        most = 128 if solver == "path" else round(MOST_VOXELS ** (1 / 3))
+        most = 128 if solver == "path" else round(voxels ** (1 / 3))
         grid = Grid.near_cubic(frame, min(max(data.shape), most))
         reason = f"of the medium, at most {most}"
     return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
 
 
-def _finer(sigma_t: GridField) -> np.ndarray:
+def _finer(sigma_t: GridField, voxels: int) -> np.ndarray:
     """Voxels along x, y, z that light needs to be known in: those of the data or, where they are
-    dense, more.
+    dense, more, but no more than so many ``voxels``.
     """
     total, squares = dr.sum(sigma_t.data), dr.squared_norm(sigma_t.data)
     dr.eval(total, squares)
@@ -138,7 +161,7 @@ def _finer(sigma_t: GridField) -> np.ndarray:
     # Extinction on average over collisions in even light.
     extinction = float(squares[0]) / float(total[0]) * float(sigma_t.scale[0])
     factor = np.clip(extinction * sigma_t.grid.voxel_size / DENSE_VOXEL, 1, FINEST)
-    most = (MOST_VOXELS / sigma_t.grid.voxel_count) ** (1 / 3)
+    most = (voxels / sigma_t.grid.voxel_count) ** (1 / 3)
     return np.floor(sigma_t.grid.resolution * np.minimum(factor, most)).astype(int)
 
 

@@ -21,8 +21,7 @@ from .lamps import Falloff
 from .medium import MediumGrid
 from .memory import require_memory
 from .solvers import path
-from .solvers.directional_sweep import BATCH as DIRECTIONAL_BATCH
-from .solvers.directional_sweep import DirectionalSweep
+from .solvers.directional_sweep import DirectionalSweep, directional_batch
 from .solvers.sweep import Sweep, batch_of
 
 
@@ -153,9 +152,10 @@ class LitMedium:
         channels = 1 if mi.is_monochromatic else 3
         swept, depth = self.solver == "sweep", settings.max_depth
         batch = BATCH
-        if swept:
-            isotropic = medium.phase is None
-            batch = batch_of(settings.samples or SINGLE, depth) if isotropic else DIRECTIONAL_BATCH
+        if swept and directional is not None:
+            batch = directional_batch(directional.order)
+        elif swept:
+            batch = batch_of(settings.samples or SINGLE, depth)
         cache = IrradianceCache(
             grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
         )
@@ -335,6 +335,8 @@ def _check_memory(
         # light is scattered again, the voxels' own and what is kept between sweeps.
         sets = channels if together else 1
         numbers = 5 + 2 * channels + (0 if max_depth == 2 else 12 * sets + 3 * channels)
+        # Moments of one channel are solved for at a time.
+        numbers += moments * (3 * channels + (4 if max_depth == 2 else 10))
     else:
         numbers = channels * (3 * 2 + 3) + 5  # sums in float64
         numbers += channels * moments * 3

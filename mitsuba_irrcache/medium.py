@@ -39,6 +39,9 @@ class MediumGrid:
         self.exact = True
         #: None where it is isotropic
         self.phase: Phase | None = None
+        #: the power of transmittance that is left of light if what is scattered into a forward peak
+        #: is taken from it, too (see `similarity`)
+        self.straight = 1.0
         #: what it is called among others
         self.name = ""
         #: Mitsuba's medium, as rays carry it, and what else there is in the scene; None where

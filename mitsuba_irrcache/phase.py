@@ -19,8 +19,11 @@ from .boundary import Boundary
 from .errors import UnsupportedSceneError
 from .grid import Grid
 
-#: Highest order of spherical harmonics that a cache holds.
-HIGHEST = 4
+#: Highest order of spherical harmonics that a cache holds, and where a forward peak is taken away.
+HIGHEST, SHARPEST = 4, 6
+#: Share of light in a forward peak up to which the lower of these will do, and up to which the
+#: other does. Of ``hg``, g is at most 0.75 and 0.85 then.
+PEAK, LARGEST_PEAK = 0.25, 0.33
 #: Moments beyond the order of a cache are at most so large: what is left out of the radiance is
 #: scattered with this share of its weight or less. Of ``hg``, |g| is at most 0.58 then.
 TAIL = 0.07
@@ -32,11 +35,15 @@ PROBES = 1024
 
 class Phase:
     """A phase function that is not isotropic: Mitsuba's ``plugin``, its ``moments`` g_0 = 1, g_1,
-    ..., and its ``peak``, the maximum of 4 pi p.
+    ..., and its ``peak``, the maximum of 4 pi p. These are without the share ``forward`` of light
+    that goes on straight (see `similarity`).
     """
 
-    def __init__(self, plugin: mi.PhaseFunction, moments: np.ndarray, peak: float) -> None:
+    def __init__(
+        self, plugin: mi.PhaseFunction, moments: np.ndarray, peak: float, forward: float = 0.0
+    ) -> None:
         self.plugin, self.moments, self.peak = plugin, moments, peak
+        self.forward = forward
 
     def tail(self, order: int) -> float:
         """The largest moment beyond ``order``."""
@@ -45,8 +52,23 @@ class Phase:
     @property
     def order(self) -> int | None:
         """Of the spherical harmonics that a cache has to hold; None where there were too many."""
-        fitting = (n for n in range(1, HIGHEST + 1) if self.tail(n) <= TAIL)
-        return next(fitting, None)
+        if self.forward:
+            return int(np.flatnonzero(self.moments)[-1])
+        return next((n for n in range(1, HIGHEST + 1) if self.tail(n) <= TAIL), None)
+
+    @property
+    def has_peak(self) -> bool:
+        """Whether what makes it sharp is a forward peak, not too large a one."""
+        return self.order is None and 0 < self.moments[SHARPEST + 1] <= LARGEST_PEAK
+
+    def without_peak(self) -> Phase:
+        """The same where light in the peak goes on straight."""
+        orders = range(HIGHEST, SHARPEST)
+        order = next((n for n in orders if self.moments[n + 1] <= PEAK), SHARPEST)
+        share = float(self.moments[order + 1])
+        known = np.arange(len(self.moments)) <= order
+        moments = np.where(known, (self.moments - share) / (1 - share), 0)
+        return Phase(self.plugin, moments, self.peak / (1 - share), share)
 
     def gain(
         self, p: mi.Point3f, direction: mi.Vector3f, towards: mi.Vector3f, active: mi.Bool = True
@@ -54,7 +76,7 @@ class Phase:
         """4 pi p for light at ``p`` from ``towards`` that is seen along ``direction``."""
         place = interaction(p, direction)
         value, _ = self.plugin.eval_pdf(mi.PhaseFunctionContext(), place, towards, active)
-        return 4 * dr.pi * value[0]
+        return 4 * dr.pi / (1 - self.forward) * value[0]
 
 
 def interaction(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f:
@@ -133,11 +155,12 @@ def refuse_sharp(phase: Phase, name: str) -> None:
     """Raises UnsupportedSceneError, with the bound, where ``phase`` has too many moments."""
     if phase.order is not None:
         return
-    limit = TAIL ** (1 / (HIGHEST + 1))
+    limit, most = TAIL ** (1 / (HIGHEST + 1)), LARGEST_PEAK ** (1 / (SHARPEST + 1))
     raise UnsupportedSceneError(
         f"irrcache: {name} has the phase function {phase.plugin.class_name()} with the mean cosine "
         f"{phase.moments[1]:.2f}, too sharp for a cache: of its Legendre moments beyond order "
         f"{HIGHEST} the largest is {phase.tail(HIGHEST):.2f}, and only up to {TAIL:g} (|g| up to "
-        f'{limit:.2f} of "hg") images are right. Make it broader, or render this scene with '
-        '"volpath".'
+        f'{limit:.2f} of "hg") images are right; sharper ones, up to {most:.2f}, only forward and '
+        "where this medium is all there is in the scene and does not shine. Make it broader, or "
+        'render this scene with "volpath".'
     )

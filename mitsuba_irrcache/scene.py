@@ -16,6 +16,7 @@ from .emission import Emission, place_emission
 from .errors import UnsupportedSceneError
 from .medium import MediumGrid, bake, children
 from .phase import refuse_sharp
+from .similarity import take_away_peak
 from .surroundings import Surroundings
 from .transport import MOST_CROSSINGS, is_null
 
@@ -50,9 +51,7 @@ def bake_media(scene: mi.Scene, emission: Emission | None = None) -> list[Medium
         grids = [_bake_simple(scene, boundary)]
         place_emission(emission, grids)
     else:
-        grids = bake_general(scene, emission)
-        for grid in grids:
-            grid.alone = boundary is not None
+        grids = bake_general(scene, emission, boundary is not None)
     for grid in grids:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
@@ -124,15 +123,19 @@ def _bake_simple(scene: mi.Scene, boundary: Boundary) -> MediumGrid:
     return grid
 
 
-def bake_general(scene: mi.Scene, emission: Emission | None = None) -> list[MediumGrid]:
-    """The media of any scene on grids that know their `Surroundings`; only those that are seen."""
+def bake_general(
+    scene: mi.Scene, emission: Emission | None = None, alone: bool = False
+) -> list[MediumGrid]:
+    """The media of any scene on grids that know their `Surroundings`; only those that are seen. In
+    a simple scene there is but one, which is ``alone``.
+    """
     shapes, grids, seen = scene.shapes(), [], []
     for shape in shapes:
         _check_shape(scene, shape)
     for medium, filled in media_of(scene).items():
         exact = _exact_boundary(scene, filled)
         grid = bake(medium, exact or Boundary("box", _extent(medium, filled)))
-        grid.exact = exact is not None
+        grid.exact, grid.alone = exact is not None, alone
         grid.pointer, grid.name = mi.MediumPtr(medium), _name(medium, [g.name for g in grids])
         dr.make_opaque(grid.pointer)
         grids.append(grid)
@@ -141,7 +144,9 @@ def bake_general(scene: mi.Scene, emission: Emission | None = None) -> list[Medi
             sensor.get_medium() == medium for sensor in scene.sensors()
         ):
             seen.append(grid)
-            if grid.phase is not None:
+            if grid.phase is not None and grid.phase.has_peak and alone and emission is None:
+                take_away_peak(grid)
+            elif grid.phase is not None:
                 refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
     Surroundings(scene, grids)
     place_emission(emission, grids)

@@ -114,11 +114,24 @@ class SimpleSight:
             ray, near, far, background, 1 - sampler.next_1d(active), active & hit
         )
         if self.lit:
-            background = transmittance * background + emitted
+            background = self._left_of(transmittance, ray.d) * background + emitted
         alpha = mi.Float(1)
         if not visible:  # dr.mean would write the number of samples into the kernel
             alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
         return View(scattered, background, transmittance, alpha, gathered)
+
+    def _left_of(self, transmittance: mi.Spectrum, direction: mi.Vector3f) -> mi.Spectrum:
+        """What the medium leaves of the environment in a ``direction``."""
+        field = self.projection.directional
+        if self.medium.straight == 1 or field is None:
+            return transmittance
+        narrow = mi.Bool(False)
+        for source in field.directional.sources:
+            if source.far:
+                towards, cosine = source.seen_from(mi.Point3f(0))
+                narrow |= dr.dot(direction, towards) >= cosine
+        power = dr.opaque(mi.Float, self.medium.straight)
+        return dr.select(narrow, dr.power(transmittance, power), transmittance)
 
 
 class Sight:

@@ -11,6 +11,8 @@ SWEEP = "tests/system/test_sweep.py"
 UNBIASED = "tests/system/test_unbiased.py"
 PROJECTION = "tests/unit/test_projection.py"
 CACHE = "tests/unit/test_cache.py"
+MOMENTS = "tests/unit/test_moments.py"
+PHASE = "tests/system/test_phase.py"
 
 
 @dataclass(frozen=True)
@@ -227,5 +229,33 @@ MUTANTS = (
         "light[channel] * self._spread for light",
         "light[channel] for light",
         ("tests/system/test_lamps.py",),
+    ),
+    Mutant(
+        "light from the opposite side (moments)",
+        "solvers/moments.py",
+        "even, odd = there + back, there - back",
+        "even, odd = there + back, back - there",
+        (MOMENTS,),
+    ),
+    Mutant(
+        "what lines lose not per depth (moments)",
+        "solvers/moments.py",
+        "dr.select(v.w > 0, v.z / v.w, 0)",
+        "v.z",
+        (PHASE,),
+    ),
+    Mutant(
+        "light of narrow lights twice (moments)",
+        "solvers/moments.py",
+        "light = light - own",
+        "light = light - 0 * own",
+        (PHASE,),
+    ),
+    Mutant(
+        "a forward peak of what is absorbed, too",
+        "similarity.py",
+        "s * (1 - share * a)",
+        "s * (1 - share)",
+        ("tests/unit/test_similarity.py",),
     ),
 )

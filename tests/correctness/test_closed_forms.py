@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.cache import IrradianceCache
+from mitsuba_irrcache.directional import Directional, sources_of
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.projection import Projection
-from mitsuba_irrcache.scene import bake_scene
+from mitsuba_irrcache.scene import bake_media, bake_scene
 from mitsuba_irrcache.solvers import path, sweep
+from mitsuba_irrcache.solvers.directional_sweep import DirectionalSweep, directional_batch
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -136,15 +138,18 @@ def radiance(medium, cache, cosine: float, step: float) -> float:
     direction = mi.Vector3f(-math.sqrt(1 - cosine**2), 0, -cosine)
     ray = mi.Ray3f(mi.Point3f(-direction), direction)
     _, near, far = medium.intersect(ray)
-    projection = Projection(medium, cache.field(), "exponential", step)
+    field = cache.field()
+    moments = cache.directional_field(field.channels)
+    projection = Projection(medium, field, "exponential", step, directional=moments)
     result, *_ = projection.march(ray, near, far, mi.Spectrum(0), mi.Float(1), mi.Bool(True))
     return float(result.x[0])
 
 
-def slab(scenes, sigma_t, albedo, depth: float, **objects) -> mi.Scene:
+def slab(scenes, sigma_t, albedo, depth: float, phase=None, **objects) -> mi.Scene:
     """A slab below z = 0 that is 200 mean free paths wide."""
     to_world = scenes.placement((200.0, 200.0, depth), center=(0, 0, -depth / 2))
-    shape = scenes.boundary(scenes.medium(sigma_t, albedo), to_world)
+    medium = scenes.medium(sigma_t, albedo) | ({"phase": phase} if phase else {})
+    shape = scenes.boundary(medium, to_world)
     return scenes.load({"type": "irrcache"}, shape, **objects)
 
 
@@ -176,13 +181,19 @@ def swept(scene, depth: float, layers: int, columns: int, batches: int = 1):
     """The medium of a slab of ``depth``, and its light by the solver ``sweep``, in so many layers,
     each of ``columns`` x ``columns`` voxels.
     """
-    medium = bake_scene(scene)
+    (medium,) = bake_media(scene)
     place = np.diag([200.0, 200.0, depth, 1.0])
     place[:3, 3] = -100, -100, -depth
     grid = Grid((layers, columns, columns), place)
-    index, batch = dr.arange(mi.UInt32, grid.voxel_count), sweep.BATCH
-    cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True)
-    sweep.Sweep(scene, medium, cache, seed=1).refine(batches * batch)
+    index, moments = dr.arange(mi.UInt32, grid.voxel_count), None
+    solver, batch = sweep.Sweep, sweep.BATCH
+    if medium.phase is not None:
+        moments = Directional(medium.phase, sources_of(scene))
+        solver, batch = DirectionalSweep, directional_batch(moments.order)
+    count = moments.count if moments else 0
+    cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True, moments=count)
+    cache.directional = moments
+    solver(scene, medium, cache, 1).refine(batches * batch)
     return medium, cache
 
 
@@ -265,6 +276,31 @@ def test_sunlit_slabs_by_sweeps(scenes, name, depth, albedo, leaving):
     medium, cache = swept(scene, depth, *(THIN if thin else (1024, 21, 1)))
     found = [radiance(medium, cache, cosine, 0.25) for cosine in COSINES]
     np.testing.assert_allclose(found, leaving, rtol=0.01)
+
+
+# Forward scattering, hg with g = 0.75, albedo 1, a sun at the zenith, of flux pi: name, depth,
+# layers, flux that leaves the lit side, radiance there at the `COSINES`.
+FORWARD_SLABS = [
+    ("3a", 1.0, 20, 0.247374, (0.151159, 0.101103, 0.0395460)),
+    ("3b", 8.0, 64, 1.59096, (0.379740, 0.519598, 0.493302)),
+]
+
+
+@pytest.mark.parametrize(("name", "depth", "layers", "flux", "leaving"), FORWARD_SLABS)
+def test_forward_scattering_slabs(scenes, name, depth, layers, flux, leaving):
+    """DISORT 3a and 3b by ``sweep``, which lets the 24 % of the light in a forward peak go on. Flux
+    to 1.5 %. The little light that comes straight back was scattered forward before: five moments
+    tell its directions to a tenth.
+    """
+    sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": math.pi}
+    scene = slab(scenes, 1.0, 1.0, depth, {"type": "hg", "g": 0.75}, emitter=sun)
+    medium, cache = swept(scene, depth, layers, 19)
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    cosines = 0.5 * (nodes + 1)
+    up = [radiance(medium, cache, float(cosine), 0.25) for cosine in cosines]
+    assert np.pi * (weights * cosines) @ up == pytest.approx(flux, rel=0.015)
+    found = [radiance(medium, cache, cosine, 0.25) for cosine in COSINES]
+    np.testing.assert_allclose(found, leaving, rtol=0.1)
 
 
 @pytest.mark.parametrize("solver", ["path", "sweep"])

@@ -34,6 +34,8 @@ SCENES = {
     "rayleigh": (RAYLEIGH, -1, {}, {}),
     "rayleigh, point": (RAYLEIGH, 3, {"emitter": POINT, "sun": None}, {"tolerance": 0.04}),
     "hg 0.5, sun of an envmap": (hg(0.5), -1, "envmap", {"tolerance": 0.03}),
+    "hg 0.75": (hg(0.75), -1, {}, {}),
+    "hg 0.85, sun of an envmap": (hg(0.85), -1, "envmap", {"tolerance": 0.03}),
 }
 BY_PATH = "hg 0.3, single", "hg 0.5, sun of an envmap"
 CASES = [("sweep", name) for name in SCENES] + [("path", name) for name in BY_PATH]

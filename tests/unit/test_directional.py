@@ -48,7 +48,8 @@ def test_isotropic_ones_have_none(scenes, phase):
 
 
 REFUSED = {
-    "sharp": (hg(0.8), "HGPhaseFunction.*0.80.*0.59.*volpath"),
+    "sharp": (hg(0.95), "HGPhaseFunction.*0.95.*0.59.*0.85.*volpath"),
+    "sharp and backwards": (hg(-0.8), "HGPhaseFunction.*-0.80.*0.59.*volpath"),
     "oriented": (
         {"type": "sggx", "S": {"type": "gridvolume", "grid": "S"}}, "angle of scattering.*volpath",
     ),

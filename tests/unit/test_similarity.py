@@ -1,0 +1,115 @@
+"""Media without their forward peaks: similarity, phase functions, and what is refused."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import UnsupportedSceneError
+from mitsuba_irrcache.phase import LARGEST_PEAK, PEAK, Phase
+from mitsuba_irrcache.scene import bake_media
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+def hg(g: float) -> dict:
+    return {"type": "hg", "g": g}
+
+
+def moments(g: float) -> Phase:
+    return Phase(None, g ** np.arange(32), 1.0)
+
+
+@pytest.mark.parametrize("g", [0.6, 0.75, 0.77, 0.85])
+def test_moments_without_the_peak(g):
+    """A delta function forwards and the rest have the moments of before, up to the order."""
+    whole, rest = moments(g), moments(g).without_peak()
+    assert whole.has_peak and rest.moments[0] == 1
+    both = rest.forward + (1 - rest.forward) * rest.moments
+    known = rest.order + 1
+    np.testing.assert_allclose(both[:known], whole.moments[:known], rtol=1e-12)
+    assert rest.forward == pytest.approx(g**known) and rest.forward <= LARGEST_PEAK
+    assert rest.forward <= PEAK or rest.order == 6
+
+
+def test_only_forward_peaks_are_taken_away():
+    for g in (0.5, -0.8, 0.9, 0.0):
+        assert not moments(g).has_peak
+
+
+def scene_of(scenes, settings: dict, **objects) -> mi.Scene:
+    medium = scenes.medium(1.0, 0.9) | {"phase": hg(0.8)}
+    return scenes.load({"type": "irrcache"} | settings, scenes.boundary(medium), 8, **objects)
+
+
+def grid(values) -> dict:
+    data = mi.VolumeGrid(np.float32(values))
+    place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale([2, 2, 2])
+    return {"type": "gridvolume", "grid": data, "raw": True, "to_world": place}
+
+
+RNG = np.random.default_rng(1)
+FIELDS = {
+    "constants": (1.5, 0.9),
+    "colours": (1.5, (0.9, 0.5, 0.7)),
+    "grid of extinction": (RNG.uniform(0, 3, (4, 5, 6, 1)), 0.8),
+    "grid of extinction, coloured albedo": (RNG.uniform(0, 3, (4, 5, 6, 1)), (0.9, 0.5, 0.7)),
+    "two grids": (RNG.uniform(0, 3, (4, 5, 6, 1)), RNG.uniform(0, 1, (4, 5, 6, 3))),
+}
+
+
+@pytest.mark.parametrize(("sigma_t", "albedo"), FIELDS.values(), ids=FIELDS)
+def test_what_is_absorbed_stays(scenes, sigma_t, albedo):
+    """At the voxel centres: sigma_t (1 - albedo) is as before, sigma_s less by the peak."""
+    medium = {"type": "heterogeneous" if np.ndim(sigma_t) > 1 else "homogeneous", "phase": hg(0.8)}
+    for name, value in (("sigma_t", sigma_t), ("albedo", albedo)):
+        if np.ndim(value) > 1:
+            medium[name] = grid(value)
+        else:
+            plain = np.ndim(value) == 0
+            colour = value if plain else {"type": "rgb", "value": list(value)}
+            volume = {"type": "constvolume", "value": colour}
+            medium[name] = volume if medium["type"] == "heterogeneous" else colour
+    found = bake_media(scenes.load({"type": "irrcache"}, scenes.boundary(medium), 8))[0]
+    z, y, x = (np.ravel(i) for i in np.indices((4, 5, 6)))
+    centres = np.float32([(x + 0.5) / 3 - 1, (y + 0.5) / 2.5 - 1, (z + 0.5) / 2 - 1])
+
+    def at(field) -> np.ndarray:
+        value = mi.Color3f(field.at_world(mi.Point3f(centres)))
+        return np.array(value + dr.zeros(mi.Float, centres.shape[1])).T
+
+    def before(value) -> np.ndarray:
+        flat = np.reshape(value, (-1, np.shape(value)[-1])) if np.ndim(value) > 1 else value
+        return np.broadcast_to(flat, (centres.shape[1], 3))
+
+    extinction, scattered = before(sigma_t), before(sigma_t) * before(albedo)
+    share = found.phase.forward
+    assert share == pytest.approx(0.8**7, rel=1e-3)
+    new = at(found.sigma_t) * at(found.albedo)
+    np.testing.assert_allclose(new, (1 - share) * scattered, rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        at(found.sigma_t) - new, extinction - scattered, rtol=1e-4, atol=1e-5
+    )
+
+
+REFUSED = {
+    "path": ({"solver": "path"}, r"sharply.*0\.80.*path.*auto.*volpath"),
+    "an order": ({"solver": "auto", "max_depth": 3}, r"sharply.*0\.80.*max_depth 3.*-1.*volpath"),
+}
+
+
+@pytest.mark.parametrize(("settings", "message"), REFUSED.values(), ids=REFUSED)
+def test_settings_are_refused(scenes, settings, message):
+    """Where paths would have to follow the peak, or orders of scattering are told apart."""
+    scene = scene_of(scenes, settings)
+    with pytest.raises(UnsupportedSceneError, match=message):
+        scene.integrator().prepare(scene)
+
+
+def test_sharp_media_among_surfaces_are_refused(scenes):
+    place = mi.ScalarTransform4f().translate([0, -1.2, 0]).rotate([1, 0, 0], -90)
+    ground = {"type": "rectangle", "to_world": place}
+    with pytest.raises(UnsupportedSceneError, match=r"0\.80.*all there is in the scene.*volpath"):
+        bake_media(scene_of(scenes, {}, ground=ground))
