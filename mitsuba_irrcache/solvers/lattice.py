@@ -214,7 +214,7 @@ class Lattice:
                 lanes, row = self._lanes_of(len(group))
                 copies = dr.opaque(mi.Float, 0, 2 * len(group) * voxels * (4 if sent else 1))
                 begin = row * dr.opaque(mi.UInt32, 2 * voxels)
-                empty = self._empty.slices if self._empty and not sent else None
+                empty = self._empty.slices if self._empty else None
                 follow(
                     corners, self._extinction.own, empty, copies, sent(group) if sent else None,
                     table, group.pair(row), lanes, begin,
@@ -246,7 +246,7 @@ class Lattice:
             self._launch_together(volume, scatters, table, pairs)
             return
         corners = self._corners(axis)  # one set at a time is kept
-        empty = self._empty.slices if self._empty and not scatters else None
+        empty = self._empty.slices if self._empty else None
         source = volume if scatters else None
         channels = self._channels(volume, scatters)
         for i in pairs:

@@ -166,27 +166,27 @@ def follow(
                 _write(volume, _sum(before_back, L_back), place_back, needed_back & ~middle)
         else:
             if dr.hint(apart, mode="scalar"):
-                sent = _read(mi.Float, source, place, channels, active)
-                sent_back = _read(mi.Float, source, place_back, channels, active)
+                sent = _read(mi.Float, source, place, channels, needed)
+                sent_back = _read(mi.Float, source, place_back, channels, needed_back)
             else:
-                voxel = _read(mi.Vector4f, volume, place, channels, active)
-                voxel_back = _read(mi.Vector4f, volume, place_back, channels, active)
+                voxel = _read(mi.Vector4f, volume, place, channels, needed)
+                voxel_back = _read(mi.Vector4f, volume, place_back, channels, needed_back)
                 sent, sent_back = _sent(voxel), _sent(voxel_back)
                 if dr.hint(elsewhere, mode="scalar"):
-                    sent = _sources(source, index, channels, active)
-                    sent_back = _sources(source, index_back, channels, active)
+                    sent = _sources(source, index, channels, needed)
+                    sent_back = _sources(source, index_back, channels, needed_back)
             sent, sent_back = _times(sent, weight), _times(sent_back, weight)
             L, tally = _crossed(L, sent, s * scale, s_next * scale, since, count, area)
             L_back, tally_back = _crossed(
                 L_back, sent_back, s_back * scale, s_next_back * scale, since_back, count, area
             )
             if dr.hint(apart, mode="scalar"):
-                _write(volume, tally, place, active)
-                _write(volume, tally_back, place_back, active)
+                _write(volume, tally, place, needed)
+                _write(volume, tally_back, place_back, needed_back)
             else:
                 tally = _sum(tally, _chosen(middle, tally_back, len(L) * [0]))
-                _write(volume, _sum(voxel, tally), place, active)
-                _write(volume, _sum(voxel_back, tally_back), place_back, active & ~middle)
+                _write(volume, _sum(voxel, tally), place, needed)
+                _write(volume, _sum(voxel_back, tally_back), place_back, needed_back & ~middle)
         s0, s0_back = s_next, s_next_back
         ib, fb, since = there_b.advance(ib, fb, ahead)
         ic, fc, near = there_c.advance(ic, fc, ahead)

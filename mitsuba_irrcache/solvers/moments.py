@@ -77,7 +77,9 @@ class Moments:
         """No light, at so many places."""
         return [dr.opaque(mi.Float, 0, width) for _ in range(self.count)]
 
-    def uncollided(self, passes: list[Pass], lattice: Lattice) -> tuple[mi.Float, list[mi.Float]]:
+    def uncollided(
+        self, passes: list[Pass], lattice: Lattice
+    ) -> tuple[mi.Float, list[mi.Float | None]]:
         """Moments of the light from far away at the wanted voxels, the sum of all ``passes``, but
         for that of narrow lights; and those of each narrow light (none where it is not far away).
         """

@@ -4,6 +4,7 @@ rounding.
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.solvers import empty, lattice
 from mitsuba_irrcache.solvers.empty import CELL, Emptiness
 from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.scattering import Level
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -68,7 +70,9 @@ def test_nothing_is_skipped_where_it_gains_too_little():
 @pytest.mark.parametrize("box", [((0, 0, 0), (32, 21, 26)), ((3, 1, 2), (32, 20, 25))])
 @pytest.mark.parametrize("detailed", [False, True])
 def test_light_is_the_same(monkeypatch, box, detailed):
-    """Whichever way lines go, and where they enter: with voxels of the medium, and its detail."""
+    """Whichever way lines go, and where they enter: with voxels of the medium, and its detail; light
+    that enters, and what voxels scatter besides.
+    """
     monkeypatch.setattr(lattice, "SMALL", 0)
     monkeypatch.setattr(lattice, "RECEIVED", 0.0)
     monkeypatch.setattr(empty, "WORTHWHILE", 1.0)
@@ -94,16 +98,23 @@ def test_light_is_the_same(monkeypatch, box, detailed):
     directions = rng.normal(size=(12, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     light, offsets = rng.random((12, 2)), rng.random((12, 2))
-    values = [
-        np.array(
-            Lattice(
-                grid, mi.Float(density.ravel().tolist()), lower, upper, medium, wanted, skip
-            ).carry(directions, light, offsets)
-        )
-        for skip in (False, True)
-    ]
+    sigma_t = mi.Float(density.ravel().tolist())
+    lines = [Lattice(grid, sigma_t, lower, upper, medium, wanted, skip) for skip in (False, True)]
+    values = [np.array(each.carry(directions, light, offsets)) for each in lines]
     assert values[0].max() > 2 * values[0].min()
     np.testing.assert_allclose(*values, rtol=1e-6)
+    count, index = grid.voxel_count, np.array(wanted)
+    matter = mi.Float(occupied.ravel().astype(float).tolist())
+    phi = mi.Float(rng.random(count).tolist())
+    for channels in (1, 3):
+        found = []
+        for each in lines:
+            level = Level(grid, matter, dr.tile(matter * 0.8, channels), each)
+            table = each.table(directions, light, np.full(12, 0.5), offsets)
+            scattered = level.scatter(dr.tile(phi, channels), table)
+            found.append([np.array(v).reshape(channels, -1)[:, index] for v in scattered])
+        for all_voxels, some in zip(*found, strict=True):
+            np.testing.assert_allclose(all_voxels, some, rtol=2e-6)
 
 
 def _dilated(mask: np.ndarray, by: int) -> np.ndarray:
