@@ -171,6 +171,12 @@ def kind_anisotropic() -> dict:
     return {"box": box(smoke(phase={"type": "hg", "g": 0.5})), "sky": sky(), "sun": sun()}
 
 
+def kind_forward() -> dict:
+    """A cloud that scatters as clouds do, under a sky and a sun."""
+    cloud = smoke(albedo=(0.99,) * 3, phase={"type": "hg", "g": 0.85})
+    return {"box": box(cloud), "sky": sky(), "sun": sun()}
+
+
 KINDS: dict[str, Callable[[], dict]] = {
     "cloud, sky": kind_cloud,
     "cloud over the ground, sun": kind_ground,
@@ -180,6 +186,7 @@ KINDS: dict[str, Callable[[], dict]] = {
     "chromatic extinction": kind_chromatic,
     "camera in fog": kind_fog,
     "hg, g = 0.5": kind_anisotropic,
+    "hg, g = 0.85": kind_forward,
 }
 
 

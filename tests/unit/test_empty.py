@@ -70,8 +70,8 @@ def test_nothing_is_skipped_where_it_gains_too_little():
 @pytest.mark.parametrize("box", [((0, 0, 0), (32, 21, 26)), ((3, 1, 2), (32, 20, 25))])
 @pytest.mark.parametrize("detailed", [False, True])
 def test_light_is_the_same(monkeypatch, box, detailed):
-    """Whichever way lines go, and where they enter: with voxels of the medium, and its detail; light
-    that enters, and what voxels scatter besides.
+    """Whichever way lines go, and where they enter, with voxels of the medium and its detail: of
+    light that enters, and what voxels scatter besides.
     """
     monkeypatch.setattr(lattice, "SMALL", 0)
     monkeypatch.setattr(lattice, "RECEIVED", 0.0)
