@@ -72,8 +72,8 @@ MUTANTS = (
     Mutant(
         "the cosine of the slope forgotten: area of a line (sweep)",
         "solvers/lines.py",
-        "mi.Vector4f(0, middle, lost * area, weight * tau * area)",
-        "mi.Vector4f(0, middle, lost, weight * tau)",
+        "mi.Vector4f(0, middle, lost * area, count * tau * area)",
+        "mi.Vector4f(0, middle, lost, count * tau)",
         (SWEEP,),
     ),
     Mutant(
@@ -135,7 +135,7 @@ MUTANTS = (
     Mutant(
         "the background in front of the medium",
         "sight.py",
-        "background = transmittance * background + emitted",
+        "background = self._left_of(transmittance, ray.d) * background + emitted",
         "background = background + emitted",
         (CLOSED_FORMS,),
     ),

@@ -21,8 +21,9 @@ import numpy as np
 
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.solvers.lattice import Entering, Lattice, Table
+from mitsuba_irrcache.solvers.lattice import Lattice
 from mitsuba_irrcache.solvers.layout import joined
+from mitsuba_irrcache.solvers.table import Entering, Table
 from mitsuba_irrcache.surroundings import probe
 from mitsuba_irrcache.transport import Start, out_of, trace
 

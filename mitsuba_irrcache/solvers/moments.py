@@ -14,9 +14,10 @@ import numpy as np
 
 from mitsuba_irrcache.directional import Directional
 from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.solvers.lattice import Group, Lattice, Table, sharpened
+from mitsuba_irrcache.solvers.lattice import Lattice, sharpened
 from mitsuba_irrcache.solvers.passes import Pass, joined
 from mitsuba_irrcache.solvers.scattering import Level
+from mitsuba_irrcache.solvers.table import Group, Table
 
 #: Highest degree of what is corrected on coarser grids.
 SMOOTH = 1

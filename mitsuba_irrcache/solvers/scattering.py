@@ -17,7 +17,8 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grid import Grid, stencil
-from mitsuba_irrcache.solvers.lattice import Lattice, Table
+from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.table import Table
 
 #: Voxels along the longest side of the coarsest grid, at most.
 COARSEST = 20

@@ -17,10 +17,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache import LAYERS, IrradianceCache
-from mitsuba_irrcache.grid import Field, Grid, GridField
+from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.arrivals import Around
+from mitsuba_irrcache.solvers.baking import baked, detail_of
 from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.glow import emitted_light
 from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp, split
@@ -38,10 +39,6 @@ DIRECTIONS = 16
 #: An order of scattering that changes the light by less is one too many, as single precision has
 #: it; looked at every so many orders.
 NO_LIGHT, CHECKED = 1e-7, 8
-#: Most points along each axis of a voxel over which the medium is averaged.
-FINEST = 4
-#: Values of the extinction along each axis of a voxel that lines see, about.
-DETAIL = 2
 
 #: called with (samples done, samples in all), both in voxels times directions
 Progress = Callable[[int, int], None]
@@ -82,7 +79,7 @@ class Sweep:
         if not cache.active_count:
             return
         grid = cache.grid
-        detail = _detail(medium, grid)
+        detail = detail_of(medium, grid)
         extinction = baked(medium, medium.sigma_t, detail)
         box = occupied_box(grid, cache.active)
         # Blocks of the medium's voxels, and voxels that lie askew to these, reach farther.
@@ -295,74 +292,6 @@ def _changed_by(before: mi.Float, after: mi.Float) -> float:
     change, scale = dr.sum(dr.abs(after - before)), dr.sum(dr.abs(after))
     dr.eval(change, scale)
     return float(change[0]) / max(float(scale[0]), 1e-30)
-
-
-def _detail(medium: MediumGrid, grid: Grid) -> Grid:
-    """The voxels in which lines see the extinction, where ``grid`` lies over the same box as those
-    of the medium: these, or where ``grid`` is much coarser, blocks of them, about `DETAIL` in a
-    voxel along each axis.
-    """
-    data = medium.sigma_t.grid
-    if data is None or not medium.fills(grid) or not medium.fills(data):
-        return grid
-    block = np.maximum(np.rint(data.resolution / (DETAIL * grid.resolution)), 1).astype(int)
-    block = np.where(data.resolution % block == 0, block, 1)
-    sides = data.resolution // block
-    if (sides == grid.resolution).all():
-        return grid
-    return data if (block == 1).all() else Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
-
-
-def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> list[mi.Float]:
-    """Channels of ``field`` at the voxels of ``grid``: its means over voxels that are larger than
-    the field's, or that the boundary of the medium may cut. Outside of it the field counts as 0 if
-    ``masked``.
-    """
-    cut = masked and not medium.fills(grid)
-    if field.grid is not None and not cut:
-        block, rest = np.divmod(field.grid.resolution, grid.resolution)
-        if not rest.any() and np.prod(block) <= FINEST**3 and medium.fills(field.grid):
-            return _blocks(field, grid, block)
-    ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
-    points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
-    index = dr.arange(mi.UInt32, grid.voxel_count)
-    values = _mean(medium, field, grid, index, dr.opaque(mi.UInt32, points), cut)
-    dr.eval(values)
-    return values
-
-
-def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
-    """Means over blocks of so many voxels (x, y, z), which are the voxels of ``grid``."""
-    sums: list = [0.0] * field.channels
-    at = grid.places(dr.arange(mi.UInt32, grid.voxel_count))
-    for dz, dy, dx in np.ndindex(*block[::-1]):
-        voxel = (a * int(n) + d for a, n, d in zip(at, block, (dx, dy, dz), strict=True))
-        place = field.grid.index(*voxel) * field.channels
-        for c in range(field.channels):
-            sums[c] = sums[c] + dr.gather(mi.Float, field.data, place + c)
-    values = [total * (field.scale / int(np.prod(block))) for total in sums]
-    dr.eval(values)
-    return values
-
-
-@dr.syntax
-def _mean(medium, field, grid, index, points, cut: bool):
-    """Means over points^3 places in the voxels ``index``."""
-    corner = mi.Point3f(*grid.places(index))
-    count = points * points * points
-    sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
-    k = mi.UInt32(0)
-    while dr.hint(k < count, label="points in a voxel"):
-        place = mi.Point3f(k % points, (k // points) % points, k // (points * points)) + 0.5
-        p = grid.world.point(corner + place / mi.Float(points))
-        value = field.at_world(p)
-        if dr.hint(cut, mode="scalar"):
-            value = dr.select(medium.contains(p), value, 0)
-        for c in range(field.channels):
-            part = value if dr.hint(field.channels == 1, mode="scalar") else value[c]
-            sums[c] = sums[c] + part
-        k += 1
-    return [s / mi.Float(count) for s in sums]
 
 
 def is_grey(spectra: Sequence[mi.Spectrum]) -> bool:

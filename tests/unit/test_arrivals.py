@@ -11,7 +11,8 @@ from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.scene import bake_media
 from mitsuba_irrcache.solvers import arrivals
 from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
-from mitsuba_irrcache.solvers.lattice import Entering, Lattice
+from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.table import Entering
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -9,8 +9,9 @@ import pytest
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.solvers import lattice, scattering
 from mitsuba_irrcache.solvers.directions import spread
-from mitsuba_irrcache.solvers.lattice import Entering, Lattice
+from mitsuba_irrcache.solvers.lattice import Lattice
 from mitsuba_irrcache.solvers.scattering import Level
+from mitsuba_irrcache.solvers.table import Entering
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

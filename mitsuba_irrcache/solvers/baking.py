@@ -1,0 +1,83 @@
+"""Fields of a medium at the voxels of other grids, as the solver ``sweep`` wants them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grid import Field, Grid, GridField
+from mitsuba_irrcache.medium import MediumGrid
+
+#: Most points along each axis of a voxel over which the medium is averaged.
+FINEST = 4
+#: Values of the extinction along each axis of a voxel that lines see, about.
+DETAIL = 2
+
+
+def detail_of(medium: MediumGrid, grid: Grid) -> Grid:
+    """The voxels in which lines see the extinction, where ``grid`` lies over the same box as those
+    of the medium: these, or where ``grid`` is much coarser, blocks of them, about `DETAIL` in a
+    voxel along each axis.
+    """
+    data = medium.sigma_t.grid
+    if data is None or not medium.fills(grid) or not medium.fills(data):
+        return grid
+    block = np.maximum(np.rint(data.resolution / (DETAIL * grid.resolution)), 1).astype(int)
+    block = np.where(data.resolution % block == 0, block, 1)
+    sides = data.resolution // block
+    if (sides == grid.resolution).all():
+        return grid
+    return data if (block == 1).all() else Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
+
+
+def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> list[mi.Float]:
+    """Channels of ``field`` at the voxels of ``grid``: its means over voxels that are larger than
+    the field's, or that the boundary of the medium may cut. Outside of it the field counts as 0 if
+    ``masked``.
+    """
+    cut = masked and not medium.fills(grid)
+    if field.grid is not None and not cut:
+        block, rest = np.divmod(field.grid.resolution, grid.resolution)
+        if not rest.any() and np.prod(block) <= FINEST**3 and medium.fills(field.grid):
+            return _blocks(field, grid, block)
+    ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
+    points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
+    index = dr.arange(mi.UInt32, grid.voxel_count)
+    values = _mean(medium, field, grid, index, dr.opaque(mi.UInt32, points), cut)
+    dr.eval(values)
+    return values
+
+
+def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
+    """Means over blocks of so many voxels (x, y, z), which are the voxels of ``grid``."""
+    sums: list = [0.0] * field.channels
+    at = grid.places(dr.arange(mi.UInt32, grid.voxel_count))
+    for dz, dy, dx in np.ndindex(*block[::-1]):
+        voxel = (a * int(n) + d for a, n, d in zip(at, block, (dx, dy, dz), strict=True))
+        place = field.grid.index(*voxel) * field.channels
+        for c in range(field.channels):
+            sums[c] = sums[c] + dr.gather(mi.Float, field.data, place + c)
+    values = [total * (field.scale / int(np.prod(block))) for total in sums]
+    dr.eval(values)
+    return values
+
+
+@dr.syntax
+def _mean(medium, field, grid, index, points, cut: bool):
+    """Means over points^3 places in the voxels ``index``."""
+    corner = mi.Point3f(*grid.places(index))
+    count = points * points * points
+    sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
+    k = mi.UInt32(0)
+    while dr.hint(k < count, label="points in a voxel"):
+        place = mi.Point3f(k % points, (k // points) % points, k // (points * points)) + 0.5
+        p = grid.world.point(corner + place / mi.Float(points))
+        value = field.at_world(p)
+        if dr.hint(cut, mode="scalar"):
+            value = dr.select(medium.contains(p), value, 0)
+        for c in range(field.channels):
+            part = value if dr.hint(field.channels == 1, mode="scalar") else value[c]
+            sums[c] = sums[c] + part
+        k += 1
+    return [s / mi.Float(count) for s in sums]
