@@ -133,7 +133,7 @@ def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
         turned = after(window, lambda: window.enter("rotation", 120))
         assert difference(turned, front) > 3
         window.tick("compare with volpath")
-        window.wait_for(r"volpath, \d+ samples per pixel; RMSE", 60)
+        window.wait_for(r"volpath, \d{2,} samples per pixel; RMSE", 90)  # in sRGB noise is bias
         window.page.add_style_tag(content=".mantine-Paper-root {visibility: hidden}")
         ours, theirs = np.split(screen(window, SIZE[0]), 2, axis=1)
         assert ours.std() > 10 and abs(ours.mean() - theirs.mean()) < 6
