@@ -25,6 +25,7 @@ def cases() -> list[Case]:
         media.colours,
         views.films,
         media.empty_media,
+        media.phases,
         media.many_samples,
         media.refusals,
     )

@@ -182,6 +182,29 @@ def empty_media() -> list[Case]:
     ]
 
 
+def phases() -> list[Case]:
+    """Light that is known by its direction: at all depths, in few voxels, among empty ones.
+
+    From 0.6 on a forward peak is taken away.
+    """
+    found = []
+    for g in (-0.5, 0.5, 0.85):
+        for depth in (1e-30, 1e-8, 1, 80, 1e4, 1e30):
+            white = Matter(depth / 2, 1.0, g=g)
+            solvers = SOLVERS if depth <= 1 and g < 0.6 else ("sweep",)
+            name = f"g = {g:g}, depth {depth:g}"
+            checks = (p.furnace, p.no_brighter())
+            found.append(case("phase", name, *checks, matter=white, solvers=solvers))
+        for shape in ((1, 1, 1), (1, 1, 31), (7, 11, 13)):
+            values = np.where(texture(shape, 0, 1) > 0.7, np.float32(1e3), np.float32(0))
+            matter = Matter(values, 0.9, g=g)
+            name = f"g = {g:g}, 0 and 1e3 in {'x'.join(map(str, shape[::-1]))}"
+            found.append(
+                case("phase", name, p.no_brighter(1.02), matter=matter, solvers=("sweep",))
+            )
+    return found
+
+
 def many_samples() -> list[Case]:
     """2^25 samples of one voxel: in the middle of a ball every ray is as long, so the mean of all
     samples is that of each.

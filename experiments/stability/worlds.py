@@ -54,6 +54,7 @@ class Matter:
         albedo: likewise.
         turn: degrees about an oblique axis.
         mirror: whether the box is mirrored in its own x axis.
+        g: mean cosine of the scattering, by ``hg``.
     """
 
     sigma_t: object = 1.0
@@ -62,6 +63,7 @@ class Matter:
     shape: str = "cube"
     turn: float = 0.0
     mirror: bool = False
+    g: float = 0.0
 
     def _linear(self) -> np.ndarray:
         """Columns: half the edges of the box."""
@@ -83,6 +85,8 @@ class Matter:
             "albedo": _volume(self.albedo, grid),
             "scale": 1 / world.scale,
         }
+        if self.g:
+            interior["phase"] = {"type": "hg", "g": self.g}
         return {
             "type": self.shape,
             "to_world": world.place(linear @ outwards, np.zeros(3)),

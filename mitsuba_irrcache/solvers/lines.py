@@ -82,7 +82,8 @@ def follow(
 
     With ``copy_back`` both ways are told apart: the light of opposite directions is left from that
     voxel on, nothing is added to anything, ``source`` holds what voxels send in both ways at the
-    same places, one value each, and depths are not times solid angles.
+    same places, one value each, depths are not times solid angles, and irradiance is without that
+    of what the voxel sends itself.
     """
     entering, elsewhere, apart = table.entering, source is not volume, copy_back is not None
     row = [dr.gather(mi.Int32, table.integers, which * INTEGERS + i) for i in range(INTEGERS)]
@@ -181,8 +182,8 @@ def follow(
                 L_back, sent_back, s_back * scale, s_next_back * scale, since_back, count, area
             )
             if dr.hint(apart, mode="scalar"):
-                _write(volume, tally, place, needed)
-                _write(volume, tally_back, place_back, needed_back)
+                _write(volume, _without(tally, sent), place, needed)
+                _write(volume, _without(tally_back, sent_back), place_back, needed_back)
             else:
                 tally = _sum(tally, _chosen(middle, tally_back, len(L) * [0]))
                 _write(volume, _sum(voxel, tally), place, needed)
@@ -301,6 +302,10 @@ def _times(values: list, factor: mi.Float) -> list:
 
 def _sources(source: mi.Float, place: mi.UInt32, channels: int, active: mi.Bool) -> list:
     return [dr.gather(mi.Float, source, p * 4, active) for p in _places(place, channels)]
+
+
+def _without(tally: list[mi.Vector4f], sent: list[mi.Float]) -> list[mi.Vector4f]:
+    return [t - mi.Vector4f(0, s, 0, 0) for t, s in zip(tally, sent, strict=True)]
 
 
 def _sent(voxels: list[mi.Vector4f]) -> list[mi.Float]:

@@ -163,6 +163,8 @@ class DirectionalLevel(Level):
         # Weighted by their depths, what lines lose lets as much be scattered as collides.
         collided = [4 * dr.pi * lost[0] / dr.select(depth > 0, depth, 1), *lost[1:]]
         if scattered is not None:
+            # Directions tell what differs from what a voxel sends out, whose moments are known.
+            received = [light + moments.part(scattered, k) for k, light in enumerate(received)]
             collided = [mean + moments.part(scattered, k) for k, mean in enumerate(collided)]
         pairs = zip(collided, received, strict=True)
         collided = [dr.select(depth > 0, mean, light) for mean, light in pairs]
@@ -211,8 +213,9 @@ def _with_light(moments, sums: list, copies, group, axis: int, grid, lower, uppe
 
 @dr.syntax
 def _with_collisions(moments, received: list, lost: list, depth, copies, group):
-    """Moments of the light in all voxels; what lines lose there, and moments of this per depth; the
-    ``depth`` of these times solid angles: each with those of a group.
+    """Moments of the light in all voxels, without what they send out; what lines lose there, and
+    moments of this per depth; the ``depth`` of these times solid angles: each with those of a
+    group.
     """
     voxels = dr.width(depth)
     step = dr.opaque(mi.UInt32, voxels)
