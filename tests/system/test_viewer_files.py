@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 import zipfile
 from pathlib import Path
 
@@ -133,10 +134,14 @@ def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
         turned = after(window, lambda: window.enter("rotation", 120))
         assert difference(turned, front) > 3
         window.tick("compare with volpath")
-        window.wait_for(r"volpath, \d{2,} samples per pixel; RMSE", 90)  # in sRGB noise is bias
+        window.wait_for(r"volpath, \d{2,} samples per pixel; RMSE", 90)
         window.page.add_style_tag(content=".mantine-Paper-root {visibility: hidden}")
-        ours, theirs = np.split(screen(window, SIZE[0]), 2, axis=1)
-        assert ours.std() > 10 and abs(ours.mean() - theirs.mean()) < 6
+        latest = time.monotonic() + 30  # the picture comes behind the text; in sRGB noise is bias
+        apart = np.inf
+        while not apart < 3 and time.monotonic() < latest:
+            ours, theirs = np.split(screen(window, SIZE[0]), 2, axis=1)
+            apart = abs(ours.mean() - theirs.mean())
+        assert ours.std() > 10 and apart < 3
         assert window.errors == []
     log = (tmp_path / "log.txt").read_text()
     assert "Traceback" not in log, log
