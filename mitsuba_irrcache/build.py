@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from time import perf_counter
 
 import drjit as dr
@@ -89,11 +90,12 @@ class CacheBuilder:
             self.revision += 1
             media = bake_media(scene, self._baked_emission())
             wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
+            settings = replace(self.settings, samples=self.samples)
             self.parts = [
                 LitMedium(
                     scene,
                     medium,
-                    self.settings,
+                    settings,
                     choose_solver(scene, medium, *wanted),
                     medium.name if len(media) > 1 else "",
                     edited,

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .cache import BATCH, IrradianceCache, active_voxels
-from .choices import SINGLE, choose_grid, choose_samples, warn_of_dense_border
+from .choices import choose_grid, choose_samples, swept_samples, warn_of_dense_border
 from .directional import Directional, sources_of
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import digests
@@ -20,9 +20,9 @@ from .grid import Grid
 from .lamps import Falloff
 from .medium import MediumGrid
 from .memory import require_memory
-from .solvers import path
-from .solvers.directional_sweep import DirectionalSweep, directional_batch
-from .solvers.sweep import Sweep, batch_of
+from .solvers import path, sweep
+from .solvers.directional_sweep import DirectionalSweep, least_batch
+from .solvers.sweep import Sweep
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ class LitMedium:
         """Samples per voxel to build up to where ``samples`` (0: chosen) are wanted, a multiple of
         the cache's batch.
         """
-        samples, batch = samples or choose_samples(self.cache, self.solver), self.cache.batch
+        alone, batch = self.medium.alone, self.cache.batch
+        samples = samples or choose_samples(self.cache, self.solver, alone)
         return max(-(-samples // batch), 2 if self.settings.with_error else 1) * batch
 
     @property
@@ -133,7 +134,7 @@ class LitMedium:
         if medium.phase is not None:
             directional = Directional(medium.phase, sources_of(scene))
         moments = directional.count if directional is not None else 0
-        together = medium.surroundings is not None
+        together = sweep.swept_together(medium, grid.voxel_count)
         _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments, together)
         warn_of_dense_border(medium, grid)
         active, survey = active_voxels(medium, grid), None
@@ -152,10 +153,11 @@ class LitMedium:
         channels = 1 if mi.is_monochromatic else 3
         swept, depth = self.solver == "sweep", settings.max_depth
         batch = BATCH
-        if swept and directional is not None:
-            batch = directional_batch(directional.order)
-        elif swept:
-            batch = batch_of(settings.samples or SINGLE, depth)
+        if swept:
+            wanted = settings.samples or swept_samples(depth, medium.alone)
+            wanted = wanted // 2 if settings.with_error else wanted
+            least = sweep.BATCH if directional is None else least_batch(directional.order)
+            batch = sweep.batch_of(wanted, depth, least)
         cache = IrradianceCache(
             grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
         )

@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from .grid import ConstantField, Field, Grid, GridField
+from .layers import interleaved
 from .macrocells import Macrocells
 from .medium import MediumGrid
 
@@ -56,9 +57,7 @@ def _combined(function: Callable, *fields: Field) -> Field:
     dr.eval(values)
     if grid is None:
         return ConstantField(np.array([v[0] for v in values], dtype=np.float64))
-    data = dr.opaque(mi.Float, 0, grid.voxel_count * channels)
-    for c, value in enumerate(values):
-        dr.scatter(data, value, index * channels + c)
+    data = interleaved(values, grid.voxel_count)
     dr.eval(data)
     return GridField(grid, data, channels)
 

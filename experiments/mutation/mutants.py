@@ -65,8 +65,8 @@ MUTANTS = (
     Mutant(
         "the cosine of the slope forgotten: length of a line in a slice (sweep)",
         "solvers/lattice.py",
-        "[1 / abs(velocity[axis]), *ways",
-        "[1 / np.linalg.norm(velocity), *ways",
+        "[1 / abs(velocity[axis]), weights[i]",
+        "[1 / np.linalg.norm(velocity), weights[i]",
         (SWEEP,),
     ),
     Mutant(
@@ -75,6 +75,13 @@ MUTANTS = (
         "mi.Vector4f(0, middle, lost * area, count * tau * area)",
         "mi.Vector4f(0, middle, lost, count * tau)",
         (SWEEP,),
+    ),
+    Mutant(
+        "the albedo of a voxel is its plain mean, not that of its collisions (sweep)",
+        "solvers/baking.py",
+        "sigma_t = mi.Spectrum(medium.sigma_t.at_world(p)) * weight",
+        "sigma_t = mi.Spectrum(weight)",
+        ("tests/unit/test_baking.py",),
     ),
     Mutant(
         "lines that leave through a side go on with their light (sweep)",

@@ -113,11 +113,13 @@ class Arrivals:
             joined([dr.gather(mi.Float, kind[c], here) for c in channels])
             for kind in (self.returned, *([self.emitted] if emitted else []))
         ]
-        voxel = dr.gather(mi.UInt32, self._voxels[grid.shape], here)
-        layers = [dr.opaque(mi.UInt32, i * grid.voxel_count) for i in range(1, len(channels))]
-        voxels = joined([voxel, *(voxel + layer for layer in layers)])
-        dr.eval(values, voxels)
-        return Returning(len(channels), places, cells, voxels, *values)
+        # All matter is in wanted voxels: no light comes from others.
+        at = lattice.places(dr.gather(mi.UInt32, self._voxels[grid.shape], here))
+        first = dr.minimum(at, dr.opaque(mi.UInt32, lattice.count - 1)) * len(channels)
+        dr.eval(first)
+        sources = joined([first + c for c in range(len(channels))])
+        dr.eval(values, sources)
+        return Returning(len(channels), places, cells, sources, *values)
 
     def _cells(self, most: np.ndarray) -> None:
         """Lays out cells: blocks of lines, so many along an edge that there are not too ``many``
@@ -235,25 +237,25 @@ def _one_of(edge, cell_b, cell_c, least_b, least_c, slope_b, slope_c, nb, nc, na
 
 
 class Returning(Entering):
-    """`Entering` light ``emitted + returned phi(voxel)``."""
+    """`Entering` light ``emitted + returned phi(source)``."""
 
     def __init__(
         self,
         channels: int,
         places: np.ndarray,
         cells: np.ndarray,
-        voxel: mi.UInt32,
+        source: mi.UInt32,
         returned: mi.Float,
         emitted: mi.Float | None = None,
     ) -> None:
         super().__init__(places, cells, None, channels)
-        self._voxel, self._returned, self._emitted = voxel, returned, emitted
+        self._source, self._returned, self._emitted = source, returned, emitted
 
     def receive(self, phi: mi.Float | None) -> None:
         """Where the mean irradiance of collisions is ``phi`` (None: 0)."""
-        light = dr.zeros(mi.Float, dr.width(self._voxel))
+        light = dr.zeros(mi.Float, dr.width(self._source))
         if phi is not None:
-            light = self._returned * dr.gather(mi.Float, phi, self._voxel)
+            light = self._returned * dr.gather(mi.Float, phi, self._source)
         self.values = light if self._emitted is None else light + self._emitted
         dr.eval(self.values)
 

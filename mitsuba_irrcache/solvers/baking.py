@@ -11,6 +11,10 @@ from mitsuba_irrcache.medium import MediumGrid
 
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
+#: Where collisions are counted along each axis of a voxel or, if it is larger than one of the data,
+#: of parts of it, and their weights: Radau's points of both halves, exact for products of fields
+#: that are linear in each. Values of the data lie in the middle where grids are alike.
+RADAU = (1 / 6, 3 / 8), (1 / 2, 1 / 4), (5 / 6, 3 / 8)
 #: Values of the extinction along each axis of a voxel that lines see, about.
 DETAIL = 2
 
@@ -31,12 +35,11 @@ def detail_of(medium: MediumGrid, grid: Grid) -> Grid:
     return data if (block == 1).all() else Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
 
 
-def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> list[mi.Float]:
+def baked(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
     """Channels of ``field`` at the voxels of ``grid``: its means over voxels that are larger than
-    the field's, or that the boundary of the medium may cut. Outside of it the field counts as 0 if
-    ``masked``.
+    the field's, or that the boundary of the medium may cut. Outside of it the field counts as 0.
     """
-    cut = masked and not medium.fills(grid)
+    cut = not medium.fills(grid)
     if field.grid is not None and not cut:
         block, rest = np.divmod(field.grid.resolution, grid.resolution)
         if not rest.any() and np.prod(block) <= FINEST**3 and medium.fills(field.grid):
@@ -45,6 +48,22 @@ def baked(medium: MediumGrid, field: Field, grid: Grid, masked: bool = True) -> 
     points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
     index = dr.arange(mi.UInt32, grid.voxel_count)
     values = _mean(medium, field, grid, index, dr.opaque(mi.UInt32, points), cut)
+    dr.eval(values)
+    return values
+
+
+def albedo_of_collisions(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[mi.Float]:
+    """Channels of the albedo at these ``voxels`` of ``grid``: means over the collisions in even
+    light. At the edge of matter extinction and albedo change together.
+    """
+    albedo, extinction = medium.albedo, medium.sigma_t
+    if albedo.grid is None:
+        none, values = dr.zeros(mi.Float, dr.width(voxels)), mi.Spectrum(albedo.value)
+        return [value + none for value in list(values)[: albedo.channels]]
+    fields = [f.grid for f in (albedo, extinction) if f.grid is not None]
+    ratio = max((grid.voxel_size / data.voxel_size).max() for data in fields)
+    parts = dr.opaque(mi.UInt32, int(np.clip(np.ceil(ratio - 1e-3), 1, FINEST // 2)))
+    values = _collided(medium, grid, voxels, parts, not medium.fills(grid))
     dr.eval(values)
     return values
 
@@ -81,3 +100,34 @@ def _mean(medium, field, grid, index, points, cut: bool):
             sums[c] = sums[c] + part
         k += 1
     return [s / mi.Float(count) for s in sums]
+
+
+@dr.syntax
+def _collided(medium, grid, index, parts, cut: bool):
+    """Means of the albedo over the voxels ``index``, weighted by extinction: `RADAU` in so many
+    ``parts`` along each axis.
+    """
+    channels = max(medium.albedo.channels, medium.sigma_t.channels)
+    corner, points = mi.Point3f(*grid.places(index)), 3 * parts
+    count = points * points * points
+    scattered = [dr.zeros(mi.Float, dr.width(index)) for _ in range(channels)]
+    collided = [dr.zeros(mi.Float, dr.width(index)) for _ in range(channels)]
+    k = mi.UInt32(0)
+    while dr.hint(k < count, label="collisions in a voxel"):
+        within, weight = [], mi.Float(1)
+        for i in (k % points, (k // points) % points, k // (points * points)):
+            part = i // 3
+            middle = i - part * 3 == 1
+            aside = dr.select(i - part * 3 == 0, RADAU[0][0], RADAU[2][0])
+            within.append(mi.Float(part) + dr.select(middle, RADAU[1][0], aside))
+            weight *= dr.select(middle, RADAU[1][1], RADAU[0][1])
+        p = grid.world.point(corner + mi.Point3f(within) / mi.Float(parts))
+        sigma_t = mi.Spectrum(medium.sigma_t.at_world(p)) * weight
+        albedo = mi.Spectrum(medium.albedo.at_world(p))
+        if dr.hint(cut, mode="scalar"):
+            sigma_t = dr.select(medium.contains(p), sigma_t, 0)
+        for c in range(channels):
+            collided[c] = collided[c] + sigma_t[c]
+            scattered[c] = scattered[c] + sigma_t[c] * albedo[c]
+        k += 1
+    return [dr.select(collided[c] > 0, scattered[c] / collided[c], 0) for c in range(channels)]

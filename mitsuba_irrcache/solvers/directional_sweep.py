@@ -22,7 +22,7 @@ def directions_of(order: int) -> int:
     return DIRECTIONS if order <= 4 else MORE_DIRECTIONS
 
 
-def directional_batch(order: int) -> int:
+def least_batch(order: int) -> int:
     """The directions of a batch of a cache with moments up to ``order``: two passes."""
     return 2 * directions_of(order)
 
@@ -38,31 +38,25 @@ class DirectionalSweep(Sweep):
         super().__init__(scene, medium, cache, *rest)
         if not cache.active_count:
             return
-        self._places_of_moments = self._moments.places(cache.active, cache.grid.voxel_count)
         # Point-like lights, in the order of `Sky.near`.
         self._towards = [s.seen_from(self._places)[0] for s in sources if not s.far]
 
-    def _active(self, layer: int) -> mi.UInt32:
-        return self._places_of_moments
-
     def _new_level(self, *arguments: object) -> Level:
-        return DirectionalLevel(*arguments, self._moments)
+        return DirectionalLevel(*arguments, moments=self._moments)
 
-    def _solved(
-        self, passes: list[Pass], light: tuple[int, ...], medium: tuple[int, ...]
-    ) -> list[tuple]:
+    def _solved(self, passes: list[Pass], channels: tuple[int, ...]) -> list[tuple]:
         """As of `Sweep`; narrow lights are not in the moments of the light straight from emitters,
         but beside them.
         """
         moments, several = self._moments, self.cache.max_depth != 2
-        lattice = self._lattices[min(medium[0], len(self._lattices) - 1)]
+        lattice = self._lattice(channels)
         arriving = passes[1:] if several else passes
         scale = dr.opaque(mi.Float, 1 / len(arriving))
         smooth, own = moments.uncollided(arriving, lattice)
         swept = sum((light for light in own if light is not None), smooth) * scale
         smooth *= scale
         none = dr.zeros(mi.Float, self.cache.active_count)
-        direct = [emitted[light[0]] for emitted in self._direct]
+        direct = [emitted[channels[0]] for emitted in self._direct]
         near = iter(direct)
         narrow = [
             next(near) if not source.far else none if n is None else moments.part(n, 0) * scale
@@ -71,7 +65,7 @@ class DirectionalSweep(Sweep):
         uncollided = moments.part(swept, 0) + sum(direct)
         scattered = None
         if several:
-            scattered = self._received(self._level(medium), passes, light) - swept
+            scattered = self._received(self._level(channels), passes, channels) - swept
             smooth = smooth + scattered
             scattered = dr.maximum(moments.part(scattered, 0), 0)
         further = [moments.part(smooth, k) for k in range(1, moments.count)]

@@ -82,12 +82,11 @@ class Sky:
 
     def tables(
         self, passes: int, pairs: int, channels: int, rng: np.random.Generator
-    ) -> tuple[list[list[tuple]], np.ndarray]:
+    ) -> tuple[list[tuple], np.ndarray]:
         """Directions for a number of passes, and the light from far away along them.
 
-        Returns for each channel a list of arguments of `Lattice.table`, one for each pass, and the
-        factors (channels) of what these give. Where channels differ by a factor only, there is one
-        list for all.
+        Returns arguments of `Lattice.table`, those of each pass, and the factors (channels) of what
+        these give: where channels differ by a factor only, light has a single one.
         """
         tables = [self.rows(pairs, rng) for _ in range(passes)]
         light = np.concatenate([table[1] for table in tables])
@@ -95,11 +94,10 @@ class Sky:
         colour = brightest / brightest.max() if brightest.max() > 0 else np.ones(channels)
         apart = np.abs(light - light.max(axis=-1, keepdims=True) * colour)
         if not self.near and not self._glows and apart.max() <= 1e-6 * light.max():
-            return [[(d, light.max(axis=-1), w, o) for d, light, w, o in tables]], colour
-        by_channel = [
-            [(d, light[..., c], w, o) for d, light, w, o in tables] for c in range(channels)
-        ]
-        return by_channel, np.ones(channels)
+            return [
+                (d, light.max(axis=-1, keepdims=True), w, o) for d, light, w, o in tables
+            ], colour
+        return tables, np.ones(channels)
 
     def rows(self, pairs: int, rng: np.random.Generator) -> tuple:
         """Directions of a pass, irradiance along both ways (n, 2, channels), weights, offsets: an

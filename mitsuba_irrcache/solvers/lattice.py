@@ -48,9 +48,9 @@ class Lattice:
     outside of this box are empty and get no light).
 
     ``sigma_t`` holds the extinction [1/scene unit] at all voxels of ``detail``, a grid over the
-    same box (None: the same grid). `carry` finds the light at the voxels ``wanted`` (flat indices;
-    None: all). Where these hold all extinction, ``sparse`` lets it skip what is empty between them,
-    if that gains time.
+    same box (None: the same grid). Light is found at the voxels ``wanted`` (flat indices; None:
+    all). Where these hold all extinction, ``sparse`` lets it skip what is empty between them, if
+    that gains time.
     """
 
     def __init__(
@@ -75,7 +75,11 @@ class Lattice:
         self.together = grid.voxel_count <= SMALL
         self._extinction = Extinction(grid, self.detail, sigma_t)
         self.wanted = dr.arange(mi.UInt32, grid.voxel_count) if wanted is None else wanted
-        self._empty: Emptiness | None = None
+        self.count = dr.width(self.wanted)
+        #: whether all voxels are wanted
+        self.whole = self.count == grid.voxel_count
+        self._places: mi.UInt32 | None = None
+        self.sparse, self._empty = sparse, None
         if sparse and not self.together:
             self._empty = Emptiness.find(grid, self.wanted, lower, upper)
         #: where the corners of each axis begin among all that are kept
@@ -85,6 +89,16 @@ class Lattice:
             sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
             self._first_corner = np.cumsum([0, *sizes[:2]]).tolist()
             self._all_corners = joined(corners)
+
+    def places(self, voxels: mi.UInt32) -> mi.UInt32:
+        """Where these voxels are among the wanted ones; of others, the number of these."""
+        if self.whole:
+            return voxels
+        if self._places is None:
+            self._places = dr.opaque(mi.UInt32, self.count, self.grid.voxel_count)
+            dr.scatter(self._places, dr.arange(mi.UInt32, self.count), self.wanted)
+            dr.eval(self._places)
+        return dr.gather(mi.UInt32, self._places, voxels)
 
     def table(
         self,
@@ -98,8 +112,8 @@ class Lattice:
 
         Args:
             directions: (n, 3), where the light goes to, world space, unit length.
-            light: (n, 2), irradiance that enters along a direction and along its opposite: radiance
-                times solid angle.
+            light: (n, 2) or (n, 2, channels), irradiance that enters along a direction and along
+                its opposite: radiance times solid angle.
             weights: (n), solid angles that each of a pair stands for, for light from the voxels.
             offsets: (n, 2), in [0, 1), random.
             by_slice: whether the volume that lines leave light in is laid out by their slices.
@@ -107,11 +121,11 @@ class Lattice:
         count = len(directions)
         integers = np.zeros((count, INTEGERS), np.int64)
         numbers = np.zeros((count, NUMBERS), np.float64)
+        light = light if light.ndim == 3 else light[..., None]
         velocities = directions @ self._to_voxels.T
         axes = np.abs(velocities).argmax(axis=1)
         ratio = self.detail.resolution / self.grid.resolution
         for i, (velocity, axis) in enumerate(zip(velocities, axes, strict=True)):
-            ways = light[i] if velocity[axis] > 0 else light[i][::-1]
             across = [k for k in range(3) if k != axis]
             order = (*across, axis)
             layout = slicewise(axis)
@@ -133,15 +147,16 @@ class Lattice:
                 row += [slope, start, (end >> 24) % int(self.sides[k]), end & (ONE - 1)]
             row += [self._empty.strides[k] for k in order] if self._empty else [0, 0, 0]
             integers[i] = row
-            numbers[i, :5] = [1 / abs(velocity[axis]), *ways, weights[i], self._extinction.quantum]
+            numbers[i, :3] = [1 / abs(velocity[axis]), weights[i], self._extinction.quantum]
             numbers[i, DIRECTION:] = directions[i] * np.sign(velocity[axis])
-            numbers[i, 5:DIRECTION] = [
+            numbers[i, 3:DIRECTION] = [
                 x
                 for k in across
                 for x in (ratio[k], self.lower[k] * ratio[k] - 0.5, self.detail.resolution[k] - 1)
             ]
-        rows = Rows(axes, velocities[np.arange(count), axes] > 0, integers)
-        return Table(integers, numbers, rows)
+        forward = velocities[np.arange(count), axes] > 0
+        along = np.where(forward[:, None, None], light, light[:, ::-1])
+        return Table(integers, numbers, along, Rows(axes, forward, integers))
 
     def carry(
         self,
@@ -152,13 +167,13 @@ class Lattice:
     ) -> mi.Float:
         """Irradiance at the centres of the wanted voxels: the light that enters along pairs of
         directions, told as in `table`; instead of that ``light``, line by line, if a function of
-        the table is given that makes `Entering`, of all channels of which one follows the other.
+        the table is given that makes `Entering`. Of several channels one follows the other.
         """
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
         table.entering = entering(table) if entering is not None else None
         box = self.lower, self.lower + self.sides
-        channels = 1 if table.entering is None else table.entering.channels
-        wanted = dr.width(self.wanted)
+        channels = table.channels if table.entering is None else table.entering.channels
+        wanted = self.count
         total = dr.opaque(mi.Float, 0, wanted * channels)
         for axis, pairs in table.by_axis:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)

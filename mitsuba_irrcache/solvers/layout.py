@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.layers import interleaved
+
 #: Axes of an array from the fastest to the slowest, unless they are laid out by slices.
 STANDARD = (0, 1, 2)
 
@@ -56,3 +58,32 @@ def joined(parts: Sequence[mi.Float | mi.UInt32]) -> mi.Float | mi.UInt32:
         start += dr.width(part)
     dr.eval(result)
     return result
+
+
+def side_by_side(channels: Sequence[mi.Float]) -> mi.Float:
+    """Channels as one array that has the values of a voxel next to each other."""
+    if len(channels) == 1:
+        return channels[0]
+    result = interleaved(list(channels))
+    dr.eval(result)
+    return result
+
+
+def voxels_of(count: int, channels: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """Of all values of an array that has those of all ``channels`` of a voxel next to each other:
+    voxel and channel.
+    """
+    index = dr.arange(mi.UInt32, count * channels)
+    if channels == 1:
+        return index, mi.UInt32(0)
+    voxel = index // channels
+    return voxel, index - voxel * channels
+
+
+def layers_of(voxels: int, count: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """Of all values of an array that has ``count`` ones for each voxel, one layer after the other:
+    layer and voxel.
+    """
+    index, step = dr.arange(mi.UInt32, voxels * count), dr.opaque(mi.UInt32, voxels)
+    layer = index // step
+    return layer, index - layer * step

@@ -10,9 +10,9 @@ from mitsuba_irrcache.solvers.empty import CELL
 #: Positions within a voxel are integers below this: lines can be followed back without rounding.
 ONE = 1 << 24
 #: Parameters of a pair of directions.
-INTEGERS, NUMBERS = 22, 14
+INTEGERS, NUMBERS = 22, 12
 #: Of these, the solid angle, and the last three: where light along the axis goes to, world space.
-WEIGHT, DIRECTION = 3, 11
+WEIGHT, DIRECTION = 1, 9
 
 
 class _Across:
@@ -89,9 +89,10 @@ def follow(
     row = [dr.gather(mi.Int32, table.integers, which * INTEGERS + i) for i in range(INTEGERS)]
     nb, nc, na, sb, sc, sa, base, tb, tc, ta, shift, mb, fb, eb, gb, mc, fc, ec, gc = row[:19]
     cells = row[19:]
-    length, light, light_back, weight, quantum, *detail = (
+    length, weight, quantum, *detail = (
         dr.gather(mi.Float, table.numbers, which * NUMBERS + i) for i in range(DIRECTION)
     )
+    light, light_back = (table.entering_along(which, way, channels) for way in range(2))
     detail_b, detail_c = (tb, *detail[:3]), (tc, *detail[3:])
     lane = mi.Int32(lanes)
     jc = lane // dr.maximum(nb, 1)  # 0 where a vector of lanes is not filled
@@ -149,8 +150,8 @@ def follow(
             found_back = entering.at(pair, arriving, 1, na - 1 - k_back, kb, gb, kc, gc, new_back)
             L, L_back = _chosen(new, found, L), _chosen(new_back, found_back, L_back)
         else:
-            L = _chosen(since < 1, len(L) * [light], L)
-            L_back = _chosen(since_back < 1, len(L) * [light_back], L_back)
+            L = _chosen(since < 1, light, L)
+            L_back = _chosen(since_back < 1, light_back, L_back)
         # In the middle slice both ways are in the same voxel: the first to write writes for both.
         middle = off == off_back
         if dr.hint(source is None, mode="scalar"):

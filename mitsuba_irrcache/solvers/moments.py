@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.directional import Directional
-from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.solvers.lattice import Lattice, sharpened
-from mitsuba_irrcache.solvers.passes import Pass, joined
+from mitsuba_irrcache.solvers.layout import joined, layers_of
+from mitsuba_irrcache.solvers.passes import Pass, merged
 from mitsuba_irrcache.solvers.scattering import Level
 from mitsuba_irrcache.solvers.table import Group, Table
 
@@ -46,14 +46,7 @@ class Moments:
 
     def of(self, light: mi.Float, direction: mi.Vector3f) -> mi.Float:
         """Moments of the irradiance ``light`` from ``direction``, at each place."""
-        return _one_after_another([light * y for y in self.basis(direction)])
-
-    def places(self, index: mi.UInt32, voxels: int) -> mi.UInt32:
-        """Where the moments at the voxels ``index`` are among those of all ``voxels``."""
-        moment, place = _apart(self.count, dr.width(index))
-        found = dr.gather(mi.UInt32, index, place) + moment * dr.opaque(mi.UInt32, voxels)
-        dr.eval(found)
-        return found
+        return joined([light * y for y in self.basis(direction)])
 
     def part(self, values: mi.Float, number: int) -> mi.Float:
         """One of the moments at all places."""
@@ -72,7 +65,7 @@ class Moments:
         for axis, group, copies in lattice.apart(table):
             sums = _with_light(self, sums, copies, group, axis, lattice.grid, *box, wanted)
             dr.eval(sums)
-        return _one_after_another(sums)
+        return joined(sums)
 
     def nothing(self, width: int) -> list[mi.Float]:
         """No light, at so many places."""
@@ -84,17 +77,17 @@ class Moments:
         """Moments of the light from far away at the wanted voxels, the sum of all ``passes``, but
         for that of narrow lights; and those of each narrow light (none where it is not far away).
         """
-        directions, light, weights, offsets = joined([p.rows for p in passes])
+        directions, light, weights, offsets = merged([p.rows for p in passes])
         apart = []
         for source in self.directional.sources:
             own = np.zeros_like(light)
             if source.far:
-                own = light * source.covers(np.stack([-directions, directions], axis=1))
+                own = light * source.covers(np.stack([-directions, directions], axis=1))[..., None]
                 light = light - own
             apart.append(own)
         found = []
         for part in (light, *apart):
-            lit = part.any(axis=1)
+            lit = part.any(axis=(1, 2))
             rows = directions[lit], part[lit], weights[lit], offsets[lit]
             found.append(self.carry(lattice, rows) if lit.any() else None)
         smooth = dr.opaque(mi.Float, 0, self.count * dr.width(lattice.wanted))
@@ -104,30 +97,20 @@ class Moments:
 class DirectionalLevel(Level):
     """A `Level` whose light are the ``moments``, one after the other."""
 
-    def __init__(
-        self,
-        grid: Grid,
-        sigma_t: mi.Float,
-        albedo: mi.Float,
-        lattice: Lattice,
-        moments: Moments,
-    ) -> None:
-        super().__init__(grid, sigma_t, albedo, lattice)
+    def __init__(self, *arguments: object, moments: Moments) -> None:
+        """``arguments`` are those of `Level`."""
+        super().__init__(*arguments)
         self.moments = moments
 
-    def _coarse(
-        self, grid: Grid, sigma_t: mi.Float, albedo: mi.Float, lattice: Lattice
-    ) -> DirectionalLevel:
+    def _coarse(self, *arguments: object) -> DirectionalLevel:
         # What is slow to converge is smooth, and so are its directions.
         smooth = Moments(self.moments.directional, min(self.moments.order, SMOOTH))
-        return DirectionalLevel(grid, sigma_t, albedo, lattice, smooth)
+        return DirectionalLevel(*arguments, moments=smooth)
 
     def restrict(self, values: mi.Float) -> mi.Float:
-        if dr.width(values) == self.grid.voxel_count:  # of a field that has but one value
-            return super().restrict(values)
         coarser = self.coarser
-        moment, place = _apart(coarser.moments.count, coarser.grid.voxel_count)
-        begin, result = moment * dr.opaque(mi.UInt32, self.grid.voxel_count), mi.Float(0)
+        moment, place = layers_of(coarser.lattice.count, coarser.moments.count)
+        begin, result = moment * dr.opaque(mi.UInt32, self.lattice.count), mi.Float(0)
         for child, weight in self._children:
             voxel = begin + dr.gather(mi.UInt32, child, place)
             result += dr.gather(mi.Float, values, voxel) * dr.gather(mi.Float, weight, place)
@@ -136,28 +119,28 @@ class DirectionalLevel(Level):
 
     def prolong(self, values: mi.Float) -> mi.Float:
         """As of `Level`; moments that the coarser one does not have are 0."""
-        grid, moments = self.coarser.grid, self.coarser.moments
-        moment, place = _apart(self.moments.count, self.grid.voxel_count)
+        moments = self.coarser.moments
+        moment, place = layers_of(self.lattice.count, self.moments.count)
         known = moment < dr.opaque(mi.UInt32, moments.count)
-        begin = dr.select(known, moment, 0) * dr.opaque(mi.UInt32, grid.voxel_count)
-        return dr.select(known, self._interpolated(values, place, begin), 0)
+        begin = dr.select(known, moment, 0) * dr.opaque(mi.UInt32, self.coarser.lattice.count)
+        return dr.select(known, self._interpolated(values, place, 1, begin), 0)
 
     def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
         """As of `Level`, all moments of it."""
-        moments, voxels = self.moments, self.grid.voxel_count
-        received, lost = (moments.nothing(voxels) for _ in range(2))
-        depth = dr.opaque(mi.Float, 0, voxels)
+        moments, wanted, voxels = self.moments, self.lattice.wanted, self.grid.voxel_count
+        received, lost = (moments.nothing(self.lattice.count) for _ in range(2))
+        depth = dr.opaque(mi.Float, 0, self.lattice.count)
         scattered = None if phi is None else self._scattered(phi)
 
         def sent(group: Group) -> mi.Float:
             source = dr.opaque(mi.Float, 0, 2 * len(group) * voxels)
             if scattered is not None:
-                _send_out(moments, source, scattered, group, voxels)
+                _send_out(moments, source, scattered, group, wanted, voxels)
                 dr.eval(source)
             return source
 
         for _, group, copies in self.lattice.apart(table, sent):
-            found = _with_collisions(moments, received, lost, depth, copies, group)
+            found = _with_collisions(moments, received, lost, depth, copies, group, wanted, voxels)
             dr.eval(found)
             received, lost, depth = found
         # Weighted by their depths, what lines lose lets as much be scattered as collides.
@@ -168,32 +151,15 @@ class DirectionalLevel(Level):
             collided = [mean + moments.part(scattered, k) for k, mean in enumerate(collided)]
         pairs = zip(collided, received, strict=True)
         collided = [dr.select(depth > 0, mean, light) for mean, light in pairs]
-        return _one_after_another(received), _one_after_another(collided)
+        return joined(received), joined(collided)
 
     def _scattered(self, phi: mi.Float) -> mi.Float:
         """Moments of the light that is sent out, per optical depth."""
-        moment, place = _apart(self.moments.count, self.grid.voxel_count)
+        moment, place = layers_of(self.lattice.count, self.moments.count)
         factor = dr.gather(mi.Float, self.moments.factors, moment)
         scattered = phi * factor * dr.gather(mi.Float, self.albedo, place)
         dr.eval(scattered)
         return scattered
-
-
-def _apart(count: int, width: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """The moment and the place of all values of an array of ``count`` moments at so many places."""
-    lane, step = dr.arange(mi.UInt32, count * width), dr.opaque(mi.UInt32, width)
-    moment = lane // step
-    return moment, lane - moment * step
-
-
-def _one_after_another(parts: list[mi.Float]) -> mi.Float:
-    width = dr.width(parts[0])
-    result = dr.opaque(mi.Float, 0, len(parts) * width)
-    index, step = dr.arange(mi.UInt32, width), dr.opaque(mi.UInt32, width)
-    for k, part in enumerate(parts):
-        dr.scatter(result, part, index + step * k)
-    dr.eval(result)
-    return result
 
 
 @dr.syntax
@@ -212,14 +178,15 @@ def _with_light(moments, sums: list, copies, group, axis: int, grid, lower, uppe
 
 
 @dr.syntax
-def _with_collisions(moments, received: list, lost: list, depth, copies, group):
-    """Moments of the light in all voxels, without what they send out; what lines lose there, and
-    moments of this per depth; the ``depth`` of these times solid angles: each with those of a
-    group.
+def _with_collisions(
+    moments, received: list, lost: list, depth, copies, group, wanted, voxels: int
+):
+    """Moments of the light in the ``wanted`` ones of so many voxels, without what they send out;
+    what lines lose there, and moments of this per depth; the ``depth`` of these times solid angles:
+    each with those of a group.
     """
-    voxels = dr.width(depth)
     step = dr.opaque(mi.UInt32, voxels)
-    k, place = mi.UInt32(0), dr.arange(mi.UInt32, voxels)
+    k, place = mi.UInt32(0), mi.UInt32(wanted)
     while dr.hint(k < group.count, label="collisions of pairs"):
         there = dr.gather(mi.Vector4f, copies, place)
         back = dr.gather(mi.Vector4f, copies, place + step)
@@ -245,13 +212,13 @@ def _with_both(moments: Moments, sums: list, basis: list, there: mi.Float, back:
 
 
 @dr.syntax
-def _send_out(moments, source, scattered, group, voxels: int):
-    """Writes the radiance per optical depth that all voxels send along the lines of a group, and
-    against them.
+def _send_out(moments, source, scattered, group, wanted, voxels: int):
+    """Writes the radiance per optical depth that the ``wanted`` ones of so many voxels send along
+    the lines of a group, and against them.
     """
     parts = [moments.part(scattered, i) for i in range(moments.count)]
-    index, step = dr.arange(mi.UInt32, voxels), dr.opaque(mi.UInt32, voxels)
-    k, place = mi.UInt32(0), mi.UInt32(index)
+    step = dr.opaque(mi.UInt32, voxels)
+    k, place = mi.UInt32(0), mi.UInt32(wanted)
     while dr.hint(k < group.count, label="light of voxels"):
         even, odd = parts[0] * dr.inv_four_pi, mi.Float(0)
         basis = moments.basis(-group.direction(k))

@@ -21,29 +21,46 @@ ARRIVING = 64
 
 
 class Pass:
-    """Directions, light from far away along them, weights and offsets: light that enters and light
-    from voxels goes the same ways.
+    """Directions, light from far away along them in some ``channels`` or alike in all, weights and
+    offsets: light that enters and light from voxels goes the same ways.
     """
 
-    def __init__(self, rows: Rows) -> None:
-        self.rows = rows
+    def __init__(self, rows: Rows, channels: Sequence[int]) -> None:
+        directions, light, weights, offsets = rows
+        own = light if light.shape[-1] == 1 else light[..., list(channels)]
+        self.rows = directions, own, weights, offsets
 
     @staticmethod
     def uncollided(passes: Sequence[Pass], lattice: Lattice) -> mi.Float:
-        """Irradiance at the wanted voxels straight from the emitters, the sum of all ``passes``."""
-        directions, light, _, offsets = joined([p.rows for p in passes])
-        lit = light.any(axis=1)
+        """Irradiance at the wanted voxels straight from the emitters, the sum of all ``passes``, in
+        all channels one after the other; once if it is alike in all.
+        """
+        directions, light, _, offsets = merged([p.rows for p in passes])
+        lit = light.any(axis=(1, 2))
         return lattice.carry(directions[lit], light[lit], offsets[lit])
 
     def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         """As `Level.scatter`, with the light that enters."""
         return level.scatter(phi, level.lattice.table(*self.rows))
 
-    def solve(self, level: Level, b: mi.Float) -> mi.Float:
-        """All orders of scattering, of which ``b`` is the first."""
-        directions, _, weights, offsets = self.rows
+    def solve(self, level: Level, b: mi.Float, passes: int) -> mi.Float:
+        """All orders of scattering, of which ``b`` is the first, for so many further ``passes``:
+        what is left of its error these correct, and divide by their number.
+        """
+        return level.solve(b, self._between, tolerance=max(1.0, passes / 2))
+
+    def corrected(self, level: Level, phi: mi.Float, swept: mi.Float) -> mi.Float:
+        """As `Level.corrected`, of a sweep along the lines of this pass."""
+        coarse = [] if level.coarsest else level.coarser.tables(self._between)
+        return level.corrected(phi, swept, coarse)
+
+    @property
+    def _between(self) -> Rows:
+        """Those along which voxels send light, none from outside."""
+        directions, light, weights, offsets = self.rows
         even = weights != 0  # the others carry light of emitters only
-        return level.solve(b, directions[even], weights[even], offsets[even])
+        none = np.zeros_like(light)
+        return [part[even] for part in (directions, none, weights, offsets)]
 
 
 class ArrivingPass:
@@ -71,7 +88,7 @@ class ArrivingPass:
     @staticmethod
     def uncollided(passes: Sequence[ArrivingPass], lattice: Lattice) -> mi.Float:
         """As `Pass.uncollided`."""
-        directions, light, _, offsets = joined([p.rows for p in passes])
+        directions, light, _, offsets = merged([p.rows for p in passes])
         arrivals, channels = passes[0].arrivals, passes[0].channels
         numbers = np.concatenate([p.numbers for p in passes])
         lit = arrivals.lit[numbers]
@@ -97,15 +114,16 @@ class ArrivingPass:
         dr.eval(both)
         return both
 
-    def solve(self, level: Level, b: mi.Float) -> mi.Float:
-        """As `Pass.solve`; light may leave the medium between two orders."""
-        directions, _, weights, offsets = self.inner
-        numbers = np.arange(len(directions))
+    def corrected(self, level: Level, phi: mi.Float, swept: mi.Float) -> mi.Float:
+        """The sweep as it is: what differs between passes here is light that arrives."""
+        return swept
+
+    def solve(self, level: Level, b: mi.Float, passes: int) -> mi.Float:
+        """All orders, of which ``b`` is the first; light may leave the medium between two."""
+        numbers = np.arange(len(self.inner[0]))
         return level.solve(
             b,
-            directions,
-            weights,
-            offsets,
+            self.inner,
             lambda *of_table: self.returns.returning(
                 self.channels, *of_table, numbers, emitted=False
             ),
@@ -132,7 +150,7 @@ def arriving(
         directions, weights = spread(pairs, rng)
         black = np.zeros((pairs, *rows[0][1].shape[1:]))
         inner.append((directions, black, weights, rng.random((pairs, 2))))
-    arrivals = Arrivals(around, lattice, joined(rows), several, (*seed, 0))
+    arrivals = Arrivals(around, lattice, merged(rows), several, (*seed, 0))
     returns = Arrivals(around, lattice, inner[0], several, (*seed, 1)) if several else None
     starts = np.cumsum([0] + [len(row[0]) for row in rows])
     kinds = [*arrivals.kinds, *(returns.kinds if several else ())]
@@ -147,7 +165,7 @@ def arriving(
     return of, kinds
 
 
-def joined(rows: Sequence[Rows]) -> tuple[np.ndarray, ...]:
+def merged(rows: Sequence[Rows]) -> tuple[np.ndarray, ...]:
     """Several sets as one."""
     return tuple(np.concatenate(parts) for parts in zip(*rows, strict=True))
 

@@ -21,21 +21,25 @@ from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.arrivals import Around
-from mitsuba_irrcache.solvers.baking import baked, detail_of
+from mitsuba_irrcache.solvers.baking import albedo_of_collisions, baked, detail_of
 from mitsuba_irrcache.solvers.directions import Sky
 from mitsuba_irrcache.solvers.glow import emitted_light
 from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp, split
 from mitsuba_irrcache.solvers.lattice import Lattice
-from mitsuba_irrcache.solvers.layout import joined
+from mitsuba_irrcache.solvers.layout import side_by_side
 from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass, arriving
 from mitsuba_irrcache.solvers.scattering import Level
 
 #: Directions per voxel of a batch, pairs of opposite ones. Spread evenly together, 32 leave half
-#: the noise of two sets of 16, and 64 four fifths of that of two sets of 32.
-BATCH, LARGE_BATCH = 32, 64
+#: the noise of two sets of 16, and 64 four fifths of that of two sets of 32. The largest batches
+#: are those of scattered light.
+BATCH, LARGE_BATCH, LARGEST_BATCH = 32, 64, 256
 #: Directions of a pass, of which a batch is made where light is scattered more than once: the
 #: orders before the last are solved for with one such set.
 DIRECTIONS = 16
+#: Voxels of a cache whose channels are swept one by one, if there are more: together they take
+#: several times the memory.
+TOGETHER = 1 << 24
 #: An order of scattering that changes the light by less is one too many, as single precision has
 #: it; looked at every so many orders.
 NO_LIGHT, CHECKED = 1e-7, 8
@@ -53,9 +57,19 @@ def takes(emitter: mi.Emitter) -> bool:
     return is_lamp(emitter) if surface else any(mi.has_flag(emitter.flags(), f) for f in flags)
 
 
-def batch_of(samples: int, max_depth: int) -> int:
-    """The directions of a batch of a cache of so many, in an isotropic medium."""
-    return LARGE_BATCH if max_depth == 2 and samples >= LARGE_BATCH else BATCH
+def swept_together(medium: MediumGrid, voxels: int) -> bool:
+    """Whether the channels of light in a cache of so many ``voxels`` go the same ways at once."""
+    return medium.phase is None and medium.sigma_t.channels == 1 and voxels <= TOGETHER
+
+
+def batch_of(samples: int, max_depth: int, least: int) -> int:
+    """The directions of a batch of a cache of so many, ``least`` at least: where light is scattered
+    more than once about as many, since each batch solves for all orders anew.
+    """
+    batch, most = least, LARGE_BATCH if max_depth == 2 else LARGEST_BATCH
+    while batch < most and 2 * batch <= samples:
+        batch *= 2
+    return batch
 
 
 class Sweep:
@@ -91,8 +105,9 @@ class Sweep:
         self._levels: dict[tuple[int, ...], Level] = {}
         self._sigma_t = self._albedo = [mi.Float(0)]
         if cache.max_depth != 2:
-            self._sigma_t = extinction if detail is grid else baked(medium, medium.sigma_t, grid)
-            self._albedo = baked(medium, medium.albedo, grid, masked=False)
+            sigma_t = extinction if detail is grid else baked(medium, medium.sigma_t, grid)
+            self._sigma_t = self._at_active(sigma_t)
+            self._albedo = albedo_of_collisions(medium, grid, cache.active)
         self._medium, self._places = medium, Places(scene, grid).of(cache.active)
         # What is scattered near a lamp is what a voxel gets on average, not in its middle.
         self._spread = mi.Float(1)
@@ -139,27 +154,24 @@ class Sweep:
             self._emitted = [light]
         media = max(len(self._lattices), len(self._albedo))
         if self._around is None:
-            tables, colour = self._sky.tables(passes, pairs, cache.channels, rng)
-            # Channels that differ by a factor only are computed once.
-            keys = [((min(c, len(tables) - 1),), (min(c, media - 1),)) for c in range(len(colour))]
+            rows, colour = self._sky.tables(passes, pairs, cache.channels, rng)
+            # Channels that differ by a factor only are one.
+            grey = media == 1 and rows[0][1].shape[-1] == 1
 
             def passes_of(channels: Sequence[int]) -> list[Pass]:
-                return [Pass(row) for row in tables[channels[0]]]
+                return [Pass(row, channels) for row in rows]
         else:
             seed = self.seed, number
             lattice, colour = self._lattices[0], np.ones(cache.channels)
             passes_of, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
             self._direct = self._lamps.light(seed)
             grey = media == 1 and is_grey([*kinds, *self._direct])
-            keys = [2 * (group,) for group in self._together(grey)]
-        found: dict[tuple, list] = {}
+        found = []
+        for channels in self._together(grey):
+            found += self._solved(passes_of(channels), channels)
         layers: list[list] = [[] for _ in range(len(LAYERS) + cache.moments)]
         for c in range(cache.channels):
-            key = keys[min(c, len(keys) - 1)]
-            if key not in found:
-                found[key] = self._solved(passes_of(key[0]), *key)
-            each = found[key][key[0].index(c) if c in key[0] else 0]
-            for layer, phi in zip(layers, each, strict=True):
+            for layer, phi in zip(layers, found[min(c, len(found) - 1)], strict=True):
                 layer.append(phi if phi is None else phi * dr.opaque(mi.Float, colour[c]))
         dr.eval(layers)
         light, moments = layers[: len(LAYERS)], layers[len(LAYERS) :]
@@ -167,24 +179,26 @@ class Sweep:
         return (*parts, tuple(chain(*moments))) if moments else tuple(parts)
 
     def _together(self, grey: bool) -> list[tuple[int, ...]]:
-        """The channels whose light goes the same ways, of all or of the first one."""
+        """The channels that are swept at once, of all or of the first one."""
         channels = range(1 if grey else self.cache.channels)
-        if len(self._lattices) > 1:
-            return [(c,) for c in channels]
-        return [tuple(channels)]
+        if swept_together(self._medium, self.cache.grid.voxel_count):
+            return [tuple(channels)]
+        return [(c,) for c in channels]
 
     def _level(self, channels: tuple[int, ...]) -> Level:
         """The finest level, made when it is first asked for."""
         if channels not in self._levels:
             sigma_t, albedo = self._sigma_t, self._albedo
-            one = min(channels[0], len(sigma_t) - 1)
             self._levels[channels] = self._new_level(
-                self.cache.grid,
-                sigma_t[one],
-                joined([albedo[min(c, len(albedo) - 1)] for c in channels]),
-                self._lattices[one],
+                sigma_t[min(channels[0], len(sigma_t) - 1)],
+                side_by_side([albedo[min(c, len(albedo) - 1)] for c in channels]),
+                self._lattice(channels),
             )
         return self._levels[channels]
+
+    def _lattice(self, channels: tuple[int, ...]) -> Lattice:
+        """The lines of these channels of the medium."""
+        return self._lattices[min(channels[0], len(self._lattices) - 1)]
 
     def _new_level(self, *arguments: object) -> Level:
         return Level(*arguments, evenly=not self._medium.alone)  # as `arrivals` takes for granted
@@ -192,94 +206,101 @@ class Sweep:
     def _solved(
         self,
         passes: list[Pass] | list[ArrivingPass],
-        light: tuple[int, ...],
-        medium: tuple[int, ...],
+        channels: tuple[int, ...],
     ) -> list[tuple]:
         """For each channel the irradiance at the active voxels: straight from the emitters, and
-        scattered, if wanted; then moments, if there are any. Light of these channels is scattered
-        as by those of the medium.
+        scattered, if wanted; then moments, if there are any.
         """
         if self.cache.max_depth == 2:
-            lattice = self._lattices[min(medium[0], len(self._lattices) - 1)]
-            return [(phi, None) for phi in self._uncollided(lattice, passes, light)[1]]
-        level = self._level(medium)
-        swept, uncollided = self._uncollided(level.lattice, passes[1:], light)
+            lattice = self._lattice(channels)
+            return [(phi, None) for phi in self._uncollided(lattice, passes, channels)[1]]
+        level = self._level(channels)
+        swept, uncollided = self._uncollided(level.lattice, passes[1:], channels)
+        received = self._received(level, passes, channels)
         # Both layers with the same directions: under a white sky the sum has no noise.
-        scattered = dr.maximum(self._received(level, passes, light) - swept, 0)
+        scattered = [
+            dr.maximum(dr.gather(mi.Float, received, place) - phi, 0)
+            for place, phi in zip(self._places_of(channels), swept, strict=True)
+        ]
         dr.eval(scattered)
-        return list(zip(uncollided, self._apart(scattered, len(light)), strict=True))
+        return list(zip(uncollided, scattered, strict=True))
 
     def _received(
-        self, level: Level, passes: list[Pass] | list[ArrivingPass], light: tuple[int, ...]
+        self, level: Level, passes: list[Pass] | list[ArrivingPass], channels: tuple[int, ...]
     ) -> mi.Float:
         """Light of all orders wanted along lines at the active voxels, on average over all passes
-        but the first one, of these channels one after the other.
+        but the first one, of all channels next to each other.
         """
         first, *passes = passes
-        active = joined([self._active(c) for c in range(len(light))])
-        total = dr.opaque(mi.Float, 0, dr.width(active))
-        phi = self._collided(level, first, light)
+        phi, total = self._collided(level, first, channels, len(passes)), mi.Float(0)
         for known, each in enumerate(passes, 1):
             received, again = each.scatter(level, phi)
-            total = total + dr.gather(mi.Float, received, active)
-            if self.cache.max_depth < 0:
+            total = total + received
+            dr.eval(total)
+            if self.cache.max_depth < 0 and known < len(passes):
                 # Of all orders there is now another estimate: on average they have less noise.
-                old, new = (dr.opaque(mi.Float, n / (known + 1)) for n in (known, 1))
-                phi = phi * old + self._with_near_light(again, light) * new
-            dr.eval(total, phi)
+                again = each.corrected(level, phi, self._with_near_light(again, channels))
+                phi = dr.lerp(phi, again, dr.opaque(mi.Float, 1 / (known + 1)))
+                dr.eval(phi)
         return total * dr.opaque(mi.Float, 1 / len(passes))
 
-    def _active(self, layer: int) -> mi.UInt32:
-        """The active voxels in one of several channels that follow each other."""
-        if not layer:
-            return self.cache.active
-        return self.cache.active + dr.opaque(mi.UInt32, layer * self.cache.grid.voxel_count)
+    def _at_active(self, fields: list[mi.Float]) -> list[mi.Float]:
+        """The values at the active voxels."""
+        found = [dr.gather(mi.Float, field, self.cache.active) for field in fields]
+        dr.eval(found)
+        return found
+
+    def _places_of(self, channels: Sequence[int]) -> list[mi.UInt32]:
+        """Where each channel's values are in an array that has those of all next to each other."""
+        place = dr.arange(mi.UInt32, self.cache.active_count) * len(channels)
+        return [place + c for c in range(len(channels))]
 
     def _apart(self, values: mi.Float, channels: int) -> list[mi.Float]:
-        """The values at the active voxels of each of so many channels."""
-        if channels == 1:
-            return [values]
+        """The values at the active voxels of each of so many channels, which may be alike."""
         count = self.cache.active_count
+        if dr.width(values) == count:
+            return [values] * channels
         place = dr.arange(mi.UInt32, count)
         starts = (dr.opaque(mi.UInt32, c * count) for c in range(channels))
         return [dr.gather(mi.Float, values, place + start) for start in starts]
 
     def _uncollided(
-        self, lattice: Lattice, passes: list[Pass] | list[ArrivingPass], light: tuple[int, ...]
-    ) -> tuple[mi.Float, list[mi.Float]]:
-        """Irradiance straight from emitters along lines, on average over passes, in all channels
-        one after the other; and that from all emitters in each.
+        self, lattice: Lattice, passes: list[Pass] | list[ArrivingPass], channels: tuple[int, ...]
+    ) -> tuple[list[mi.Float], list[mi.Float]]:
+        """Irradiance straight from emitters along lines, on average over passes, in each channel;
+        and that from all emitters.
         """
         values = passes[0].uncollided(passes, lattice)
-        swept = values * dr.opaque(mi.Float, 1 / len(passes))
+        swept = self._apart(values * dr.opaque(mi.Float, 1 / len(passes)), len(channels))
         emitters = *self._direct, *self._emitted
         return swept, [
             phi + sum(emitted[c] for emitted in emitters)
-            for c, phi in zip(light, self._apart(swept, len(light)), strict=True)
+            for c, phi in zip(channels, swept, strict=True)
         ]
 
     def _collided(
-        self, level: Level, first: Pass | ArrivingPass, light: tuple[int, ...]
+        self, level: Level, first: Pass | ArrivingPass, channels: tuple[int, ...], passes: int
     ) -> mi.Float:
-        """Mean irradiance of collisions, of all orders but the last."""
+        """Mean irradiance of collisions, of all orders but the last, which so many further
+        ``passes`` make use of.
+        """
         _, phi = first.scatter(level, None)
-        phi = self._with_near_light(phi, light)
+        phi = self._with_near_light(phi, channels)
         if self.cache.max_depth < 0:
-            return first.solve(level, phi)
+            return first.solve(level, phi, passes)
         for order in range(self.cache.max_depth - 3):
-            before, phi = phi, self._with_near_light(first.scatter(level, phi)[1], light)
+            before, phi = phi, self._with_near_light(first.scatter(level, phi)[1], channels)
             # However many are asked for: once there is no light in them, they need no sweeps.
             if order % CHECKED == CHECKED - 1 and _changed_by(before, phi) < NO_LIGHT:
                 break
         return phi
 
-    def _with_near_light(self, volume: mi.Float, light: tuple[int, ...]) -> mi.Float:
-        for layer, c in enumerate(light):
-            for value in self._near_light(c):
-                dr.eval(volume)
-                dr.scatter_reduce(dr.ReduceOp.Add, volume, value, self._active(layer))
-        dr.eval(volume)
-        return volume
+    def _with_near_light(self, phi: mi.Float, channels: tuple[int, ...]) -> mi.Float:
+        near = [sum(self._near_light(c)) for c in channels]
+        if self._direct or self._emitted:
+            phi = phi + side_by_side(near)
+            dr.eval(phi)
+        return phi
 
     def _near_light(self, channel: int) -> list[mi.Float]:
         """Light at the active voxels that does not come along lines, on average over each."""

@@ -10,14 +10,21 @@ from mitsuba_irrcache.solvers.lines import DIRECTION, NUMBERS, ONE, WEIGHT
 
 
 class Table:
-    """Parameters of pairs of directions as arrays: another direction compiles nothing."""
+    """Parameters of pairs of directions as arrays: another direction compiles nothing.
 
-    def __init__(self, integers: np.ndarray, numbers: np.ndarray, rows: Rows) -> None:
+    ``light`` (n, 2, channels) is what enters along the axis and against it; if it has one channel,
+    in all alike.
+    """
+
+    def __init__(
+        self, integers: np.ndarray, numbers: np.ndarray, light: np.ndarray, rows: Rows
+    ) -> None:
         self.rows = rows
         #: the light that enters, where it is not the same along all lines of a pair
         self.entering: Entering | None = None
         self.integers = mi.Int32(integers.astype(np.int32).ravel())
         self.numbers = mi.Float(numbers.astype(np.float32).ravel())
+        self.light, self.channels = mi.Float(light.astype(np.float32).ravel()), light.shape[2]
         found = [(axis, np.flatnonzero(rows.axis == axis).tolist()) for axis in range(3)]
         #: the pairs of each dominant axis, which have their corners in common
         self.by_axis = [(axis, pairs) for axis, pairs in found if pairs]
@@ -25,6 +32,12 @@ class Table:
         self.order = [i for _, pairs in self.by_axis for i in pairs]
         # One more, since kernels that read an array of a single value are different ones.
         self.ordered = mi.UInt32([*self.order, 0, 1])
+
+    def entering_along(self, which: mi.UInt32, way: int, channels: int) -> list[mi.Float]:
+        """The light of each of ``channels`` that enters along the axis (0) or against it (1)."""
+        first = (which * 2 + way) * self.channels
+        light = [dr.gather(mi.Float, self.light, first + c) for c in range(self.channels)]
+        return light if self.channels == channels else light * channels
 
 
 class Group:

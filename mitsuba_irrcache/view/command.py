@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib.util
 import signal
 import threading
@@ -63,6 +64,7 @@ def _show(args: argparse.Namespace) -> None:
     from mitsuba_irrcache.view.session import Session
 
     document, appearance = _document(args)
+    gc.freeze()  # collections look through what the viewer makes, not through all modules
     session = Session(document)
     session.start()
     server = None
@@ -78,6 +80,7 @@ def _show(args: argparse.Namespace) -> None:
         if server is not None:
             server.stop()
         session.stop()
+        gc.unfreeze()  # what is left then, modules find and report at the end
 
 
 def _document(args: argparse.Namespace) -> tuple:

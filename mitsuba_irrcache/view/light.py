@@ -170,10 +170,10 @@ class Light:
             sight = sight_of(
                 parts, self.settings, s.hide_emitters, s.quadrature, s.step, layered, with_error
             )
-            self._seen[key] = known = (
-                self.revision,
-                Seen(self.scene, parts, sight, layered),
-            )
+            known = self.revision, Seen(self.scene, parts, sight, layered)
+            # Of the light before, fields as large as the cache would stay.
+            self._seen = {k: v for k, v in self._seen.items() if v[0] == self.revision}
+            self._seen[key] = known
         return known[1]
 
 

@@ -8,6 +8,7 @@ launches as long as a camera moves.
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 from collections import deque
@@ -20,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError, essence
+from mitsuba_irrcache.memory import give_back
 from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.light import Light, Seen, Status
@@ -56,6 +58,7 @@ class Session:
         self.history: deque[tuple[str, float, float]] = deque(maxlen=20000)
         self._variant = variant or mi.variant()
         self._windows: list[Window] = []
+        self._closed: list[Window] = []  # and not forgotten yet
         self._tasks: deque[Callable[[], None]] = deque()
         self._news = threading.Condition()
         self._stopped = False
@@ -97,9 +100,11 @@ class Session:
         return window
 
     def close(self, window: Window) -> None:
-        """Forgets a window."""
+        """Forgets a window, and lets go of what was computed for it, whoever still holds it."""
         with self._news, suppress(ValueError):
             self._windows.remove(window)
+            self._closed.append(window)
+            self._news.notify_all()
 
     def look(self, window: Window, view: View) -> None:
         """What ``window`` wants to see from now on. Another camera or size moves it."""
@@ -168,7 +173,7 @@ class Session:
             try:
                 if not self._step():
                     with self._news:
-                        if not (self._tasks or self._stopped or self._is_work_waiting):
+                        if not (self._is_called or self._closed or self._is_work_waiting):
                             self._news.wait(self._until_rest)
             except Superseded:
                 continue
@@ -214,6 +219,11 @@ class Session:
         self._light = light
 
     @property
+    def _is_called(self) -> bool:
+        """Whether somebody waits for it, or for its end."""
+        return bool(self._tasks) or self._stopped
+
+    @property
     def _is_work_waiting(self) -> bool:
         return any(w.fresh for w in self._windows)
 
@@ -228,6 +238,8 @@ class Session:
 
     def _step(self) -> bool:
         """Does what is most urgent; whether there was anything to do."""
+        while self._closed:
+            self._closed.pop().forget()
         while self._tasks:
             self._tasks.popleft()()
         if self._show_moving():
@@ -276,10 +288,18 @@ class Session:
             self._revision += 1
             self._shown, self._shown_samples = light, light.samples
             if other:
-                dr.flush_malloc_cache()  # of arrays as large as those of the light before
+                self._let_go()
         elif not self._wants_light:
             self._revision += 1
         self._say()
+
+    def _let_go(self) -> None:
+        """Frees the light before, arrays as large as those of the one that is shown."""
+        for window in list(self._windows):
+            window.let_go(self._shown)
+        gc.collect()  # media among surfaces are in a cycle of references
+        dr.flush_malloc_cache()
+        give_back()
 
     def _say(self, message: str = "") -> None:
         self.status = Status.of(self._light or self._shown, self._wants_light, message)
@@ -291,17 +311,17 @@ class Session:
             return
         dr.sync_thread()
         self._checked = perf_counter()
-        if self._tasks or self._stopped:
+        if self._is_called:
             raise Superseded
         if self._shown is None or not any(w.fresh or w.is_moving for w in self._windows):
             return
         with self._noted("interruption"):
-            while not (self._tasks or self._stopped):
+            while not self._is_called:
                 if self._show_moving():
                     continue
                 if any(w.is_moving for w in self._windows):
                     with self._news:
-                        if not (self._is_work_waiting or self._tasks or self._stopped):
+                        if not (self._is_work_waiting or self._is_called):
                             self._news.wait(self._until_rest)
                 elif not self._show_resting(first=True):
                     return
@@ -364,7 +384,7 @@ class Session:
                 picture = window.compared(light, view, extent, self._wants_light)
                 if picture is not None:
                     window.show(picture)
-                if monotonic() > until or self._tasks or self._stopped or self._is_work_waiting:
+                if monotonic() > until or self._is_called or self._is_work_waiting:
                     return True
 
     def _taken(self, window: Window) -> View:

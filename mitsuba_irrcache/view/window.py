@@ -100,8 +100,16 @@ class Window:
         return True
 
     def forget(self) -> None:
-        """Shows nothing until there is another view."""
-        self.view, self.fresh, self._resting, self._reference = None, False, None, None
+        """Shows nothing until there is another view, and holds nothing that was computed."""
+        self.view, self.fresh, self._resting = None, False, None
+        self.samples = self._light = self._reference = None
+
+    def let_go(self, light: Light) -> None:
+        """Holds nothing any more that was computed of any other ``light``."""
+        if self._light is not light:
+            self.samples = self._light = None
+        if self._reference is not None and self._reference.light is not light:
+            self._reference = None
 
     def lacks(self, light: Light, revision: int, first: bool) -> bool:
         """Whether a picture at rest could be better; or where ``first``, whether there is none."""

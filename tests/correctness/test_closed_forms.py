@@ -17,7 +17,7 @@ from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.projection import Projection
 from mitsuba_irrcache.scene import bake_media, bake_scene
 from mitsuba_irrcache.solvers import path, sweep
-from mitsuba_irrcache.solvers.directional_sweep import DirectionalSweep, directional_batch
+from mitsuba_irrcache.solvers.directional_sweep import DirectionalSweep, least_batch
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -189,7 +189,7 @@ def swept(scene, depth: float, layers: int, columns: int, batches: int = 1):
     solver, batch = sweep.Sweep, sweep.BATCH
     if medium.phase is not None:
         moments = Directional(medium.phase, sources_of(scene))
-        solver, batch = DirectionalSweep, directional_batch(moments.order)
+        solver, batch = DirectionalSweep, least_batch(moments.order)
     count = moments.count if moments else 0
     cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True, moments=count)
     cache.directional = moments

@@ -23,6 +23,12 @@ VARIED[:, 3:8] = [0.9, 0.7, 0.5]
 VARIED[2, 5] = 12.0
 
 
+@pytest.fixture(autouse=True)
+def small_batches(monkeypatch):
+    """Enough batches for a standard error, of few directions."""
+    monkeypatch.setattr(sweep, "LARGEST_BATCH", 64)
+
+
 def sun(*direction: float, irradiance=4.0) -> dict:
     return {"type": "directional", "direction": list(direction), "irradiance": irradiance}
 
@@ -86,7 +92,7 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
     """
     if tolerance:
         monkeypatch.setattr(scattering, "TOLERANCE", tolerance)
-        monkeypatch.setattr(scattering, "COARSE_TOLERANCE", tolerance / 10)
+        monkeypatch.setattr(scattering, "FEW_TOLERANCE", tolerance / 10)
         monkeypatch.setattr(scattering, "CORRECTIONS", 40)
     if kind == "homogeneous":
         shape = scenes.boundary(scenes.medium(25.0, 1.0))
@@ -98,7 +104,7 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
     if tolerance:
         np.testing.assert_allclose(phi, 1, atol=3e-4)
     else:
-        assert np.abs(phi - 1).mean() < scattering.TOLERANCE
+        assert np.abs(phi - 1).mean() < 1e-3
 
 
 def test_sunlight_along_an_axis(scenes):
@@ -338,9 +344,9 @@ def test_a_file_is_continued(scenes, tmp_path):
     order is not fixed; and a file of one solver is not continued by the other.
     """
     settings = {"resolution": 10, "light": envmap(VARIED)}
-    whole = filled(scenes, soft_cloud(scenes), **settings, **batches(2))
+    whole = filled(scenes, soft_cloud(scenes), **settings, **batches(4))
     file = {"cache_file": str(tmp_path / "light.npz")}
-    for count in (1, 2):
+    for count in (2, 4):
         parts = filled(scenes, soft_cloud(scenes), **settings, **file, **batches(count))
     for name in ("uncollided", "scattered", "standard_error"):
         ours, theirs = values(getattr(parts, name)), values(getattr(whole, name))

@@ -9,12 +9,19 @@ import pytest
 from mitsuba_irrcache.choices import choose_solver
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.scene import bake_media
+from mitsuba_irrcache.solvers import sweep
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 SIZE, BLOCK, VOXELS = 16, 4, 16
 SKY = {"type": "constant", "radiance": 1.0}
 DIM = {"type": "constant", "radiance": 0.1}
+
+
+@pytest.fixture(autouse=True)
+def small_batches(monkeypatch):
+    """Enough batches for a standard error, of few directions."""
+    monkeypatch.setattr(sweep, "LARGEST_BATCH", 64)
 
 
 def grey(value: float) -> dict:
@@ -237,8 +244,8 @@ def test_standard_error_is_the_scatter(scenes):
 def test_more_batches_compile_nothing(scenes, kernels):
     """More batches: the kernels of the first ones, but for one by accident."""
     scene = load(scenes, scene_room(scenes))
-    integrator = mi.load_dict({"type": "irrcache", "cache_spp": 64, "resolution": 12})
+    integrator = mi.load_dict({"type": "irrcache", "cache_spp": 128, "resolution": 12})
     known = {k["hash"] for k in kernels(lambda: integrator.prepare(scene))}
-    integrator.cache_spp = 160
+    integrator.cache_spp = 320
     found = {k["hash"] for k in kernels(lambda: integrator.prepare(scene))}
     assert found and len(found - known) <= 1

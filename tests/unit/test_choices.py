@@ -1,4 +1,4 @@
-"""What is chosen where nothing is told: voxels of the cache."""
+"""What is chosen where nothing is told: voxels of the cache, and directions."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from mitsuba_irrcache.boundary import Boundary
 from mitsuba_irrcache.choices import choose_grid
 from mitsuba_irrcache.grid import ConstantField, Grid, GridField
 from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.solvers import sweep
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -53,3 +54,30 @@ def test_finer_voxels_have_a_limit(monkeypatch):
     shape = chosen(np.full((10, 10, 10), 100.0))
     assert shape == (13, 13, 13)
     assert chosen(np.full((20, 20, 20), 100.0)) == (14, 14, 14)
+
+
+@pytest.mark.parametrize(
+    ("samples", "max_depth", "batch"),
+    [(1, -1, 32), (63, -1, 32), (64, 2, 64), (1000, 2, 64), (128, -1, 128), (1000, 3, 256)],
+)
+def test_size_of_batches(samples, max_depth, batch):
+    """As large as what is wanted, up to 64 directions, or 256 where each solves for all orders."""
+    assert sweep.batch_of(samples, max_depth, sweep.BATCH) == batch
+
+
+def test_directions_by_default(scenes):
+    """128 in one batch; in two where an error is wanted; those asked for later count."""
+    shape = scenes.boundary(scenes.medium(scenes.texture((4, 4, 4), 0.5, 3.0, 1), 0.9))
+    for wanted, asked, expected in (
+        ({}, 0, (128, 128)),
+        ({"filter": "bilateral"}, 0, (128, 64)),
+        ({}, 64, (64, 64)),
+    ):
+        scene = scenes.load(
+            {"type": "irrcache", "max_depth": -1, "solver": "auto"} | wanted, shape, size=2
+        )
+        if asked:
+            scene.integrator().cache_spp = asked
+        scene.integrator().prepare(scene)
+        cache = scene.integrator().cache
+        assert (cache.samples, cache.batch) == expected

@@ -52,10 +52,10 @@ def lines(sigma_t: np.ndarray) -> Lattice:
 
 def level(sigma_t: np.ndarray, albedo: float, moments: Moments | None) -> Level:
     of_matter = lines(sigma_t)
-    number = of_matter.grid.voxel_count
+    number = of_matter.count
     fields = (mi.Float(v.ravel().tolist()) for v in (sigma_t, np.full(number, albedo)))
-    arguments = of_matter.grid, *fields, of_matter
-    return Level(*arguments) if moments is None else DirectionalLevel(*arguments, moments)
+    arguments = *fields, of_matter
+    return Level(*arguments) if moments is None else DirectionalLevel(*arguments, moments=moments)
 
 
 def rows(pairs: int, light: float = 0.0, seed: int = 1) -> tuple[np.ndarray, ...]:
@@ -135,13 +135,14 @@ def test_solution():
     sigma_t = mi.Float(rng.uniform(0, 40, grid.voxel_count).tolist())
     box = Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
     moments = moments_of(0.5, 2)
-    white = DirectionalLevel(grid, sigma_t, dr.full(mi.Float, 0.99, grid.voxel_count), box, moments)
+    albedo = dr.full(mi.Float, 0.99, grid.voxel_count)
+    white = DirectionalLevel(sigma_t, albedo, box, moments=moments)
     table = rows(16, 1.0)
     _, b = white.scatter(None, box.table(*table))
     directions, _, weights, offsets = table
-    phi = white.solve(b, directions, weights, offsets)
-    dark = np.zeros((16, 2))
-    image = white.scatter(phi, box.table(directions, dark, weights, offsets))[1] + b
+    dark = directions, np.zeros((16, 2)), weights, offsets
+    phi = white.solve(b, dark)
+    image = white.scatter(phi, box.table(*dark))[1] + b
     phi, image = np.array(phi), np.array(image)
     assert np.abs(image - phi).mean() < 2e-3 * np.abs(phi).mean()
     assert phi[: grid.voxel_count].mean() > 2 * np.array(b)[: grid.voxel_count].mean()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import time
+import weakref
+from collections.abc import Iterator
 from dataclasses import replace
 
 import drjit as dr
@@ -130,6 +133,42 @@ def test_it_is_beside_the_picture_until_something_changes(document):
     finally:
         session.stop()
         dr.sync_thread()
+
+
+@pytest.mark.parametrize("document", list(SCENES), indirect=True)
+def test_light_that_is_not_seen_any_more_is_freed(document, uncollected):
+    """With its medium, once there is other light, in a window that has compared it before."""
+    session = Session(document)
+    session.target_error = 0.05
+    session.start()
+    try:
+        screen = Screen()
+        window = session.open(screen.show)
+        view = View(front(session), SIZE)
+        session.look(window, replace(view, compared=True))
+        screen.wait(lambda p: "RMSE" in p.comparison)
+        session.look(window, view)
+        screen.wait(lambda p: p.view == view)
+        light = session.call(lambda: weakref.ref(session.light))
+        medium = session.call(lambda: weakref.ref(session.light.parts[0].medium))
+        assert light() is not None and medium() is not None
+        count = len(screen.pictures)
+        session.edit(lambda document: document.set_density(0.5))
+        screen.wait(lambda p: len(screen.pictures) > count + 1 and p.final)
+        assert session.call(lambda: (light(), medium())) == (None, None)
+    finally:
+        session.stop()
+        dr.sync_thread()
+
+
+@pytest.fixture
+def uncollected() -> Iterator[None]:
+    """Python does not look for cycles of references of its own accord, as in a large program it
+    hardly does.
+    """
+    gc.disable()
+    yield
+    gc.enable()
 
 
 def _samples(picture: Picture) -> int:

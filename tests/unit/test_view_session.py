@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from dataclasses import replace
 
 import drjit as dr
@@ -279,6 +280,19 @@ def test_windows_have_cameras_of_their_own(session):
     again = screens[1].wait(lambda p: p.final and p.view.camera == front(session)).pixels
     np.testing.assert_array_equal(again, first)
     assert len(screens[0].pictures) == count
+
+
+def test_a_closed_window_holds_nothing(session):
+    """Though it is held itself: its controls are in cycles of references."""
+    screen = Screen()
+    window = session.open(screen.show)
+    session.look(window, View(front(session), SIZE))
+    screen.wait(final)
+    samples = session.call(lambda: weakref.ref(window.samples))
+    assert samples() is not None
+    session.close(window)
+    session.call(lambda: None)
+    assert samples() is None
 
 
 def test_all_that_can_be_shown(session):
