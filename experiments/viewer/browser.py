@@ -47,7 +47,7 @@ def chromium() -> str | None:
 @contextmanager
 def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
     """``irrcache view`` with these arguments in a process of its own, and its address; what it
-    prints goes to ``log``.
+    prints goes to ``log``, and to stderr too if what is done with it, or it itself, fails.
     """
     command = [sys.executable, "-m", "mitsuba_irrcache", "view", *arguments, "--no-browser"]
     with open(log, "w") as stream:
@@ -55,9 +55,14 @@ def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
     try:
         while not (found := re.search(r"http://\S+", log.read_text())):
             if process.poll() is not None:
-                raise RuntimeError(f"the viewer ended: {log.read_text()}")
+                raise RuntimeError("the viewer ended before there was an address")
             time.sleep(0.05)
         yield found.group()
+        if process.poll() is not None:
+            raise RuntimeError(f"the viewer ended by itself: {process.returncode}")
+    except BaseException:
+        print(log.read_text(), file=sys.stderr)
+        raise
     finally:
         process.terminate()
         process.wait(20)
@@ -155,7 +160,8 @@ class Browser:
 
     def __enter__(self) -> Browser:
         self._playwright = sync_playwright().start()
-        arguments = ["--no-sandbox", "--enable-unsafe-swiftshader"]
+        # Shared memory of containers is small, and a page that wants more of it crashes.
+        arguments = ["--no-sandbox", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
         self._browser = self._playwright.chromium.launch(executable_path=chromium(), args=arguments)
         return self
 
