@@ -189,6 +189,7 @@ def _listen(pipe, process, tally: Tally, first: int, count: int) -> int:
             tally.peak_megabytes = max(tally.peak_megabytes, peak)
             if error:
                 tally.errors.append(f"mutant {index}: {error}")
+        process.join(PATIENCE)  # to its own end: what is killed leaves semaphores behind
         return count
     except EOFError:
         tally.crashes += 1
