@@ -70,10 +70,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - cache_spp
        - |int|
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
-         of 8 samples or 32 directions (64 if as many are wanted, and 128 or 256 of light that is
-         scattered more than once: each of these batches solves for all orders anew);
-         0: 128 directions, 64 among surfaces; 16 to 256 samples, about 2^24 for all voxels, 2^22
-         among surfaces. (Default: 0)
+         of 8 samples or 32 to 256 directions, as many as are wanted;
+         0: 256 directions, 128 where a phase function is not isotropic, 64 among surfaces (128 for
+         single scattering); 16 to 256 samples, about 2^24 for all voxels, 2^22 among surfaces.
+         (Default: 0)
 
      * - cache_seed
        - |int|

@@ -28,9 +28,10 @@ MOST_VOXELS, MOST_DIRECTIONAL = 1 << 25, 1 << 21
 #: twice the voxels of the data along an axis: the light falls off within denser ones. On a CT head
 #: of 1.2 per voxel the error falls from 0.7 to 0.3 % of the mean.
 DENSE_VOXEL, FINEST = 0.8, 2.0
-#: Directions per voxel of the solver ``sweep``, unless told otherwise; among surfaces, whose light
-#: has the noise of the image's samples besides, if it is scattered more than once.
-SWEPT, SWEPT_AMONG_SURFACES = 128, 64
+#: Directions per voxel of the solver ``sweep``, unless told otherwise: for irradiance, for light by
+#: its direction, where each is more work, and among surfaces, whose light has the noise of the
+#: image's samples besides (twice as many for single scattering).
+SWEPT, SWEPT_BY_DIRECTION, SWEPT_AMONG_SURFACES = 256, 128, 64
 
 
 def choose_solver(
@@ -165,19 +166,21 @@ def _finer(sigma_t: GridField, voxels: int) -> np.ndarray:
     return np.floor(sigma_t.grid.resolution * np.minimum(factor, most)).astype(int)
 
 
-def choose_samples(cache: IrradianceCache, solver: str, alone: bool) -> int:
+def choose_samples(cache: IrradianceCache, solver: str, medium: MediumGrid) -> int:
     """Samples per voxel: for ``path`` about 2^24 in all, 2^22 among surfaces, where each is more
     work; 16 to 256 each.
     """
     if solver == "sweep":
-        return swept_samples(cache.max_depth, alone)
+        return swept_samples(cache.max_depth, medium)
     paths = 2**24 if cache.survey is None else 2**22
     return int(np.clip(paths // max(cache.active_count, 1), 16, 256))
 
 
-def swept_samples(max_depth: int, alone: bool) -> int:
-    """Directions per voxel of the solver ``sweep``, in a medium that is all there is or not."""
-    return SWEPT if alone or max_depth == 2 else SWEPT_AMONG_SURFACES
+def swept_samples(max_depth: int, medium: MediumGrid) -> int:
+    """Directions per voxel of the solver ``sweep``."""
+    if not medium.alone:
+        return SWEPT_AMONG_SURFACES * (2 if max_depth == 2 else 1)
+    return SWEPT if medium.phase is None else SWEPT_BY_DIRECTION
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:

@@ -93,8 +93,8 @@ class LitMedium:
         """Samples per voxel to build up to where ``samples`` (0: chosen) are wanted, a multiple of
         the cache's batch.
         """
-        alone, batch = self.medium.alone, self.cache.batch
-        samples = samples or choose_samples(self.cache, self.solver, alone)
+        batch = self.cache.batch
+        samples = samples or choose_samples(self.cache, self.solver, self.medium)
         return max(-(-samples // batch), 2 if self.settings.with_error else 1) * batch
 
     @property
@@ -154,10 +154,10 @@ class LitMedium:
         swept, depth = self.solver == "sweep", settings.max_depth
         batch = BATCH
         if swept:
-            wanted = settings.samples or swept_samples(depth, medium.alone)
-            wanted = wanted // 2 if settings.with_error else wanted
+            wanted = settings.samples or swept_samples(depth, medium)
+            wanted = -(-wanted // 2) if settings.with_error else wanted
             least = sweep.BATCH if directional is None else least_batch(directional.order)
-            batch = sweep.batch_of(wanted, depth, least)
+            batch = sweep.batch_of(wanted, least)
         cache = IrradianceCache(
             grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
         )

@@ -4,7 +4,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import reduce
 
 import drjit as dr
 import mitsuba as mi
@@ -115,20 +115,17 @@ def _block_bounds(
     beyond it.
     """
     channels = sigma_t.channels
-    bounds = []
-    for reduce in (dr.minimum, dr.maximum):
-        values, sides = sigma_t.data, list(sigma_t.grid.shape[::-1])
-        # Channels first, then axis by axis: windows overlap, so this reads less than blocks would.
-        if channels > 1:
-            index = dr.arange(mi.UInt32, sigma_t.grid.voxel_count) * channels
-            values = dr.gather(mi.Float, values, index)
-            for c in range(1, channels):
-                values = reduce(values, dr.gather(mi.Float, sigma_t.data, index + c))
-        for axis in range(3):
-            values = _reduced(values, sides, axis, size, shape[2 - axis], reduce)
-            sides[axis] = shape[2 - axis]
-        bounds.append(values)
-    least, largest = bounds
+    least = largest = sigma_t.data
+    # Channels first, then axis by axis: windows overlap, so this reads less than blocks would.
+    if channels > 1:
+        index = dr.arange(mi.UInt32, sigma_t.grid.voxel_count) * channels
+        values = [dr.gather(mi.Float, sigma_t.data, index + c) for c in range(channels)]
+        least, largest = reduce(dr.minimum, values), reduce(dr.maximum, values)
+        dr.eval(least, largest)
+    sides = list(sigma_t.grid.shape[::-1])
+    for axis in range(3):
+        least, largest = _reduced(least, largest, sides, axis, size, shape[2 - axis])
+        sides[axis] = shape[2 - axis]
     # A little slack, since interpolation may round beyond its eight values.
     least, largest = least * sigma_t.scale * (1 - 1e-6), largest * sigma_t.scale * (1 + 1e-6)
     dr.eval(least, largest)
@@ -136,10 +133,10 @@ def _block_bounds(
 
 
 def _reduced(
-    values: mi.Float, sides: list[int], axis: int, size: int, count: int, reduce: Callable
-) -> mi.Float:
+    least: mi.Float, largest: mi.Float, sides: list[int], axis: int, size: int, count: int
+) -> tuple[mi.Float, mi.Float]:
     """Bounds of ``count`` windows along one axis, each of ``size`` values and one more at both
-    ends.
+    ends; at first both are bounds of the same array.
     """
     stride, side = int(np.prod(sides[:axis])), sides[axis]
     index = dr.arange(mi.UInt32, int(np.prod(sides)) // side * count)
@@ -148,10 +145,12 @@ def _reduced(
     window = row % count
     start = index - row * before + row // count * (before * sides_here)
     first = mi.Int32(window * size) - 1
-    result = None
-    for k in range(size + 2):
-        place = mi.UInt32(dr.clip(first + k, 0, mi.Int32(sides_here) - 1))
-        value = dr.gather(mi.Float, values, start + place * before)
-        result = value if result is None else reduce(result, value)
-    dr.eval(result)
-    return result
+    places = [
+        start + mi.UInt32(dr.clip(first + k, 0, mi.Int32(sides_here) - 1)) * before
+        for k in range(size + 2)
+    ]
+    low = [dr.gather(mi.Float, least, place) for place in places]
+    high = low if least is largest else [dr.gather(mi.Float, largest, place) for place in places]
+    bounds = reduce(dr.minimum, low), reduce(dr.maximum, high)
+    dr.eval(bounds)
+    return bounds

@@ -318,7 +318,7 @@ class Clearance:
 
 def _constant_if_it_is(field: Field) -> Field:
     """A grid that holds one value only, as that value."""
-    if not isinstance(field, GridField):
+    if not isinstance(field, GridField) or _varies(field):
         return field
     channels = [
         dr.gather(mi.Float, field.data, dr.arange(mi.UInt32, field.grid.voxel_count) * n + c)
@@ -329,6 +329,20 @@ def _constant_if_it_is(field: Field) -> Field:
     if any(a != b for a, b in ends):
         return field
     return ConstantField(np.array([a for a, _ in ends]) * field.scale[0])
+
+
+def _varies(field: GridField) -> bool:
+    """Whether some of its voxels, scattered over the grid, differ: it takes less time to find out
+    than that none does.
+    """
+    voxels, channels = field.grid.voxel_count, field.channels
+    count = min(voxels, 4096)
+    place = dr.arange(mi.UInt32, count) * dr.opaque(mi.UInt32, voxels // count * channels)
+    same = mi.Bool(True)
+    for c in range(channels):
+        first = dr.gather(mi.Float, field.data, mi.UInt32(c))
+        same &= dr.gather(mi.Float, field.data, place + c) == first
+    return not dr.all(same)[0]
 
 
 def _select(mask: mi.Bool, a: list, b: list) -> list:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -103,18 +105,17 @@ def _halved(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
     begin, at[axis] = mi.Float(at[axis]), mi.UInt32(0)
     rest, stride = flat(at, strides), dr.opaque(mi.UInt32, strides[axis])
     ratio, last = dr.opaque(mi.Float, before / count), dr.opaque(mi.Float, before - 1)
-    step = dr.select(last > 0, stride, 0)
-    halves = []
-    for half in range(2):
-        total = 0.0
-        # Two points: exact where kinks, the centres of voxels, lie between them or at the ends.
-        for point in (0.125, 0.375):
-            u = dr.clip((begin + (0.5 * half + point)) * ratio - 0.5, 0, last)
-            lower = mi.UInt32(dr.minimum(u, dr.maximum(last - 1, 0)))
-            place = rest + lower * stride
-            low, high = (_level(levels, i) for i in (place, place + step))
-            total += dr.lerp(mi.Float(low), mi.Float(high), u - mi.Float(lower))
-        halves.append(_rounded(0.5 * total, 0.5 * half))
+    # Two points of each half: exact where kinks, the centres of voxels, lie between them or at the
+    # ends. All that they are interpolated of is read once.
+    points = (0.125, 0.375, 0.625, 0.875)
+    where = [dr.clip((begin + point) * ratio - 0.5, 0, last) for point in points]
+    first, values = dr.floor(where[0]), [0.0] * len(points)
+    for k in range(math.ceil(0.75 * before / count) + 2):
+        slice_ = first + k
+        level = mi.Float(_level(levels, rest + mi.UInt32(dr.minimum(slice_, last)) * stride))
+        for i, u in enumerate(where):
+            values[i] += dr.maximum(1 - dr.abs(u - slice_), 0) * level
+    halves = [_rounded(0.5 * (values[2 * i] + values[2 * i + 1]), 0.5 * i) for i in range(2)]
     result = halves[0] | halves[1] << 16
     dr.eval(result)
     return result

@@ -30,10 +30,9 @@ from mitsuba_irrcache.solvers.layout import side_by_side
 from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass, arriving
 from mitsuba_irrcache.solvers.scattering import Level
 
-#: Directions per voxel of a batch, pairs of opposite ones. Spread evenly together, 32 leave half
-#: the noise of two sets of 16, and 64 four fifths of that of two sets of 32. The largest batches
-#: are those of scattered light.
-BATCH, LARGE_BATCH, LARGEST_BATCH = 32, 64, 256
+#: Directions per voxel of a batch, pairs of opposite ones, at least and at most. Spread evenly
+#: together, 32 leave half the noise of two sets of 16, and 64 four fifths of that of two of 32.
+BATCH, LARGEST_BATCH = 32, 256
 #: Directions of a pass, of which a batch is made where light is scattered more than once: the
 #: orders before the last are solved for with one such set.
 DIRECTIONS = 16
@@ -62,14 +61,12 @@ def swept_together(medium: MediumGrid, voxels: int) -> bool:
     return medium.phase is None and medium.sigma_t.channels == 1 and voxels <= TOGETHER
 
 
-def batch_of(samples: int, max_depth: int, least: int) -> int:
-    """The directions of a batch of a cache of so many, ``least`` at least: where light is scattered
-    more than once about as many, since each batch solves for all orders anew.
+def batch_of(samples: int, least: int) -> int:
+    """The directions of a batch of a cache of so many: all of them, or equal parts if there are too
+    many, in multiples of ``least``. Each batch solves for all orders anew.
     """
-    batch, most = least, LARGE_BATCH if max_depth == 2 else LARGEST_BATCH
-    while batch < most and 2 * batch <= samples:
-        batch *= 2
-    return batch
+    batches = -(-samples // LARGEST_BATCH)
+    return -(-samples // (batches * least)) * least
 
 
 class Sweep:

@@ -196,7 +196,7 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     if medium.phase is not None:
         moments = Directional(medium.phase, sources_of(scene))
         solver, least = DirectionalSweep, least_batch(moments.order)
-    batch = sweep.batch_of(samples, -1, least)
+    batch = sweep.batch_of(samples, least)
     count = moments.count if moments else 0
     cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True, moments=count)
     cache.directional = moments

@@ -57,20 +57,20 @@ def test_finer_voxels_have_a_limit(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("samples", "max_depth", "batch"),
-    [(1, -1, 32), (63, -1, 32), (64, 2, 64), (1000, 2, 64), (128, -1, 128), (1000, 3, 256)],
+    ("samples", "batch"),
+    [(1, 32), (32, 32), (33, 64), (96, 96), (128, 128), (256, 256), (257, 160), (1000, 256)],
 )
-def test_size_of_batches(samples, max_depth, batch):
-    """As large as what is wanted, up to 64 directions, or 256 where each solves for all orders."""
-    assert sweep.batch_of(samples, max_depth, sweep.BATCH) == batch
+def test_size_of_batches(samples, batch):
+    """All that is wanted, or equal parts of up to 256 directions."""
+    assert sweep.batch_of(samples, sweep.BATCH) == batch
 
 
 def test_directions_by_default(scenes):
-    """128 in one batch; in two where an error is wanted; those asked for later count."""
+    """256 in one batch; in two where an error is wanted; those asked for later count."""
     shape = scenes.boundary(scenes.medium(scenes.texture((4, 4, 4), 0.5, 3.0, 1), 0.9))
     for wanted, asked, expected in (
-        ({}, 0, (128, 128)),
-        ({"filter": "bilateral"}, 0, (128, 64)),
+        ({}, 0, (256, 256)),
+        ({"filter": "bilateral"}, 0, (256, 128)),
         ({}, 64, (64, 64)),
     ):
         scene = scenes.load(
