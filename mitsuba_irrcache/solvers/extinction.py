@@ -41,10 +41,15 @@ class Extinction:
         sides[axis] = self.grid.resolution[axis]
         return sides
 
-    def corners(self, axis: int) -> mi.UInt32:
+    def words(self, by_rows: bool) -> int:
+        """How many `corners` keeps together."""
+        return (1 if by_rows else 2) if self.own else 4
+
+    def corners(self, axis: int, words: int) -> mi.UInt32:
         """For each value of the extinction in all slices along ``axis`` those of four, from it on
-        along both other axes: flat, two words of two values each, or four words of the means over
-        both halves of a slice, unless voxels have their own values.
+        along both other axes: flat, two ``words`` of two values each, or four words of the means
+        over both halves of a slice, unless voxels have their own values. A single word is only that
+        row of two: the other is read where it is a line's own, half as much memory in all.
         """
         sides = self.sides(axis)
         if self.own:
@@ -64,8 +69,9 @@ class Extinction:
         places = [row + step for row in (index, index + steps[1]) for step in (0, steps[0])]
         if values is not None:
             return dr.ravel(mi.Array4u([dr.gather(mi.UInt32, values, p) for p in places]))
-        words = [_level(self._levels, place) for place in places]
-        return dr.ravel(mi.Vector2u(words[0] | words[1] << 16, words[2] | words[3] << 16))
+        pairs = zip(places[0::2], places[1::2], strict=True)
+        rows = [_level(self._levels, a) | _level(self._levels, b) << 16 for a, b in pairs]
+        return rows[0] if words == 1 else dr.ravel(mi.Vector2u(rows))
 
 
 def _packed(values: mi.UInt32) -> mi.UInt32:

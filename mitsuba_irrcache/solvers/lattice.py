@@ -85,7 +85,8 @@ class Lattice:
         #: where the corners of each axis begin among all that are kept
         self._first_corner = [0, 0, 0]
         if self.together:
-            corners = [self._extinction.corners(axis) for axis in range(3)]
+            words = self._extinction.words(by_rows=False)
+            corners = [self._extinction.corners(axis, words) for axis in range(3)]
             sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
             self._first_corner = np.cumsum([0, *sizes[:2]]).tolist()
             self._all_corners = joined(corners)
@@ -125,6 +126,7 @@ class Lattice:
         velocities = directions @ self._to_voxels.T
         axes = np.abs(velocities).argmax(axis=1)
         ratio = self.detail.resolution / self.grid.resolution
+        last = self.detail.resolution - 1 - (self.lower if self._extinction.own else 0)
         for i, (velocity, axis) in enumerate(zip(velocities, axes, strict=True)):
             across = [k for k in range(3) if k != axis]
             order = (*across, axis)
@@ -150,9 +152,7 @@ class Lattice:
             numbers[i, :3] = [1 / abs(velocity[axis]), weights[i], self._extinction.quantum]
             numbers[i, DIRECTION:] = directions[i] * np.sign(velocity[axis])
             numbers[i, 3:DIRECTION] = [
-                x
-                for k in across
-                for x in (ratio[k], self.lower[k] * ratio[k] - 0.5, self.detail.resolution[k] - 1)
+                x for k in across for x in (ratio[k], self.lower[k] * ratio[k] - 0.5, last[k])
             ]
         forward = velocities[np.arange(count), axes] > 0
         along = np.where(forward[:, None, None], light, light[:, ::-1])
@@ -216,7 +216,7 @@ class Lattice:
         voxels = self.grid.voxel_count
         most = max(1, COPIES // (2 * voxels))
         for axis, pairs in table.by_axis:
-            corners = self._corners(axis)
+            corners, words = self._corners(axis, sent is not None)
             for start in range(0, len(pairs), most):
                 group = Group(table, pairs[start : start + most])
                 lanes, row = self._lanes_of(len(group))
@@ -224,7 +224,7 @@ class Lattice:
                 begin = row * dr.opaque(mi.UInt32, 2 * voxels)
                 empty = self._empty.slices if self._empty else None
                 follow(
-                    corners, self._extinction.own, empty, copies, sent(group) if sent else None,
+                    corners, words, empty, copies, sent(group) if sent else None,
                     table, group.pair(row), lanes, begin,
                     copy_back=begin + dr.opaque(mi.UInt32, voxels),
                 )  # fmt: skip
@@ -232,12 +232,17 @@ class Lattice:
                 self.pause()
                 yield axis, group, copies
 
-    def _corners(self, axis: int) -> mi.UInt32:
+    def _corners(self, axis: int, scatters: bool) -> tuple[mi.UInt32, int]:
+        """Values of the extinction for lines along ``axis``, and the words that are together. By
+        rows, lines that meet little else find the one above in a cache; wide volumes that light is
+        scattered in would have replaced it.
+        """
+        words = self._extinction.words(by_rows=not (self.together or scatters))
         if self.together:
-            return self._all_corners
-        corners = self._extinction.corners(axis)
+            return self._all_corners, words
+        corners = self._extinction.corners(axis, words)
         dr.eval(corners)
-        return corners
+        return corners, words
 
     def _lanes_of(self, count: int) -> tuple[mi.UInt32, mi.UInt32]:
         """Of each line of ``count`` pairs its number, and the pair's."""
@@ -253,13 +258,13 @@ class Lattice:
         if self.together:
             self._launch_together(volume, scatters, table, pairs)
             return
-        corners = self._corners(axis)  # one set at a time is kept
+        corners, words = self._corners(axis, scatters)  # one set at a time is kept
         empty = self._empty.slices if self._empty else None
         source = volume if scatters else None
         channels = self._channels(volume, scatters)
         for i in pairs:
             follow(
-                corners, self._extinction.own, empty, volume, source, table, table.places[i],
+                corners, words, empty, volume, source, table, table.places[i],
                 self._lanes, dr.opaque(mi.UInt32, 0), channels,
             )  # fmt: skip
             dr.eval(volume)
@@ -279,7 +284,7 @@ class Lattice:
             lanes, row = self._lanes_of(len(group))
             copies = dr.opaque(mi.Float, 0, dr.width(volume) * len(group))
             follow(
-                self._all_corners, self._extinction.own, None, copies, volume if scatters else None,
+                *self._corners(0, scatters), None, copies, volume if scatters else None,
                 table, group.pair(row), lanes, row * dr.opaque(mi.UInt32, voxels),
                 self._channels(volume, scatters),
             )  # fmt: skip

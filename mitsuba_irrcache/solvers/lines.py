@@ -60,11 +60,15 @@ class _Across:
         lower = mi.Int32(u)
         return lower * self.stride, u - mi.Float(lower)
 
+    def above(self, place: mi.Int32) -> mi.Int32:
+        """From ``place``, of the lower value, to the upper one; there is none at the grid's end."""
+        return dr.select(place < mi.Int32(self.last) * self.stride, self.stride, 0)
+
 
 @dr.syntax
 def follow(
     corners: mi.UInt32,
-    own: bool,
+    words: int,
     empty: mi.UInt32 | None,
     volume: mi.Float,
     source: mi.Float | None,
@@ -75,10 +79,11 @@ def follow(
     channels: int = 1,
     copy_back: mi.UInt32 | None = None,
 ):
-    """Follows pairs of directions. ``empty``: the slices that may be skipped, of `Emptiness`.
-    ``source``: what `Lattice.scatter` calls volume, None if voxels send no light; may be ``volume``
-    itself, where the light is added, from voxel ``copy`` on. Light of several ``channels`` goes the
-    same way; a voxel has those of all of them next to each other.
+    """Follows pairs of directions. ``corners``: so many ``words`` together, of `Extinction`.
+    ``empty``: the slices that may be skipped, of `Emptiness`. ``source``: what `Lattice.scatter`
+    calls volume, None if voxels send no light; may be ``volume`` itself, where the light is added,
+    from voxel ``copy`` on. Light of several ``channels`` goes the same way; a voxel has those of
+    all of them next to each other.
 
     With ``copy_back`` both ways are told apart: the light of opposite directions is left from that
     voxel on, nothing is added to anything, ``source`` holds what voxels send in both ways at the
@@ -140,9 +145,9 @@ def follow(
             index, index_back = index * channels, index_back * channels
         place, place_back = index + copy, index_back + (copy_back if apart else copy)
         # Of the half before the middle of the slice, and of the half behind it.
-        s, s_next = _levels(corners, own, slice_, there_b, there_c, ib, fb, ic, fc, needed)
+        s, s_next = _levels(corners, words, slice_, there_b, there_c, ib, fb, ic, fc, needed)
         s_next_back, s_back = _levels(
-            corners, own, slice_back, back_b, back_c, kb, gb, kc, gc, needed_back
+            corners, words, slice_back, back_b, back_c, kb, gb, kc, gc, needed_back
         )
         if dr.hint(entering is not None, mode="scalar"):
             new, new_back = active & (since < 1), active_back & (since_back < 1)
@@ -227,8 +232,9 @@ def _slices(empty, strides, b, c, a, active) -> mi.Int32:
     return mi.Int32(dr.gather(mi.UInt32, empty, mi.UInt32(cell), active))
 
 
-def _levels(corners, own, slice_, across_b, across_c, ib, fb, ic, fc, active) -> tuple:
+def _levels(corners, words, slice_, across_b, across_c, ib, fb, ic, fc, active) -> tuple:
     """Extinction of a line in both halves of a slice, bilinear, in units of the quantum."""
+    own = words < 4
     place_b, weight_b = across_b.lower(ib, fb, own)
     place_c, weight_c = across_c.lower(ic, fc, own)
 
@@ -237,12 +243,15 @@ def _levels(corners, own, slice_, across_b, across_c, ib, fb, ic, fc, active) ->
         return dr.fma(rows[1] - rows[0], weight_c, rows[0])
 
     place = mi.UInt32(slice_ + place_b + place_c)
+    if words == 1:
+        above = place + mi.UInt32(across_c.above(place_c))
+        rows = [dr.gather(mi.UInt32, corners, p, active) for p in (place, above)]
+    else:
+        rows = dr.gather(mi.Vector2u if words == 2 else mi.Array4u, corners, place, active)
     if own:
-        words = dr.gather(mi.Vector2u, corners, place, active)
-        value = bilinear(*(mi.Float(v) for w in words for v in (w & 0xFFFF, w >> 16)))
+        value = bilinear(*(mi.Float(v) for w in rows for v in (w & 0xFFFF, w >> 16)))
         return value, value
-    words = dr.gather(mi.Array4u, corners, place, active)
-    first, second = ([mi.Float(w & 0xFFFF) for w in words], [mi.Float(w >> 16) for w in words])
+    first, second = ([mi.Float(w & 0xFFFF) for w in rows], [mi.Float(w >> 16) for w in rows])
     return bilinear(*first), bilinear(*second)
 
 
