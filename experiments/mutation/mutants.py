@@ -58,8 +58,8 @@ MUTANTS = (
     Mutant(
         "extinction of coarse caches shifted by half a voxel (sweep)",
         "solvers/lattice.py",
-        "self.lower[k] * ratio[k] - 0.5, self",
-        "self.lower[k] * ratio[k], self",
+        "self.lower[k] * ratio[k] - 0.5, last",
+        "self.lower[k] * ratio[k], last",
         (SWEEP,),
     ),
     Mutant(

@@ -321,7 +321,7 @@ def test_wanted_error(folder, capsys):
 
 
 @pytest.mark.parametrize("how", ["interrupt", "terminate"])
-def test_a_stopped_progressive_render(folder, capsys, monkeypatch, how):
+def test_a_stopped_progressive_render(folder, capsys, monkeypatch, request, how):
     """Ctrl-C or SIGTERM in the pass after the opening: status 130, the last finished image, and a
     cache file of the samples that it shows; what was reached is printed.
     """
@@ -336,6 +336,9 @@ def test_a_stopped_progressive_render(folder, capsys, monkeypatch, how):
         refine(*args, **kwargs)
 
     monkeypatch.setattr(path, "refine", stopped)
+    # What a shell starts in the background would not hear of Ctrl-C.
+    interrupted = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, interrupted))
     before = signal.getsignal(signal.SIGTERM)
     settings = f"solver=path,resolution=8,cache_file={folder / 'light.npz'}"
     flags = ["-i", f"irrcache{{{settings}}}", "--budget", 100]
