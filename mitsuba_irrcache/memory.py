@@ -10,6 +10,11 @@ from pathlib import Path
 
 from .errors import IrrcacheError
 
+#: Bytes of the smallest array that is freed at once; where glibc begins.
+LARGE = 1 << 17
+#: glibc's name of that, from its malloc.h.
+_M_MMAP_THRESHOLD = -3
+
 
 def available_memory() -> int:
     """Bytes that a new array can take without swapping; 2^63 where the system does not say."""
@@ -34,10 +39,10 @@ def require_memory(needed: int, what: str, remedy: str) -> None:
         )
 
 
-def give_back() -> None:
-    """Makes what is free in the heap the system's again; a few milliseconds. Only glibc needs it:
-    it keeps arrays of up to 32 MiB in arenas, up to eight for each core, and in them what was freed
-    between others.
+def free_at_once() -> None:
+    """From now on arrays are the system's again as soon as they are freed. Only glibc needs it: it
+    learns from the first large array that is freed to keep those of up to 32 MiB in arenas, up to
+    eight for each core, and `malloc_trim` leaves what lies at the end of each, up to 64 MiB.
     """
     if platform.libc_ver()[0] == "glibc":
-        ctypes.CDLL(None).malloc_trim(0)
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)  # and it learns no more

@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.loading import integrator_of, parse_parameters
+from mitsuba_irrcache.memory import free_at_once
 from mitsuba_irrcache.render import REPLACED, add_scene_options
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.volumes import importer
@@ -63,6 +64,7 @@ def _show(args: argparse.Namespace) -> None:
     from mitsuba_irrcache.view.server import Server, is_local
     from mitsuba_irrcache.view.session import Session
 
+    free_at_once()
     document, appearance = _document(args)
     gc.freeze()  # collections look through what the viewer makes, not through all modules
     session = Session(document)

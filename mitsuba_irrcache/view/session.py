@@ -21,7 +21,6 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError, essence
-from mitsuba_irrcache.memory import give_back
 from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.light import Light, Seen, Status
@@ -299,7 +298,6 @@ class Session:
             window.let_go(self._shown)
         gc.collect()  # media among surfaces are in a cycle of references
         dr.flush_malloc_cache()
-        give_back()
 
     def _say(self, message: str = "") -> None:
         self.status = Status.of(self._light or self._shown, self._wants_light, message)
