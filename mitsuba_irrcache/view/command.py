@@ -66,11 +66,10 @@ def _show(args: argparse.Namespace) -> None:
 
     free_at_once()
     document, appearance = _document(args)
+    session, server = Session(document), None
     gc.freeze()  # collections look through what the viewer makes, not through all modules
-    session = Session(document)
-    session.start()
-    server = None
     try:
+        session.start()
         server = Server(session, args.host, args.port, args.output, appearance)
         print(f"irrcache view: {server.address} (Ctrl-C ends it)", flush=True)
         if not is_local(args.host):
