@@ -89,7 +89,7 @@ class Lattice:
             corners = [self._extinction.corners(axis, words) for axis in range(3)]
             sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
             self._first_corner = np.cumsum([0, *sizes[:2]]).tolist()
-            self._all_corners = joined(corners)
+            self._all_corners = joined(corners), words
 
     def places(self, voxels: mi.UInt32) -> mi.UInt32:
         """Where these voxels are among the wanted ones; of others, the number of these."""
@@ -237,9 +237,9 @@ class Lattice:
         rows, lines that meet little else find the one above in a cache; wide volumes that light is
         scattered in would have replaced it.
         """
-        words = self._extinction.words(by_rows=not (self.together or scatters))
         if self.together:
-            return self._all_corners, words
+            return self._all_corners
+        words = self._extinction.words(by_rows=not scatters)
         corners = self._extinction.corners(axis, words)
         dr.eval(corners)
         return corners, words
@@ -284,7 +284,7 @@ class Lattice:
             lanes, row = self._lanes_of(len(group))
             copies = dr.opaque(mi.Float, 0, dr.width(volume) * len(group))
             follow(
-                *self._corners(0, scatters), None, copies, volume if scatters else None,
+                *self._all_corners, None, copies, volume if scatters else None,
                 table, group.pair(row), lanes, row * dr.opaque(mi.UInt32, voxels),
                 self._channels(volume, scatters),
             )  # fmt: skip
