@@ -18,6 +18,7 @@ from .files import atomic_write
 from .grid import Affine, Grid, RootField
 from .lamps import Falloff
 from .macrocells import Macrocells
+from .shadows import Shadows
 from .survey import Survey
 
 #: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
@@ -72,6 +73,8 @@ class IrradianceCache:
         self.directional: Directional | None = None
         #: how the light of lamps nearby falls off; None where there are none
         self.falloff: Falloff | None = None
+        #: what keeps the light at the edges of shadows; None where there are none
+        self.shadows: Shadows | None = None
         #: where voxels lie among surfaces; None where there are none
         self.survey: Survey | None = None
         #: samples taken per voxel from each random stream
@@ -88,7 +91,7 @@ class IrradianceCache:
     def lie_like(self, other: IrradianceCache) -> None:
         """Takes over what is known of the place of ``other``, another cache of the same medium."""
         self.directional, self.survey = other.directional, other.survey
-        self.falloff = other.falloff
+        self.falloff, self.shadows = other.falloff, other.shadows
 
     # ------------------------------------------------------------------ statistics
 
@@ -175,6 +178,8 @@ class IrradianceCache:
             smooth = dr.rsqrt(self.falloff.of_voxels(self.active))
             roots = [r * smooth for r in roots]
         roots, noise = (self._tensor(x).array for x in (roots, noise[:channels]))
+        if self.shadows is not None:
+            roots = self.shadows.corrected(roots, noise, self.active, channels)
         if self.survey is not None:
             roots = self.survey.filled(roots, channels)
         field = RootField(self.grid, roots, channels, noise)

@@ -265,4 +265,18 @@ MUTANTS = (
         "s * (1 - share)",
         ("tests/unit/test_similarity.py",),
     ),
+    Mutant(
+        "light at the edges of shadows lost",
+        "cache.py",
+        "if self.shadows is not None:",
+        "if self.shadows is False:",
+        ("tests/system/test_lamps.py",),
+    ),
+    Mutant(
+        "what matter swallows taken for shadows",
+        "shadows.py",
+        "found / (squared + explained)",
+        "found / squared",
+        ("tests/unit/test_shadows.py",),
+    ),
 )

@@ -117,17 +117,19 @@ def test_all_orders_in_infinite_matter(scenes):
 
 
 def test_beside_a_spot_light(scenes):
-    """A narrow beam from right above, resolved better by more voxels: the mean of the picture."""
+    """A narrow beam from right above: the mean of the picture, of which what interpolation loses at
+    the beam's edge is 2 %.
+    """
     look = mi.ScalarTransform4f().look_at([0.1, 1.6, 0.2], [0, 0, 0], [1, 0, 0])
     spot = {"type": "spot", "to_world": look, "intensity": 1.0, "cutoff_angle": 30.0}
     cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO))
     means = []
-    for integrator in ({"type": "irrcache", "resolution": 64}, {"type": "volpath"}):
+    for integrator in ({"type": "irrcache", "resolution": 32}, {"type": "volpath"}):
         scene = scenes.load(
             {"max_depth": 2, **integrator}, cube, SIZE,
             emitter=spot, sun=None, sensor=camera(scenes),
         )  # fmt: skip
-        means.append([scenes.image(scene, spp=512, seed=seed).mean() for seed in range(3)])
+        means.append([scenes.image(scene, spp=1024, seed=seed).mean() for seed in range(3)])
     (ours, theirs), errors = np.mean(means, axis=1), np.std(means, axis=1, ddof=1) / 3**0.5
-    assert errors[1] < 0.015 * theirs, "too noisy to say"
-    assert abs(ours - theirs) < 0.01 * theirs + 3 * errors.max()
+    assert errors[1] < 0.003 * theirs, "too noisy to say"
+    assert abs(ours - theirs) < 0.005 * theirs + 3 * errors.max()
