@@ -12,13 +12,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .conservation import conserving
 from .directional import Directional, DirectionalField
 from .errors import CacheFileError, IrrcacheError
 from .files import atomic_write
 from .grid import Affine, Grid, RootField
 from .lamps import Falloff
 from .macrocells import Macrocells
-from .shadows import Shadows
 from .survey import Survey
 
 #: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
@@ -73,8 +73,6 @@ class IrradianceCache:
         self.directional: Directional | None = None
         #: how the light of lamps nearby falls off; None where there are none
         self.falloff: Falloff | None = None
-        #: what keeps the light at the edges of shadows; None where there are none
-        self.shadows: Shadows | None = None
         #: where voxels lie among surfaces; None where there are none
         self.survey: Survey | None = None
         #: samples taken per voxel from each random stream
@@ -91,7 +89,7 @@ class IrradianceCache:
     def lie_like(self, other: IrradianceCache) -> None:
         """Takes over what is known of the place of ``other``, another cache of the same medium."""
         self.directional, self.survey = other.directional, other.survey
-        self.falloff, self.shadows = other.falloff, other.shadows
+        self.falloff = other.falloff
 
     # ------------------------------------------------------------------ statistics
 
@@ -178,8 +176,8 @@ class IrradianceCache:
             smooth = dr.rsqrt(self.falloff.of_voxels(self.active))
             roots = [r * smooth for r in roots]
         roots, noise = (self._tensor(x).array for x in (roots, noise[:channels]))
-        if self.shadows is not None:
-            roots = self.shadows.corrected(roots, noise, self.active, channels)
+        if self.correlated:  # else it would enlarge the noise by more than it is worth
+            roots = conserving(self.grid, roots, self._marks, channels)
         if self.survey is not None:
             roots = self.survey.filled(roots, channels)
         field = RootField(self.grid, roots, channels, noise)
@@ -199,6 +197,14 @@ class IrradianceCache:
             chosen = [v for i, v in enumerate(values) if i % self.channels < channels]
             scattered.append([self._tensor([v]).array for v in chosen])
         return DirectionalField(self.directional, self.grid, *scattered)
+
+    @property
+    def _marks(self) -> mi.Bool:
+        """Of all voxels, whether they are active."""
+        result = dr.zeros(mi.Bool, self.grid.voxel_count)
+        if self.active_count:
+            dr.scatter(result, mi.Bool(True), self.active)
+        return result
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Variance of the voxels over their squared mean, at most 1; 0 where it is not known, or

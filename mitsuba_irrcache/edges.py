@@ -28,7 +28,6 @@ class Edges:
     """The cells of a cache over ``grid`` that surfaces cut, and the planes that stand for these."""
 
     def __init__(self, scene: mi.Scene, grid: Grid) -> None:
-        self.inner = grid
         self.grid = Extension(grid).grid  #: that lookups interpolate on
         self.cells = tuple(n - 1 for n in self.grid.sides)
         count = int((self.grid.resolution - 1).prod())
@@ -82,17 +81,6 @@ class Edges:
         )
         offset = dr.dot(normal, middle - hit) - dr.dot(steps, first)
         return nearest < dr.inf, steps.x, steps.y, steps.z, offset
-
-    def touch(self, voxel: mi.UInt32) -> mi.Bool:
-        """Whether a cell around these voxels of the cache is cut."""
-        found = mi.Bool(False)
-        if not self.count:
-            return found
-        place, (width, height, _) = self.inner.places(voxel), map(mi.UInt32, self.cells)
-        for corner in CORNERS:
-            x, y, z = (p + c for p, c in zip(place, corner, strict=True))
-            found |= dr.gather(mi.UInt32, self._number, (z * height + y) * width + x) > 0
-        return found
 
     @dr.syntax
     def corrected(self, field: RootField, p: mi.Point3f, phi: mi.Float | mi.Color3f, active):

@@ -20,7 +20,6 @@ from .grid import Grid
 from .lamps import Falloff
 from .medium import MediumGrid
 from .memory import require_memory
-from .shadows import Shadows
 from .solvers import path, sweep
 from .solvers.directional_sweep import DirectionalSweep, least_batch
 from .solvers.sweep import Sweep
@@ -164,8 +163,6 @@ class LitMedium:
         )
         cache.survey, cache.directional = survey, directional
         cache.falloff = Falloff.of(scene, grid)
-        edges = survey.edges if survey is not None else None
-        cache.shadows = Shadows.of(scene, medium, grid, edges)
         self.saved_samples = 0
         if not self.file:
             return cache

@@ -32,6 +32,9 @@ ROUNDS = 8
 #: err by 1/8, and interpolating these between voxels of edge 2h to the centres of the fine ones,
 #: where the difference is taken, by 3/8 (1/3 on average over all places).
 COARSE_TO_FINE = (1 / 12) / (1 / 8 + 3 / 8)
+#: What is left of this, about, where interpolation keeps the light of voxels (`conservation`): of
+#: smooth light nothing, of a CT head and a cloud 0.5 to 0.7 of the error of the image.
+KEPT = 0.6
 
 
 class UncertaintyField:
@@ -69,7 +72,8 @@ def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
         phi, error = phi * smooth, error * smooth
     root = dr.sqrt(phi)
     # Of twice the size in Phi, relatively; without a quotient, which explodes in shadows.
-    bias = 2 * COARSE_TO_FINE * (_at_half_resolution(cache, root) - root)
+    left = COARSE_TO_FINE * (KEPT if cache.correlated else 1)
+    bias = 2 * left * (_at_half_resolution(cache, root) - root)
     extension = Extension(cache.grid)
     roots, deviations, biases = (
         _everywhere(cache, values) for values in (root, dr.select(phi > 0, error / root, 0), bias)

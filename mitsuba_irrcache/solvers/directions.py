@@ -2,30 +2,86 @@
 
 A set is of pairs of opposite directions, spread evenly and turned at random, so that every
 direction alone is uniform. Its weights integrate spherical harmonics up to degree 3 exactly: inside
-dense matter radiance has no others, whatever the turn.
+dense matter radiance has no others, whatever the turn. The sets of several passes together are as
+even as one of so many directions: independent turns would leave three times the noise.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+from itertools import combinations
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.polynomial.legendre import legval
 
 from mitsuba_irrcache.medium import MediumGrid
 
 _GOLDEN = (1 + 5**0.5) / 2
+#: One over the root of x^3 = x + 1: steps of it are spread evenly.
+_STEP = 0.7548776662466927
+#: What a set, of several that share their directions, is to integrate, and how much it matters:
+#: spherical harmonics by their degree.
+DEGREES = {2: 4.0, 4: 2.0, 6: 0.5, 8: 0.2}
+#: Rounds of exchange between sets, at most; few are needed.
+ROUNDS = 8
 
 
 def spread(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """``count`` directions (n, 3) of one hemisphere, and the solid angle (n) that each of them
     stands for; so does its opposite.
     """
-    i = np.arange(count)
-    z = 1 - (i + 0.5) / count
-    radius, angle = np.sqrt(1 - z * z), 2 * np.pi * i / _GOLDEN
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    return spread_together(1, count, rng)[0]
+
+
+def spread_together(
+    sets: int, count: int, rng: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """As many ``sets`` of `spread` directions, which are spread evenly together, too."""
+    points, members = _shared_out(sets, count)
     points = points @ _rotation(rng).T
-    return points, _weights(points)
+    return [(points[own], _weights(points[own])) for own in members]
+
+
+@lru_cache(maxsize=32)
+def _shared_out(sets: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of one hemisphere on a Fibonacci spiral, and which of them each set has."""
+    number = np.arange(sets * count)
+    z, turn = 1 - (number + 0.5) / len(number), number / _GOLDEN % 1
+    radius, angle = np.sqrt(1 - z * z), 2 * np.pi * turn
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    members = _strata(sets, turn, 1 / _GOLDEN)
+    # The squared error of a set's integrals is the sum of this over all pairs of its points, by the
+    # addition theorem. Two sets exchange those two points that lower it most.
+    factors = np.zeros(max(DEGREES) + 1)
+    for degree, weight in DEGREES.items():
+        factors[degree] = weight * (2 * degree + 1)
+    error = legval(points @ points.T, factors)
+    for _ in range(ROUNDS):
+        exchanged = False
+        for a, b in combinations(range(sets), 2):
+            first, second = members[a], members[b]
+            within, beyond = error[np.ix_(first, first)], error[np.ix_(second, second)]
+            between = error[np.ix_(first, second)]
+            out = between.sum(axis=1) - within.sum(axis=1) + np.diag(within)
+            into = between.sum(axis=0) - beyond.sum(axis=1) + np.diag(beyond)
+            change = out[:, None] + into - 2 * between
+            i, j = np.unravel_index(change.argmin(), change.shape)
+            if change[i, j] < -1e-9:
+                first[i], second[j], exchanged = second[j], first[i], True
+        if not exchanged:
+            break
+    return points, members
+
+
+def _strata(sets: int, place: np.ndarray, step: float) -> np.ndarray:
+    """Numbers (sets, n) of points for each of so many ``sets``: one of each as many in a row, by
+    the order of their ``place`` in [0, 1), which goes round by ``step`` from row to row.
+    """
+    rows = place.reshape(-1, sets) - step * np.arange(len(place) // sets)[:, None]
+    order = np.argsort(rows % 1, axis=1)
+    return np.ascontiguousarray((order + sets * np.arange(len(order))[:, None]).T)
 
 
 def _weights(points: np.ndarray) -> np.ndarray:
@@ -81,14 +137,16 @@ class Sky:
                 self.near.append(emitter)
 
     def tables(
-        self, passes: int, pairs: int, channels: int, rng: np.random.Generator
+        self, passes: int, pairs: int, channels: int, rng: np.random.Generator, first: int = 0
     ) -> tuple[list[tuple], np.ndarray]:
-        """Directions for a number of passes, and the light from far away along them.
+        """Directions for a number of passes, and the light from far away along them; before these,
+        if wanted, for a ``first`` pass of so many pairs.
 
         Returns arguments of `Lattice.table`, those of each pass, and the factors (channels) of what
         these give: where channels differ by a factor only, light has a single one.
         """
-        tables = [self.rows(pairs, rng) for _ in range(passes)]
+        tables = self.rows(1, first, rng) if first else []
+        tables += self.rows(passes, pairs, rng)
         light = np.concatenate([table[1] for table in tables])
         brightest = light.max(axis=(0, 1))
         colour = brightest / brightest.max() if brightest.max() > 0 else np.ones(channels)
@@ -99,19 +157,33 @@ class Sky:
             ], colour
         return tables, np.ones(channels)
 
-    def rows(self, pairs: int, rng: np.random.Generator) -> tuple:
-        """Directions of a pass, irradiance along both ways (n, 2, channels), weights, offsets: an
+    def rows(self, passes: int, pairs: int, rng: np.random.Generator) -> list[tuple]:
+        """Directions of passes, irradiance along both ways (n, 2, channels), weights, offsets: an
         even set, which light from voxels takes too, and those that only emitters need.
         """
-        directions, weights = spread(pairs, rng)
-        colours = dr.size_v(mi.Spectrum)
+        even = spread_together(passes, pairs, rng)
+        varies = (
+            self._environment is not None
+            and self._environment.class_name() != "ConstantBackgroundEmitter"
+        )
+        bright = self._bright_rows(passes, pairs, rng) if varies else [None] * passes
+        return [self._pass(*own, more, rng) for own, more in zip(even, bright, strict=True)]
+
+    def _pass(
+        self,
+        directions: np.ndarray,
+        weights: np.ndarray,
+        bright: tuple | None,
+        rng: np.random.Generator,
+    ) -> tuple:
+        """A pass of `rows`, with ``bright`` ones if the environment varies."""
+        pairs, colours = len(directions), dr.size_v(mi.Spectrum)
         light = np.zeros((pairs, 2, colours))
         rows = [(directions, light, weights)]
-        if self._environment is not None:
-            if self._environment.class_name() == "ConstantBackgroundEmitter":
-                light += self._both_ways(directions) * weights[:, None, None]
-            else:
-                rows.append(self._bright_rows(pairs, rng))
+        if bright is not None:
+            rows.append(bright)
+        elif self._environment is not None:
+            light += self._both_ways(directions) * weights[:, None, None]
         lines = max(1, pairs // SUN_SHARE)
         for direction, irradiance in self._suns:
             ways = np.stack([irradiance / lines, np.zeros(colours)])
@@ -124,28 +196,38 @@ class Sky:
             offsets[end - lines : end] = (offsets[end - 1] + _even(lines)) % 1
         return *joined, offsets
 
-    def _bright_rows(self, pairs: int, rng: np.random.Generator) -> tuple:
-        """Directions of an environment that varies: half of them even, half by its luminance. One
-        may come from either half, and as the opposite of one: what it stands for is one over the
-        density of all ways to get it.
+    def _bright_rows(self, passes: int, pairs: int, rng: np.random.Generator) -> list[tuple]:
+        """Directions of an environment that varies, for each pass: half of them even, half by its
+        luminance. One may come from either half, and as the opposite of one: what it stands for is
+        one over the density of all ways to get it.
         """
         even, bright = pairs - pairs // 2, pairs // 2
-        directions = np.concatenate([spread(even, rng)[0], self._bright(bright, rng)])
-        angle = 1 / (even / (2 * np.pi) + bright * self._density(directions))
-        return directions, self._both_ways(directions) * angle[:, None, None], np.zeros(pairs)
+        rows = []
+        sets = spread_together(passes, even, rng), self._bright(passes, bright, rng)
+        for (plain, _), chosen in zip(*sets, strict=True):
+            directions = np.concatenate([plain, chosen])
+            angle = 1 / (even / (2 * np.pi) + bright * self._density(directions))
+            light = self._both_ways(directions) * angle[:, None, None]
+            rows.append((directions, light, np.zeros(pairs)))
+        return rows
 
     def _both_ways(self, directions: np.ndarray) -> np.ndarray:
         """Radiance (n, 2, channels) along directions and their opposites."""
         both = [environment_radiance(self._environment, s * directions) for s in (1, -1)]
         return np.stack(both, axis=1)
 
-    def _bright(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Directions (n, 3) of light from the environment, by its own density."""
-        samples = ((_even(count).T + rng.random((2, 1))) % 1).astype(np.float32)
+    def _bright(self, sets: int, count: int, rng: np.random.Generator) -> list[np.ndarray]:
+        """Sets of directions (n, 3) of light from the environment, by its own density, all of them
+        together evenly.
+        """
+        points = _even(sets * count)
+        members = _strata(sets, points[:, 1], _STEP)
+        samples = ((points.T + rng.random((2, 1))) % 1).astype(np.float32)
         record, _ = self._environment.sample_direction(
-            dr.zeros(mi.Interaction3f, count), mi.Point2f(samples)
+            dr.zeros(mi.Interaction3f, sets * count), mi.Point2f(samples)
         )
-        return -np.array(record.d, dtype=np.float64).T
+        directions = -np.array(record.d, dtype=np.float64).T
+        return [directions[own] for own in members]
 
     def _density(self, directions: np.ndarray) -> np.ndarray:
         """Density (n) with which the environment draws directions or their opposites [1/sr]."""
@@ -165,7 +247,7 @@ class Sky:
 def _even(count: int) -> np.ndarray:
     """Points (n, 2) that lie evenly in the unit square."""
     i = np.arange(count)
-    return np.stack([(i + 0.5) / count, i * 0.7548776662466927 % 1], axis=1)
+    return np.stack([(i + 0.5) / count, i * _STEP % 1], axis=1)
 
 
 def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -> mi.Spectrum:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
-from mitsuba_irrcache.solvers.directions import Sky, spread
+from mitsuba_irrcache.solvers.directions import Sky, spread, spread_together
 from mitsuba_irrcache.solvers.lattice import Lattice
 from mitsuba_irrcache.solvers.scattering import Level
 
@@ -47,15 +47,15 @@ class Pass:
         """All orders of scattering, of which ``b`` is the first, for so many further ``passes``:
         what is left of its error these correct, and divide by their number.
         """
-        return level.solve(b, self._between, tolerance=max(1.0, passes / 2))
+        return level.solve(b, self.between, tolerance=max(1.0, passes / 2))
 
     def corrected(self, level: Level, phi: mi.Float, swept: mi.Float) -> mi.Float:
         """As `Level.corrected`, of a sweep along the lines of this pass."""
-        coarse = [] if level.coarsest else level.coarser.tables(self._between)
+        coarse = [] if level.coarsest else level.coarser.tables(self.between)
         return level.corrected(phi, swept, coarse)
 
     @property
-    def _between(self) -> Rows:
+    def between(self) -> Rows:
         """Those along which voxels send light, none from outside."""
         directions, light, weights, offsets = self.rows
         even = weights != 0  # the others carry light of emitters only
@@ -81,7 +81,7 @@ class ArrivingPass:
         returns: Arrivals | None,
         channels: Sequence[int],
     ) -> None:
-        self.rows, self.inner = rows, inner
+        self.rows, self.inner, self.between = rows, inner, inner
         self.arrivals, self.returns, self.channels = arrivals, returns, channels
         self.numbers = np.arange(start, start + len(rows[0]))
 
@@ -144,10 +144,13 @@ def arriving(
     ``pairs`` are those between voxels.
     """
     several = passes > 1
-    rows = [sky.rows(ARRIVING // 2 if several else pairs, rng) for _ in range(passes)]
-    inner = []
-    for _ in range(passes):
-        directions, weights = spread(pairs, rng)
+    arriving_pairs = ARRIVING // 2 if several else pairs
+    rows = sky.rows(1, arriving_pairs, rng) if several else []
+    rows += sky.rows(passes - len(rows), arriving_pairs, rng)
+    inner, sets = [], [spread(pairs, rng)]
+    if several:
+        sets += spread_together(passes - 1, pairs, rng)
+    for directions, weights in sets:
         black = np.zeros((pairs, *rows[0][1].shape[1:]))
         inner.append((directions, black, weights, rng.random((pairs, 2))))
     arrivals = Arrivals(around, lattice, merged(rows), several, (*seed, 0))

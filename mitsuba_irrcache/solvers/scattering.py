@@ -168,6 +168,17 @@ class Level:
         dr.eval(phi, collided)
         return phi, collided
 
+    def passed_on(self, phi: mi.Float, rows: Sequence[np.ndarray], sets: int) -> mi.Float:
+        """About A phi, irradiance, along ``rows`` of so many ``sets`` of directions: found on the
+        coarser level, if there is one.
+        """
+        directions, light, weights, offsets = rows
+        coarse = self if self.coarsest else self.coarser
+        table = coarse.lattice.table(directions, light, weights / sets, offsets)
+        if self.coarsest:
+            return self.scatter(phi, table)[0]
+        return self.prolong(coarse.scatter(self.restrict(phi), table)[0])
+
     def tables(self, rows: Sequence[np.ndarray], returning: Callable | None = None) -> list[Table]:
         """Those of this level and of all coarser ones for ``rows`` as in `Lattice.table`, along
         which no light enters from outside. ``returning``, if given, makes of a lattice and such a

@@ -27,7 +27,7 @@ from mitsuba_irrcache.solvers.glow import emitted_light
 from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp, split
 from mitsuba_irrcache.solvers.lattice import Lattice
 from mitsuba_irrcache.solvers.layout import side_by_side
-from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass, arriving
+from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass, arriving, merged
 from mitsuba_irrcache.solvers.scattering import Level
 
 #: Directions per voxel of a batch, pairs of opposite ones, at least and at most. Spread evenly
@@ -151,7 +151,8 @@ class Sweep:
             self._emitted = [light]
         media = max(len(self._lattices), len(self._albedo))
         if self._around is None:
-            rows, colour = self._sky.tables(passes, pairs, cache.channels, rng)
+            first = self._first_pairs(pairs)
+            rows, colour = self._sky.tables(passes - bool(first), pairs, cache.channels, rng, first)
             # Channels that differ by a factor only are one.
             grey = media == 1 and rows[0][1].shape[-1] == 1
 
@@ -174,6 +175,18 @@ class Sweep:
         light, moments = layers[: len(LAYERS)], layers[len(LAYERS) :]
         parts = [tuple(chain(*light)), (None,) * cache.channels]
         return (*parts, tuple(chain(*moments))) if moments else tuple(parts)
+
+    def _first_pairs(self, pairs: int) -> int:
+        """Pairs of directions of the pass by which the orders before the last are known, where
+        others have so many ``pairs``; 0 where there are none.
+
+        Few orders are found one by one with more directions, in about the time of all passes:
+        their noise is not made good by those that follow.
+        """
+        orders = self.cache.max_depth - 2
+        if orders <= 0:
+            return pairs if orders else 0
+        return max(pairs, self.cache.batch // 2 // orders)
 
     def _together(self, grey: bool) -> list[tuple[int, ...]]:
         """The channels that are swept at once, of all or of the first one."""
@@ -230,16 +243,22 @@ class Sweep:
         """
         first, *passes = passes
         phi, total = self._collided(level, first, channels, len(passes)), mi.Float(0)
+        used, share = mi.Float(0), dr.opaque(mi.Float, 1 / len(passes))
         for known, each in enumerate(passes, 1):
             received, again = each.scatter(level, phi)
-            total = total + received
-            dr.eval(total)
-            if self.cache.max_depth < 0 and known < len(passes):
+            total, used = total + received, used + phi
+            dr.eval(total, used)
+            if self.cache.max_depth < 0:
                 # Of all orders there is now another estimate: on average they have less noise.
                 again = each.corrected(level, phi, self._with_near_light(again, channels))
                 phi = dr.lerp(phi, again, dr.opaque(mi.Float, 1 / (known + 1)))
                 dr.eval(phi)
-        return total * dr.opaque(mi.Float, 1 / len(passes))
+        if self.cache.max_depth >= 0:
+            return total * share
+        # What first passes sent on is not as well known as it is now. Else their noise would count
+        # three times as much as that of others.
+        rows = merged([each.between for each in passes])
+        return dr.fma(total, share, level.passed_on(phi - used * share, rows, len(passes)))
 
     def _at_active(self, fields: list[mi.Float]) -> list[mi.Float]:
         """The values at the active voxels."""

@@ -92,13 +92,13 @@ ORDERS = {1.0: 1.54237649, 2.0: 0.76483116, 3.0: 0.37801463}
 
 
 def test_all_orders_in_infinite_matter(scenes):
-    """16 mean free paths across, a third of one per voxel. Shells around the distances hold 100 to
-    1000 voxels; 4 %, of which voxels of a third of a mean free path leave 3. ``path`` has a noise
-    without bounds here, like all paths that meet a lamp without a size.
+    """16 mean free paths across, a quarter of one per voxel. Shells around the distances hold 200
+    to 2500 voxels; 2.5 %, of which such voxels leave 1.6. ``path`` has a noise without bounds here,
+    like all paths that meet a lamp without a size.
     """
     to_world = scenes.placement((16.0, 16.0, 16.0))
     lamp = np.array([0.05, 0.11, -0.07])
-    settings = {"max_depth": -1, "resolution": 48, "solver": "sweep", "cache_spp": 128}
+    settings = {"max_depth": -1, "resolution": 64, "solver": "sweep", "cache_spp": 128}
     scene = scenes.load(
         {"type": "irrcache", "rr_depth": 50, **settings},
         scenes.boundary(scenes.medium(1.0, 0.8), to_world), 4, emitter=point(lamp), sun=None,
@@ -113,7 +113,7 @@ def test_all_orders_in_infinite_matter(scenes):
         expected = value * 2 / np.pi / r
         # e^-kr / r is what it is like, so that the shell's width does not matter.
         like = np.exp(-0.71 * (distance[shell] - r)) * r / distance[shell]
-        assert (phi[shell] / like).mean() == pytest.approx(expected, rel=0.04)
+        assert (phi[shell] / like).mean() == pytest.approx(expected, rel=0.025)
 
 
 def test_beside_a_spot_light(scenes):
@@ -124,7 +124,10 @@ def test_beside_a_spot_light(scenes):
     spot = {"type": "spot", "to_world": look, "intensity": 1.0, "cutoff_angle": 30.0}
     cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO))
     means = []
-    for integrator in ({"type": "irrcache", "resolution": 32}, {"type": "volpath"}):
+    for integrator in (
+        {"type": "irrcache", "solver": "sweep", "resolution": 32},
+        {"type": "volpath"},
+    ):
         scene = scenes.load(
             {"max_depth": 2, **integrator}, cube, SIZE,
             emitter=spot, sun=None, sensor=camera(scenes),
