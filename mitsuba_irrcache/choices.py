@@ -28,10 +28,10 @@ MOST_VOXELS, MOST_DIRECTIONAL = 1 << 25, 1 << 21
 #: twice the voxels of the data along an axis: the light falls off within denser ones. On a CT head
 #: of 1.2 per voxel the error of single scattering falls from 0.7 to 0.3 % of the mean.
 DENSE_VOXEL, FINEST = 0.7, 2.0
-#: Directions per voxel of the solver ``sweep``, unless told otherwise: for irradiance, for light by
-#: its direction, where each is more work, and among surfaces, whose light has the noise of the
-#: image's samples besides (twice as many for single scattering).
-SWEPT, SWEPT_BY_DIRECTION, SWEPT_AMONG_SURFACES = 256, 128, 64
+#: Directions per voxel of the solver ``sweep``, unless told otherwise: for all orders of
+#: scattering, and among surfaces, whose light has the noise of the image's samples besides. Twice
+#: as many for single scattering of irradiance, where each is less work and blurs less.
+SWEPT, SWEPT_AMONG_SURFACES = 128, 64
 
 
 def choose_solver(
@@ -178,9 +178,8 @@ def choose_samples(cache: IrradianceCache, solver: str, medium: MediumGrid) -> i
 
 def swept_samples(max_depth: int, medium: MediumGrid) -> int:
     """Directions per voxel of the solver ``sweep``."""
-    if not medium.alone:
-        return SWEPT_AMONG_SURFACES * (2 if max_depth == 2 else 1)
-    return SWEPT if medium.phase is None else SWEPT_BY_DIRECTION
+    once = max_depth == 2 and medium.phase is None
+    return (SWEPT if medium.alone else SWEPT_AMONG_SURFACES) * (2 if once else 1)
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:

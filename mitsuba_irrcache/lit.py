@@ -336,7 +336,7 @@ def _check_memory(
         # Extinction with its neighbours, the light that lines carry, sums and spreads; and where
         # light is scattered again, the voxels' own and what is kept between sweeps.
         sets = channels if together else 1
-        numbers = 5 + 2 * channels + (0 if max_depth == 2 else 12 * sets + 3 * channels)
+        numbers = 5 + 2 * channels + (0 if max_depth == 2 else 5 + 12 * sets + 3 * channels)
         # Moments of one channel are solved for at a time.
         numbers += moments * (3 * channels + (4 if max_depth == 2 else 10))
     else:

@@ -15,6 +15,10 @@ from mitsuba_irrcache.solvers.layout import flat, places_of, slicewise, strides_
 #: this optical depth of a voxel.
 OPAQUE = 16.0
 LEVELS = (1 << 16) - 1
+#: Optical depth of a voxel from which on the extinction of its halves is told apart where light
+#: collides. With one value for both, all orders of scattering in a CT head of 1.2 per voxel were
+#: too bright by 0.5 %.
+DENSE = 0.5
 
 
 class Extinction:
@@ -28,8 +32,10 @@ class Extinction:
         self.grid, self.detail = grid, detail
         #: whether each voxel has a value of its own
         self.own = detail.shape == grid.shape
-        opaque = OPAQUE * np.linalg.norm(grid.coordinates.matrix[:3, :3], axis=1).max()
-        top = float(min(dr.max(sigma_t)[0], opaque))
+        slices = np.linalg.norm(grid.coordinates.matrix[:3, :3], axis=1).max()
+        top = float(min(dr.max(sigma_t)[0], OPAQUE * slices))
+        #: whether it matters to collisions how the extinction changes within a voxel
+        self.dense = top > DENSE * slices
         self.quantum = top / LEVELS
         levels = sigma_t * dr.opaque(mi.Float, LEVELS / top if top else 0)
         self._levels = _packed(_rounded(dr.minimum(levels, LEVELS)))
@@ -41,18 +47,20 @@ class Extinction:
         sides[axis] = self.grid.resolution[axis]
         return sides
 
-    def words(self, by_rows: bool) -> int:
-        """How many `corners` keeps together."""
-        return (1 if by_rows else 2) if self.own else 4
+    def words(self, own: bool, by_rows: bool) -> int:
+        """How many `corners` keeps together, of values that voxels have of their ``own``, or of
+        both halves of slices.
+        """
+        return (1 if by_rows else 2) if own else 4
 
     def corners(self, axis: int, words: int) -> mi.UInt32:
         """For each value of the extinction in all slices along ``axis`` those of four, from it on
-        along both other axes: flat, two ``words`` of two values each, or four words of the means
-        over both halves of a slice, unless voxels have their own values. A single word is only that
+        along both other axes: flat, two ``words`` of two values each that voxels have of their
+        own, or four words of the means over both halves of a slice. A single word is only that
         row of two: the other is read where it is a line's own, half as much memory in all.
         """
         sides = self.sides(axis)
-        if self.own:
+        if words < 4:
             values = None
         elif axis in self._halves:
             values = self._halves[axis]

@@ -85,11 +85,13 @@ class Lattice:
         #: where the corners of each axis begin among all that are kept
         self._first_corner = [0, 0, 0]
         if self.together:
-            words = self._extinction.words(by_rows=False)
-            corners = [self._extinction.corners(axis, words) for axis in range(3)]
             sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
             self._first_corner = np.cumsum([0, *sizes[:2]]).tolist()
-            self._all_corners = joined(corners), words
+            self._all_corners: dict[int, mi.UInt32] = {}  # of all axes
+
+    def _own(self, scatters: bool) -> bool:
+        """Whether lines read the extinction that voxels have of their own, one value of each."""
+        return self._extinction.own and not (scatters and self._extinction.dense)
 
     def places(self, voxels: mi.UInt32) -> mi.UInt32:
         """Where these voxels are among the wanted ones; of others, the number of these."""
@@ -126,7 +128,8 @@ class Lattice:
         velocities = directions @ self._to_voxels.T
         axes = np.abs(velocities).argmax(axis=1)
         ratio = self.detail.resolution / self.grid.resolution
-        last = self.detail.resolution - 1 - (self.lower if self._extinction.own else 0)
+        own = self._own(not by_slice)
+        last = self.detail.resolution - 1 - (self.lower if own else 0)
         for i, (velocity, axis) in enumerate(zip(velocities, axes, strict=True)):
             across = [k for k in range(3) if k != axis]
             order = (*across, axis)
@@ -135,11 +138,7 @@ class Lattice:
             places = strides_of(self._extinction.sides(axis), layout)
             row = [*(int(self.sides[k]) for k in order), *(strides[k] for k in order)]
             row += [int(np.dot(self.lower, strides)), *(places[k] for k in order)]
-            corner = (
-                np.dot(self.lower, places)
-                if self._extinction.own
-                else self.lower[axis] * places[axis]
-            )
+            corner = np.dot(self.lower, places) if own else self.lower[axis] * places[axis]
             row += [int(corner) + self._first_corner[axis]]
             for k, offset in zip(across, offsets[i], strict=True):
                 slope = round(velocity[k] / velocity[axis] * ONE)
@@ -237,9 +236,13 @@ class Lattice:
         rows, lines that meet little else find the one above in a cache; wide volumes that light is
         scattered in would have replaced it.
         """
+        by_rows = not scatters and not self.together
+        words = self._extinction.words(self._own(scatters), by_rows)
         if self.together:
-            return self._all_corners
-        words = self._extinction.words(by_rows=not scatters)
+            if words not in self._all_corners:
+                parts = [self._extinction.corners(k, words) for k in range(3)]
+                self._all_corners[words] = joined(parts)
+            return self._all_corners[words], words
         corners = self._extinction.corners(axis, words)
         dr.eval(corners)
         return corners, words
@@ -278,13 +281,13 @@ class Lattice:
         """
         kind, size = (mi.Vector4f, 4) if scatters else (mi.Float, 1)
         voxels = dr.width(volume) // size  # of all channels
-        most = max(1, COPIES // voxels)
+        most, (corners, words) = max(1, COPIES // voxels), self._corners(0, scatters)
         for start in range(0, len(pairs), most):
             group = Group(table, pairs[start : start + most])
             lanes, row = self._lanes_of(len(group))
             copies = dr.opaque(mi.Float, 0, dr.width(volume) * len(group))
             follow(
-                *self._all_corners, None, copies, volume if scatters else None,
+                corners, words, None, copies, volume if scatters else None,
                 table, group.pair(row), lanes, row * dr.opaque(mi.UInt32, voxels),
                 self._channels(volume, scatters),
             )  # fmt: skip

@@ -66,11 +66,14 @@ def test_size_of_batches(samples, batch):
 
 
 def test_directions_by_default(scenes):
-    """256 in one batch; in two where an error is wanted; those asked for later count."""
+    """128 in one batch, twice as many for single scattering; in two where an error is wanted; those
+    asked for later count.
+    """
     shape = scenes.boundary(scenes.medium(scenes.texture((4, 4, 4), 0.5, 3.0, 1), 0.9))
     for wanted, asked, expected in (
-        ({}, 0, (256, 256)),
-        ({"filter": "bilateral"}, 0, (256, 128)),
+        ({}, 0, (128, 128)),
+        ({"max_depth": 2}, 0, (256, 256)),
+        ({"filter": "bilateral"}, 0, (128, 64)),
         ({}, 64, (64, 64)),
     ):
         scene = scenes.load(

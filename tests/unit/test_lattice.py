@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -329,3 +330,20 @@ def test_sharpening_takes_back_a_mean(monkeypatch):
         flat = np.zeros(grid.shape)
         flat[inside] = 2.5
         np.testing.assert_array_equal(at(inside, flat, axis), np.full(6 * 4 * 6, 2.5))
+
+
+@pytest.mark.parametrize(("scale", "halves"), [(1.0, True), (0.01, False)])
+def test_dense_voxels_have_two_halves(scale, halves):
+    """Lines collide where the medium is, linear between its voxels: in each of these, an eighth of
+    it as in either neighbour. Thin ones have a single value, which is half the work.
+    """
+    grid, layers = Grid((8, 8, 8), np.eye(4)), scale * np.array([0, 1, 5, 8, 2, 0, 3, 1.0])
+    sweep = lines(grid, np.broadcast_to(layers[:, None, None], grid.shape))
+    volume = dr.opaque(mi.Float, 0, grid.voxel_count * 4)
+    directions = np.array([[0.0, 0.0, 1.0]])
+    sweep.scatter(volume, sweep.table(directions, np.zeros((1, 2)), np.ones(1), offsets(1)))
+    depth = np.array(volume).reshape(*grid.shape, 4)[..., 3]  # both ways, over the cross section
+    beside = np.concatenate([layers[:1], layers, layers[-1:]])
+    expected = (beside[:-2] + 6 * layers + beside[2:]) / 8 if halves else layers
+    wanted = np.broadcast_to(2 * expected[:, None, None], grid.shape)
+    np.testing.assert_allclose(depth, wanted, atol=1e-3 * layers.max())
