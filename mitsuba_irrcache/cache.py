@@ -167,20 +167,24 @@ class IrradianceCache:
         to the last bit. Its maximum is that of Phi, or more.
         """
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
-        noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
-        roots = [dr.sqrt(m) * _root_correction(v) for m, v in zip(means, noise, strict=True)]
+        roots, variance = [dr.sqrt(m) for m in means], None
+        if not self.correlated:  # neighbours that err alike do no harm to interpolation
+            noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
+            roots = [r * _root_correction(v) for r, v in zip(roots, noise, strict=True)]
         if all(dr.all(r == roots[0])[0] for r in roots[1:]):
             roots = roots[:1]
         channels = len(roots)
         if self.falloff is not None:
             smooth = dr.rsqrt(self.falloff.of_voxels(self.active))
             roots = [r * smooth for r in roots]
-        roots, noise = (self._tensor(x).array for x in (roots, noise[:channels]))
-        if self.correlated:  # else it would enlarge the noise by more than it is worth
-            roots = conserving(self.grid, roots, self._marks, channels)
+        values = self._tensor(roots).array
+        if self.correlated:
+            values = conserving(self.grid, values, self._marks, channels)
+        else:  # it would enlarge the noise by more than it is worth
+            variance = self._tensor(noise[:channels]).array
         if self.survey is not None:
-            roots = self.survey.filled(roots, channels)
-        field = RootField(self.grid, roots, channels, noise)
+            values = self.survey.filled(values, channels)
+        field = RootField(self.grid, values, channels, variance)
         if self.falloff is not None:
             field.maximum *= self.falloff.maximum(self.active)
         return field
@@ -207,10 +211,8 @@ class IrradianceCache:
         return result
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
-        """Variance of the voxels over their squared mean, at most 1; 0 where it is not known, or
-        neighbours err alike: then it does no harm to interpolation.
-        """
-        variance = None if self.correlated else self._variance(channel)
+        """Variance of the voxels over their squared mean, at most 1; 0 where it is not known."""
+        variance = self._variance(channel)
         if variance is None:
             return dr.zeros(mi.Float, dr.width(mean))
         # Not the quotient of squares: these vanish for light of 1e-19 and less.
