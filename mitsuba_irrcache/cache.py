@@ -179,7 +179,7 @@ class IrradianceCache:
             roots = [r * smooth for r in roots]
         values = self._tensor(roots).array
         if self.correlated:
-            values = conserving(self.grid, values, self._marks, channels)
+            values = conserving(self.grid, values, marked(self.grid, self.active), channels)
         else:  # it would enlarge the noise by more than it is worth
             variance = self._tensor(noise[:channels]).array
         if self.survey is not None:
@@ -201,14 +201,6 @@ class IrradianceCache:
             chosen = [v for i, v in enumerate(values) if i % self.channels < channels]
             scattered.append([self._tensor([v]).array for v in chosen])
         return DirectionalField(self.directional, self.grid, *scattered)
-
-    @property
-    def _marks(self) -> mi.Bool:
-        """Of all voxels, whether they are active."""
-        result = dr.zeros(mi.Bool, self.grid.voxel_count)
-        if self.active_count:
-            dr.scatter(result, mi.Bool(True), self.active)
-        return result
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Variance of the voxels over their squared mean, at most 1; 0 where it is not known."""
@@ -455,6 +447,14 @@ def _sum(terms):
 def _sums(first: list, second: list) -> list:
     """Term by term."""
     return [_sum(pair) for pair in zip(first, second, strict=True)]
+
+
+def marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
+    """Of all voxels of ``grid``, whether they are among ``voxels``."""
+    marks = dr.zeros(mi.Bool, grid.voxel_count)
+    if dr.width(voxels):
+        dr.scatter(marks, mi.Bool(True), voxels)
+    return marks
 
 
 def _root_correction(variance: mi.Float) -> mi.Float:

@@ -38,7 +38,6 @@ def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -
         bend = around[0] + around[1] - 2 * spread
         spread = spread + dr.select(inside, bend / 6, 0)
         stride = stride * mi.UInt32(side)
-    share = dr.select(spread > 0, roots / dr.select(spread > 0, spread, 1), 1)
-    result = roots * dr.sqrt(share)
+    result = roots * dr.select(spread > 0, dr.sqrt(roots / spread), 1)
     dr.eval(result)
     return result

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from .boundary import safe_rcp
-from .cache import active_voxels
+from .cache import active_voxels, marked
 from .errors import IrrcacheError
 from .grid import ConstantField, Field, Grid
 from .macrocells import Macrocells
@@ -77,9 +77,8 @@ class Emission:
         own = SimpleNamespace(macrocells=Macrocells.build(self.field, None))
         nz, ny, nx = cells.shape
         place = np.linalg.inv(cells.coordinates.matrix) @ np.diag([nx, ny, nz, 1.0])
-        marks = dr.zeros(mi.Bool, cells.count)
-        dr.scatter(marks, mi.Bool(True), active_voxels(own, Grid(cells.shape, place)))
-        return marks
+        grid = Grid(cells.shape, place)
+        return marked(grid, active_voxels(own, grid))
 
 
 def bake_emission(value: object, scale: float) -> Emission | None:

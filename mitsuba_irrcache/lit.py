@@ -11,7 +11,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from .cache import BATCH, IrradianceCache, active_voxels
+from .cache import BATCH, IrradianceCache, active_voxels, marked
 from .choices import choose_grid, choose_samples, swept_samples, warn_of_dense_border
 from .directional import Directional, sources_of
 from .errors import CacheFileError, IrrcacheError
@@ -140,7 +140,7 @@ class LitMedium:
         active, survey = active_voxels(medium, grid), None
         if medium.surroundings is not None and self.solver == "path":  # else nothing is among them
             survey = medium.surroundings.survey(scene, grid, medium)
-            active = dr.compress(survey.reach & _marked(grid, active))
+            active = dr.compress(survey.reach & marked(grid, active))
         dark = not scene.emitters() and medium.emission is None
         if medium.albedo.maximum == 0 or dark:
             active = mi.UInt32()
@@ -310,13 +310,6 @@ def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> 
             f'irrcache: cache_file "{file}" contradicts itself: {", ".join(differing)} do not fit '
             "its fingerprint. Delete it."
         )
-
-
-def _marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
-    """Of all voxels of ``grid``, whether they are among ``voxels``."""
-    marks = dr.zeros(mi.Bool, grid.voxel_count)
-    dr.scatter(marks, mi.Bool(True), voxels)
-    return marks
 
 
 def _check_memory(

@@ -268,7 +268,7 @@ MUTANTS = (
     Mutant(
         "interpolated roots do not keep the light",
         "cache.py",
-        "values = conserving(self.grid, values, self._marks, channels)",
+        "values = conserving(self.grid, values, marked(self.grid, self.active), channels)",
         "values = values + 0",
         ("tests/system/test_lamps.py",),
     ),

@@ -144,12 +144,10 @@ def arriving(
     ``pairs`` are those between voxels.
     """
     several = passes > 1
-    arriving_pairs = ARRIVING // 2 if several else pairs
-    rows = sky.rows(1, arriving_pairs, rng) if several else []
-    rows += sky.rows(passes - len(rows), arriving_pairs, rng)
-    inner, sets = [], [spread(pairs, rng)]
-    if several:
-        sets += spread_together(passes - 1, pairs, rng)
+    many, inner = ARRIVING // 2 if several else pairs, []
+    # The first one is apart, the others are even together.
+    rows = sky.rows(1, many, rng) + (sky.rows(passes - 1, many, rng) if several else [])
+    sets = [spread(pairs, rng)] + (spread_together(passes - 1, pairs, rng) if several else [])
     for directions, weights in sets:
         black = np.zeros((pairs, *rows[0][1].shape[1:]))
         inner.append((directions, black, weights, rng.random((pairs, 2))))
