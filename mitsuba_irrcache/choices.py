@@ -14,6 +14,8 @@ from .medium import MediumGrid
 from .obstacles import boxes_meet, corners_of, obstacle
 from .solvers import sweep
 
+#: Why something is as a property says.
+AS_TOLD = "as told"
 #: Optical depth of a voxel at the boundary of a medium from which on the pixels there are off by
 #: more than 10 % (a homogeneous cube; at half of it, by 5 %).
 DENSE_BORDER = 1.0
@@ -41,7 +43,7 @@ def choose_solver(
 
     Raises IrrcacheError where ``sweep`` is told that cannot be used.
     """
-    reason = "as told" if solver == "path" else None
+    reason = AS_TOLD if solver == "path" else None
     reason = reason or _why_not_sweep(scene, medium, max_depth, resolution)
     if medium.phase is not None and medium.phase.forward:
         _check_sharp(medium, reason, max_depth)
@@ -55,7 +57,7 @@ def choose_solver(
     if reason:
         return "path", reason
     if solver == "sweep":
-        return solver, "as told"
+        return solver, AS_TOLD
     if medium.alone:
         return "sweep", "all light comes from far away or from points"
     return "sweep", "no surface and no other medium is among the voxels"
@@ -67,16 +69,17 @@ def _check_sharp(medium: MediumGrid, reason: str | None, max_depth: int) -> None
     """
     cosine = medium.phase.forward + (1 - medium.phase.forward) * float(medium.phase.moments[1])
     sharp = f'irrcache: medium "{medium.name}" scatters sharply, with a mean cosine of {cosine:.2f}'
-    remedy = 'make it broader, or render this scene with "volpath".'
+    remedy = 'make it broader, or render this scene with "volpath"'
     if reason:
+        why = AS_TOLD if reason == AS_TOLD else f"since {reason}"
+        remedy = f'set solver to "auto", {remedy}' if reason == AS_TOLD else remedy
         raise UnsupportedSceneError(
-            f'{sharp}, too sharply for the solver "path", which is used, {reason}. Set solver to '
-            f'"auto", {remedy}'
+            f'{sharp}, too sharply for the solver "path", which is used, {why}; {remedy}.'
         )
     if max_depth >= 0:
         raise UnsupportedSceneError(
-            f"{sharp}: light of all orders is known, not of max_depth {max_depth}. Set max_depth "
-            f"to -1, {remedy}"
+            f"{sharp}: light of all orders is known, not of max_depth {max_depth}; set max_depth "
+            f"to -1, {remedy}."
         )
 
 
@@ -89,12 +92,8 @@ def _why_not_sweep(
         if not sweep.takes(emitter):
             kind = f'"{emitter.id()}" ({emitter.class_name()})'
             return f"emitter {kind} is neither far away nor a point nor an even area"
-    if medium.phase is not None and medium.emission is not None:
-        return f"{name} shines, and does not scatter alike to all sides"
     if medium.alone:
         return None
-    if not medium.surroundings.media.isotropic:
-        return "a phase function is not isotropic, and there is more than its medium"
     for shining in medium.surroundings.media.grids:
         if shining.emission is not None:
             return f'medium "{shining.name}" shines among surfaces'
@@ -132,7 +131,7 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
         grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
         reason = f"of the medium, {least} to {most} among surfaces"
     elif resolution:
-        grid, reason = Grid.near_cubic(frame, resolution), "as told"
+        grid, reason = Grid.near_cubic(frame, resolution), AS_TOLD
     elif data is None:
         count = np.clip(np.ceil(per_path), 32, 96)
         grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"

@@ -8,9 +8,9 @@ tell. What is scattered into the direction of a ray is
     J = Phi / (4 pi) f,   Phi f = Phi + sum_lm 4 pi g_l Y_lm L_lm + sum_k (4 pi p_k - 1) E_k
 
 where L_lm leaves out the light E_k of narrow lights. (Of lamps, which have a size, it does not, and
-p_k is without the degrees that L_lm has: only what these lack is taken from one direction.) Phi is
-what it is in isotropic media; the *factor* f is that of values interpolated alike, so that what is
-noisy or dark weighs little.
+p_k is without the degrees that L_lm has: only what these lack is told by one direction, blurred as
+the lamp's size has it.) Phi is what it is in isotropic media; the *factor* f is that of values
+interpolated alike, so that what is noisy or dark weighs little.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from .grid import Grid
 from .layers import interleaved
 from .phase import Phase
 
-#: Half the angle that a lamp may take up to be narrow; larger ones are smooth enough.
-WIDEST = float(np.deg2rad(35))
+#: Sine of half the angle that a lamp may take up to be told apart: one has to be beside it.
+WIDEST = 0.95
 #: Half the angle within which light from something without a size is its own.
 NARROWEST = 0.005
 #: Half the angle of a bright spot of the sky; the share of the sky's light that makes it one
@@ -32,24 +32,31 @@ NARROWEST = 0.005
 SPOT, SPOT_SHARE, MOST_SPOTS = float(np.deg2rad(4)), 0.02, 4
 #: Directions that are drawn to find these.
 SPOT_SAMPLES = 1 << 16
-#: Lamps that are told apart.
-MOST_LAMPS = 8
+#: Lamps that are told apart, and points of each that tell how it lies.
+MOST_LAMPS, POINTS = 8, 1024
+#: Terms of a series of Legendre polynomials that are left out beyond the last one larger than this.
+NO_TERM = 1e-3
 #: Values in one load.
 WIDTH = 4
 
 
 class Source:
     """A narrow light: at ``place``, or, if ``far``, in the direction ``place``; ``size`` is its
-    radius, or half its angle.
+    radius, or half its angle; ``covariance`` (3, 3) that of the points of a lamp.
     """
 
-    def __init__(self, place: np.ndarray, size: float, far: bool) -> None:
+    def __init__(
+        self, place: np.ndarray, size: float, far: bool, covariance: np.ndarray | None = None
+    ) -> None:
         self.far = far
         self._direction, self._cosine = np.array(place), np.cos(size)
         #: whether it is so narrow that nothing of its light has to be in the moments
         self.sharp = far or not size
         self.place = mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in place))
         self._size = dr.opaque(mi.Float, float(np.cos(size) if far else size))
+        if covariance is not None:
+            rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in covariance]
+            self._covariance = [mi.Vector3f(*row) for row in rows]
 
     def seen_from(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
         """The direction to it, and the cosine of the angle within which light is its own: 2 where
@@ -60,12 +67,22 @@ class Source:
         way = self.place - mi.Vector3f(p)
         distance = dr.norm(way)
         sine = dr.maximum(self._size / distance, NARROWEST)
-        cosine = dr.select(sine < float(np.sin(WIDEST)), dr.sqrt(1 - dr.square(sine)), 2)
+        cosine = dr.select(sine < WIDEST, dr.sqrt(1 - dr.square(sine)), 2)
         return way / distance, cosine
 
+    def variance(self, p: mi.Point3f) -> mi.Float:
+        """Of the angles from its middle to its points, as a lamp is seen from ``p``: the mean of
+        their squares.
+        """
+        way = self.place - mi.Vector3f(p)
+        inverse = dr.rcp(dr.squared_norm(way))
+        along = sum(w * dr.dot(row, way) for w, row in zip(way, self._covariance, strict=True))
+        total = sum(row[i] for i, row in enumerate(self._covariance))
+        return dr.maximum(total - along * inverse, 0) * inverse
+
     def covers(self, directions: np.ndarray) -> np.ndarray:
-        """Whether light from each of ``directions`` (..., 3) is its own; it is ``far``."""
-        return directions @ self._direction >= self._cosine
+        """Whether light from each of ``directions`` (..., 3) is its own, if it is ``far``."""
+        return (directions @ self._direction >= self._cosine) & self.far
 
 
 class Directional:
@@ -85,6 +102,15 @@ class Directional:
         self._degrees = [
             dr.opaque(mi.Float, float((2 * degree + 1) * phase.moments[degree]))
             for degree in range(1, self.order + 1)
+        ]
+        # Those of the phase function itself; and less what the moments tell.
+        terms = 2 * np.arange(len(phase.all_moments)) + 1
+        own = phase.all_moments * terms / (1 - phase.forward)
+        rest = own - phase.moments * terms * (np.arange(len(own)) <= self.order)
+        last = int(np.flatnonzero(np.abs(own) > NO_TERM)[-1]) + 1
+        self._terms = [
+            tuple(dr.opaque(mi.Float, float(v)) for v in pair)
+            for pair in zip(own[:last], rest[:last], strict=True)
         ]
 
     @property
@@ -110,21 +136,65 @@ class Directional:
             smooth = [m + y * light for m, y in zip(smooth, basis, strict=True)]
         return smooth + narrow
 
+    def shines(
+        self, origin: mi.Point3f, direction: mi.Vector3f, far: mi.Bool, near: mi.Bool
+    ) -> mi.Bool:
+        """Whether a narrow light is what is met along rays, those that meet something ``far`` away,
+        or an emitter ``near``.
+        """
+        found = mi.Bool(False)
+        for source in self.sources:
+            towards, cosine = source.seen_from(origin)
+            found |= (far if source.far else near) & (dr.dot(direction, towards) >= cosine)
+        return found
+
+    def apart(self, directions: np.ndarray, light: np.ndarray) -> list[np.ndarray]:
+        """Of ``light`` (n, 2, channels) along ``directions`` (n, 3) and their opposites what is not
+        of narrow lights far away, then that of each (0 for others).
+        """
+        towards, parts = np.stack([-directions, directions], axis=1), []
+        for source in self.sources:
+            own = light * source.covers(towards)[..., None]
+            light = light - own
+            parts.append(own)
+        return [light, *parts]
+
     def basis(self, direction: mi.Vector3f) -> list[mi.Float]:
         """What the smooth moments count for a ray along ``direction``."""
         values = dr.sh_eval(direction, self.order)[1:]
         return [factor * y for factor, y in zip(self._factors, values, strict=True)]
 
-    def gains(self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
-        """What the narrow lights count for a ray along ``direction`` at ``p``."""
+    def gains(
+        self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool, with_peak: bool = True
+    ) -> list[mi.Float]:
+        """What the narrow lights count for a ray along ``direction`` at ``p``; without a forward
+        peak, if wanted, light in which counts as not scattered.
+        """
         found = []
         for source in self.sources:
             towards, _ = source.seen_from(p)
-            gain = self.phase.gain(p, direction, towards, active) - 1
-            if not source.sharp:
-                gain -= self._smooth(dr.dot(direction, towards))
-            found.append(gain)
+            cosine = dr.dot(direction, towards)
+            if not with_peak and self.phase.forward:
+                found.append(self._smooth(cosine) if source.sharp else mi.Float(0))
+                continue
+            gain = self.phase.gain(p, direction, towards, active)
+            found.append(gain - 1 if source.sharp else self._rest(gain, cosine, source.variance(p)))
         return found
+
+    def _rest(self, gain: mi.Float, cosine: mi.Float, variance: mi.Float) -> mi.Float:
+        """What moments do not tell of a lamp whose angles have this ``variance``, where ``gain`` is
+        4 pi p in its middle. Being as wide takes exp(-l (l + 1) variance / 4) of degree l.
+        """
+        before, legendre, result = mi.Float(0), mi.Float(1), mi.Float(0)
+        left, ratio, blur = mi.Float(1), mi.Float(1), dr.exp(-0.5 * variance)
+        for degree, (own, rest) in enumerate(self._terms):
+            result += rest * left * legendre
+            gain = gain - own * legendre
+            following = ((2 * degree + 1) * cosine * legendre - degree * before) / (degree + 1)
+            before, legendre = legendre, following
+            ratio *= blur
+            left *= ratio
+        return dr.fma(gain, left, result)
 
     def _smooth(self, cosine: mi.Float) -> mi.Float:
         """4 pi p - 1, as far as the moments tell."""
@@ -134,6 +204,28 @@ class Directional:
             following = ((2 * degree + 1) * cosine * legendre - degree * before) / (degree + 1)
             before, legendre = legendre, following
         return result
+
+
+def nothing(count: int) -> list[mi.Spectrum]:
+    """So many sums of light, 0 so far."""
+    return [mi.Spectrum(0) for _ in range(count)]
+
+
+def added(
+    sums: list[mi.Spectrum],
+    position: mi.Point3f,
+    towards: mi.Vector3f,
+    uncollided: mi.Spectrum,
+    scattered: mi.Spectrum,
+    directional: Directional | None,
+) -> list[mi.Spectrum]:
+    """``sums``, an irradiance and its `Directional.moments` if it has any, with the light that
+    comes to ``position`` from one direction.
+    """
+    found = [uncollided + scattered]
+    if directional is not None:
+        found += directional.moments(position, [(towards, uncollided, scattered)])
+    return [a + b for a, b in zip(sums, found, strict=True)]
 
 
 class DirectionalField:
@@ -155,12 +247,19 @@ class DirectionalField:
         dr.eval(self.data)
 
     def factor(
-        self, p: mi.Point3f, direction: mi.Vector3f, basis: list[mi.Float], active: mi.Bool
+        self,
+        p: mi.Point3f,
+        direction: mi.Vector3f,
+        basis: list[mi.Float],
+        active: mi.Bool,
+        with_peak: bool = True,
     ) -> mi.Float | mi.Color3f:
-        """At ``p`` for a ray along ``direction``, for which ``basis`` is that of `Directional`."""
+        """At ``p`` for a ray along ``direction``, for which ``basis`` is that of `Directional`;
+        ``with_peak`` is as of its `gains`.
+        """
         directional = self.directional
         values = self._interpolated(self.grid.coordinates.point(p), active)
-        weights = basis + directional.gains(p, direction, active)
+        weights = basis + directional.gains(p, direction, active, with_peak)
         found = []
         for c in range(self.channels):
             phi, *moments = values[c * self._row : (c + 1) * self._row]
@@ -193,10 +292,16 @@ def sources_of(scene: mi.Scene) -> list[Source]:
             found += _spots(emitter)
     for shape in scene.shapes():
         if shape.is_emitter():
-            box = shape.bbox()
-            radius = 0.5 * float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
-            lamps.append(Source(np.array(box.center()).ravel(), radius, far=False))
+            lamps.append(_lamp(shape))
     return found + lamps[:MOST_LAMPS]
+
+
+def _lamp(shape: mi.Shape) -> Source:
+    box, rng = shape.bbox(), np.random.default_rng(POINTS)
+    radius = 0.5 * float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
+    points = shape.sample_position(0.0, mi.Point2f(np.float32(rng.random((2, POINTS))))).p
+    covariance = np.cov(np.array(points, dtype=np.float64))
+    return Source(np.array(box.center()).ravel(), radius, False, covariance)
 
 
 def _sampled(emitter: mi.Emitter) -> mi.DirectionSample3f:

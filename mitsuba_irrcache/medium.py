@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from copy import copy
 
 import drjit as dr
 import mitsuba as mi
@@ -42,6 +43,7 @@ class MediumGrid:
         #: the power of transmittance that is left of light if what is scattered into a forward peak
         #: is taken from it, too (see `similarity`)
         self.straight = 1.0
+        self._with_peak: MediumGrid | None = None
         #: what it is called among others
         self.name = ""
         #: Mitsuba's medium, as rays carry it, and what else there is in the scene; None where
@@ -78,6 +80,15 @@ class MediumGrid:
     def shortest_edge(self) -> float:
         """Of a voxel of the extinction [scene units]; infinite where nothing varies."""
         return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
+
+    @property
+    def with_peak(self) -> MediumGrid:
+        """The medium before a forward peak was taken away from it."""
+        return self._with_peak or self
+
+    def keep_peak(self) -> None:
+        """Remembers the medium as it is."""
+        self._with_peak = copy(self)
 
     def contains(self, p: mi.Point3f) -> mi.Bool:
         """Whether a point is in the medium."""

@@ -40,10 +40,17 @@ class Phase:
     """
 
     def __init__(
-        self, plugin: mi.PhaseFunction, moments: np.ndarray, peak: float, forward: float = 0.0
+        self,
+        plugin: mi.PhaseFunction,
+        moments: np.ndarray,
+        peak: float,
+        forward: float = 0.0,
+        all_moments: np.ndarray | None = None,
     ) -> None:
         self.plugin, self.moments, self.peak = plugin, moments, peak
         self.forward = forward
+        #: with that share
+        self.all_moments = moments if all_moments is None else all_moments
 
     def tail(self, order: int) -> float:
         """The largest moment beyond ``order``."""
@@ -68,7 +75,7 @@ class Phase:
         share = float(self.moments[order + 1])
         known = np.arange(len(self.moments)) <= order
         moments = np.where(known, (self.moments - share) / (1 - share), 0)
-        return Phase(self.plugin, moments, self.peak / (1 - share), share)
+        return Phase(self.plugin, moments, self.peak / (1 - share), share, self.moments)
 
     def gain(
         self, p: mi.Point3f, direction: mi.Vector3f, towards: mi.Vector3f, active: mi.Bool = True
@@ -160,7 +167,6 @@ def refuse_sharp(phase: Phase, name: str) -> None:
         f"irrcache: {name} has the phase function {phase.plugin.class_name()} with the mean cosine "
         f"{phase.moments[1]:.2f}, too sharp for a cache: of its Legendre moments beyond order "
         f"{HIGHEST} the largest is {phase.tail(HIGHEST):.2f}, and only up to {TAIL:g} (|g| up to "
-        f'{limit:.2f} of "hg") images are right; sharper ones, up to {most:.2f}, only forward and '
-        "where this medium is all there is in the scene and does not shine. Make it broader, or "
-        'render this scene with "volpath".'
+        f'{limit:.2f} of "hg") images are right; sharper ones, up to {most:.2f}, only forward. '
+        'Make it broader, or render this scene with "volpath".'
     )

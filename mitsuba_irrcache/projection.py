@@ -120,13 +120,25 @@ class Projection:
     def irradiance_at(
         self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> mi.Float | mi.Color3f:
-        """The cached irradiance alone, as much as is seen along ``direction``."""
+        """The cached irradiance alone, as much as paths from surfaces see along ``direction``."""
         phi = self._within_edges(p, self.irradiance.at_world(p, active), active)
         if self.falloff is not None:
             phi = phi * self.falloff.at(p)
         if self.directional is None:
             return phi
-        return phi * self.directional.factor(p, *self.seen_along(direction), active)
+        view = self.seen_along(direction)
+        return phi * self.directional.factor(p, *view, active, with_peak=False)
+
+    @property
+    def blurs(self) -> bool:
+        """Whether light in a forward peak counts as not scattered (see `similarity`)."""
+        return self.directional is not None and self.medium.straight != 1
+
+    def unscattered(self, transmittance: mi.Spectrum) -> mi.Spectrum:
+        """What is left of a ``transmittance`` where it counts as scattered."""
+        if not self.blurs:
+            return transmittance
+        return dr.power(transmittance, dr.opaque(mi.Float, self.medium.straight))
 
     def _within_edges(
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool

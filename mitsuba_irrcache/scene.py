@@ -144,12 +144,13 @@ def bake_general(
             sensor.get_medium() == medium for sensor in scene.sensors()
         ):
             seen.append(grid)
-            if grid.phase is not None and grid.phase.has_peak and alone and emission is None:
-                take_away_peak(grid)
-            elif grid.phase is not None:
+            if grid.phase is not None and not grid.phase.has_peak:
                 refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
     Surroundings(scene, grids)
     place_emission(emission, grids)
+    for grid in seen:
+        if grid.phase is not None and grid.phase.has_peak:
+            take_away_peak(grid)
     if not seen and emission is not None:
         _refuse("all media are behind surfaces, and the emission in them is unknown to volpath")
     if not seen:

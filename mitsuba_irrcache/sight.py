@@ -122,16 +122,11 @@ class SimpleSight:
 
     def _left_of(self, transmittance: mi.Spectrum, direction: mi.Vector3f) -> mi.Spectrum:
         """What the medium leaves of the environment in a ``direction``."""
-        field = self.projection.directional
-        if self.medium.straight == 1 or field is None:
+        if not self.projection.blurs:
             return transmittance
-        narrow = mi.Bool(False)
-        for source in field.directional.sources:
-            if source.far:
-                towards, cosine = source.seen_from(mi.Point3f(0))
-                narrow |= dr.dot(direction, towards) >= cosine
-        power = dr.opaque(mi.Float, self.medium.straight)
-        return dr.select(narrow, dr.power(transmittance, power), transmittance)
+        lights = self.projection.directional.directional
+        narrow = lights.shines(mi.Point3f(0), direction, mi.Bool(True), mi.Bool(False))
+        return dr.select(narrow, self.projection.unscattered(transmittance), transmittance)
 
 
 class Sight:
@@ -149,6 +144,9 @@ class Sight:
         #: the one that gathers most: a dark medium has no errors to tell
         self.projection = max(projections, key=lambda p: p.channel_count)
         self.hide_emitters = hide_emitters
+        #: of narrow lights what is scattered into a forward peak, if there is one, is seen beside
+        #: them
+        self.narrow = next((p.directional.directional for p in projections if p.blurs), None)
         #: the caches hold what paths of any length find; for shorter ones they hold too much
         self.known = self._is_known if max_depth < 0 else None
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
@@ -166,8 +164,8 @@ class Sight:
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
         offset = 1 - sampler.next_1d(active)
         rng = _stream(sampler, active)
-        scattered, background, passed, gathered, end, pointer, stopped, escaped = self._straight(
-            scene, ray, pointer, offset, active
+        scattered, background, passed, gathered, end, pointer, stopped, escaped, unscattered = (
+            self._straight(scene, ray, pointer, offset, active)
         )
         # What is hardly seen is traced rarely.
         chance = dr.minimum(dr.max(passed) * (1 / FAINT), 1)
@@ -187,7 +185,11 @@ class Sight:
         )
         if self.known is not None:
             reflected += last.weight * self._irradiance(last) * dr.inv_four_pi
-        background += dr.select(traced, weight * (straight + reflected), 0)
+        shown = weight
+        if self.narrow is not None:
+            lamp = self.narrow.shines(ray.o, ray.d, far=mi.Bool(False), near=traced)
+            shown = dr.select(lamp, unscattered / chance, weight)
+        background += dr.select(traced, shown * straight + weight * reflected, 0)
         alpha = mi.Float(1)
         if self.hide_emitters or scene.environment() is None:
             clear = dr.select(traced & ~met, weight, 0)
@@ -206,10 +208,11 @@ class Sight:
     ):
         """Up to the first surface that is not null: scattered light, emitters seen, transmittance
         and gathered sums; then the ray that ends there, its medium, and whether it stopped at a
-        surface, or escaped.
+        surface, or escaped; and the transmittance for narrow lights.
         """
         scattered, background, passed = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(1)
         gathered = self.projection.nothing()
+        unscattered = mi.Spectrum(1)
         # Distances are those from the camera all along, so that depths are too.
         segment, pointer, near = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Float(0)
         stopped, escaped, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
@@ -232,6 +235,8 @@ class Sight:
                 background += dr.select(lit, passed * shine, 0)
                 gathered = _added(gathered, sums, passed, scale)
                 passed *= through
+                if dr.hint(self.narrow is not None, mode="scalar"):
+                    unscattered *= projection.unscattered(through)
             # Emitters, and what lies behind them if they are hidden.
             emitter = si.emitter(scene, active)
             shines = active & (emitter != None)  # noqa: E711
@@ -242,7 +247,11 @@ class Sight:
                 shines = mi.Bool(False)
             shines &= crosses | ~valid
             light = emitter.eval(si, shines & lit)
-            background += dr.select(shines & lit, passed * light, 0)
+            left = mi.Spectrum(passed)
+            if dr.hint(self.narrow is not None, mode="scalar"):
+                narrow = self.narrow.shines(ray.o, ray.d, shines & ~valid, shines & valid)
+                left = dr.select(narrow, unscattered, left)
+            background += dr.select(shines & lit, left * light, 0)
             stopped |= valid & ~crosses
             escaped |= active & ~valid
             pointer = dr.select(crosses & null, behind(si, ray.d, pointer), pointer)
@@ -251,7 +260,8 @@ class Sight:
             near = dr.select(crosses, far, near)
             crossings += 1
             active &= crosses & (dr.max(passed) > 0) & (crossings < MOST_CROSSINGS)
-        return scattered, background, passed, gathered, segment, pointer, stopped, escaped
+        found = scattered, background, passed, gathered, segment, pointer, stopped, escaped
+        return *found, unscattered
 
     def _is_known(self, pointer: mi.MediumPtr) -> mi.Bool:
         """Whether the light in a medium is cached."""

@@ -10,7 +10,8 @@ as few moments as a broad one. f is the first moment that is left out. What is s
 narrow lights takes the phase function as it is, divided by 1 - f.
 
 So transmittance counts what is scattered into the peak as not scattered. Of narrow lights that is
-known otherwise: where they are seen themselves, through the medium, it counts as scattered.
+known otherwise: where they are seen themselves, through the medium, it counts as scattered. To
+paths from surfaces, which see light from all sides at once, nothing is scattered into the peak.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ def take_away_peak(medium: MediumGrid) -> None:
     """Makes of ``medium``, whose phase function has a forward peak, the one that is like it but for
     that.
     """
+    medium.keep_peak()
     phase = medium.phase.without_peak()
     share, sigma_t, albedo = phase.forward, medium.sigma_t, medium.albedo
     medium.sigma_t = _combined(lambda s, a: s * (1 - share * a), sigma_t, albedo)

@@ -34,6 +34,12 @@ class Media:
         self.grids = list(grids)
         self.isotropic = all(grid.phase is None for grid in self.grids)
 
+    def around(self, medium: MediumGrid) -> Media:
+        """The same for paths that end in ``medium``, whose light is known, and in no other one:
+        there forward peaks are scattered like all else.
+        """
+        return Media([grid if grid is medium else grid.with_peak for grid in self.grids])
+
     def fly(
         self,
         pointer: mi.MediumPtr,

@@ -19,10 +19,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.directional import Directional
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.lattice import Lattice
 from mitsuba_irrcache.solvers.layout import joined
+from mitsuba_irrcache.solvers.scattering import Level
 from mitsuba_irrcache.solvers.table import Entering, Table
 from mitsuba_irrcache.surroundings import probe
 from mitsuba_irrcache.transport import Start, out_of, trace
@@ -40,14 +42,21 @@ class Around:
     """What is around a medium, as far as its light comes from there.
 
     ``lamps`` are area emitters that lines meet by chance: what the others send straight to a voxel
-    is known otherwise. ``rr_depth`` is that of paths.
+    is known otherwise. ``rr_depth`` is that of paths. ``directional`` is what is to be known of
+    light by its direction, None where the medium is isotropic.
     """
 
     def __init__(
-        self, scene: mi.Scene, medium: MediumGrid, lamps: Sequence[mi.EmitterPtr], rr_depth: int
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        lamps: Sequence[mi.EmitterPtr],
+        rr_depth: int,
+        directional: Directional | None = None,
     ) -> None:
-        self.scene, self.media = scene, medium.surroundings.media
+        self.scene, self.media = scene, medium.surroundings.media.around(medium)
         self.pointer, self.lamps = medium.pointer, list(lamps)
+        self.directional = directional
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
 
@@ -69,40 +78,47 @@ class Arrivals:
         """
         directions, light, weights, offsets = rows
         self.lattice = lattice
-        #: rows along which light may come straight from emitters
-        self.lit = light.any(axis=(1, 2)) | ((weights > 0) & bool(around.lamps))
+        parts = [light] if around.directional is None else around.directional.apart(rows[0], light)
+        #: rows along which light may come straight from emitters; where it is told by its
+        #: direction, from those that are not narrow, and from each that is
+        self.lit = [part.any(axis=(1, 2)) for part in parts]
+        self.lit[0] |= (weights > 0) & bool(around.lamps)
         self._lines = lattice.table(directions, light[..., 0], weights, offsets).rows
         self._cells(np.where(weights > 0, CELLS, LIT_CELLS))
-        found = _follow(around, self, *self._numbers(directions, light, weights), paths, seed)
-        #: for each channel: straight from emitters; all of what does not depend on phi; factors of
-        #: phi; and for all of them, the voxels of phi
-        self.straight, self.emitted, self.returned, self.voxel = found
+        found = _follow(around, self, *self._numbers(directions, parts, weights), paths, seed)
+        #: for each channel: straight from emitters, as of `lit`; all of what does not depend on
+        #: phi; factors of phi; and for all of them, the voxels of phi, and the directions in which
+        #: these are seen, if they matter
+        self.straight, self.emitted, self.returned, self.voxel, self._heading = found
         self._voxels: dict[tuple, mi.UInt32] = {lattice.grid.shape: self.voxel}
 
     @property
-    def kinds(self) -> tuple[list, list, list]:
+    def kinds(self) -> list[list]:
         """All that has channels."""
-        return self.straight, self.emitted, self.returned
+        return [*self.straight, self.emitted, self.returned]
 
-    def directly(self, channels: Sequence[int], table: Table, rows: np.ndarray) -> Entering:
-        """Light straight from emitters, along the lines of a ``table`` of the same lattice for
-        these ``rows``.
+    def directly(
+        self, channels: Sequence[int], table: Table, rows: np.ndarray, part: int = 0
+    ) -> Entering:
+        """Light straight from emitters, that ``part`` of it, along the lines of a ``table`` of the
+        same lattice for these ``rows``.
         """
-        light = joined([self.straight[c] for c in channels])
+        light = joined([self.straight[part][c] for c in channels])
         return Entering(*self._placed(self.lattice, table, rows), light, len(channels))
 
     def returning(
         self,
         channels: Sequence[int],
-        lattice: Lattice,
+        level: Level,
         table: Table,
         rows: np.ndarray,
         emitted: bool,
     ) -> Returning:
         """Light along the lines of a ``table`` for these ``rows``, which follow each other, of the
-        same lattice or that of a coarser grid; without what is ``emitted`` unless that is wanted.
+        same lattice or that of a coarser ``level``; without what is ``emitted`` unless that is
+        wanted.
         """
-        grid = lattice.grid
+        lattice, grid = level.lattice, level.grid
         if grid.shape not in self._voxels:
             self._voxels[grid.shape] = _coarser(self.lattice.grid, grid, self.voxel)
         places, cells = self._placed(lattice, table, rows)
@@ -118,8 +134,11 @@ class Arrivals:
         first = dr.minimum(at, dr.opaque(mi.UInt32, lattice.count - 1)) * len(channels)
         dr.eval(first)
         sources = joined([first + c for c in range(len(channels))])
-        dr.eval(values, sources)
-        return Returning(len(channels), places, cells, sources, *values)
+        heading = None
+        if self._heading is not None:
+            heading = mi.Vector3f(*(dr.gather(mi.Float, x, here) for x in self._heading))
+        dr.eval(values, sources, heading)
+        return Returning(level, len(channels), places, cells, sources, heading, *values)
 
     def _cells(self, most: np.ndarray) -> None:
         """Lays out cells: blocks of lines, so many along an edge that there are not too ``many``
@@ -138,18 +157,18 @@ class Arrivals:
         self._first, self._count = np.concatenate([[0], self._ends[:-1]]), int(self._ends[-1])
 
     def _numbers(
-        self, directions: np.ndarray, light: np.ndarray, weights: np.ndarray
-    ) -> tuple[tuple[mi.UInt32, mi.Float], mi.Float]:
-        """What `_follow` has to know of each row."""
+        self, directions: np.ndarray, parts: list[np.ndarray], weights: np.ndarray
+    ) -> tuple[tuple[mi.UInt32, mi.Float], list[mi.Float]]:
+        """What `_follow` has to know of each row; ``parts`` are those of the light."""
         lines = self._lines
         integers = np.column_stack([self._first, self._sides[:, 0], lines.axis, lines.across[:, 0]])
         sign = np.where(lines.forward, 1.0, -1.0)
-        parts = [sign[:, None] * directions, lines.slopes, lines.starts + self._least]
-        parts += [lines.sides, self._edge, weights]
-        numbers = np.column_stack(parts)
-        ways = np.where(lines.forward[:, None, None], light, light[:, ::-1])
+        columns = [sign[:, None] * directions, lines.slopes, lines.starts + self._least]
+        numbers = np.column_stack([*columns, lines.sides, self._edge, weights])
+        forward = lines.forward[:, None, None]
+        ways = [np.where(forward, light, light[:, ::-1]).ravel().tolist() for light in parts]
         as_list = mi.UInt32([*integers.ravel().tolist(), 0xFFFFFFFF])  # the end, to be searched for
-        return (as_list, mi.Float(numbers.ravel().tolist())), mi.Float(ways.ravel().tolist())
+        return (as_list, mi.Float(numbers.ravel().tolist())), [mi.Float(way) for way in ways]
 
     def begin(
         self, numbers: tuple[mi.UInt32, mi.Float], seed: tuple[int, int, int]
@@ -237,25 +256,28 @@ def _one_of(edge, cell_b, cell_c, least_b, least_c, slope_b, slope_c, nb, nc, na
 
 
 class Returning(Entering):
-    """`Entering` light ``emitted + returned phi(source)``."""
+    """`Entering` light ``emitted + returned phi(source)``, this as it is seen along ``heading``."""
 
     def __init__(
         self,
+        level: Level,
         channels: int,
         places: np.ndarray,
         cells: np.ndarray,
         source: mi.UInt32,
+        heading: mi.Vector3f | None,
         returned: mi.Float,
         emitted: mi.Float | None = None,
     ) -> None:
         super().__init__(places, cells, None, channels)
-        self._source, self._returned, self._emitted = source, returned, emitted
+        self._level, self._source, self._heading = level, source, heading
+        self._returned, self._emitted = returned, emitted
 
     def receive(self, phi: mi.Float | None) -> None:
         """Where the mean irradiance of collisions is ``phi`` (None: 0)."""
         light = dr.zeros(mi.Float, dr.width(self._source))
         if phi is not None:
-            light = self._returned * dr.gather(mi.Float, phi, self._source)
+            light = self._returned * self._level.seen(phi, self._source, self._heading)
         self.values = light if self._emitted is None else light + self._emitted
         dr.eval(self.values)
 
@@ -272,29 +294,33 @@ def _follow(
     around: Around,
     arrivals: Arrivals,
     numbers: tuple[mi.UInt32, mi.Float],
-    colours: mi.Float,
+    colours: list[mi.Float],
     paths: bool,
     seed: tuple[int, int, int],
-) -> tuple[list, list, list, mi.UInt32]:
+) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
     """What arrives along the lines of all cells, both ways in turn; see `Arrivals`."""
     grid = arrivals.lattice.grid
     way, weight, hit, ray, rng = arrivals.begin(numbers, seed)
     pointer = probe(around.scene, ray.o, ray.d)
 
-    light = dr.gather(mi.Spectrum, colours, way)
-    lit = hit & (dr.max(light) > 0)
+    parts = [dr.gather(mi.Spectrum, colour, way) for colour in colours]
+    lit = hit & (dr.max(sum(parts)) > 0)
     if around.lamps:
         lit |= hit & (weight > 0)
     passed, glow, rng = out_of(around.scene, around.media, ray, pointer, around.lamps, rng, lit)
-    straight = dr.select(lit, light * passed + weight * glow, 0)
-    emitted, returned, voxel = straight, mi.Spectrum(0), mi.UInt32(0)
+    parts = [light * passed for light in parts]
+    parts[0] += weight * glow
+    straight = [dr.select(lit, light, 0) for light in parts]
+    emitted, returned, voxel = sum(straight), mi.Spectrum(0), mi.UInt32(0)
+    heading = mi.Vector3f(0, 0, 1)
     if paths:
         begin = Start(ray, pointer, depth=1, pdf=0.0, clear=pointer == around.pointer)
         _, scattered, _, end, _ = trace(
             around.scene, around.media, begin, around.max_depth, around.rr_depth, False, rng,
             hit & (weight > 0), lambda medium: medium == around.pointer,
         )  # fmt: skip
-        emitted = straight + weight * scattered
+        emitted = emitted + weight * scattered
+        heading = end.direction
         returned = weight * end.weight * dr.inv_four_pi
         u = grid.coordinates.point(end.p)
         at = (
@@ -303,7 +329,9 @@ def _follow(
         )
         voxel = grid.index(*at)
     none = dr.zeros(mi.Float, dr.width(weight))
-    layers = [[v + none for v in kind] for kind in (straight, emitted, returned)]
+    straight = [[v + none for v in part] for part in straight]
+    emitted, returned = ([v + none for v in kind] for kind in (emitted, returned))
     voxel = voxel + dr.zeros(mi.UInt32, dr.width(weight))
-    dr.eval(layers, voxel)
-    return *layers, voxel
+    heading = None if around.directional is None else heading + none
+    dr.eval(straight, emitted, returned, voxel, heading)
+    return straight, emitted, returned, voxel, heading

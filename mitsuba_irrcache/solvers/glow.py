@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.directional import Directional, added, nothing
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.tracking import free_flight
 
@@ -14,17 +15,23 @@ STEPS = (3242174889, 2447445414)
 
 @dr.syntax
 def emitted_light(
-    medium: MediumGrid, position: mi.Point3f, count: int, seed: int, number: int
-) -> mi.Spectrum:
-    """Irradiance at ``position`` from the emission of ``medium``, an unbiased estimate by ``count``
-    directions, spread evenly and shifted at random at each position; ``number`` is the batch's.
+    medium: MediumGrid,
+    position: mi.Point3f,
+    count: int,
+    seed: tuple[int, int],
+    directional: Directional | None = None,
+) -> list[mi.Spectrum]:
+    """Irradiance at ``position`` from the emission of ``medium``, and its moments if it is told by
+    its direction: unbiased estimates by ``count`` directions, spread evenly and shifted at random
+    at each position. ``seed`` ends with the number of the batch.
     """
     place = dr.arange(mi.UInt32, dr.width(position))
-    stream = mi.sample_tea_32(dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, number))[0]
+    stream = mi.sample_tea_32(*(dr.opaque(mi.UInt32, s) for s in seed))[0]
     state = mi.sample_tea_32(place, stream)
     rng = mi.PCG32(initstate=mi.UInt64(state[0]) << 32 | mi.UInt64(state[1]), initseq=1)
     shift = [rng.next_uint32(), rng.next_uint32()]
-    total, weight = mi.Spectrum(0), dr.opaque(mi.Float, 4 * dr.pi / count)
+    moments = 0 if directional is None else directional.count
+    total, weight = nothing(1 + moments), dr.opaque(mi.Float, 4 * dr.pi / count)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, count)
     while dr.hint(k < count, label="emission"):
         ray = mi.Ray3f(position, _direction(shift, k))
@@ -32,7 +39,8 @@ def emitted_light(
         *_, rng, light = free_flight(
             medium, ray, dr.maximum(near, 0), far, mi.Spectrum(1), rng, hit
         )
-        total += light * weight
+        # None of it is of narrow lights.
+        total = added(total, position, ray.d, mi.Spectrum(0), light * weight, directional)
         k += 1
     dr.eval(total)
     return total

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.directional import Directional, added, nothing
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.directions import marched
@@ -64,8 +65,8 @@ def _solid_angle(emitter: mi.Emitter, grid: Grid, lower: np.ndarray, upper: np.n
 
 
 class Lamps:
-    """Irradiance at world positions ``p`` in ``medium``: from ``small`` area lights, and from
-    point-like ``lights``.
+    """Irradiance at world positions ``p`` in ``medium``: from ``small`` area lights, with moments
+    where light is told by its direction, and from point-like ``lights``.
     """
 
     def __init__(
@@ -75,9 +76,11 @@ class Lamps:
         small: Sequence[mi.Emitter],
         lights: Sequence[mi.Emitter],
         p: mi.Point3f,
+        directional: Directional | None = None,
     ) -> None:
-        around = medium.surroundings.media.grids
+        around = medium.surroundings.media.around(medium).grids
         self._scene, self._medium, self._p = scene, medium, p
+        self._directional = directional
         self._others = Media([grid for grid in around if grid is not medium])
         self._small = len(small)
         if small:
@@ -88,8 +91,10 @@ class Lamps:
             dr.eval(self._emitters)
         self._lights = [self._from(light) for light in lights]
 
-    def light(self, seed: tuple[int, int]) -> list[mi.Spectrum]:
-        """Irradiance from each point-like light, and a sample of that from all lamps."""
+    def light(self, seed: tuple[int, int]) -> list[list[mi.Spectrum]]:
+        """Irradiance from each point-like light; a sample of that from all lamps, and of its
+        moments.
+        """
         if not self._small:
             return self._lights
         samples = min(max(SAMPLES, self._small), MOST_SAMPLES)
@@ -100,23 +105,26 @@ class Lamps:
         light = _sampled(
             self._scene, self._medium, self._others, self._emitters, self._p,
             dr.opaque(mi.UInt32, self._small), dr.opaque(mi.UInt32, samples), rng,
+            self._directional,
         )  # fmt: skip
         dr.eval(light)
         return [*self._lights, light]
 
-    def _from(self, emitter: mi.Emitter) -> mi.Spectrum:
+    def _from(self, emitter: mi.Emitter) -> list[mi.Spectrum]:
         """Irradiance from a point-like emitter."""
         rng = mi.PCG32(dr.width(self._p))
-        light, _ = _shone(
+        light, *_ = _shone(
             self._scene, self._medium, self._others, emitter, self._p,
             mi.Point2f(0.5), rng,
         )  # fmt: skip
         dr.eval(light)
-        return light
+        return [light]
 
 
 def _shone(scene, medium, others, emitter, p, sample, rng) -> tuple:
-    """One sample of the irradiance at ``p`` straight from an emitter, and the random generator."""
+    """One sample of the irradiance at ``p`` straight from an emitter, the direction it comes from,
+    and the random generator.
+    """
     vertex = dr.zeros(mi.Interaction3f, dr.width(p))
     vertex.p = p
     record, light = emitter.sample_direction(vertex, sample)
@@ -125,14 +133,15 @@ def _shone(scene, medium, others, emitter, p, sample, rng) -> tuple:
     passed, rng = visibility(scene, others, vertex, record.p, medium.pointer, rng, lit)
     lit &= dr.max(passed) > 0
     passed *= marched(medium, mi.Ray3f(p, record.d), record.dist, lit)
-    return dr.select(lit, light * passed, 0), rng
+    return dr.select(lit, light * passed, 0), record.d, rng
 
 
 @dr.syntax
-def _sampled(scene, medium, others, emitters, p, count, samples, rng):
-    """The mean of samples of the irradiance from all of ``count`` lamps."""
+def _sampled(scene, medium, others, emitters, p, count, samples, rng, directional):
+    """The mean of samples of the irradiance from all of ``count`` lamps, and of its moments."""
     shift = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-    total, k = mi.Spectrum(0), mi.UInt32(0)
+    total, k = nothing(1 if directional is None else 1 + directional.count), mi.UInt32(0)
+    weight = mi.Float(count) / mi.Float(samples)
     while dr.hint(k < samples, label="lamps"):
         # The same number on each lamp, as far as it goes; evenly spread over it.
         which = mi.UInt32((mi.Float(k) + shift.z) / mi.Float(samples) * mi.Float(count))
@@ -140,7 +149,7 @@ def _sampled(scene, medium, others, emitters, p, count, samples, rng):
         u = mi.Float(k) * 0.7548776662466927 + shift.x
         v = mi.Float(k) * 0.5698402909980532 + shift.y
         sample = mi.Point2f(u - dr.floor(u), v - dr.floor(v))
-        light, rng = _shone(scene, medium, others, emitter, p, sample, rng)
-        total += light
+        light, towards, rng = _shone(scene, medium, others, emitter, p, sample, rng)
+        total = added(total, p, towards, light * weight, mi.Spectrum(0), directional)
         k += 1
-    return total * (mi.Float(count) / mi.Float(samples))
+    return total

@@ -8,6 +8,8 @@ L_lm is multiplied by g_l wherever light is scattered (see `phase`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,7 +17,7 @@ import numpy as np
 from mitsuba_irrcache.directional import Directional
 from mitsuba_irrcache.solvers.lattice import Lattice, sharpened
 from mitsuba_irrcache.solvers.layout import joined, layers_of
-from mitsuba_irrcache.solvers.passes import Pass, merged
+from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass
 from mitsuba_irrcache.solvers.scattering import Level
 from mitsuba_irrcache.solvers.table import Group, Table
 
@@ -54,11 +56,17 @@ class Moments:
         index = dr.arange(mi.UInt32, width) + number * dr.opaque(mi.UInt32, width)
         return dr.gather(mi.Float, values, index)
 
-    def carry(self, lattice: Lattice, rows: tuple[np.ndarray, ...]) -> mi.Float:
-        """As `Lattice.carry`, for ``rows`` as `Lattice.table` wants them: moments of the light that
-        enters along them, at the wanted voxels.
-        """
-        table = lattice.table(*rows, by_slice=True)
+    def carry(
+        self,
+        lattice: Lattice,
+        directions: np.ndarray,
+        light: np.ndarray,
+        offsets: np.ndarray,
+        entering: Callable | None = None,
+    ) -> mi.Float:
+        """As `Lattice.carry`: moments of the light that enters."""
+        table = lattice.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
+        table.entering = entering(table) if entering is not None else None
         wanted = lattice.wanted
         sums = self.nothing(dr.width(wanted))
         box = lattice.lower, lattice.lower + lattice.sides
@@ -72,24 +80,16 @@ class Moments:
         return [dr.opaque(mi.Float, 0, width) for _ in range(self.count)]
 
     def uncollided(
-        self, passes: list[Pass], lattice: Lattice
+        self, passes: list[Pass] | list[ArrivingPass], lattice: Lattice
     ) -> tuple[mi.Float, list[mi.Float | None]]:
-        """Moments of the light from far away at the wanted voxels, the sum of all ``passes``, but
-        for that of narrow lights; and those of each narrow light (none where it is not far away).
+        """Moments of the light straight from emitters along lines at the wanted voxels, the sum of
+        all ``passes``, but for that of narrow lights; and those of each narrow light (none where it
+        is not far away).
         """
-        directions, light, weights, offsets = merged([p.rows for p in passes])
-        apart = []
-        for source in self.directional.sources:
-            own = np.zeros_like(light)
-            if source.far:
-                own = light * source.covers(np.stack([-directions, directions], axis=1))[..., None]
-                light = light - own
-            apart.append(own)
-        found = []
-        for part in (light, *apart):
-            lit = part.any(axis=(1, 2))
-            rows = directions[lit], part[lit], weights[lit], offsets[lit]
-            found.append(self.carry(lattice, rows) if lit.any() else None)
+        found = [
+            self.carry(lattice, *rows) if len(rows[0]) else None
+            for rows in passes[0].straight(passes, self.directional)
+        ]
         smooth = dr.opaque(mi.Float, 0, self.count * dr.width(lattice.wanted))
         return (smooth if found[0] is None else found[0]), found[1:]
 
@@ -105,7 +105,7 @@ class DirectionalLevel(Level):
     def _coarse(self, *arguments: object) -> DirectionalLevel:
         # What is slow to converge is smooth, and so are its directions.
         smooth = Moments(self.moments.directional, min(self.moments.order, SMOOTH))
-        return DirectionalLevel(*arguments, moments=smooth)
+        return DirectionalLevel(*arguments, self.evenly, moments=smooth)
 
     def restrict(self, values: mi.Float) -> mi.Float:
         coarser = self.coarser
@@ -128,6 +128,8 @@ class DirectionalLevel(Level):
     def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
         """As of `Level`, all moments of it."""
         moments, wanted, voxels = self.moments, self.lattice.wanted, self.grid.voxel_count
+        if phi is not None and table.entering is not None:
+            table.entering.receive(phi)
         received, lost = (moments.nothing(self.lattice.count) for _ in range(2))
         depth = dr.opaque(mi.Float, 0, self.lattice.count)
         scattered = None if phi is None else self._scattered(phi)
@@ -152,6 +154,15 @@ class DirectionalLevel(Level):
         pairs = zip(collided, received, strict=True)
         collided = [dr.select(depth > 0, mean, light) for mean, light in pairs]
         return joined(received), joined(collided)
+
+    def seen(self, phi: mi.Float, place: mi.UInt32, heading: mi.Vector3f | None) -> mi.Float:
+        """As of `Level`."""
+        step, result = dr.opaque(mi.UInt32, self.lattice.count), dr.gather(mi.Float, phi, place)
+        basis = self.moments.directional.basis(heading)
+        for factor in basis[: self.moments.count - 1]:
+            place = place + step
+            result = dr.fma(factor, dr.gather(mi.Float, phi, place), result)
+        return result
 
     def _scattered(self, phi: mi.Float) -> mi.Float:
         """Moments of the light that is sent out, per optical depth."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.directional import Directional
 from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
 from mitsuba_irrcache.solvers.directions import Sky, spread, spread_together
 from mitsuba_irrcache.solvers.lattice import Lattice
@@ -31,13 +33,18 @@ class Pass:
         self.rows = directions, own, weights, offsets
 
     @staticmethod
-    def uncollided(passes: Sequence[Pass], lattice: Lattice) -> mi.Float:
-        """Irradiance at the wanted voxels straight from the emitters, the sum of all ``passes``, in
-        all channels one after the other; once if it is alike in all.
+    def straight(passes: Sequence[Pass], directional: Directional | None = None) -> list[tuple]:
+        """The light of all ``passes`` that comes straight from emitters, as `Lattice.carry` takes
+        it; where it is told by its direction, first without that of narrow lights, then that of
+        each.
         """
         directions, light, _, offsets = merged([p.rows for p in passes])
-        lit = light.any(axis=(1, 2))
-        return lattice.carry(directions[lit], light[lit], offsets[lit])
+        parts = [light] if directional is None else directional.apart(directions, light)
+        lit = [part.any(axis=(1, 2)) for part in parts]
+        return [
+            (directions[rows], part[rows], offsets[rows])
+            for part, rows in zip(parts, lit, strict=True)
+        ]
 
     def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         """As `Level.scatter`, with the light that enters."""
@@ -57,10 +64,7 @@ class Pass:
     @property
     def between(self) -> Rows:
         """Those along which voxels send light, none from outside."""
-        directions, light, weights, offsets = self.rows
-        even = weights != 0  # the others carry light of emitters only
-        none = np.zeros_like(light)
-        return [part[even] for part in (directions, none, weights, offsets)]
+        return between(self.rows)
 
 
 class ArrivingPass:
@@ -86,23 +90,24 @@ class ArrivingPass:
         self.numbers = np.arange(start, start + len(rows[0]))
 
     @staticmethod
-    def uncollided(passes: Sequence[ArrivingPass], lattice: Lattice) -> mi.Float:
-        """As `Pass.uncollided`."""
+    def straight(
+        passes: Sequence[ArrivingPass], directional: Directional | None = None
+    ) -> list[tuple]:
+        """As `Pass.straight`."""
         directions, light, _, offsets = merged([p.rows for p in passes])
         arrivals, channels = passes[0].arrivals, passes[0].channels
         numbers = np.concatenate([p.numbers for p in passes])
-        lit = arrivals.lit[numbers]
-        return lattice.carry(
-            directions[lit],
-            light[lit],
-            offsets[lit],
-            lambda table: arrivals.directly(channels, table, numbers[lit]),
-        )
+        parts = []
+        for part, rows in enumerate(arrivals.lit):
+            lit = rows[numbers]
+            entering = partial(arrivals.directly, channels, rows=numbers[lit], part=part)
+            parts.append((directions[lit], light[lit], offsets[lit], entering))
+        return parts
 
     def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         """As `Level.scatter`, with the light that arrives."""
         table = level.lattice.table(*self.rows)
-        of_table = self.channels, level.lattice, table, self.numbers
+        of_table = self.channels, level, table, self.numbers
         table.entering = self.arrivals.returning(*of_table, emitted=True)
         table.entering.receive(phi)
         found = level.scatter(None, table)
@@ -130,6 +135,20 @@ class ArrivingPass:
         )
 
 
+class JointPass(ArrivingPass):
+    """Of light by its direction: what arrives and what voxels send go the same ways. What even
+    directions make of their sum, where it is alike from all sides, is what they make of nothing.
+    """
+
+    def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        table = level.lattice.table(*self.rows)
+        of_table = self.channels, level, table, self.numbers
+        table.entering = self.arrivals.returning(*of_table, emitted=True)
+        if phi is None:
+            table.entering.receive(phi)
+        return level.scatter(phi, table)
+
+
 def arriving(
     around: Around,
     sky: Sky,
@@ -143,14 +162,15 @@ def arriving(
     one's orders can be solved for if there are several; and what differs between channels.
     ``pairs`` are those between voxels.
     """
-    several = passes > 1
-    many, inner = ARRIVING // 2 if several else pairs, []
+    several, joint = passes > 1, around.directional is not None
+    many, inner = max(ARRIVING // 2, pairs) if several else pairs, []
     # The first one is apart, the others are even together.
     rows = sky.rows(1, many, rng) + (sky.rows(passes - 1, many, rng) if several else [])
     sets = [spread(pairs, rng)] + (spread_together(passes - 1, pairs, rng) if several else [])
     for directions, weights in sets:
         black = np.zeros((pairs, *rows[0][1].shape[1:]))
         inner.append((directions, black, weights, rng.random((pairs, 2))))
+    inner = [between(row) for row in rows] if joint else inner
     arrivals = Arrivals(around, lattice, merged(rows), several, (*seed, 0))
     returns = Arrivals(around, lattice, inner[0], several, (*seed, 1)) if several else None
     starts = np.cumsum([0] + [len(row[0]) for row in rows])
@@ -158,8 +178,9 @@ def arriving(
 
     def of(channels: Sequence[int]) -> list[ArrivingPass]:
         parts = enumerate(zip(rows, inner, starts, strict=False))
+        kind = JointPass if joint else ArrivingPass
         return [
-            ArrivingPass(dark(row), dark(own), arrivals, start, None if i else returns, channels)
+            kind(dark(row), dark(own), arrivals, start, None if i else returns, channels)
             for i, (row, own, start) in parts
         ]
 
@@ -169,6 +190,14 @@ def arriving(
 def merged(rows: Sequence[Rows]) -> tuple[np.ndarray, ...]:
     """Several sets as one."""
     return tuple(np.concatenate(parts) for parts in zip(*rows, strict=True))
+
+
+def between(rows: Rows) -> Rows:
+    """Those along which voxels send light, none from outside."""
+    directions, light, weights, offsets = rows
+    even = weights != 0  # the others carry light of emitters only
+    none = np.zeros_like(light)
+    return [part[even] for part in (directions, none, weights, offsets)]
 
 
 def dark(rows: Rows) -> Rows:

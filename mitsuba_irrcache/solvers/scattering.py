@@ -168,6 +168,12 @@ class Level:
         dr.eval(phi, collided)
         return phi, collided
 
+    def seen(self, phi: mi.Float, place: mi.UInt32, heading: mi.Vector3f | None) -> mi.Float:
+        """4 pi times the radiance that rays along ``heading`` see scattered from ``phi`` at a
+        ``place`` of it, per albedo.
+        """
+        return dr.gather(mi.Float, phi, place)
+
     def passed_on(self, phi: mi.Float, rows: Sequence[np.ndarray], sets: int) -> mi.Float:
         """About A phi, irradiance, along ``rows`` of so many ``sets`` of directions: found on the
         coarser level, if there is one.
@@ -181,14 +187,14 @@ class Level:
 
     def tables(self, rows: Sequence[np.ndarray], returning: Callable | None = None) -> list[Table]:
         """Those of this level and of all coarser ones for ``rows`` as in `Lattice.table`, along
-        which no light enters from outside. ``returning``, if given, makes of a lattice and such a
+        which no light enters from outside. ``returning``, if given, makes of a level and such a
         table of it the light that enters because phi is what it is.
         """
         tables, level = [], self
         while True:
             tables.append(level.lattice.table(*rows))
             if returning is not None:
-                tables[-1].entering = returning(level.lattice, tables[-1])
+                tables[-1].entering = returning(level, tables[-1])
             if level.coarsest:
                 return tables
             level = level.coarser

@@ -111,14 +111,18 @@ class Sweep:
         if cache.falloff is not None and cache.max_depth != 2:
             self._spread = cache.falloff.spread(cache.active)
             dr.eval(self._spread)
-        self._emitted: list[mi.Spectrum] = []  # of a batch
+        # Light that does not come along lines, of a batch: irradiance, and the moments, if they
+        # are not known from the direction.
+        self._direct: list[list[mi.Spectrum]] = []
+        self._emitted: list[list[mi.Spectrum]] = []
         self._around: Around | None = None
         if medium.alone:
-            self._direct = self._sky.near_light(medium, self._places)
+            self._direct = [[e] for e in self._sky.near_light(medium, self._places)]
             return
         small, large = split(scene, grid, *box)
-        self._around = Around(scene, medium, large, rr_depth)
-        self._lamps = Lamps(scene, medium, small, self._sky.near, self._places)
+        self._around = Around(scene, medium, large, rr_depth, cache.directional)
+        lights = small, self._sky.near
+        self._lamps = Lamps(scene, medium, *lights, self._places, cache.directional)
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Adds ``samples`` directions per voxel, a multiple of the cache's batch.
@@ -147,8 +151,9 @@ class Sweep:
             pairs, passes = self.directions // 2, cache.batch // self.directions + 1
         rng = np.random.default_rng((self.seed, number))
         if self._medium.emission is not None:
-            light = emitted_light(self._medium, self._places, cache.batch, self.seed, number)
-            self._emitted = [light]
+            seed = self.seed, number
+            shines = self._medium, self._places, cache.batch
+            self._emitted = [emitted_light(*shines, seed, cache.directional)]
         media = max(len(self._lattices), len(self._albedo))
         if self._around is None:
             first = self._first_pairs(pairs)
@@ -163,7 +168,7 @@ class Sweep:
             lattice, colour = self._lattices[0], np.ones(cache.channels)
             passes_of, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
             self._direct = self._lamps.light(seed)
-            grey = media == 1 and is_grey([*kinds, *self._direct])
+            grey = media == 1 and is_grey([*kinds, *chain(*self._direct)])
         found = []
         for channels in self._together(grey):
             found += self._solved(passes_of(channels), channels)
@@ -286,11 +291,11 @@ class Sweep:
         """Irradiance straight from emitters along lines, on average over passes, in each channel;
         and that from all emitters.
         """
-        values = passes[0].uncollided(passes, lattice)
+        values = lattice.carry(*passes[0].straight(passes)[0])
         swept = self._apart(values * dr.opaque(mi.Float, 1 / len(passes)), len(channels))
         emitters = *self._direct, *self._emitted
         return swept, [
-            phi + sum(emitted[c] for emitted in emitters)
+            phi + sum(irradiance[c] for irradiance, *_ in emitters)
             for c, phi in zip(channels, swept, strict=True)
         ]
 
@@ -320,8 +325,8 @@ class Sweep:
 
     def _near_light(self, channel: int) -> list[mi.Float]:
         """Light at the active voxels that does not come along lines, on average over each."""
-        near = [light[channel] * self._spread for light in self._direct]
-        return near + [light[channel] for light in self._emitted]
+        near = [irradiance[channel] * self._spread for irradiance, *_ in self._direct]
+        return near + [irradiance[channel] for irradiance, *_ in self._emitted]
 
 
 def _changed_by(before: mi.Float, after: mi.Float) -> float:

@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
-from tests.system.test_surfaces import check, fog, images
+from mitsuba_irrcache.errors import CacheFileError
+from tests.system.test_surfaces import check, diffuse, fog, ground, images, lamp
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -60,8 +60,54 @@ def two_kinds(scenes) -> dict:
     }
 
 
-def test_two_media_of_two_kinds(scenes):
-    check(*images(scenes, two_kinds(scenes), {}, {"max_depth": -1, "rr_depth": 50}, (64, 256)))
+@pytest.mark.parametrize("solver", ["path", "sweep"])
+def test_two_media_of_two_kinds(scenes, solver):
+    depth, ours = {"max_depth": -1, "rr_depth": 50}, {"solver": solver}
+    check(*images(scenes, two_kinds(scenes), ours, depth, (64, 256)))
+
+
+def sharp_beside(scenes) -> dict:
+    """A sharp medium beside another one, over the ground."""
+    thin = fog() | {"phase": hg(0.7)}
+    beside = scenes.boundary(thin, scenes.placement((0.9, 1.6, 1.6), center=(0.8, 0, 0)))
+    place = scenes.placement((1.0, 1.6, 1.6), center=(-0.5, 0, 0))
+    cloud = scenes.medium(scenes.texture((6, 6, 6), 0, 4, 4), 0.95, place) | {"phase": hg(0.85)}
+    return {"cloud": scenes.boundary(cloud, place), "beside": beside, "ground": ground()}
+
+
+def lamps(scenes) -> dict:
+    """Two lamps over a medium, one close to it and wide, the other small; a point light."""
+    return {
+        "cloud": scenes.boundary(scenes.medium((1.0, 1.2, 1.4), 0.9) | {"phase": hg(0.5)}),
+        "wide": lamp((0.2, 1.6, 0.1), (0, 0, 0), 0.6, (3, 3, 3)),
+        "small": lamp((-1.5, 1.6, -1.0), (0, 0, 0), 0.1, (60, 50, 40)),
+        "emitter": POINT | {"intensity": 5.0}, "sun": None, "ground": ground(),
+    }  # fmt: skip
+
+
+AMONG_SURFACES = {
+    "hg 0.85, hg 0.7, sun": (sharp_beside, -1, {}),
+    "lamps, single": (lamps, 2, {}),
+    "lamps": (lamps, -1, {}),
+}
+
+
+@pytest.mark.parametrize(("build", "depth", "bounds"), AMONG_SURFACES.values(), ids=AMONG_SURFACES)
+def test_among_surfaces(scenes, build, depth, bounds):
+    """By lines, whose light comes back from the ground and from the other medium."""
+    depths, ours = {"max_depth": depth, "rr_depth": 50}, {"cache_spp": 128, "solver": "sweep"}
+    check(*images(scenes, build(scenes), ours, depths, (64, 512)), **bounds)
+
+
+def test_furnace_among_surfaces(scenes):
+    """Nothing absorbs, neither the ground nor a medium that scatters sharply: all pixels are 1."""
+    medium = scenes.medium(3.0, 1.0) | {"phase": hg(0.8)}
+    objects = {"emitter": {"type": "constant", "radiance": 1.0}, "sun": None}
+    objects["ground"] = ground(bsdf=diffuse(1.0, 1.0, 1.0))
+    integrator = {"type": "irrcache", "solver": "auto", "resolution": 12, "rr_depth": 1000}
+    scene = scenes.load(integrator, scenes.boundary(medium), 16, **objects)
+    image = scenes.image(scene, spp=64)
+    assert image.mean() == pytest.approx(1, abs=5e-3) and np.abs(image - 1).max() < 0.1
 
 
 @pytest.mark.parametrize("g", [0.5, -0.4])
@@ -117,21 +163,16 @@ def test_files(scenes, tmp_path):
         foreign.integrator().prepare(foreign)
 
 
-@pytest.mark.parametrize(("more", "solver"), [({}, "sweep"), ({"emission": 0.1}, "path")])
-def test_choice_of_solver(scenes, more, solver):
-    """A medium that is alone is swept, unless it shines."""
-    scene = loaded(scenes, hg(0.4), solver="auto", **more)
-    scene.integrator().prepare(scene)
-    assert scene.integrator()._builder.solver == solver
-
-
-def test_sweep_is_refused_among_others(scenes):
-    integrator = {"type": "irrcache", "solver": "sweep"}
-    null = {"bsdf": {"type": "null"}, "type": "cube"}
-    parts = {name: null | shape for name, shape in two_kinds(scenes).items()}
-    scene = scenes.load(integrator, parts.pop("a"), 8, **parts)
-    with pytest.raises(IrrcacheError, match=r"isotropic.*path.*auto"):
-        scene.integrator().prepare(scene)
+@pytest.mark.parametrize("g", [0.4, 0.75])
+def test_equilibrium(scenes, g):
+    """Matter that emits what it absorbs, under a sky of 1: all is 1."""
+    medium = scenes.medium(2.0, 0.6) | {"phase": hg(g)}
+    integrator = {"type": "irrcache", "solver": "auto", "emission": 0.8, "resolution": 10}
+    sky = {"type": "constant", "radiance": 1.0}
+    scene = scenes.load(integrator, scenes.boundary(medium), 16, emitter=sky, sun=None)
+    image = scenes.image(scene, spp=16)
+    assert scene.integrator()._builder.solver == "sweep"
+    assert image.mean() == pytest.approx(1, abs=3e-3) and np.abs(image - 1).max() < 0.05
 
 
 def test_layers_add_up(scenes):

@@ -23,7 +23,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 class Nothing:
     """What is around a medium where that does not matter."""
 
-    lamps = ()
+    lamps, directional = (), None
 
 
 def swept(lattice: Lattice, found: Arrivals, values: mi.Float, i: int, offset) -> np.ndarray:
@@ -40,7 +40,7 @@ def swept(lattice: Lattice, found: Arrivals, values: mi.Float, i: int, offset) -
 @pytest.fixture
 def alone(monkeypatch):
     """Arrivals without anything to be followed."""
-    monkeypatch.setattr(arrivals, "_follow", lambda *args: (None, None, None, mi.UInt32(0)))
+    monkeypatch.setattr(arrivals, "_follow", lambda *args: (None, None, None, mi.UInt32(0), None))
 
 
 @pytest.mark.parametrize("way", [0, 1])
@@ -59,7 +59,7 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
     offsets = np.random.default_rng(3).random((len(DIRECTIONS), 2))
     rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
     found = Arrivals(Nothing, fine, rows, True, (0, 0, 0))
-    _, _, hit, ray, _ = found.begin(found._numbers(*rows[:3])[0], (0, 0, 0))
+    _, _, hit, ray, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (0, 0, 0))
     lattice, low, high = fine, lower, upper
     if coarse:
         half = Grid((6, 5, 4), place)
@@ -102,7 +102,7 @@ def test_what_returns_is_linear_in_phi(scenes):
     found = Arrivals(Around(scene, medium, [], 1000), lattice, rows, True, (1, 2, 0))
     returned, voxel = np.array(found.returned[0]) * 4 * np.pi, np.array(found.voxel)
     assert np.array(found.emitted).max() == 0
-    _, _, hit, _, _ = found.begin(found._numbers(*rows[:3])[0], (1, 2, 0))
+    _, _, hit, _, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (1, 2, 0))
     returned = returned[np.array(hit)]
     assert returned.mean() == pytest.approx(1, rel=0.02)
     places = np.stack(np.unravel_index(voxel[np.array(hit)], grid.shape), axis=1)

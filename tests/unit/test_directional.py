@@ -65,8 +65,8 @@ def test_others_are_refused(scenes, phase, message):
         bake_media(scene_of(scenes, phase))
 
 
-def lamp(size: float) -> dict:
-    place = mi.ScalarTransform4f().look_at([0.6, 2.2, 1.5], [0, 0, 0], [0.1, 1, 0.2]).scale(size)
+def lamp(size: float, place: tuple = (0.6, 2.2, 1.5)) -> dict:
+    place = mi.ScalarTransform4f().look_at(list(place), [0, 0, 0], [0.1, 1, 0.2]).scale(size)
     emitter = {"type": "area", "radiance": 10.0}
     return {"type": "rectangle", "to_world": place, "emitter": emitter}
 
@@ -77,6 +77,7 @@ LIGHTS = {
     "point": ({"emitter": POINT, "sun": None}, 0.02),
     "small lamp": ({"emitter": 0.1, "sun": None}, 0.02),
     "large lamp": ({"emitter": 0.5, "sun": None}, 0.03),
+    "lamp close by": ({"emitter": (0.4, (0.3, 1.3, -0.2)), "sun": None}, 0.03),
 }
 
 
@@ -88,6 +89,8 @@ def test_scattered_light_of_one_place(scenes, objects, tolerance, g):
     """
     if isinstance(objects.get("emitter"), float):
         objects = objects | {"emitter": lamp(objects["emitter"])}
+    elif isinstance(objects.get("emitter"), tuple):
+        objects = objects | {"emitter": lamp(*objects["emitter"])}
     scene = scene_of(scenes, hg(g), **objects)
     medium, count = bake_media(scene)[0], 1 << 16
     directional = Directional(medium.phase, sources_of(scene))

@@ -108,8 +108,28 @@ def test_settings_are_refused(scenes, settings, message):
         scene.integrator().prepare(scene)
 
 
-def test_sharp_media_among_surfaces_are_refused(scenes):
-    place = mi.ScalarTransform4f().translate([0, -1.2, 0]).rotate([1, 0, 0], -90)
-    ground = {"type": "rectangle", "to_world": place}
-    with pytest.raises(UnsupportedSceneError, match=r"0\.80.*all there is in the scene.*volpath"):
-        bake_media(scene_of(scenes, {}, ground=ground))
+def prepared(scenes, ball: dict) -> mi.Scene:
+    scene = scene_of(scenes, {"solver": "auto", "resolution": 6, "cache_spp": 64}, ball=ball)
+    scene.integrator().prepare(scene)
+    return scene
+
+
+def test_sharp_media_around_surfaces_are_refused(scenes):
+    """Paths would have to follow the peak there; beside a surface nothing has to."""
+    ball = {"type": "sphere", "radius": 0.3}
+    with pytest.raises(UnsupportedSceneError, match=r'sharply.*0\.80.*"ball" reaches.*volpath'):
+        prepared(scenes, ball)
+    aside = prepared(scenes, ball | {"center": [0, 2, 0]})
+    assert aside.integrator().cache.samples == 128
+
+
+def test_other_media_keep_their_peaks(scenes):
+    """To paths that know the light of one medium, another one scatters as it is."""
+    place = scenes.placement((1, 1, 1), center=(3, 0, 0))
+    other = scenes.boundary(scenes.medium(2.0, 0.5) | {"phase": hg(0.7)}, place)
+    sharp, medium = bake_media(scene_of(scenes, {}, other=other))
+    around = medium.surroundings.media.around(medium).grids
+    assert around == [sharp.with_peak, medium]
+    assert around[0].sigma_t.maximum == pytest.approx(2.0)
+    left = 2.0 * (1 - sharp.phase.forward * 0.5)
+    assert sharp.sigma_t.maximum == pytest.approx(left, rel=1e-5)
