@@ -233,8 +233,8 @@ MUTANTS = (
     Mutant(
         "light in the voxel of a lamp as in its middle (sweep)",
         "solvers/sweep.py",
-        "light[channel] * self._spread for light",
-        "light[channel] for light",
+        "irradiance[channel] * self._spread for irradiance",
+        "irradiance[channel] for irradiance",
         ("tests/system/test_lamps.py",),
     ),
     Mutant(
@@ -253,9 +253,37 @@ MUTANTS = (
     ),
     Mutant(
         "light of narrow lights twice (moments)",
-        "solvers/moments.py",
+        "directional.py",
         "light = light - own",
         "light = light - 0 * own",
+        (PHASE,),
+    ),
+    Mutant(
+        "light that comes back to a medium seen from any side (moments)",
+        "solvers/moments.py",
+        "for factor in basis[: self.moments.count - 1]:",
+        "for factor in ():",
+        (PHASE,),
+    ),
+    Mutant(
+        "wide lamps as narrow as points (directional)",
+        "directional.py",
+        "left *= ratio",
+        "left *= 1",
+        ("tests/unit/test_directional.py",),
+    ),
+    Mutant(
+        "forward peaks of other media taken away, too",
+        "transport.py",
+        "grid if grid is medium else grid.with_peak",
+        "grid",
+        ("tests/unit/test_similarity.py",),
+    ),
+    Mutant(
+        "moments of lamps forgotten (directional sweep)",
+        "solvers/directional_sweep.py",
+        "moments.part(smooth, k) + sum(light[k] for light in others)",
+        "moments.part(smooth, k)",
         (PHASE,),
     ),
     Mutant(

@@ -211,7 +211,7 @@ EXTRAS = {
     ),
     "phase function": (
         f'<shape type="sphere" id="other"> {NULL} <medium name="interior" type="homogeneous" '
-        'id="haze"> <phase type="hg"/> </medium> </shape>',
+        'id="haze"> <phase type="hg"> <float name="g" value="0.95"/> </phase> </medium> </shape>',
         "haze.*HGPhaseFunction",
     ),
 }

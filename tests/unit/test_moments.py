@@ -72,9 +72,9 @@ def test_light_of_one_direction():
     way = np.array([[0.3, -0.5, 0.6]]) / np.sqrt(0.7)
     offsets = np.array([[0.2, 0.7]])
     for light, sign in (([1.0, 0.0], -1), ([0.0, 1.0], 1)):
-        pair = way, np.array([light]), np.zeros(1), offsets
-        found = values(moments.carry(of_matter, pair), moments.count)
-        irradiance = np.array(of_matter.carry(way, np.array([light]), offsets))
+        entering = way, np.array([light]), offsets
+        found = values(moments.carry(of_matter, *entering), moments.count)
+        irradiance = np.array(of_matter.carry(*entering))
         basis = np.ravel(
             [np.array(y) for y in moments.basis(mi.Vector3f((sign * way[0]).tolist()))]
         )
