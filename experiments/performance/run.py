@@ -68,6 +68,8 @@ SPP, STEPS = (1, 2, 4, 16), (1.0, 2.0, 4.0)
 #: Of all caches, before the best of them are seen in other ways.
 FIRST_SPP, FIRST_STEP = 4, 1.0
 COLD_RUNS, MOVED_RUNS = 3, 5
+#: Samples per pixel of the scenes.
+DEFAULT_SPP = 64
 #: A setting that takes longer than so many seconds is not repeated, nor are costlier ones tried.
 PATIENCE = 10.0
 #: A stock integrator in a process of its own: variant, scene, image, integrator, parameters.
@@ -122,7 +124,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=90, help="of a reference")
     parser.add_argument("--stock-seconds", type=float, default=5, help="of a stock image")
     parser.add_argument("--pixels", type=int, default=256, help="per side")
-    parser.add_argument("--resolutions", nargs="+", type=int, default=RESOLUTIONS)
+    parser.add_argument(
+        "--resolutions", nargs="*", type=int, default=RESOLUTIONS, help="none: defaults alone"
+    )
     parser.add_argument("--batches", nargs="+", type=int, default=BATCHES)
     parser.add_argument("--spp", nargs="+", type=int, default=SPP, help="of the best caches")
     parser.add_argument("--steps", nargs="+", type=float, default=STEPS, help="likewise")
@@ -173,8 +177,9 @@ def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -
         key = f"{case.key} {args.seconds:g} {setting} spp {spp}"
         return points.row(key, partial(point_row, case, truth, setting, spp))
 
-    found = explore(case.depth, args, point)
-    default = point(64)  # the scenes' own samples per pixel
+    found = explore(case.depth, args, point) if args.resolutions else []
+    default = point(DEFAULT_SPP)
+    twice = point(DEFAULT_SPP, resolution=2 * default["longest"])
     about = asdict(case) | {"scene": str(case.scene), "mean": mean}
     about |= {
         "reference": judge,
@@ -183,7 +188,8 @@ def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -
     }
     about["resolved"] = least
     reached = [reach(case, target, rivals, [*found, default], stock, points) for target in TARGETS]
-    return about | {"stock": rivals, "points": found, "default": default, "targets": reached}
+    known = {"stock": rivals, "points": found, "default": default, "twice": twice}
+    return about | known | {"targets": reached}
 
 
 def stock_integrators(depth: int) -> list[str]:
@@ -293,6 +299,7 @@ def point_row(case: Case, truth: Reference, integrator: str, spp: int) -> dict:
         "cold_image": image,
         "moved": float(np.median([move(scene, spp, i) for i in range(1, 1 + MOVED_RUNS)])),
         "voxels": scene.integrator().cache.grid.voxel_count,
+        "longest": max(scene.integrator().cache.grid.shape),
         "samples": scene.integrator().cache.samples,
         "load": os.getloadavg()[0],
     }
@@ -421,15 +428,18 @@ def table(cases: list[dict]) -> Table:
 
 
 def defaults(cases: list[dict]) -> Table:
-    """What ``irrcache`` does when it is told nothing."""
-    head = ["scene", "depth", "RMSE", "% of the mean", "mean error", "cold cache", "camera moved"]
+    """What ``irrcache`` does when it is told nothing, and with twice the voxels along each axis."""
+    head = ["scene", "depth", "voxels", "RMSE", "% of the mean", "at most", "mean error"]
+    head += ["cold cache", "camera moved"]
     cells = [
-        [c["name"], str(c["depth"]), f"{row['rmse']:.2e}", percent(row["rmse"] / c["mean"]),
+        [c["name"], str(c["depth"]), str(row["longest"]), f"{row['rmse']:.2e}",
+         percent(row["rmse"] / c["mean"]), percent(row["at_most"] / c["mean"]),
          percent(row["mean_error"] / c["mean"]), f"{seconds(row['cold'])} s",
          f"{seconds(row['moved'])} s"]
-        for c in cases for row in [c["default"]]
+        for c in cases for row in (c["default"], c["twice"])
     ]  # fmt: skip
-    return Table("Default settings, 64 samples per pixel", head, cells)
+    title = f"Default settings and twice their resolution, {DEFAULT_SPP} samples per pixel"
+    return Table(title, head, cells)
 
 
 if __name__ == "__main__":
