@@ -94,9 +94,6 @@ def _why_not_sweep(
             return f"emitter {kind} is neither far away nor a point nor an even area"
     if medium.alone:
         return None
-    for shining in medium.surroundings.media.grids:
-        if shining.emission is not None:
-            return f'medium "{shining.name}" shines among surfaces'
     if not medium.exact:
         return f"{name} is bounded by other shapes than one box or sphere"
     if max_depth > 2:
@@ -109,6 +106,8 @@ def _why_not_sweep(
     for other in medium.surroundings.media.grids:
         if other is not medium and boxes_meet(grid, *box, corners_of(other.frame)):
             return f'medium "{other.name}" reaches into {name}'
+    # What shines where no matter is, nothing may stand before either.
+    box = box if medium.emission is None else (np.zeros(3, int), grid.resolution)
     found = obstacle(scene, grid, *box)
     return found and f"{found} reaches into {name}"
 

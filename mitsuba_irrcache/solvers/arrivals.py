@@ -27,7 +27,7 @@ from mitsuba_irrcache.solvers.layout import joined
 from mitsuba_irrcache.solvers.scattering import Level
 from mitsuba_irrcache.solvers.table import Entering, Table
 from mitsuba_irrcache.surroundings import probe
-from mitsuba_irrcache.transport import Start, out_of, trace
+from mitsuba_irrcache.transport import Media, Start, out_of, trace
 
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
 #: find what is in the way of an emitter's light are cheaper. What comes from surfaces differs more
@@ -56,9 +56,17 @@ class Around:
     ) -> None:
         self.scene, self.media = scene, medium.surroundings.media.around(medium)
         self.pointer, self.lamps = medium.pointer, list(lamps)
+        others = Media([grid for grid in self.media.grids if grid is not medium])
+        #: the other media, if they shine: what this one does is known otherwise
+        self.shining = others if others.shines else None
         self.directional = directional
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
+
+    @property
+    def shines(self) -> bool:
+        """Whether lines meet light by chance."""
+        return bool(self.lamps) or self.shining is not None
 
 
 class Arrivals:
@@ -82,7 +90,7 @@ class Arrivals:
         #: rows along which light may come straight from emitters; where it is told by its
         #: direction, from those that are not narrow, and from each that is
         self.lit = [part.any(axis=(1, 2)) for part in parts]
-        self.lit[0] |= (weights > 0) & bool(around.lamps)
+        self.lit[0] |= (weights > 0) & around.shines
         self._lines = lattice.table(directions, light[..., 0], weights, offsets).rows
         self._cells(np.where(weights > 0, CELLS, LIT_CELLS))
         found = _follow(around, self, *self._numbers(directions, parts, weights), paths, seed)
@@ -305,9 +313,11 @@ def _follow(
 
     parts = [dr.gather(mi.Spectrum, colour, way) for colour in colours]
     lit = hit & (dr.max(sum(parts)) > 0)
-    if around.lamps:
+    if around.shines:
         lit |= hit & (weight > 0)
-    passed, glow, rng = out_of(around.scene, around.media, ray, pointer, around.lamps, rng, lit)
+    passed, glow, rng = out_of(
+        around.scene, around.media, ray, pointer, around.lamps, around.shining, rng, lit
+    )
     parts = [light * passed for light in parts]
     parts[0] += weight * glow
     straight = [dr.select(lit, light, 0) for light in parts]

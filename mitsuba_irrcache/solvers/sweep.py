@@ -168,7 +168,7 @@ class Sweep:
             lattice, colour = self._lattices[0], np.ones(cache.channels)
             passes_of, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
             self._direct = self._lamps.light(seed)
-            grey = media == 1 and is_grey([*kinds, *chain(*self._direct)])
+            grey = media == 1 and is_grey([*kinds, *chain(*self._direct, *self._emitted)])
         found = []
         for channels in self._together(grey):
             found += self._solved(passes_of(channels), channels)

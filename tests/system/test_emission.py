@@ -162,6 +162,56 @@ def test_equilibrium_among_surfaces(scenes):
     assert np.sqrt(((found - 1) ** 2).mean()) < 0.03
 
 
+def glowing(bsdf: dict, radiance: float, center, radius: float = 0.5) -> dict:
+    """A ball that shines."""
+    emitter = {"type": "area", "radiance": radiance}
+    ball = {"type": "sphere", "center": list(center), "radius": radius}
+    return ball | {"bsdf": bsdf, "emitter": emitter}
+
+
+@pytest.mark.parametrize("phase", [{"type": "isotropic"}, {"type": "hg", "g": 0.6}])
+def test_equilibrium_around(scenes, phase):
+    """By lines: two media, each with light of the other and of a grey ball beside them, which
+    shines as much as it does not reflect.
+    """
+    place, beside = scenes.placement(), scenes.placement((0.8, 1, 1), center=(2.0, 0, 0))
+    fog = scenes.medium(1.5, 0.6) | {"phase": phase}
+    objects = {
+        "beside": scenes.boundary(scenes.medium(1.5, 0.6), beside),
+        "ball": glowing({"type": "diffuse", "reflectance": 0.5}, 0.5, (-0.9, 1.8, -0.5)),
+        "emitter": SKY,
+        "sensor": scenes.description({}, None, 24)["sensor"],
+    }
+    settings = {"solver": "auto", "cache_spp": 128, "rr_depth": 1000}
+    shape = scenes.boundary(fog, place)
+    found, scene = rendered(scenes, shape, 1.5 * 0.4, 32, objects=objects, **settings)
+    assert all(cache.correlated for cache in scene.integrator().caches.values())
+    assert np.abs(found.mean(axis=(0, 1)) - 1).max() < 4e-3
+    assert np.abs(found - 1).max() < 0.05
+
+
+@pytest.mark.parametrize(("max_depth", "samples"), [(2, 512), (-1, 64)])
+def test_fire_in_a_room(scenes, max_depth, samples):
+    """Light that goes by the walls, and that of another medium: as ``path`` has it at the voxels of
+    both, on average, in every colour.
+    """
+    wall = {"type": "sphere", "radius": 4.0, "flip_normals": True}
+    wall["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.6, 0.4]}}
+    beside = scenes.boundary(scenes.medium(1.0, 0.5), scenes.placement(center=(2.2, 0, 0)))
+    post = glowing({"type": "diffuse"}, 0.2, (1.1, 0.3, 0), 0.08)
+    shape, light = flame(scenes)
+    objects, found = {"wall": wall, "beside": beside, "post": post}, []
+    for solver, spp in (("auto", 256), ("path", samples)):
+        settings = {"solver": solver, "cache_spp": spp, "resolution": 16, "max_depth": max_depth}
+        integrator = {"type": "irrcache", "emission": light, "emission_scale": 2.0} | settings
+        scene = scenes.load(integrator, shape, 4, **DARK, **objects)
+        scene.integrator().prepare(scene)
+        caches = scene.integrator().caches.values()
+        assert all(c.correlated == (solver == "auto") for c in caches)
+        found.append([np.array(c.irradiance).mean(axis=(0, 1, 2)) for c in caches])
+    np.testing.assert_allclose(*found, rtol=0.02)
+
+
 def flame(scenes) -> tuple[dict, dict]:
     """Coloured light in a corner of a cloud, some of it in an empty part."""
     place = scenes.placement()

@@ -23,7 +23,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 class Nothing:
     """What is around a medium where that does not matter."""
 
-    lamps, directional = (), None
+    shines, directional = False, None
 
 
 def swept(lattice: Lattice, found: Arrivals, values: mi.Float, i: int, offset) -> np.ndarray:
