@@ -140,13 +140,12 @@ def out_of(
     ray: mi.Ray3f,
     pointer: mi.MediumPtr,
     lamps: Sequence[mi.EmitterPtr],
-    shining: Media | None,
     rng: mi.PCG32,
     active: mi.Bool,
 ):
-    """Straight along ``ray``, through null surfaces and media: an unbiased estimate of what passes
-    out of the scene, the radiance of those ``lamps`` that are met on the way and of the media that
-    are ``shining``, if there are any, and the random generator.
+    """Straight along ``ray``, through null surfaces and ``media``: an unbiased estimate of what
+    passes out of the scene, the radiance of these media and of those ``lamps`` that are met on the
+    way, and the random generator.
     """
     through, light, escaped = mi.Spectrum(1), mi.Spectrum(0), mi.Bool(False)
     ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
@@ -154,8 +153,8 @@ def out_of(
     while dr.hint(active, label="out of the scene"):
         si = scene.ray_intersect(ray, active)
         hit = active & si.is_valid()
-        if dr.hint(shining is not None, mode="scalar"):
-            *_, rng, glow = shining.fly(pointer, ray, si.t, through, rng, active)
+        if dr.hint(media.shines, mode="scalar"):
+            *_, rng, glow = media.fly(pointer, ray, si.t, through, rng, active)
             light += dr.select(active, glow, 0)
         passed, rng = media.transmittance(pointer, ray, si.t, rng, active)
         through = dr.select(active, through * passed, through)

@@ -62,13 +62,21 @@ class Case:
 
 
 def case(
-    hazard: str, name: str, *properties, matter=None, light=None, camera=None, world=None, **options
+    hazard: str,
+    name: str,
+    *properties,
+    matter=None,
+    light=None,
+    camera=None,
+    world=None,
+    beside=None,
+    **options,
 ) -> Case:
     """A case whose scene `worlds.scene` makes of these."""
     return Case(
         hazard,
         name,
-        lambda settings: scene(settings, matter, light, camera, world),
+        lambda settings: scene(settings, matter, light, camera, world, beside),
         properties,
         **options,
     )

@@ -26,6 +26,7 @@ def cases() -> list[Case]:
         views.films,
         media.empty_media,
         media.phases,
+        media.phases_over_the_ground,
         media.many_samples,
         media.refusals,
     )

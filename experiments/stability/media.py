@@ -205,6 +205,28 @@ def phases() -> list[Case]:
     return found
 
 
+def phases_over_the_ground() -> list[Case]:
+    """The same among surfaces: over the ground, in all whiteness and with light of one side."""
+    place = mi.ScalarTransform4f().look_at([0, -1.2, 0], [0, 0, 0.001], [0, 1, 0]).scale(4)
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    ground = {"ground": {"type": "rectangle", "to_world": place, "bsdf": white}}
+    found = []
+    for g in (0.5, 0.85):
+        for depth in (1e-30, 1e-8, 1, 80, 1e4, 1e30):
+            found.append(
+                case(
+                    "phase over the ground",
+                    f"g = {g:g}, depth {depth:g}",
+                    p.furnace_of_voxels,
+                    matter=Matter(depth / 2, 1.0, g=g),
+                    beside=ground,
+                    solvers=("sweep",),
+                    quadratures=("exponential",),
+                )
+            )
+    return found
+
+
 def many_samples() -> list[Case]:
     """2^25 samples of one voxel: in the middle of a ball every ray is as long, so the mean of all
     samples is that of each.

@@ -135,12 +135,14 @@ def scene(
     light: dict | None = None,
     camera: Camera | None = None,
     world: World | None = None,
+    beside: dict | None = None,
 ) -> mi.Scene:
-    """All together, under a white sky unless ``light`` says otherwise."""
+    """All together, under a white sky unless ``light`` says otherwise; ``beside``: more objects."""
     world = world or World()
     parts = {"type": "scene", "integrator": {"type": "irrcache"} | integrator}
     parts["sensor"] = (camera or Camera()).description(world)
     parts["light"] = light or WHITE_SKY
+    parts |= beside or {}
     if matter is not None:
         parts["matter"] = matter.description(world)
     return mi.load_dict(parts)

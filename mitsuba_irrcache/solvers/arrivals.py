@@ -56,9 +56,8 @@ class Around:
     ) -> None:
         self.scene, self.media = scene, medium.surroundings.media.around(medium)
         self.pointer, self.lamps = medium.pointer, list(lamps)
-        others = Media([grid for grid in self.media.grids if grid is not medium])
-        #: the other media, if they shine: what this one does is known otherwise
-        self.shining = others if others.shines else None
+        #: the others: what leaves this one, which is convex, meets none of it going straight on
+        self.others = Media([grid for grid in self.media.grids if grid is not medium])
         self.directional = directional
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
@@ -66,7 +65,7 @@ class Around:
     @property
     def shines(self) -> bool:
         """Whether lines meet light by chance."""
-        return bool(self.lamps) or self.shining is not None
+        return bool(self.lamps) or self.others.shines
 
 
 class Arrivals:
@@ -315,9 +314,7 @@ def _follow(
     lit = hit & (dr.max(sum(parts)) > 0)
     if around.shines:
         lit |= hit & (weight > 0)
-    passed, glow, rng = out_of(
-        around.scene, around.media, ray, pointer, around.lamps, around.shining, rng, lit
-    )
+    passed, glow, rng = out_of(around.scene, around.others, ray, pointer, around.lamps, rng, lit)
     parts = [light * passed for light in parts]
     parts[0] += weight * glow
     straight = [dr.select(lit, light, 0) for light in parts]
