@@ -42,6 +42,7 @@ from mitsuba_irrcache.compare import metrics
 from mitsuba_irrcache.compare.reference import Reference, reference
 from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.tables import Table, percent, seconds
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.loading import load_scene, parse_integrator
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.solvers.sweep import BATCH
@@ -179,7 +180,11 @@ def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -
 
     found = explore(case.depth, args, point) if args.resolutions else []
     default = point(DEFAULT_SPP)
-    twice = point(DEFAULT_SPP, resolution=2 * default["longest"])
+    try:
+        twice = point(DEFAULT_SPP, resolution=2 * default["longest"])
+    except IrrcacheError as error:
+        say(case, str(error))
+        twice = None
     about = asdict(case) | {"scene": str(case.scene), "mean": mean}
     about |= {
         "reference": judge,
@@ -436,7 +441,7 @@ def defaults(cases: list[dict]) -> Table:
          percent(row["rmse"] / c["mean"]), percent(row["at_most"] / c["mean"]),
          percent(row["mean_error"] / c["mean"]), f"{seconds(row['cold'])} s",
          f"{seconds(row['moved'])} s"]
-        for c in cases for row in (c["default"], c["twice"])
+        for c in cases for row in (c["default"], c["twice"]) if row
     ]  # fmt: skip
     title = f"Default settings and twice their resolution, {DEFAULT_SPP} samples per pixel"
     return Table(title, head, cells)
