@@ -138,17 +138,16 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     there are samples per pixel, and is ``background``. Where there is no more than one medium in a
     box or sphere, and light from far away or from points, nothing has to be ray traced. The
     solver ``sweep`` can be used for media in boxes or spheres with neither surfaces nor other media
-    among their voxels; where there are surfaces, for isotropic ones, with ``max_depth`` 2 or -1.
+    among their voxels; where there are surfaces, with ``max_depth`` 2 or -1.
     Media without bounds and sharp phase functions are refused by name. What glass encloses is
     rendered as ``volpath`` does, and so is a scene without media.
 
     Phase functions may be ``isotropic``, ``hg`` with |g| up to 0.58, ``rayleigh``, or others that
     depend on the scattering angle alone and are as broad. Where one is not isotropic, the cache
     holds spherical harmonics of the radiance up to degree 4 beside the irradiance, and the light
-    of suns, points and lamps apart, whose direction is known. Such a medium is swept where it is
-    all there is to the scene and does not shine itself; there, ``hg`` may have g up to 0.85 if
-    ``max_depth`` is -1. The light in a forward peak that sharp counts as not scattered, also in
-    ``transmittance`` and alpha.
+    of suns, points and lamps apart, whose direction is known. Where such a medium is swept, ``hg``
+    may have g up to 0.85 if ``max_depth`` is -1. The light in a forward peak that sharp counts as
+    not scattered, also in ``transmittance`` and alpha.
 
     .. tabs::
         .. code-tab:: xml

@@ -47,7 +47,7 @@ class Packets:
                 values += [*planes(index + above), *planes(right + above)]
         values += [mi.Float(0)] * (WIDTH - len(values))
         # Made by a kernel, never borrowed from elsewhere: wide loads need an aligned array.
-        self.data = dr.zeros(mi.Float, grid.voxel_count * WIDTH)
+        self.data = dr.empty(mi.Float, grid.voxel_count * WIDTH)
         dr.scatter(self.data, mi.Vector4f(*values), index)
         dr.eval(self.data)
 

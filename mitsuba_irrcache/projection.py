@@ -332,11 +332,10 @@ def _constant_if_it_is(field: Field) -> Field:
     """A grid that holds one value only, as that value."""
     if not isinstance(field, GridField) or _varies(field):
         return field
-    channels = [
-        dr.gather(mi.Float, field.data, dr.arange(mi.UInt32, field.grid.voxel_count) * n + c)
-        for n in [field.channels]
-        for c in range(n)
-    ]
+    index, n = dr.arange(mi.UInt32, field.grid.voxel_count), field.channels
+    channels = [field.data]
+    if n > 1:
+        channels = [dr.gather(mi.Float, field.data, index * n + c) for c in range(n)]
     ends = [(dr.min(c)[0], dr.max(c)[0]) for c in channels]
     if any(a != b for a, b in ends):
         return field

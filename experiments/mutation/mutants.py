@@ -280,6 +280,13 @@ MUTANTS = (
         ("tests/unit/test_similarity.py",),
     ),
     Mutant(
+        "light passes a sliver of its medium on its way in (arrivals)",
+        "solvers/arrivals.py",
+        "out_of(around.scene, around.others, ray",
+        "out_of(around.scene, around.media, ray",
+        ("tests/stress/test_stability.py",),
+    ),
+    Mutant(
         "moments of lamps forgotten (directional sweep)",
         "solvers/directional_sweep.py",
         "moments.part(smooth, k) + sum(light[k] for light in others)",

@@ -29,6 +29,7 @@ CHOSEN = {
     "light": ("a point at a voxel's centre beside a ball", "a texel of 1e+06"),
     "film": ("1x1", "a crop of 0x0"),
     "empty": ("1e-38 everywhere",),
+    "phase over the ground": ("g = 0, depth 10000",),
     "samples": ("2^25 in one voxel",),
 }
 
