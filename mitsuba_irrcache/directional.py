@@ -27,11 +27,15 @@ from .phase import Phase
 WIDEST = 0.95
 #: Half the angle within which light from something without a size is its own.
 NARROWEST = 0.005
-#: Half the angle of a bright spot of the sky; the share of the sky's light that makes it one
-#: (even light would be 1/400); and how many there are at most.
-SPOT, SPOT_SHARE, MOST_SPOTS = float(np.deg2rad(4)), 0.02, 4
-#: Directions that are drawn to find these.
-SPOT_SAMPLES = 1 << 16
+#: Half the angle of a bright spot of the sky, at least and at most; the share of the sky's light
+#: that makes it one (even light would be 1/400); and how many there are at most.
+SPOT, WIDEST_SPOT, SPOT_SHARE, MOST_SPOTS = float(np.deg2rad(4)), float(np.deg2rad(12)), 0.02, 4
+#: Of what a spot has within its widest circle it has this share in its own.
+WHOLE_SPOT = 0.97
+#: Half the angle of spots that are as good as points.
+POINT_LIKE = float(np.deg2rad(1))
+#: Directions that are drawn to find these, and the step from one to the next.
+SPOT_SAMPLES, GOLDEN = 1 << 16, (5**0.5 - 1) / 2
 #: Lamps that are told apart, and points of each that tell how it lies.
 MOST_LAMPS, POINTS = 8, 1024
 #: Terms of a series of Legendre polynomials that are left out beyond the last one larger than this.
@@ -42,19 +46,24 @@ WIDTH = 4
 
 class Source:
     """A narrow light: at ``place``, or, if ``far``, in the direction ``place``; ``size`` is its
-    radius, or half its angle; ``covariance`` (3, 3) that of the points of a lamp.
+    radius, or half its angle; ``covariance`` (3, 3) that of the points of a lamp, or a spot's mean
+    square angle (0: none).
     """
 
     def __init__(
-        self, place: np.ndarray, size: float, far: bool, covariance: np.ndarray | None = None
+        self, place: np.ndarray, size: float, far: bool, covariance: np.ndarray | float = 0.0
     ) -> None:
         self.far = far
+        #: whether it is as wide as to be told from a point
+        self.wide = bool(np.any(covariance))
         self._direction, self._cosine = np.array(place), np.cos(size)
         #: whether it is so narrow that nothing of its light has to be in the moments
         self.sharp = far or not size
         self.place = mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in place))
         self._size = dr.opaque(mi.Float, float(np.cos(size) if far else size))
-        if covariance is not None:
+        if far:
+            self._variance = dr.opaque(mi.Float, float(covariance))
+        elif self.wide:
             rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in covariance]
             self._covariance = [mi.Vector3f(*row) for row in rows]
 
@@ -71,9 +80,9 @@ class Source:
         return way / distance, cosine
 
     def variance(self, p: mi.Point3f) -> mi.Float:
-        """Of the angles from its middle to its points, as a lamp is seen from ``p``: the mean of
-        their squares.
-        """
+        """The mean square of the angles from its middle to its points, as seen from ``p``."""
+        if self.far:
+            return self._variance
         way = self.place - mi.Vector3f(p)
         inverse = dr.rcp(dr.squared_norm(way))
         along = sum(w * dr.dot(row, way) for w, row in zip(way, self._covariance, strict=True))
@@ -178,17 +187,22 @@ class Directional:
                 found.append(self._smooth(cosine) if source.sharp else mi.Float(0))
                 continue
             gain = self.phase.gain(p, direction, towards, active)
-            found.append(gain - 1 if source.sharp else self._rest(gain, cosine, source.variance(p)))
+            if source.wide:
+                gain = self._blurred(gain, cosine, source.variance(p), source.sharp)
+            found.append(gain - 1 if source.sharp else gain)
         return found
 
-    def _rest(self, gain: mi.Float, cosine: mi.Float, variance: mi.Float) -> mi.Float:
-        """What moments do not tell of a lamp whose angles have this ``variance``, where ``gain`` is
-        4 pi p in its middle. Being as wide takes exp(-l (l + 1) variance / 4) of degree l.
+    def _blurred(
+        self, gain: mi.Float, cosine: mi.Float, variance: mi.Float, whole: bool
+    ) -> mi.Float:
+        """4 pi p of a light whose angles have this ``variance``, where its middle has ``gain``:
+        being as wide takes exp(-l (l + 1) variance / 4) of degree l. Without what the moments tell,
+        unless the ``whole`` of it is wanted.
         """
         before, legendre, result = mi.Float(0), mi.Float(1), mi.Float(0)
         left, ratio, blur = mi.Float(1), mi.Float(1), dr.exp(-0.5 * variance)
         for degree, (own, rest) in enumerate(self._terms):
-            result += rest * left * legendre
+            result += (own if whole else rest) * left * legendre
             gain = gain - own * legendre
             following = ((2 * degree + 1) * cosine * legendre - degree * before) / (degree + 1)
             before, legendre = legendre, following
@@ -289,7 +303,7 @@ def sources_of(scene: mi.Scene) -> list[Source]:
         elif mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
             found.append(Source(_sampled(emitter).p.numpy().ravel(), 0.0, far=False))
         elif emitter.is_environment():
-            found += _spots(emitter)
+            found += spots_of(emitter)[0]
     for shape in scene.shapes():
         if shape.is_emitter():
             lamps.append(_lamp(shape))
@@ -309,24 +323,50 @@ def _sampled(emitter: mi.Emitter) -> mi.DirectionSample3f:
     return record
 
 
-def _spots(environment: mi.Emitter) -> list[Source]:
-    """Bright spots of a sky: circles that a share of its light comes from."""
+def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
+    """Bright spots of a sky: circles that a share of its light comes from. And the irradiance
+    (1 + n, channels) that comes from beside all of them, and from each.
+    """
     rng = np.random.default_rng(3)
-    samples = mi.Point2f(np.float32(rng.random((2, SPOT_SAMPLES))))
-    record, light = environment.sample_direction(dr.zeros(mi.Interaction3f, SPOT_SAMPLES), samples)
+    number = np.arange(SPOT_SAMPLES)
+    even = np.stack([(number + 0.5) / SPOT_SAMPLES, number * GOLDEN % 1])
+    samples = mi.Point2f(np.float32((even + rng.random((2, 1))) % 1))
+    record, colours = environment.sample_direction(
+        dr.zeros(mi.Interaction3f, SPOT_SAMPLES), samples
+    )
     directions = np.array(record.d, dtype=np.float64)
-    light = np.mean([np.broadcast_to(np.array(c), SPOT_SAMPLES) for c in light], axis=0)
+    colours = np.stack([np.broadcast_to(np.array(c), SPOT_SAMPLES) for c in colours])
+    light = colours.mean(axis=0)
     if not np.isfinite(light).all() or directions.shape != (3, SPOT_SAMPLES):
-        return []
-    total, found = light.sum(), []
+        return [], np.full((1, len(colours)), np.nan)
+    total, found, numbers = light.sum(), [], np.zeros(SPOT_SAMPLES, int)
     while len(found) < MOST_SPOTS:
         centre = _brightest(directions, light)
         own = centre @ directions >= np.cos(SPOT)
         if not light[own].sum() > SPOT_SHARE * total:
             break
-        found.append(Source(centre, SPOT, far=True))
-        light = np.where(own, 0, light)
-    return found
+        size, variance = _extent(np.arccos(np.clip(centre @ directions, -1, 1)), light)
+        found.append(Source(centre, size, True, variance if variance > POINT_LIKE**2 else 0.0))
+        own = (light > 0) & (centre @ directions >= np.cos(size))
+        light, numbers[own] = np.where(own, 0, light), len(found)
+    shares = [colours[:, numbers == k].sum(axis=1) for k in range(1 + len(found))]
+    return found, np.array(shares, dtype=np.float64) / SPOT_SAMPLES
+
+
+def _extent(angles: np.ndarray, light: np.ndarray) -> tuple[float, float]:
+    """Half the angle of a spot, given the ``light`` at ``angles`` from its middle, and the mean
+    square angle in it. What shines around it is not its own.
+    """
+    circle = 1 - np.cos(WIDEST_SPOT)
+    around = (angles > WIDEST_SPOT) & (angles < 1.5 * WIDEST_SPOT)
+    level = light[around].sum() / (np.cos(WIDEST_SPOT) - np.cos(1.5 * WIDEST_SPOT))
+    order = np.argsort(angles)
+    order = order[angles[order] <= WIDEST_SPOT]
+    own = np.cumsum(light[order]) - level * (1 - np.cos(angles[order]))
+    whole = own >= WHOLE_SPOT * (light[order].sum() - level * circle)
+    size = max(SPOT, float(angles[order][whole.argmax()])) if whole.any() else SPOT
+    within = angles <= size
+    return size, float((light[within] * angles[within] ** 2).sum() / light[within].sum())
 
 
 def _brightest(directions: np.ndarray, light: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.polynomial.legendre import legval
 
+from mitsuba_irrcache.directional import spots_of
 from mitsuba_irrcache.medium import MediumGrid
 
 _GOLDEN = (1 + 5**0.5) / 2
@@ -116,8 +117,9 @@ def _values(spectrum: mi.Spectrum, count: int) -> np.ndarray:
     return np.stack(channels, axis=1)
 
 
-#: Pairs of directions of a pass for each line of light from a sun.
-SUN_SHARE = 8
+#: Pairs of directions of a pass for each line of light from a sun, and for each direction of an
+#: environment's bright parts.
+SUN_SHARE, BRIGHT_SHARE = 8, 2
 
 
 class Sky:
@@ -129,6 +131,7 @@ class Sky:
         """``glows``: there is light besides, whose colour is its own."""
         self._glows = glows
         self._environment = scene.environment()
+        self._spots: tuple | None = None
         self._suns, self.near = [], []
         for emitter in scene.emitters():
             if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
@@ -166,24 +169,28 @@ class Sky:
             self._environment is not None
             and self._environment.class_name() != "ConstantBackgroundEmitter"
         )
-        bright = self._bright_rows(passes, pairs, rng) if varies else [None] * passes
-        return [self._pass(*own, more, rng) for own, more in zip(even, bright, strict=True)]
+        if varies:
+            found = self._with_bright(even, max(1, pairs // BRIGHT_SHARE), rng)
+        else:
+            found = [(*own, self._steady(*own)) for own in even]
+        return [self._pass(pairs, *own, rng) for own in found]
+
+    def _steady(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Light of an even environment, or none, as of `rows`."""
+        if self._environment is None:
+            return np.zeros((len(directions), 2, dr.size_v(mi.Spectrum)))
+        return self._both_ways(directions) * weights[:, None, None]
 
     def _pass(
         self,
+        pairs: int,
         directions: np.ndarray,
         weights: np.ndarray,
-        bright: tuple | None,
+        light: np.ndarray,
         rng: np.random.Generator,
     ) -> tuple:
-        """A pass of `rows`, with ``bright`` ones if the environment varies."""
-        pairs, colours = len(directions), dr.size_v(mi.Spectrum)
-        light = np.zeros((pairs, 2, colours))
-        rows = [(directions, light, weights)]
-        if bright is not None:
-            rows.append(bright)
-        elif self._environment is not None:
-            light += self._both_ways(directions) * weights[:, None, None]
+        """A pass of `rows`, with those of suns."""
+        colours, rows = dr.size_v(mi.Spectrum), [(directions, light, weights)]
         lines = max(1, pairs // SUN_SHARE)
         for direction, irradiance in self._suns:
             ways = np.stack([irradiance / lines, np.zeros(colours)])
@@ -196,20 +203,46 @@ class Sky:
             offsets[end - lines : end] = (offsets[end - 1] + _even(lines)) % 1
         return *joined, offsets
 
-    def _bright_rows(self, passes: int, pairs: int, rng: np.random.Generator) -> list[tuple]:
-        """Directions of an environment that varies, for each pass: half of them even, half by its
-        luminance. One may come from either half, and as the opposite of one: what it stands for is
-        one over the density of all ways to get it.
+    def _with_bright(
+        self, even: list[tuple], count: int, rng: np.random.Generator
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """To the ``even`` directions of each pass and their weights some by the luminance of an
+        environment that varies, and the light along all. One may come from either, and as the
+        opposite of one: what it stands for is one over the density of all ways to get it.
         """
-        even, bright = pairs - pairs // 2, pairs // 2
         rows = []
-        sets = spread_together(passes, even, rng), self._bright(passes, bright, rng)
-        for (plain, _), chosen in zip(*sets, strict=True):
-            directions = np.concatenate([plain, chosen])
-            angle = 1 / (even / (2 * np.pi) + bright * self._density(directions))
+        chosen = self._bright(len(even), count, rng)
+        for (plain, weights), bright in zip(even, chosen, strict=True):
+            directions = np.concatenate([plain, bright])
+            uniform = len(plain) / (2 * np.pi)
+            angle = 1 / (uniform + count * self._density(directions))
+            angle[: len(plain)] *= weights * uniform
             light = self._both_ways(directions) * angle[:, None, None]
-            rows.append((directions, light, np.zeros(pairs)))
+            rows.append((directions, np.concatenate([weights, np.zeros(count)]), light))
+        self._make_whole(rows)
         return rows
+
+    def _make_whole(self, rows: list[tuple]) -> None:
+        """Lets as much light come from each bright spot, and from beside them, as there is: it is by
+        chance how many directions have met one.
+        """
+        if self._spots is None:
+            self._spots = spots_of(self._environment)
+        spots, irradiance = self._spots
+        numbers = []
+        for directions, *_ in rows:
+            towards = np.stack([-directions, directions], axis=1)
+            number = np.zeros(towards.shape[:2], int)
+            for k, spot in enumerate(spots, 1):
+                number[(number == 0) & spot.covers(towards)] = k
+            numbers.append(number)
+        for k, exact in enumerate(irradiance):
+            own = [light[n == k] for (*_, light), n in zip(rows, numbers, strict=True)]
+            found = np.concatenate(own).sum(axis=0) / len(rows)
+            known = (found > 0) & np.isfinite(exact)
+            factor = np.where(known, exact / np.where(known, found, 1), 1)
+            for (*_, light), number in zip(rows, numbers, strict=True):
+                light[number == k] *= factor
 
     def _both_ways(self, directions: np.ndarray) -> np.ndarray:
         """Radiance (n, 2, channels) along directions and their opposites."""

@@ -152,7 +152,7 @@ class DirectionalLevel(Level):
             received = [light + moments.part(scattered, k) for k, light in enumerate(received)]
             collided = [mean + moments.part(scattered, k) for k, mean in enumerate(collided)]
         pairs = zip(collided, received, strict=True)
-        collided = [dr.select(depth > 0, mean, light) for mean, light in pairs]
+        collided = [self.known_from(depth, mean, light) for mean, light in pairs]
         return joined(received), joined(collided)
 
     def seen(self, phi: mi.Float, place: mi.UInt32, heading: mi.Vector3f | None) -> mi.Float:
