@@ -280,6 +280,13 @@ MUTANTS = (
         ("tests/unit/test_similarity.py",),
     ),
     Mutant(
+        "suns of skies as bright as directions met them",
+        "solvers/directions.py",
+        "light[number == k] *= factor",
+        "light[number == k] *= 1",
+        ("tests/system/test_sweep.py",),
+    ),
+    Mutant(
         "light passes a sliver of its medium on its way in (arrivals)",
         "solvers/arrivals.py",
         "out_of(around.scene, around.others, ray",

@@ -223,8 +223,8 @@ class Sky:
         return rows
 
     def _make_whole(self, rows: list[tuple]) -> None:
-        """Lets as much light come from each bright spot, and from beside them, as there is: it is by
-        chance how many directions have met one.
+        """Lets as much light come from each bright spot, and from beside all, as there is: how many
+        directions meet one is chance.
         """
         if self._spots is None:
             self._spots = spots_of(self._environment)

@@ -27,7 +27,7 @@ from mitsuba_irrcache.solvers.table import Table
 COARSEST = 20
 #: Corrections on the finest grid, at most; there is one on the others.
 CORRECTIONS = 12
-#: Optical depth of a voxel about which what lines lose in it begins to tell of its collisions.
+#: Optical depth of a voxel from which on what lines lose in it tells of its collisions.
 HARDLY = 1e-2
 #: Relative error of the finest solution that is left; and changes with which that of few voxels is
 #: done, and one that only corrects finer ones, whose error is looked at in any case.
@@ -171,14 +171,14 @@ class Level:
         return phi, collided
 
     def known_from(self, depth: mi.Float, collided: mi.Float, received: mi.Float) -> mi.Float:
-        """The light of collisions: what lines tell by what they lose, ``collided``, and all that is
-        ``received`` where they hardly find matter, their ``depth`` integrated over directions. There
-        suns, whose lines find other matter, would be as bright as the former is little; and thin
+        """The light of collisions: what lines tell by what they lose, ``collided``, or all that is
+        ``received`` where they hardly find matter, their ``depth`` integrated over directions.
+        There the lines of suns find other matter, and would be as bright as that is more; and thin
         matter sees the light that there is.
         """
         size = float(self.grid.voxel_size.min()) / (4 * np.pi * HARDLY)
-        found = dr.minimum(dr.square(depth * dr.opaque(mi.Float, size)), 1e6)
-        return dr.select(depth > 0, dr.lerp(received, collided, found / (1 + found)), received)
+        found = dr.square(depth * dr.opaque(mi.Float, size))
+        return dr.select(found < 1, dr.lerp(received, collided, found), collided)
 
     def seen(self, phi: mi.Float, place: mi.UInt32, heading: mi.Vector3f | None) -> mi.Float:
         """4 pi times the radiance that rays along ``heading`` see scattered from ``phi`` at a
