@@ -40,31 +40,33 @@ SPOT_SAMPLES, GOLDEN = 1 << 16, (5**0.5 - 1) / 2
 MOST_LAMPS, POINTS = 8, 1024
 #: Terms of a series of Legendre polynomials that are left out beyond the last one larger than this.
 NO_TERM = 1e-3
+#: A distance, or its square, that is not 0.
+TINY = 1e-30
 #: Values in one load.
 WIDTH = 4
 
 
 class Source:
     """A narrow light: at ``place``, or, if ``far``, in the direction ``place``; ``size`` is its
-    radius, or half its angle; ``covariance`` (3, 3) that of the points of a lamp, or a spot's mean
-    square angle (0: none).
+    radius, or half its angle. ``spread`` is the covariance (3, 3) of the points of a lamp, or a
+    spot's mean square angle (None: as good as a point).
     """
 
     def __init__(
-        self, place: np.ndarray, size: float, far: bool, covariance: np.ndarray | float = 0.0
+        self, place: np.ndarray, size: float, far: bool, spread: np.ndarray | float | None = None
     ) -> None:
         self.far = far
-        #: whether it is as wide as to be told from a point
-        self.wide = bool(np.any(covariance))
+        #: whether it is so wide that it has to be told from a point
+        self.wide = spread is not None
         self._direction, self._cosine = np.array(place), np.cos(size)
         #: whether it is so narrow that nothing of its light has to be in the moments
         self.sharp = far or not size
         self.place = mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in place))
         self._size = dr.opaque(mi.Float, float(np.cos(size) if far else size))
-        if far:
-            self._variance = dr.opaque(mi.Float, float(covariance))
+        if self.wide and far:
+            self._variance = dr.opaque(mi.Float, float(spread))
         elif self.wide:
-            rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in covariance]
+            rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in spread]
             self._covariance = [mi.Vector3f(*row) for row in rows]
 
     def seen_from(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
@@ -74,7 +76,7 @@ class Source:
         if self.far:
             return self.place, self._size
         way = self.place - mi.Vector3f(p)
-        distance = dr.norm(way)
+        distance = dr.maximum(dr.norm(way), TINY)
         sine = dr.maximum(self._size / distance, NARROWEST)
         cosine = dr.select(sine < WIDEST, dr.sqrt(1 - dr.square(sine)), 2)
         return way / distance, cosine
@@ -84,7 +86,7 @@ class Source:
         if self.far:
             return self._variance
         way = self.place - mi.Vector3f(p)
-        inverse = dr.rcp(dr.squared_norm(way))
+        inverse = dr.rcp(dr.maximum(dr.squared_norm(way), TINY))
         along = sum(w * dr.dot(row, way) for w, row in zip(way, self._covariance, strict=True))
         total = sum(row[i] for i, row in enumerate(self._covariance))
         return dr.maximum(total - along * inverse, 0) * inverse
@@ -346,7 +348,7 @@ def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
         if not light[own].sum() > SPOT_SHARE * total:
             break
         size, variance = _extent(np.arccos(np.clip(centre @ directions, -1, 1)), light)
-        found.append(Source(centre, size, True, variance if variance > POINT_LIKE**2 else 0.0))
+        found.append(Source(centre, size, True, variance if variance > POINT_LIKE**2 else None))
         own = (light > 0) & (centre @ directions >= np.cos(size))
         light, numbers[own] = np.where(own, 0, light), len(found)
     shares = [colours[:, numbers == k].sum(axis=1) for k in range(1 + len(found))]
