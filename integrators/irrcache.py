@@ -71,8 +71,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - |int|
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
          of 8 samples or 32 to 256 directions, as many as are wanted;
-         0: 128 directions, 64 among surfaces, twice as many for single scattering where the phase
-         function is isotropic; 16 to 256 samples, about 2^24 for all voxels, 2^22 among surfaces.
+         0: 128 directions, 64 among surfaces (256 for sharp phase functions), twice as many for
+         single scattering where the phase function is isotropic; 16 to 256 samples, about 2^24 for
+         all voxels, 2^22 among surfaces.
          (Default: 0)
 
      * - cache_seed

@@ -34,6 +34,9 @@ DENSE_VOXEL, FINEST = 0.7, 2.0
 #: scattering, and among surfaces, whose light has the noise of the image's samples besides. Twice
 #: as many for single scattering of irradiance, where each is less work and blurs less.
 SWEPT, SWEPT_AMONG_SURFACES = 128, 64
+#: The same among surfaces where the phase function has a forward peak: 128 leave an error of 1.5 %
+#: under a sky with a wide sun, these 0.9 %.
+SWEPT_SHARP = 256
 
 
 def choose_solver(
@@ -177,6 +180,8 @@ def choose_samples(cache: IrradianceCache, solver: str, medium: MediumGrid) -> i
 def swept_samples(max_depth: int, medium: MediumGrid) -> int:
     """Directions per voxel of the solver ``sweep``."""
     once = max_depth == 2 and medium.phase is None
+    if medium.phase is not None and medium.phase.forward and not medium.alone:
+        return SWEPT_SHARP
     return (SWEPT if medium.alone else SWEPT_AMONG_SURFACES) * (2 if once else 1)
 
 
