@@ -15,6 +15,9 @@ interpolated alike, so that what is noisy or dark weighs little.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import count, islice
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -201,30 +204,33 @@ class Directional:
         being as wide takes exp(-l (l + 1) variance / 4) of degree l. Without what the moments tell,
         unless the ``whole`` of it is wanted.
         """
-        before, legendre, result = mi.Float(0), mi.Float(1), mi.Float(0)
-        left, ratio, blur = mi.Float(1), mi.Float(1), dr.exp(-0.5 * variance)
-        for degree, (own, rest) in enumerate(self._terms):
+        result, left, ratio = mi.Float(0), mi.Float(1), mi.Float(1)
+        blur = dr.exp(-0.5 * variance)
+        for legendre, (own, rest) in zip(_legendre(cosine), self._terms, strict=False):
             result += (own if whole else rest) * left * legendre
             gain = gain - own * legendre
-            following = ((2 * degree + 1) * cosine * legendre - degree * before) / (degree + 1)
-            before, legendre = legendre, following
             ratio *= blur
             left *= ratio
         return dr.fma(gain, left, result)
 
     def _smooth(self, cosine: mi.Float) -> mi.Float:
         """4 pi p - 1, as far as the moments tell."""
-        before, legendre, result = mi.Float(1), cosine, mi.Float(0)
-        for degree, moment in enumerate(self._degrees, 1):
-            result += moment * legendre
-            following = ((2 * degree + 1) * cosine * legendre - degree * before) / (degree + 1)
-            before, legendre = legendre, following
-        return result
+        polynomials = islice(_legendre(cosine), 1, None)
+        return sum(m * p for m, p in zip(self._degrees, polynomials, strict=False))
 
 
-def nothing(count: int) -> list[mi.Spectrum]:
-    """So many sums of light, 0 so far."""
-    return [mi.Spectrum(0) for _ in range(count)]
+def _legendre(cosine: mi.Float) -> Iterator[mi.Float]:
+    """Legendre's polynomials, from degree 0 on."""
+    before, here = mi.Float(0), mi.Float(1)
+    for degree in count():
+        yield here
+        before, here = here, ((2 * degree + 1) * cosine * here - degree * before) / (degree + 1)
+
+
+def nothing(directional: Directional | None) -> list[mi.Spectrum]:
+    """Sums of light, as `added` has them, 0 so far."""
+    moments = 0 if directional is None else directional.count
+    return [mi.Spectrum(0) for _ in range(1 + moments)]
 
 
 def added(

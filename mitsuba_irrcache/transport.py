@@ -45,6 +45,10 @@ class Media:
         """
         return Media([grid if grid is medium else grid.with_peak for grid in self.grids])
 
+    def without(self, medium: MediumGrid) -> Media:
+        """All but one."""
+        return Media([grid for grid in self.grids if grid is not medium])
+
     def fly(
         self,
         pointer: mi.MediumPtr,

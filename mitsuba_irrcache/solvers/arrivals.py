@@ -27,7 +27,7 @@ from mitsuba_irrcache.solvers.layout import joined
 from mitsuba_irrcache.solvers.scattering import Level
 from mitsuba_irrcache.solvers.table import Entering, Table
 from mitsuba_irrcache.surroundings import probe
-from mitsuba_irrcache.transport import Media, Start, out_of, trace
+from mitsuba_irrcache.transport import Start, out_of, trace
 
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
 #: find what is in the way of an emitter's light are cheaper. What comes from surfaces differs more
@@ -57,7 +57,7 @@ class Around:
         self.scene, self.media = scene, medium.surroundings.media.around(medium)
         self.pointer, self.lamps = medium.pointer, list(lamps)
         #: the others: what leaves this one, which is convex, meets none of it going straight on
-        self.others = Media([grid for grid in self.media.grids if grid is not medium])
+        self.others = self.media.without(medium)
         self.directional = directional
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)

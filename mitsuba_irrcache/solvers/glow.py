@@ -30,8 +30,7 @@ def emitted_light(
     state = mi.sample_tea_32(place, stream)
     rng = mi.PCG32(initstate=mi.UInt64(state[0]) << 32 | mi.UInt64(state[1]), initseq=1)
     shift = [rng.next_uint32(), rng.next_uint32()]
-    moments = 0 if directional is None else directional.count
-    total, weight = nothing(1 + moments), dr.opaque(mi.Float, 4 * dr.pi / count)
+    total, weight = nothing(directional), dr.opaque(mi.Float, 4 * dr.pi / count)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, count)
     while dr.hint(k < count, label="emission"):
         ray = mi.Ray3f(position, _direction(shift, k))

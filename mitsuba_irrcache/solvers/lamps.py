@@ -17,7 +17,7 @@ from mitsuba_irrcache.directional import Directional, added, nothing
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.directions import marched
-from mitsuba_irrcache.transport import Media, visibility
+from mitsuba_irrcache.transport import visibility
 
 #: Solid angle of an emitter, on average over the voxels, from which on lines are relied upon to
 #: meet it [sr].
@@ -78,10 +78,9 @@ class Lamps:
         p: mi.Point3f,
         directional: Directional | None = None,
     ) -> None:
-        around = medium.surroundings.media.around(medium).grids
         self._scene, self._medium, self._p = scene, medium, p
         self._directional = directional
-        self._others = Media([grid for grid in around if grid is not medium])
+        self._others = medium.surroundings.media.around(medium).without(medium)
         self._small = len(small)
         if small:
             pointers = [mi.EmitterPtr(e) for e in small]
@@ -140,7 +139,7 @@ def _shone(scene, medium, others, emitter, p, sample, rng) -> tuple:
 def _sampled(scene, medium, others, emitters, p, count, samples, rng, directional):
     """The mean of samples of the irradiance from all of ``count`` lamps, and of its moments."""
     shift = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-    total, k = nothing(1 if directional is None else 1 + directional.count), mi.UInt32(0)
+    total, k = nothing(directional), mi.UInt32(0)
     weight = mi.Float(count) / mi.Float(samples)
     while dr.hint(k < samples, label="lamps"):
         # The same number on each lamp, as far as it goes; evenly spread over it.

@@ -14,6 +14,7 @@ from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
 from mitsuba_irrcache.solvers.directions import Sky, spread, spread_together
 from mitsuba_irrcache.solvers.lattice import Lattice
 from mitsuba_irrcache.solvers.scattering import Level
+from mitsuba_irrcache.solvers.table import Table
 
 #: Directions and what belongs to them, as `Lattice.table` wants it.
 Rows = Sequence[np.ndarray]
@@ -106,9 +107,7 @@ class ArrivingPass:
 
     def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         """As `Level.scatter`, with the light that arrives."""
-        table = level.lattice.table(*self.rows)
-        of_table = self.channels, level, table, self.numbers
-        table.entering = self.arrivals.returning(*of_table, emitted=True)
+        table = self._arriving(level)
         table.entering.receive(phi)
         found = level.scatter(None, table)
         if phi is None:
@@ -118,6 +117,13 @@ class ArrivingPass:
         both = tuple(a + b for a, b in zip(found, between, strict=True))
         dr.eval(both)
         return both
+
+    def _arriving(self, level: Level) -> Table:
+        """The rows, with the light that arrives along them."""
+        table = level.lattice.table(*self.rows)
+        of_table = self.channels, level, table, self.numbers
+        table.entering = self.arrivals.returning(*of_table, emitted=True)
+        return table
 
     def corrected(self, level: Level, phi: mi.Float, swept: mi.Float) -> mi.Float:
         """The sweep as it is: what differs between passes here is light that arrives."""
@@ -141,9 +147,7 @@ class JointPass(ArrivingPass):
     """
 
     def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
-        table = level.lattice.table(*self.rows)
-        of_table = self.channels, level, table, self.numbers
-        table.entering = self.arrivals.returning(*of_table, emitted=True)
+        table = self._arriving(level)
         if phi is None:
             table.entering.receive(phi)
         return level.scatter(phi, table)
@@ -163,14 +167,10 @@ def arriving(
     ``pairs`` are those between voxels.
     """
     several, joint = passes > 1, around.directional is not None
-    many, inner = max(ARRIVING // 2, pairs) if several else pairs, []
+    many = max(ARRIVING // 2, pairs) if several else pairs
     # The first one is apart, the others are even together.
     rows = sky.rows(1, many, rng) + (sky.rows(passes - 1, many, rng) if several else [])
-    sets = [spread(pairs, rng)] + (spread_together(passes - 1, pairs, rng) if several else [])
-    for directions, weights in sets:
-        black = np.zeros((pairs, *rows[0][1].shape[1:]))
-        inner.append((directions, black, weights, rng.random((pairs, 2))))
-    inner = [between(row) for row in rows] if joint else inner
+    inner = [between(row) for row in rows] if joint else _inner(passes, pairs, rng)
     arrivals = Arrivals(around, lattice, merged(rows), several, (*seed, 0))
     returns = Arrivals(around, lattice, inner[0], several, (*seed, 1)) if several else None
     starts = np.cumsum([0] + [len(row[0]) for row in rows])
@@ -185,6 +185,13 @@ def arriving(
         ]
 
     return of, kinds
+
+
+def _inner(passes: int, pairs: int, rng: np.random.Generator) -> list[tuple]:
+    """Rows of light between voxels, where it goes other ways than light that arrives."""
+    black = np.zeros((pairs, 2, dr.size_v(mi.Spectrum)))
+    sets = [spread(pairs, rng)] + (spread_together(passes - 1, pairs, rng) if passes > 1 else [])
+    return [(directions, black, weights, rng.random((pairs, 2))) for directions, weights in sets]
 
 
 def merged(rows: Sequence[Rows]) -> tuple[np.ndarray, ...]:
