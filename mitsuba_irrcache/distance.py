@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .division import Divisor, unravelled
+
 
 def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.UInt32:
     """For each cell of a grid of ``shape`` (z, y, x) the Chebyshev distance to the nearest one that
@@ -13,16 +15,17 @@ def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.
     nz, ny, nx = shape
     distance = dr.select(occupied, mi.UInt32(0), dr.opaque(mi.UInt32, reach))
     dr.eval(distance)
-    for side, stride in ((nx, 1), (ny, nx), (nz, nx * ny)):
-        distance = _along(distance, *(dr.opaque(mi.Int32, n) for n in (side, stride)))
+    places = unravelled(dr.arange(mi.UInt32, dr.width(distance)), [Divisor(nx), Divisor(ny)])
+    for place, side, stride in zip(places, (nx, ny, nz), (1, nx, nx * ny), strict=True):
+        limits = (dr.opaque(mi.Int32, n) for n in (side, stride))
+        distance = _along(distance, mi.Int32(place), *limits)
     return distance
 
 
 @dr.syntax
-def _along(distance: mi.UInt32, side: mi.Int32, stride: mi.Int32) -> mi.UInt32:
+def _along(distance: mi.UInt32, place: mi.Int32, side: mi.Int32, stride: mi.Int32) -> mi.UInt32:
     """One axis of the transform: the least of max(|k|, distance of the cell k further)."""
     index = dr.arange(mi.Int32, dr.width(distance))
-    place = index // dr.maximum(stride, 1) % dr.maximum(side, 1)  # 0 where a vector is not filled
     k, nearest = mi.Int32(1), mi.Int32(distance)
     while dr.hint(k < nearest, label="clearance"):
         for there, inside in ((-k, place >= k), (k, place + k < side)):

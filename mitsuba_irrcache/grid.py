@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .division import Divisor, unravelled
 from .errors import IrrcacheError
 
 #: Largest ratio of neighbouring roots of irradiance that is extrapolated beyond the border.
@@ -43,6 +44,7 @@ class Grid:
         self.world = Affine(forward)  #: voxel coordinates -> world position
         self.coordinates = Affine(np.linalg.inv(forward))  #: world position -> voxel coordinates
         self.sides = tuple(dr.opaque(mi.Int32, n) for n in self.shape[::-1])  #: nx, ny, nz
+        self._divisors = [Divisor(n) for n in self.shape[:0:-1]]
 
     @property
     def voxel_count(self) -> int:
@@ -81,9 +83,7 @@ class Grid:
 
     def places(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """Voxels along x, y, z of the flat indices ``index`` (x fastest)."""
-        nx, ny, _ = (mi.UInt32(n) for n in self.sides)
-        row = index // nx
-        return index - row * nx, row % ny, row // ny
+        return unravelled(index, self._divisors)
 
     def index(self, x: mi.UInt32, y: mi.UInt32, z: mi.UInt32) -> mi.UInt32:
         """The flat indices of voxels: the inverse of `places`."""
@@ -247,9 +247,8 @@ class Extension:
         place = grid.to_world @ np.diag([*((n + 2) / n for n in sides), 1.0])
         place[:3, 3] = grid.to_world[:3, 3] - grid.to_world[:3, :3] @ (1 / grid.resolution)
         self.grid = Grid(tuple(n + 2 for n in grid.shape), place)
-        index = dr.arange(mi.Int32, self.grid.voxel_count)
-        row, width, height = index // (sides[0] + 2), sides[0] + 2, sides[1] + 2
-        at = [index - row * width - 1, row % height - 1, row // height - 1]
+        at = self.grid.places(dr.arange(mi.UInt32, self.grid.voxel_count))
+        at = [mi.Int32(i) - 1 for i in at]
         nearest = [dr.clip(i, 0, n - 1) for i, n in zip(at, sides, strict=True)]
         strides = (1, sides[0], sides[0] * sides[1])
         inside = sum(i * stride for i, stride in zip(nearest, strides, strict=True))

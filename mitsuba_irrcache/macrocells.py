@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from .boundary import Boundary, safe_rcp
+from .division import Divisor
 from .grid import Affine, ConstantField, Field, GridField
 
 
@@ -140,10 +141,10 @@ def _reduced(
     """
     stride, side = int(np.prod(sides[:axis])), sides[axis]
     index = dr.arange(mi.UInt32, int(np.prod(sides)) // side * count)
-    before, sides_here, count = (dr.opaque(mi.UInt32, n) for n in (stride, side, count))
-    row = index // before
-    window = row % count
-    start = index - row * before + row // count * (before * sides_here)
+    row, within = Divisor(stride).split(index)
+    behind, window = Divisor(count).split(row)
+    before, sides_here = (dr.opaque(mi.UInt32, n) for n in (stride, side))
+    start = within + behind * (before * sides_here)
     first = mi.Int32(window * size) - 1
     places = [
         start + mi.UInt32(dr.clip(first + k, 0, mi.Int32(sides_here) - 1)) * before

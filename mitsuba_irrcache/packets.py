@@ -30,20 +30,18 @@ class Packets:
 
     def __init__(self, grid: Grid, planes: Callable, decode: Callable | None = None) -> None:
         self.grid, self._decode = grid, decode
-        nx, ny, _ = grid.sides
+        nx, ny, _ = (mi.UInt32(n) for n in grid.sides)
         index = dr.arange(mi.UInt32, grid.voxel_count)
-        row = index // mi.UInt32(nx)
-        more_x = index - row * mi.UInt32(nx) + 1 < mi.UInt32(nx)
+        x, y, _ = grid.places(index)
         here = planes(index)
         values = list(here)
         # 4: along x and y, 2: along x, 1: none
         self.neighbours = 2 if len(here) == 2 else WIDTH // len(here)
         if self.neighbours > 1:
-            right = index + dr.select(more_x, mi.UInt32(1), 0)
+            right = index + dr.select(x + 1 < nx, mi.UInt32(1), 0)
             values += planes(right)
             if self.neighbours == 4:
-                more_y = row - row // mi.UInt32(ny) * mi.UInt32(ny) + 1 < mi.UInt32(ny)
-                above = dr.select(more_y, mi.UInt32(nx), 0)
+                above = dr.select(y + 1 < ny, nx, 0)
                 values += [*planes(index + above), *planes(right + above)]
         values += [mi.Float(0)] * (WIDTH - len(values))
         # Made by a kernel, never borrowed from elsewhere: wide loads need an aligned array.

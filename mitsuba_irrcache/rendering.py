@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import drjit as dr
 import mitsuba as mi
 
+from .division import Divisor
 from .errors import IrrcacheError
 from .layers import interleaved
 from .memory import require_memory
@@ -180,9 +181,8 @@ class PixelPositions:
 
 def pixel_of(index: mi.UInt32, width: int) -> mi.Vector2i:
     """Column and row of the pixels with these numbers, where rows have ``width`` of them."""
-    columns = dr.opaque(mi.UInt32, width)
-    row = index // columns
-    return mi.Vector2i(mi.Int32(index - row * columns), mi.Int32(row))
+    row, column = Divisor(width).split(index)
+    return mi.Vector2i(mi.Int32(column), mi.Int32(row))
 
 
 def camera_ray(
@@ -212,10 +212,10 @@ def _sampled(
     """The samples of a pass: their places on the film, and the values of their channels."""
     film = sensor.film()
     lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
-    index = lane // dr.opaque(mi.UInt32, per_pass)
+    index, sample = Divisor(per_pass).split(lane)
     pixel = mi.Vector2f(pixel_of(index, int(size.x)) - border)
     pixel += mi.Vector2f(film.crop_offset())
-    position = pixel + spread.next(index, lane - index * dr.opaque(mi.UInt32, per_pass))
+    position = pixel + spread.next(index, sample)
     ray, weight = camera_ray(sensor, sampler, position)
     ray.scale_differential(dr.rsqrt(float(spp)))
     value, alpha, further = radiance(sampler, ray, weight, mi.Bool(True))

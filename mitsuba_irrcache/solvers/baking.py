@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.division import Divisor, unravelled
 from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.medium import MediumGrid
 
@@ -47,7 +48,7 @@ def baked(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
     ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
     points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
     index = dr.arange(mi.UInt32, grid.voxel_count)
-    values = _mean(medium, field, grid, index, dr.opaque(mi.UInt32, points), cut)
+    values = _mean(medium, field, grid, index, points, cut)
     dr.eval(values)
     return values
 
@@ -62,7 +63,7 @@ def albedo_of_collisions(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> l
         return [value + none for value in list(values)[: albedo.channels]]
     fields = [f.grid for f in (albedo, extinction) if f.grid is not None]
     ratio = max((grid.voxel_size / data.voxel_size).max() for data in fields)
-    parts = dr.opaque(mi.UInt32, int(np.clip(np.ceil(ratio - 1e-3), 1, FINEST // 2)))
+    parts = int(np.clip(np.ceil(ratio - 1e-3), 1, FINEST // 2))
     values = _collided(medium, grid, voxels, parts, not medium.fills(grid))
     dr.eval(values)
     return values
@@ -83,15 +84,15 @@ def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
 
 
 @dr.syntax
-def _mean(medium, field, grid, index, points, cut: bool):
+def _mean(medium, field, grid, index, points: int, cut: bool):
     """Means over points^3 places in the voxels ``index``."""
-    corner = mi.Point3f(*grid.places(index))
-    count = points * points * points
+    corner, sides = mi.Point3f(*grid.places(index)), [Divisor(points)] * 2
+    points, count = dr.opaque(mi.Float, points), dr.opaque(mi.UInt32, points**3)
     sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
     k = mi.UInt32(0)
     while dr.hint(k < count, label="points in a voxel"):
-        place = mi.Point3f(k % points, (k // points) % points, k // (points * points)) + 0.5
-        p = grid.world.point(corner + place / mi.Float(points))
+        place = mi.Point3f(*unravelled(k, sides)) + 0.5
+        p = grid.world.point(corner + place / points)
         value = field.at_world(p)
         if dr.hint(cut, mode="scalar"):
             value = dr.select(medium.contains(p), value, 0)
@@ -103,25 +104,25 @@ def _mean(medium, field, grid, index, points, cut: bool):
 
 
 @dr.syntax
-def _collided(medium, grid, index, parts, cut: bool):
+def _collided(medium, grid, index, parts: int, cut: bool):
     """Means of the albedo over the voxels ``index``, weighted by extinction: `RADAU` in so many
     ``parts`` along each axis.
     """
     channels = max(medium.albedo.channels, medium.sigma_t.channels)
-    corner, points = mi.Point3f(*grid.places(index)), 3 * parts
-    count = points * points * points
+    corner, sides = mi.Point3f(*grid.places(index)), [Divisor(3 * parts)] * 2
+    parts, count = dr.opaque(mi.Float, parts), dr.opaque(mi.UInt32, (3 * parts) ** 3)
     scattered = [dr.zeros(mi.Float, dr.width(index)) for _ in range(channels)]
     collided = [dr.zeros(mi.Float, dr.width(index)) for _ in range(channels)]
     k = mi.UInt32(0)
     while dr.hint(k < count, label="collisions in a voxel"):
         within, weight = [], mi.Float(1)
-        for i in (k % points, (k // points) % points, k // (points * points)):
+        for i in unravelled(k, sides):
             part = i // 3
             middle = i - part * 3 == 1
             aside = dr.select(i - part * 3 == 0, RADAU[0][0], RADAU[2][0])
             within.append(mi.Float(part) + dr.select(middle, RADAU[1][0], aside))
             weight *= dr.select(middle, RADAU[1][1], RADAU[0][1])
-        p = grid.world.point(corner + mi.Point3f(within) / mi.Float(parts))
+        p = grid.world.point(corner + mi.Point3f(within) / parts)
         sigma_t = mi.Spectrum(medium.sigma_t.at_world(p)) * weight
         albedo = mi.Spectrum(medium.albedo.at_world(p))
         if dr.hint(cut, mode="scalar"):

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.distance import chebyshev
+from mitsuba_irrcache.division import Divisor, unravelled
 from mitsuba_irrcache.grid import Grid
 
 #: Voxels along an edge of a cell, and the farthest that is looked for the next occupied one, in
@@ -49,8 +50,7 @@ class Emptiness:
         outer = [n + 2 for n in shape]
         _, oy, ox = (dr.opaque(mi.UInt32, n) for n in outer)
         index = dr.arange(mi.UInt32, int(np.prod(outer)))
-        row = index // ox
-        at = index - row * ox, row % oy, row // oy
+        at = unravelled(index, [Divisor(n) for n in outer[:0:-1]])
         whole = [dr.opaque(mi.UInt32, int(n) // CELL) for n in sides]
         inside = mi.Bool(True)
         for a, n in zip(at, whole, strict=True):
@@ -59,8 +59,7 @@ class Emptiness:
         there = dr.gather(mi.UInt32, occupied, (z * ny + y) * nx + x, inside)
         distance = chebyshev(~inside | (there > 0), tuple(outer), REACH)
         index = dr.arange(mi.UInt32, count)
-        row = index // nx
-        x, y, z = index - row * nx, row % ny, row // ny
+        x, y, z = unravelled(index, [Divisor(n) for n in shape[:0:-1]])
         distance = dr.gather(mi.UInt32, distance, ((z + 1) * oy + y + 1) * ox + x + 1)
         there = dr.gather(mi.UInt32, occupied, index)
         # Only cells that are needed are 0; where a line may just not go far, it may go 1.

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.division import Divisor, unravelled
 from mitsuba_irrcache.layers import interleaved
 
 #: Axes of an array from the fastest to the slowest, unless they are laid out by slices.
@@ -33,9 +34,7 @@ def strides_of(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> tuple[i
 def places_of(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> list[mi.UInt32]:
     """Places along x, y, z of all values in the order of their memory."""
     index = dr.arange(mi.UInt32, int(np.prod(sides)))
-    first, second = (dr.opaque(mi.UInt32, int(sides[axis])) for axis in layout[:2])
-    row = index // first
-    places = index - row * first, row % second, row // second
+    places = unravelled(index, [Divisor(int(sides[axis])) for axis in layout[:2]])
     return [place for _, place in sorted(zip(layout, places, strict=True), key=lambda p: p[0])]
 
 
@@ -84,6 +83,4 @@ def layers_of(voxels: int, count: int) -> tuple[mi.UInt32, mi.UInt32]:
     """Of all values of an array that has ``count`` ones for each voxel, one layer after the other:
     layer and voxel.
     """
-    index, step = dr.arange(mi.UInt32, voxels * count), dr.opaque(mi.UInt32, voxels)
-    layer = index // step
-    return layer, index - layer * step
+    return Divisor(voxels).split(dr.arange(mi.UInt32, voxels * count))
