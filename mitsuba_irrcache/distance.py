@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .division import Divisor, unravelled
+from .arithmetic import Divisor, unravelled
 
 
 def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.UInt32:

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .division import Divisor, unravelled
+from .arithmetic import Divisor, clipped, unravelled
 from .errors import IrrcacheError
 
 #: Largest ratio of neighbouring roots of irradiance that is extrapolated beyond the border.
@@ -297,6 +297,6 @@ def stencil(u: mi.Float, n: mi.Int32) -> tuple[mi.Int32, mi.Float, mi.Bool]:
     """The lower of the two voxels around ``u``, the weight of the upper, and whether there is
     one.
     """
-    s = dr.clip(u - 0.5, 0.0, mi.Float(n - 1))
+    s = clipped(u - 0.5, 0.0, mi.Float(n - 1))
     lower = mi.Int32(s)
     return lower, s - mi.Float(lower), lower < n - 1

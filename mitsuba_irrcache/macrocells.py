@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arithmetic import Divisor
 from .boundary import Boundary, safe_rcp
-from .division import Divisor
 from .grid import Affine, ConstantField, Field, GridField
 
 

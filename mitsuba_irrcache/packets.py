@@ -1,114 +1,174 @@
-"""Several fields of one grid, laid out so that a lookup needs few wide loads.
+"""Several fields of one grid, laid out for rays: a lookup needs few loads of little memory.
 
-A load of two or four neighbouring floats costs little more than that of one. So what a lookup reads
-together lies together: the fields of a voxel, and while there is room in four floats, the voxel's
-neighbours along x and y too.
+What rays read of large volumes waits for memory, not for arithmetic. So values are kept in 16 bits,
+floating-point numbers without a sign: 5 bits of exponent and 11 of mantissa, rounded up or down at
+random, such that they are right on average over any few neighbours. And what a lookup reads
+together lies together: the fields of a voxel, and while there is room in two words, the voxel's
+neighbour along x.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
 
-from .grid import Extension, Field, Grid, GridField, RootField, stencil
+from .arithmetic import clipped
+from .grid import Extension, Field, Grid, GridField, RootField
 
-#: Floats in one load.
-WIDTH = 4
+#: Most values of a voxel, two in each word, and most of those that have their neighbours with them.
+MOST, PAIRED = 8, 4
 #: Larger copies could not be addressed with 32 bits.
-LARGEST = 2**31 // WIDTH
+LARGEST = 2**32 // 4
+#: Bits of a float's mantissa that are left out, and the exponent, as floats keep it, that is 0 in
+#: 16 bits. What is below 2^-30 of the largest value is 0.
+DROPPED, LEAST = 12, 96
+#: 2^32 over x, x^2 and x^3 where x^4 = x + 1: multiples spread evenly over all axes (Roberts,
+#: *The unreasonable effectiveness of quasirandom sequences*, 2018).
+SPREAD = (3518319155, 2882110345, 2360945575)
+#: Smaller largest values count as this one: its reciprocal is a number still.
+SMALLEST = 1e-37
 
 
 class Packets:
-    """Fields, at most `WIDTH` words in all, with values at the voxel centres of ``grid``, trilinear
+    """Fields, at most `MOST` values in all, with values at the voxel centres of ``grid``, trilinear
     between them and clamped at the border: the numbers of a `GridField`, copied.
 
-    ``planes`` gives, for flat indices of voxels, what is kept of them, and ``decode`` makes the
-    values of it. The copy takes `WIDTH` floats per voxel.
+    ``planes`` gives, for flat indices of voxels, what is kept of them, not negative; of each
+    ``largest`` is the largest that is told apart.
     """
 
-    def __init__(self, grid: Grid, planes: Callable, decode: Callable | None = None) -> None:
-        self.grid, self._decode = grid, decode
-        nx, ny, _ = (mi.UInt32(n) for n in grid.sides)
+    def __init__(self, grid: Grid, planes: Callable, largest: Sequence[float]) -> None:
+        self.grid, self.count = grid, len(largest)
+        #: whether a word holds a value and that of the voxel's neighbour along x
+        self.paired = self.count <= PAIRED
+        sides = [int(n) for n in grid.resolution]
+        self._last = [dr.opaque(mi.Float, n - 1) for n in sides]
+        self._lowest = [dr.opaque(mi.Int32, max(n - 2, 0)) for n in sides]
+        steps = zip(sides, (1, sides[0], sides[0] * sides[1]), strict=True)
+        self._steps = [dr.opaque(mi.Int32, step if n > 1 else 0) for n, step in steps]
+        largest = [max(value, SMALLEST) for value in largest]
+        self._scales = [dr.opaque(mi.Float, value) for value in largest]
+        scales = [dr.opaque(mi.Float, 1 / value) for value in largest]
         index = dr.arange(mi.UInt32, grid.voxel_count)
-        x, y, _ = grid.places(index)
-        here = planes(index)
-        values = list(here)
-        # 4: along x and y, 2: along x, 1: none
-        self.neighbours = 2 if len(here) == 2 else WIDTH // len(here)
-        if self.neighbours > 1:
-            right = index + dr.select(x + 1 < nx, mi.UInt32(1), 0)
-            values += planes(right)
-            if self.neighbours == 4:
-                above = dr.select(y + 1 < ny, nx, 0)
-                values += [*planes(index + above), *planes(right + above)]
-        values += [mi.Float(0)] * (WIDTH - len(values))
+        x, y, z = grid.places(index)
+        noise = x * SPREAD[0] + y * SPREAD[1] + z * SPREAD[2]
+
+        def numbers(index: mi.UInt32, noise: mi.UInt32) -> list[mi.UInt32]:
+            values = zip(planes(index), scales, strict=True)
+            return [_encoded(value * scale, noise) for value, scale in values]
+
+        here = numbers(index, noise)
+        if self.paired:
+            step = dr.select(x + 1 < mi.UInt32(grid.sides[0]), mi.UInt32(1), 0)
+            right = numbers(index + step, noise + step * SPREAD[0])
+            here = [number for pair in zip(here, right, strict=True) for number in pair]
+        words = [low | high << 16 for low, high in zip(here[::2], here[1::2], strict=False)]
+        words += here[len(words) * 2 :]
+        self.words = 1 << (len(words) - 1).bit_length()
+        words += [mi.UInt32(0)] * (self.words - len(words))
         # Made by a kernel, never borrowed from elsewhere: wide loads need an aligned array.
-        self.data = dr.empty(mi.Float, grid.voxel_count * WIDTH)
-        dr.scatter(self.data, mi.Vector4f(*values), index)
+        self.data = dr.empty(mi.UInt32, grid.voxel_count * self.words)
+        dr.scatter(self.data, _load(self.words)(*words), index)
         dr.eval(self.data)
 
     def at(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         """The fields at the voxel coordinates ``u``."""
-        nx, ny, _ = self.grid.sides
-        corners, weights, more = zip(
-            *(stencil(c, n) for c, n in zip(u, self.grid.sides, strict=True)), strict=True
-        )
-        base = (corners[2] * ny + corners[1]) * nx + corners[0]
-        dx, dy, dz = (
-            dr.select(m, mi.Int32(s), 0) for m, s in zip(more, (1, nx, nx * ny), strict=True)
-        )
+        corners, weights = [], []
+        for c, last, most in zip(u, self._last, self._lowest, strict=True):
+            s = clipped(c - 0.5, 0.0, last)
+            # Of the last voxel nothing but the upper one of two.
+            corners.append(dr.minimum(mi.Int32(s), most))
+            weights.append(s - mi.Float(corners[-1]))
         wx, wy, wz = weights
+        nx, ny, _ = self.grid.sides
+        base = (corners[2] * ny + corners[1]) * nx + corners[0]
+        dx, dy, dz = self._steps
 
-        def load(place: mi.Int32) -> list[mi.Float]:
-            values = list(dr.gather(mi.Vector4f, self.data, mi.UInt32(place), active))
-            return self._decode(values) if self._decode else values
+        def load(place: mi.Int32) -> list[mi.UInt32]:
+            words = dr.gather(_load(self.words), self.data, mi.UInt32(place), active)
+            return [words] if self.words == 1 else list(words)
 
         def edge(place: mi.Int32) -> list[mi.Float]:
             """Interpolated along x."""
-            low = load(place)
-            low, high = (low[:2], low[2:]) if self.neighbours == 2 else (low, load(place + dx))
-            return [dr.lerp(a, b, wx) for a, b in zip(low, high, strict=True)]
+            low = [half for word in load(place) for half in _decoded(word)]
+            if self.paired:
+                low, high = low[::2], low[1::2]
+            else:
+                high = [half for word in load(place + dx) for half in _decoded(word)]
+            return [dr.lerp(a, b, wx) for a, b in zip(low, high, strict=True)][: self.count]
 
         def face(place: mi.Int32) -> list[mi.Float]:
             """Interpolated along x and y."""
-            if self.neighbours == 4:
-                a, b, c, d = load(place)
-                return [dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)]
-            low, high = edge(place), edge(place + dy)
-            return [dr.lerp(a, b, wy) for a, b in zip(low, high, strict=True)]
+            return [dr.lerp(a, b, wy) for a, b in zip(edge(place), edge(place + dy), strict=True)]
 
-        near, far = face(base), face(base + dz)
-        return [dr.lerp(a, b, wz) for a, b in zip(near, far, strict=True)]
+        values = zip(face(base), face(base + dz), self._scales, strict=True)
+        return [dr.lerp(near, far, wz) * 2.0**LEAST * scale for near, far, scale in values]
+
+
+def _load(words: int) -> type:
+    """So many words that are read together."""
+    return {1: mi.UInt32, 2: mi.Vector2u, 4: mi.Array4u}[words]
+
+
+def _encoded(value: mi.Float, noise: mi.UInt32) -> mi.UInt32:
+    """A number in [0, 1], greater ones are 1, in 16 bits, rounded by ``noise``."""
+    bits = dr.reinterpret_array(mi.UInt32, dr.clip(value, 0, 1)) + (noise >> (32 - DROPPED))
+    # An exponent of 0 has another meaning for floats.
+    told = bits >= (LEAST + 1) << 23
+    return dr.select(told, (bits - (LEAST << 23)) >> DROPPED, 0)
+
+
+def _decoded(word: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Both numbers of a word, times 2^-`LEAST`: what is left out are zeros."""
+    low = (word & 0xFFFF) << DROPPED
+    high = (word >> (16 - DROPPED)) & (0xFFFF << DROPPED)
+    return dr.reinterpret_array(mi.Float, low), dr.reinterpret_array(mi.Float, high)
 
 
 class Lookups:
     """The values of several fields at one place. Those that share their voxels, and fit, are read
     together from a copy; others, and constants, by their own.
+
+    Values of a field above its ``limits``, if there are any, count as these.
     """
 
-    def __init__(self, fields: list[Field]) -> None:
+    def __init__(self, fields: list[Field], limits: Sequence[float] | None = None) -> None:
         self.fields = fields
         self.groups: list[Group] = []
+        limits = limits or [dr.inf] * len(fields)
         grids = [f if isinstance(f, GridField) else None for f in fields]
         alone = [i for i, f in enumerate(grids) if f and f.grid.voxel_count < LARGEST]
         while alone:
             group = [alone.pop(0)]
             for i in list(alone):
                 candidate = [fields[j] for j in [*group, i]]
-                if _together(candidate) and Group.words(candidate) <= WIDTH:
+                if _together(candidate) and sum(f.channels for f in candidate) <= MOST:
                     group.append(i)
                     alone.remove(i)
-            if Group.words([fields[i] for i in group]) <= WIDTH:
-                self.groups.append(Group(fields, group))
+            self.groups.append(Group([(i, fields[i], limits[i]) for i in group]))
 
-    def at_world(self, p: mi.Point3f, active: mi.Bool) -> list:
+    def along(self, ray: mi.Ray3f) -> AlongRay:
+        """The values along a ray."""
+        return AlongRay(self, ray)
+
+
+class AlongRay:
+    """`Lookups` at places of a ``ray``, which is straight in the grids' coordinates too."""
+
+    def __init__(self, lookups: Lookups, ray: mi.Ray3f) -> None:
+        self.ray, self.fields = ray, lookups.fields
+        self._groups = [(group, *group.coordinates(ray)) for group in lookups.groups]
+
+    def at(self, t: mi.Float, active: mi.Bool) -> list:
+        """The values at the distance ``t``."""
         found: dict = {}
-        for group in self.groups:
-            found |= group.at_world(p, active)
+        for group, origin, direction in self._groups:
+            found |= group.at(dr.fma(direction, t, origin), active)
         return [
-            found[i] if i in found else f.at_world(p, active) for i, f in enumerate(self.fields)
+            found[i] if i in found else field.at_world(self.ray(t), active)
+            for i, field in enumerate(self.fields)
         ]
 
 
@@ -122,50 +182,41 @@ def _together(fields: list[GridField]) -> bool:
 
 
 class Group:
-    """Fields of one grid in `Packets`."""
+    """Fields of one grid in `Packets`: each has a number, and a limit."""
 
-    @staticmethod
-    def words(fields: list[GridField]) -> int:
-        """Floats per voxel; three channels below 1 beside others take two."""
-        total = sum(f.channels for f in fields)
-        fractions = [f for f in fields if _is_fraction(f)]
-        return total - len(fractions) if total > WIDTH else total
-
-    def __init__(self, fields: list[Field], members: list[int]) -> None:
-        self.members = [(i, fields[i]) for i in members]
-        used = [f for _, f in self.members]
+    def __init__(self, members: list[tuple[int, GridField, float]]) -> None:
+        self.members = [(i, field) for i, field, _ in members]
+        used = [field for _, field in self.members]
         self.grid = _inner(used[0])
         extended = any(isinstance(f, RootField) for f in used)
         extension = Extension(self.grid) if extended else None
         self.shift = 1 if extended else 0
-        halved = sum(f.channels for f in used) > WIDTH
-        self.halved = [halved and _is_fraction(f) for f in used]
+        largest = []
+        for _, field, limit in members:
+            most = min(field.maximum, limit)
+            root = isinstance(field, RootField)
+            largest += [most**0.5 if root else most] * field.channels
 
         def planes(index: mi.UInt32) -> list[mi.Float]:
             values = []
-            for field, half in zip(used, self.halved, strict=True):
+            for field in used:
                 own = extended and not isinstance(field, RootField)
                 voxel = dr.gather(mi.UInt32, extension.inside, index) if own else index
                 n = field.channels
                 channels = [dr.gather(mi.Float, field.data, voxel * n + c) for c in range(n)]
-                channels = [c * field.scale for c in channels]
-                values += _halves(channels) if half else channels
+                values += [c * field.scale for c in channels]
             return values
 
-        self.packets = Packets(
-            extension.grid if extended else self.grid, planes, self._decode if halved else None
-        )
+        self.packets = Packets(extension.grid if extended else self.grid, planes, largest)
 
-    def _decode(self, words: list[mi.Float]) -> list[mi.Float]:
-        values = []
-        for (_, field), half in zip(self.members, self.halved, strict=True):
-            n = 2 if half else field.channels
-            own, words = words[:n], words[n:]
-            values += _fractions(own) if half else own
-        return values
+    def coordinates(self, ray: mi.Ray3f) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Origin and direction of a ray in those of `at`."""
+        place = self.grid.coordinates
+        return place.point(ray.o) + self.shift, place.vector(ray.d)
 
-    def at_world(self, p: mi.Point3f, active: mi.Bool) -> dict:
-        values = self.packets.at(self.grid.coordinates.point(p) + self.shift, active)
+    def at(self, u: mi.Point3f, active: mi.Bool) -> dict:
+        """The fields, by their numbers, at these coordinates."""
+        values = self.packets.at(u, active)
         found = {}
         for i, field in self.members:
             own, values = values[: field.channels], values[field.channels :]
@@ -173,19 +224,3 @@ class Group:
                 own = [dr.square(v) for v in own]
             found[i] = own[0] if field.channels == 1 else mi.Color3f(own)
         return found
-
-
-def _is_fraction(field: GridField) -> bool:
-    return field.channels == 3 and not isinstance(field, RootField) and field.maximum <= 1.0001
-
-
-def _halves(channels: list[mi.Float]) -> list[mi.Float]:
-    """Three numbers in [0, 1] as two words, each to 16 bits: right to 8e-6."""
-    a, b, c = (mi.UInt32(dr.clip(v, 0, 1) * 65535 + 0.5) for v in channels)
-    return [dr.reinterpret_array(mi.Float, w) for w in (a | (b << 16), c)]
-
-
-def _fractions(words: list[mi.Float]) -> list[mi.Float]:
-    """The inverse of `_halves`."""
-    first, second = (dr.reinterpret_array(mi.UInt32, w) for w in words)
-    return [mi.Float(mi.Int32(v)) * (1 / 65535) for v in (first & 0xFFFF, first >> 16, second)]

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import drjit as dr
 import mitsuba as mi
 
-from .division import Divisor
+from .arithmetic import Divisor
 from .errors import IrrcacheError
 from .layers import interleaved
 from .memory import require_memory

@@ -51,8 +51,8 @@ MUTANTS = (
     Mutant(
         "lookups shifted by half a voxel",
         "grid.py",
-        "s = dr.clip(u - 0.5, 0.0",
-        "s = dr.clip(u, 0.0",
+        "s = clipped(u - 0.5, 0.0",
+        "s = clipped(u, 0.0",
         ("tests/unit/test_grid.py",),
     ),
     Mutant(
@@ -121,15 +121,15 @@ MUTANTS = (
     Mutant(
         "the last segment skipped",
         "projection.py",
-        "active &= t < far",
-        "active &= t + step < far",
+        "active &= (t < far) & (~empty",
+        "active &= (t + step < far) & (~empty",
         (PROJECTION,),
     ),
     Mutant(
         "the curvature of a segment with the wrong sign",
         "projection.py",
-        "dr.maximum(1 - 2 * sag / (a + b), 0)",
-        "dr.maximum(1 + 2 * sag / (a + b), 0)",
+        "greatest(1 - sag, 0)",
+        "greatest(1 + sag, 0)",
         (PROJECTION,),
     ),
     Mutant(

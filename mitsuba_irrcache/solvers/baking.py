@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.division import Divisor, unravelled
+from mitsuba_irrcache.arithmetic import Divisor, unravelled
 from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.medium import MediumGrid
 

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.arithmetic import Divisor, unravelled
 from mitsuba_irrcache.distance import chebyshev
-from mitsuba_irrcache.division import Divisor, unravelled
 from mitsuba_irrcache.grid import Grid
 
 #: Voxels along an edge of a cell, and the farthest that is looked for the next occupied one, in

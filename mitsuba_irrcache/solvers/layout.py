@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.division import Divisor, unravelled
+from mitsuba_irrcache.arithmetic import Divisor, unravelled
 from mitsuba_irrcache.layers import interleaved
 
 #: Axes of an array from the fastest to the slowest, unless they are laid out by slices.

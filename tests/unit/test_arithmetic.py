@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsuba_irrcache.division import Divisor, unravelled
+from mitsuba_irrcache.arithmetic import Divisor, unravelled
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

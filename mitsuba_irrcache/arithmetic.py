@@ -1,9 +1,4 @@
-"""Flat indices taken apart by numbers that kernels do not know.
-
-Processors have no division of integer vectors: it is done one by one, and took most of the time of
-kernels that lay volumes out anew. A product and two shifts do the same (Granlund and Montgomery,
-*Division by invariant integers using multiplication*, 1994).
-"""
+"""Arithmetic that processors do fast with many numbers at once, in place of what they do slowly."""
 
 from __future__ import annotations
 
@@ -16,6 +11,10 @@ import mitsuba as mi
 class Divisor:
     """A ``number`` from 1 to 2^32 - 1 that divides any UInt32. Another number is the same
     kernel.
+
+    There is no division of integer vectors: it is done one by one, and took most of the time of
+    kernels that lay volumes out anew. A product and two shifts do the same (Granlund and
+    Montgomery, *Division by invariant integers using multiplication*, 1994).
     """
 
     def __init__(self, number: int) -> None:
@@ -40,3 +39,20 @@ def unravelled(index: mi.UInt32, sides: Sequence[Divisor]) -> tuple[mi.UInt32, .
         index, place = side.split(index)
         places.append(place)
     return (*places, index)
+
+
+def least(a: mi.Float, b: mi.Float) -> mi.Float:
+    """The less of two numbers, one instruction: ``dr.minimum`` takes six, to hand on what is no
+    number and to tell the zeros apart. Likewise `greatest`, `clipped`.
+    """
+    return dr.select(a < b, a, b)
+
+
+def greatest(a: mi.Float, b: mi.Float) -> mi.Float:
+    """The greater of two numbers."""
+    return dr.select(a > b, a, b)
+
+
+def clipped(value: mi.Float, lower: mi.Float, upper: mi.Float) -> mi.Float:
+    """``value`` between two others."""
+    return least(greatest(value, lower), upper)
