@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
+
+#: 2^f = 1 + f (c0 + f (c1 + ...)) for f in [0, 1], to 2e-9: what is left adds up over many steps.
+POWER_OF_TWO = (
+    0.69314706,
+    0.24022909,
+    0.055486184,
+    0.0096737752,
+    0.0012482289,
+    0.00021565972,
+)
+#: From here on e^-x is 0.
+ENDLESS = 87.0
 
 
 class Divisor:
@@ -56,3 +69,16 @@ def greatest(a: mi.Float, b: mi.Float) -> mi.Float:
 def clipped(value: mi.Float, lower: mi.Float, upper: mi.Float) -> mi.Float:
     """``value`` between two others."""
     return least(greatest(value, lower), upper)
+
+
+def decay(x):
+    """e^-x of what is not negative, to 1e-7 (1 + x) of it: half the instructions of ``dr.exp``."""
+    if dr.depth_v(x) > 1:
+        return type(x)([decay(channel) for channel in x])
+    power = x * -math.log2(math.e)
+    whole = dr.floor(power)
+    part, value = power - whole, mi.Float(0)
+    for factor in reversed(POWER_OF_TWO):
+        value = dr.fma(value, part, factor)
+    bits = dr.reinterpret_array(mi.Int32, dr.fma(value, part, 1)) + (mi.Int32(whole) << 23)
+    return dr.select(x < ENDLESS, dr.reinterpret_array(mi.Float, bits), 0)

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arithmetic import clipped, greatest, least
+from .arithmetic import clipped, decay, greatest, least
 from .boundary import safe_rcp
 from .directional import DirectionalField
 from .distance import chebyshev
@@ -447,9 +447,9 @@ def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
     sigma_a, sigma_b = sigma
     if quadrature == "riemann":
         absorbed = absorptance(sigma_a * length)
-        return (absorbed, dr.zeros(type(absorbed))), dr.exp(-sigma_a * length)
+        return (absorbed, dr.zeros(type(absorbed))), decay(sigma_a * length)
     tau_a, tau_b = sigma_a * length, sigma_b * length
-    passed = dr.exp(-0.5 * (tau_a + tau_b))
+    passed = decay(0.5 * (tau_a + tau_b))
     if quadrature == "trapezoid":
         near, far = 0.5 * tau_a, 0.5 * passed * tau_b
         total, absorbed = near + far, absorptance(0.5 * (tau_a + tau_b))

@@ -5,10 +5,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.arithmetic import clipped, decay, least
 from mitsuba_irrcache.solvers.empty import CELL
 
 #: Positions within a voxel are integers below this: lines can be followed back without rounding.
 ONE = 1 << 24
+#: Voxels of less optical depth lose what its series tells.
+THIN = 0.03
 #: Parameters of a pair of directions.
 INTEGERS, NUMBERS = 22, 12
 #: Of these, the solid angle, and the last three: where light along the axis goes to, world space.
@@ -35,7 +38,7 @@ class _Across:
     def start(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
         """Slices since entry in the first slice: half of one, or less through a side."""
         near = self.since(position)
-        return dr.select(voxel == self.entry, dr.minimum(near, 0.5), 0.5)
+        return dr.select(voxel == self.entry, least(near, 0.5), 0.5)
 
     def advance(self, voxel: mi.Int32, position: mi.Int32, slices: mi.Int32 | int = 1) -> tuple:
         """Voxel and position some ``slices`` on, and the slices since entry: 1 unless it is new."""
@@ -56,7 +59,7 @@ class _Across:
             lower = dr.maximum(voxel - dr.select(before, 1, 0), 0)
             return lower * self.stride, dr.select(before & (voxel == 0), 0, weight)
         place = dr.fma(mi.Float(position), 1 / ONE, mi.Float(voxel))
-        u = dr.clip(dr.fma(place, self.ratio, self.origin), 0, self.last)
+        u = clipped(dr.fma(place, self.ratio, self.origin), 0.0, self.last)
         lower = mi.Int32(u)
         return lower * self.stride, u - mi.Float(lower)
 
@@ -109,7 +112,7 @@ def follow(
     # since entry (1: not new), radiance, and depth and source in the slice before.
     width = 0 * lane
     ib, ic, fb, fc, off = mi.Int32(jb), mi.Int32(jc), fb + width, fc + width, base + width
-    since = dr.minimum(there_b.start(ib, fb), there_c.start(ic, fc))
+    since = least(there_b.start(ib, fb), there_c.start(ic, fc))
     kb, kc, gb, gc, off_back = (
         jb + eb,
         jc + ec,
@@ -118,7 +121,7 @@ def follow(
         base + sa * (na - 1) + width,
     )
     kb, kc = dr.select(kb >= nb, kb - nb, kb), dr.select(kc >= nc, kc - nc, kc)
-    since_back = dr.minimum(back_b.start(kb, gb), back_c.start(kc, gc))
+    since_back = least(back_b.start(kb, gb), back_c.start(kc, gc))
     slice_, slice_back = shift + width, shift + ta * (na - 1) + width
     L, L_back = ([mi.Float(0) for _ in range(channels)] for _ in range(2))
     s0, s0_back = mi.Float(0), mi.Float(0)
@@ -197,10 +200,10 @@ def follow(
         s0, s0_back = s_next, s_next_back
         ib, fb, since = there_b.advance(ib, fb, ahead)
         ic, fc, near = there_c.advance(ic, fc, ahead)
-        since = dr.minimum(near, since)
+        since = least(near, since)
         kb, gb, since_back = back_b.advance(kb, gb, ahead_back)
         kc, gc, near_back = back_c.advance(kc, gc, ahead_back)
-        since_back = dr.minimum(near_back, since_back)
+        since_back = least(near_back, since_back)
         off += sa * ahead
         off_back -= sa * ahead_back
         slice_ += ta * ahead
@@ -259,7 +262,7 @@ def _passed(since, before, here, scale) -> mi.Float:
     """Transmittance from the slice before: half of it and half of this one, or what of this one
     lies behind the entry.
     """
-    return dr.exp(-dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
+    return decay(dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
 
 
 def _crossed(L: list, source: list, first, second, since, count, area) -> tuple[list, list]:
@@ -270,10 +273,11 @@ def _crossed(L: list, source: list, first, second, since, count, area) -> tuple[
     """
     to_middle = dr.select(since < 1, since, 0.5) * first
     tau = dr.fma(second, 0.5, to_middle)
-    passed = dr.exp(-tau)
+    passed = decay(tau)
     # Thin voxels lose little, but what they scatter is known from just that.
-    share = dr.select(tau < 1e-3, tau * dr.fma(tau, -0.5, 1), 1 - passed)
-    half = dr.sqrt(passed) if first is second else dr.exp(-to_middle)
+    series = tau * dr.fma(tau, dr.fma(tau, 1 / 6, -1 / 2), 1)
+    share = dr.select(tau < THIN, series, 1 - passed)
+    half = dr.sqrt(passed) if first is second else decay(to_middle)
     left, tally = [], []
     for x, sent in zip(L, source, strict=True):
         lost, middle = (x - sent) * share, dr.fma(x - sent, half, sent)

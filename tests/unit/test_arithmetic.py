@@ -1,4 +1,4 @@
-"""Indices taken apart without division."""
+"""Indices taken apart without division, and numbers that take few instructions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsuba_irrcache.arithmetic import Divisor, unravelled
+from mitsuba_irrcache.arithmetic import Divisor, clipped, decay, greatest, least, unravelled
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -47,3 +47,24 @@ def test_other_numbers_are_the_same_kernel():
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(kernels) == 3
     assert all(k["cache_hit"] for k in kernels)
+
+
+def test_decay():
+    """e^-x as NumPy knows it; without bias, which would add up over steps; 0 of what is opaque."""
+    x = np.float32(np.concatenate([np.geomspace(1e-30, 80, 4001), [0.0]]))
+    expected = np.exp(-np.float64(x))
+    relative = np.float64(decay(mi.Float(x))) / expected - 1
+    assert (np.abs(relative) <= 1e-7 * (1 + x)).all()
+    thin = np.float32(np.random.default_rng(1).uniform(0, 0.1, 1 << 16))
+    bias = np.float64(decay(mi.Float(thin))) / np.exp(-np.float64(thin)) - 1
+    assert abs(bias.mean()) < 3e-9
+    np.testing.assert_array_equal(decay(mi.Float([0.0, 90.0, 1e30, np.inf])), [1, 0, 0, 0])
+    colours = decay(mi.Color3f(0.0, 1.0, 2.0))
+    np.testing.assert_allclose(np.ravel(colours), np.exp([0.0, -1.0, -2.0]), rtol=3e-7)
+
+
+def test_extremes():
+    a, b = mi.Float([1.0, 2.0, -0.0, np.inf]), mi.Float([2.0, 1.0, 0.0, 3.0])
+    np.testing.assert_array_equal(least(a, b), [1, 1, 0, 3])
+    np.testing.assert_array_equal(greatest(a, b), [2, 2, 0, np.inf])
+    np.testing.assert_array_equal(clipped(a, -1.0, 1.5), [1, 1.5, 0, 1.5])
