@@ -237,27 +237,38 @@ class RootField(GridField):
 
 
 class Extension:
-    """A grid with one more voxel at both ends of each axis: ``grid``. For each of its voxels
-    ``inside`` is the nearest one of the grid without them, and ``inwards`` along each axis the next
-    one from there: the same, unless the voxel lies beyond that end.
-    """
+    """A grid with one more voxel at both ends of each axis: ``grid``."""
 
     def __init__(self, grid: Grid) -> None:
-        sides = [int(n) for n in grid.resolution]
-        place = grid.to_world @ np.diag([*((n + 2) / n for n in sides), 1.0])
+        place = grid.to_world @ np.diag([*((n + 2) / n for n in grid.resolution), 1.0])
         place[:3, 3] = grid.to_world[:3, 3] - grid.to_world[:3, :3] @ (1 / grid.resolution)
-        self.grid = Grid(tuple(n + 2 for n in grid.shape), place)
-        at = self.grid.places(dr.arange(mi.UInt32, self.grid.voxel_count))
-        at = [mi.Int32(i) - 1 for i in at]
-        nearest = [dr.clip(i, 0, n - 1) for i, n in zip(at, sides, strict=True)]
-        strides = (1, sides[0], sides[0] * sides[1])
-        inside = sum(i * stride for i, stride in zip(nearest, strides, strict=True))
-        self.inside = mi.UInt32(inside)
-        self.inwards = [
-            mi.UInt32(inside + stride * (dr.clip(n - i, -1, 1) if side > 1 else 0))
-            for i, n, side, stride in zip(at, nearest, sides, strides, strict=True)
-        ]
-        dr.eval(self.inside, self.inwards)
+        self.inner, self.grid = grid, Grid(tuple(n + 2 for n in grid.shape), place)
+
+    def inside(self, voxel: mi.UInt32) -> mi.UInt32:
+        """The voxels of the grid without its extension that are nearest to these ones."""
+        return self.inner.index(*(nearest for nearest, _ in self._nearest(voxel)))
+
+    def inwards(self, voxel: mi.UInt32) -> list[mi.UInt32]:
+        """Along each axis the next ones from there: the same, unless a voxel lies beyond that end
+        of the grid.
+        """
+        nearest = self._nearest(voxel)
+        places = [near for near, _ in nearest]
+        found = []
+        for axis, (near, step) in enumerate(nearest):
+            next_ = mi.UInt32(mi.Int32(near) + step)
+            found.append(self.inner.index(*places[:axis], next_, *places[axis + 1 :]))
+        return found
+
+    def _nearest(self, voxel: mi.UInt32) -> list[tuple[mi.UInt32, mi.Int32]]:
+        """Along each axis the nearest voxel inside, and the step inwards from there."""
+        found = []
+        for place, side in zip(self.grid.places(voxel), self.inner.sides, strict=True):
+            at = mi.Int32(place) - 1
+            nearest = dr.clip(at, 0, side - 1)
+            step = dr.select(side > 1, nearest - at, 0)
+            found.append((mi.UInt32(nearest), step))
+        return found
 
 
 def extrapolated(
@@ -273,11 +284,10 @@ def extrapolated(
     index = dr.arange(mi.UInt32, extension.grid.voxel_count * channels)
     voxel = index // channels
     channel = index - voxel * channels
-    inside = dr.gather(mi.UInt32, extension.inside, voxel)
+    inside = extension.inside(voxel)
     outermost = dr.gather(mi.Float, roots, inside * channels + channel)
     result = outermost
-    for inwards in extension.inwards:
-        further = dr.gather(mi.UInt32, inwards, voxel)
+    for further in extension.inwards(voxel):
         beyond, place = further != inside, further * channels + channel
         other = dr.gather(mi.Float, roots, place)
         known = beyond & (outermost > 0) & (other > 0)

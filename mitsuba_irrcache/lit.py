@@ -19,7 +19,7 @@ from .fingerprint import digests
 from .grid import Grid
 from .lamps import Falloff
 from .medium import MediumGrid
-from .memory import require_memory
+from .memory import give_back, require_memory
 from .solvers import path, sweep
 from .solvers.directional_sweep import DirectionalSweep, least_batch
 from .solvers.sweep import Sweep
@@ -261,6 +261,7 @@ class LitMedium:
             path.refine(
                 scene, self.medium, cache, missing, settings.seed, settings.rr_depth, progress
             )
+        give_back(cache.grid.voxel_count)
 
     def save_as(self, scene: mi.Scene, file: str | Path) -> None:
         """Writes a copy of the cache that fits ``scene`` to a file of any name."""

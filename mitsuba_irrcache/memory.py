@@ -8,10 +8,14 @@ import platform
 from contextlib import suppress
 from pathlib import Path
 
+import drjit as dr
+
 from .errors import IrrcacheError
 
 #: Bytes of the smallest array that is freed at once; where glibc begins.
 LARGE = 1 << 17
+#: Voxels of a cache from which on arrays are the system's again after every step of work.
+MANY = 1 << 22
 #: glibc's name of that, from its malloc.h.
 _M_MMAP_THRESHOLD = -3
 
@@ -46,3 +50,12 @@ def free_at_once() -> None:
     """
     if platform.libc_ver()[0] == "glibc":
         ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)  # and it learns no more
+
+
+def give_back(voxels: int) -> None:
+    """Hands arrays that are free again back to the system, after a step of work on so many voxels.
+    Dr.Jit keeps them for others of their size, which the next step may not want. Small ones stay:
+    to have them anew would take longer than they are worth.
+    """
+    if voxels >= MANY:
+        dr.flush_malloc_cache()

@@ -3,8 +3,8 @@
 What rays read of large volumes waits for memory, not for arithmetic. So values are kept in 16 bits,
 floating-point numbers without a sign: 5 bits of exponent and 11 of mantissa, rounded up or down at
 random, such that they are right on average over any few neighbours. And what a lookup reads
-together lies together: the fields of a voxel, and while there is room in two words, the voxel's
-neighbour along x.
+together lies together: the fields of a voxel, and while there is room in four words, those of the
+voxel's neighbour along x.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import mitsuba as mi
 from .arithmetic import clipped
 from .grid import Extension, Field, Grid, GridField, RootField
 
-#: Most values of a voxel, two in each word, and most of those that have their neighbours with them.
-MOST, PAIRED = 8, 4
+#: Most values of a voxel, two in each word; so many have those of their neighbours with them.
+MOST, PAIRED = 8, (1, 2, 4)
 #: Larger copies could not be addressed with 32 bits.
 LARGEST = 2**32 // 4
 #: Bits of a float's mantissa that are left out, and the exponent, as floats keep it, that is 0 in
@@ -42,7 +42,7 @@ class Packets:
     def __init__(self, grid: Grid, planes: Callable, largest: Sequence[float]) -> None:
         self.grid, self.count = grid, len(largest)
         #: whether a word holds a value and that of the voxel's neighbour along x
-        self.paired = self.count <= PAIRED
+        self.paired = self.count in PAIRED
         sides = [int(n) for n in grid.resolution]
         self._last = [dr.opaque(mi.Float, n - 1) for n in sides]
         self._lowest = [dr.opaque(mi.Int32, max(n - 2, 0)) for n in sides]
@@ -129,17 +129,17 @@ def _decoded(word: mi.UInt32) -> tuple[mi.Float, mi.Float]:
 
 class Lookups:
     """The values of several fields at one place. Those that share their voxels, and fit, are read
-    together from a copy; others, and constants, by their own.
+    together from a copy, after which they are not needed; others, and constants, by their own.
 
     Values of a field above its ``limits``, if there are any, count as these.
     """
 
     def __init__(self, fields: list[Field], limits: Sequence[float] | None = None) -> None:
-        self.fields = fields
         self.groups: list[Group] = []
         limits = limits or [dr.inf] * len(fields)
         grids = [f if isinstance(f, GridField) else None for f in fields]
         alone = [i for i, f in enumerate(grids) if f and f.grid.voxel_count < LARGEST]
+        self._others = {i: f for i, f in enumerate(fields) if i not in alone}
         while alone:
             group = [alone.pop(0)]
             for i in list(alone):
@@ -149,27 +149,36 @@ class Lookups:
                     alone.remove(i)
             self.groups.append(Group([(i, fields[i], limits[i]) for i in group]))
 
+    def at_world(self, p: mi.Point3f, active: mi.Bool) -> list:
+        """The values at world positions."""
+        found = [group.at(group.place(p), active) for group in self.groups]
+        return self._all(found, p, active)
+
     def along(self, ray: mi.Ray3f) -> AlongRay:
         """The values along a ray."""
         return AlongRay(self, ray)
+
+    def _all(self, found: list[dict], p: mi.Point3f, active: mi.Bool) -> list:
+        values = {i: field.at_world(p, active) for i, field in self._others.items()}
+        for group in found:
+            values |= group
+        return [values[i] for i in range(len(values))]
 
 
 class AlongRay:
     """`Lookups` at places of a ``ray``, which is straight in the grids' coordinates too."""
 
     def __init__(self, lookups: Lookups, ray: mi.Ray3f) -> None:
-        self.ray, self.fields = ray, lookups.fields
-        self._groups = [(group, *group.coordinates(ray)) for group in lookups.groups]
+        self.ray, self._lookups = ray, lookups
+        self._ways = [
+            (group.place(ray.o), group.grid.coordinates.vector(ray.d)) for group in lookups.groups
+        ]
 
     def at(self, t: mi.Float, active: mi.Bool) -> list:
         """The values at the distance ``t``."""
-        found: dict = {}
-        for group, origin, direction in self._groups:
-            found |= group.at(dr.fma(direction, t, origin), active)
-        return [
-            found[i] if i in found else field.at_world(self.ray(t), active)
-            for i, field in enumerate(self.fields)
-        ]
+        groups = zip(self._lookups.groups, self._ways, strict=True)
+        found = [group.at(dr.fma(d, t, o), active) for group, (o, d) in groups]
+        return self._lookups._all(found, self.ray(t), active)
 
 
 def _inner(field: GridField) -> Grid:
@@ -182,45 +191,40 @@ def _together(fields: list[GridField]) -> bool:
 
 
 class Group:
-    """Fields of one grid in `Packets`: each has a number, and a limit."""
+    """Fields of one ``grid`` in `Packets`: each has a number, and a limit."""
 
-    def __init__(self, members: list[tuple[int, GridField, float]]) -> None:
-        self.members = [(i, field) for i, field, _ in members]
-        used = [field for _, field in self.members]
-        self.grid = _inner(used[0])
-        extended = any(isinstance(f, RootField) for f in used)
+    def __init__(self, fields: list[tuple[int, GridField, float]]) -> None:
+        self.grid = _inner(fields[0][1])
+        #: numbers, channels, and whether roots are kept
+        self.members = [(i, f.channels, isinstance(f, RootField)) for i, f, _ in fields]
+        extended = any(root for *_, root in self.members)
         extension = Extension(self.grid) if extended else None
-        self.shift = 1 if extended else 0
+        self._shift = 1 if extended else 0
         largest = []
-        for _, field, limit in members:
+        for (_, channels, root), (_, field, limit) in zip(self.members, fields, strict=True):
             most = min(field.maximum, limit)
-            root = isinstance(field, RootField)
-            largest += [most**0.5 if root else most] * field.channels
+            largest += [most**0.5 if root else most] * channels
 
         def planes(index: mi.UInt32) -> list[mi.Float]:
             values = []
-            for field in used:
-                own = extended and not isinstance(field, RootField)
-                voxel = dr.gather(mi.UInt32, extension.inside, index) if own else index
-                n = field.channels
+            for (_, n, root), (_, field, _) in zip(self.members, fields, strict=True):
+                voxel = extension.inside(index) if extended and not root else index
                 channels = [dr.gather(mi.Float, field.data, voxel * n + c) for c in range(n)]
                 values += [c * field.scale for c in channels]
             return values
 
         self.packets = Packets(extension.grid if extended else self.grid, planes, largest)
 
-    def coordinates(self, ray: mi.Ray3f) -> tuple[mi.Point3f, mi.Vector3f]:
-        """Origin and direction of a ray in those of `at`."""
-        place = self.grid.coordinates
-        return place.point(ray.o) + self.shift, place.vector(ray.d)
+    def place(self, p: mi.Point3f) -> mi.Point3f:
+        """Voxel coordinates of world positions in what is kept."""
+        return self.grid.coordinates.point(p) + self._shift
 
     def at(self, u: mi.Point3f, active: mi.Bool) -> dict:
         """The fields, by their numbers, at these coordinates."""
         values = self.packets.at(u, active)
         found = {}
-        for i, field in self.members:
-            own, values = values[: field.channels], values[field.channels :]
-            if isinstance(field, RootField):
-                own = [dr.square(v) for v in own]
-            found[i] = own[0] if field.channels == 1 else mi.Color3f(own)
+        for i, channels, root in self.members:
+            own, values = values[:channels], values[channels:]
+            own = [dr.square(v) for v in own] if root else own
+            found[i] = own[0] if channels == 1 else mi.Color3f(own)
         return found

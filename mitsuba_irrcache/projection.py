@@ -71,17 +71,19 @@ class Projection:
         layered: bool = False,
         uncertainty: UncertaintyField | None = None,
         directional: DirectionalField | None = None,
+        edges: Edges | None = None,
     ) -> None:
         self.medium = medium
-        self.irradiance = irradiance
+        self.lit = irradiance is not None
+        self._channels = irradiance.channels if irradiance else 1
         self.quadrature = quadrature
         self.layered = layered
         self.uncertainty = uncertainty
         self.directional = directional
         #: how the light of lamps falls off, which the cache is without
         self.falloff: Falloff | None = None
-        #: surfaces that end the light, where there are any
-        self.edges: Edges | None = None
+        #: surfaces that end the light, where there are any, and the light that they choose from
+        self._edges = (edges, irradiance) if edges is not None else None
         albedo = _constant_if_it_is(medium.albedo)
         fields = medium.sigma_t, medium.albedo, irradiance, medium.emission
         grids = [f.grid for f in fields if f and f.grid]
@@ -111,7 +113,7 @@ class Projection:
         sigma_t, *rest = fields.at(t, active)
         sigma_t = type(sigma_t)(sigma_t)  # a constant's own value would be carried by loops
         known = [rest[-1]] if self.layered else []
-        if self.irradiance is None:
+        if not self.lit:
             return sigma_t, mi.Float(0), known
         phi, albedo = rest
         phi = self._within_edges(p, phi, active)
@@ -131,7 +133,8 @@ class Projection:
         self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> mi.Float | mi.Color3f:
         """The cached irradiance alone, as much as paths from surfaces see along ``direction``."""
-        phi = self._within_edges(p, self.irradiance.at_world(p, active), active)
+        _, phi, *_ = self.lookups.at_world(p, active)
+        phi = self._within_edges(p, phi, active)
         if self.falloff is not None:
             phi = phi * self.falloff.at(p)
         if self.directional is None:
@@ -154,9 +157,10 @@ class Projection:
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
     ) -> mi.Float | mi.Color3f:
         """Irradiance that was looked up, without what is on the other side of surfaces."""
-        if self.edges is None:
+        if self._edges is None:
             return phi
-        return self.edges.corrected(self.irradiance, p, phi, active)
+        edges, irradiance = self._edges
+        return edges.corrected(irradiance, p, phi, active)
 
     @dr.syntax
     def march(
@@ -269,15 +273,15 @@ class Projection:
     def _nowhere(self) -> tuple:
         """What `fetch` returns, of no place."""
 
-        def zero(*fields: Field) -> mi.Float | mi.Color3f:
-            return (mi.Color3f if any(f.channels == 3 for f in fields) else mi.Float)(0)
+        def zero(*channels: int) -> mi.Float | mi.Color3f:
+            return (mi.Color3f if 3 in channels else mi.Float)(0)
 
-        albedo = self.medium.albedo
-        source = zero(albedo, self.irradiance) if self.irradiance else mi.Float(0)
+        albedo = self.medium.albedo.channels
+        source = zero(albedo, self._channels) if self.lit else mi.Float(0)
         known = [zero(albedo)] if self.layered else []
-        if self.uncertainty is not None and self.irradiance:
+        if self.uncertainty is not None and self.lit:
             known += [mi.Float(0)] * self.uncertainty.count
-        return zero(self.medium.sigma_t), source, known
+        return zero(self.medium.sigma_t.channels), source, known
 
     @property
     def channel_count(self) -> int:

@@ -16,6 +16,7 @@ from .cache import IrradianceCache
 from .layers import luminance
 from .lit import CacheSettings, LitMedium
 from .medium import MediumGrid
+from .memory import give_back
 from .projection import Projection
 from .surroundings import Surroundings
 from .transport import MOST_CROSSINGS, End, Start, behind, is_null, trace
@@ -44,13 +45,17 @@ def sight_of(
     def project(medium: MediumGrid, cache: IrradianceCache | None) -> Projection:
         lit = cache is not None and cache.active_count and cache.samples
         field = cache.field() if lit else None
+        if lit:
+            give_back(cache.grid.voxel_count)
         uncertainty = uncertainty_of(cache) if lit and with_error else None
         directional = cache.directional_field(field.channels) if lit else None
-        projection = Projection(medium, field, quadrature, step, layered, uncertainty, directional)
+        edges = cache.survey.edges if lit and cache.survey is not None else None
+        errors = uncertainty, directional, edges
+        projection = Projection(medium, field, quadrature, step, layered, *errors)
         if lit:
             projection.falloff = cache.falloff
-        if lit and cache.survey is not None:
-            projection.edges = cache.survey.edges
+            del field  # it has been copied
+            give_back(cache.grid.voxel_count)
         return projection
 
     projections = [project(part.medium, part.shown) for part in parts]
@@ -275,7 +280,7 @@ class Sight:
         result = mi.Spectrum(0)
         for projection in self.projections:
             here = (dr.max(end.weight) > 0) & (end.pointer == projection.medium.pointer)
-            if projection.irradiance is not None:
+            if projection.lit:
                 phi = mi.Spectrum(projection.irradiance_at(end.p, end.direction, here))
                 result = dr.select(here, phi, result)
         return result

@@ -78,17 +78,19 @@ def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     roots, deviations, biases = (
         _everywhere(cache, values) for values in (root, dr.select(phi > 0, error / root, 0), bias)
     )
-    beyond = sum(dr.select(i != extension.inside, mi.Float(1), 0) for i in extension.inwards)
-    inner = dr.gather(mi.Float, roots, extension.inside)
+    voxel = dr.arange(mi.UInt32, extension.grid.voxel_count)
+    inside = extension.inside(voxel)
+    beyond = sum(dr.select(i != inside, mi.Float(1), 0) for i in extension.inwards(voxel))
+    inner = dr.gather(mi.Float, roots, inside)
     growth = extrapolated(extension, roots) / dr.select(inner > 0, inner, 1)
     # a^2 / b of two values that err alike errs as the root of 2^2 + 1 of them, mostly as a does.
-    deviation = dr.gather(mi.Float, deviations, extension.inside) * growth * 5 ** (0.5 * beyond)
-    random, _ = mi.sample_tea_32(extension.inside, mi.UInt32(0x5EED), ROUNDS)
+    deviation = dr.gather(mi.Float, deviations, inside) * growth * 5 ** (0.5 * beyond)
+    random, _ = mi.sample_tea_32(inside, mi.UInt32(0x5EED), ROUNDS)
     if cache.correlated:
         random = random & 0  # all errors to the same side
     bits = dr.reinterpret_array(mi.UInt32, deviation) & ~mi.UInt32(2**PROBES - 1)
     signed = dr.reinterpret_array(mi.Float, bits | (random >> (32 - PROBES)))
-    bias = dr.gather(mi.Float, biases, extension.inside) * growth
+    bias = dr.gather(mi.Float, biases, inside) * growth
     return UncertaintyField(extension.grid, interleaved([signed, bias]))
 
 

@@ -32,6 +32,8 @@ def plot(options: Options) -> Section:
         floors = [floor(row) / 1e6 for row in sizes]
         label = f"bandwidth / {STEP_BYTES} bytes"
         left.plot(voxels, floors, "--", color=style.GREY, label=label)
+        loads = [row["loads"] / 1e6 for row in sizes]
+        left.plot(voxels, loads, ":", color=style.GREY, label="its loads and stores")
         left.set_xlabel("voxels")
         left.set_ylabel("million voxels × directions per second")
         right.plot(
@@ -47,8 +49,8 @@ def plot(options: Options) -> Section:
         left.legend()
     caption = (
         "Single scattering by sweeps, grey. Left: clouds and the thorax of the paper's size; the "
-        "dashed line is a kernel y = a x in the same process. Right: images of the 128³ cloud from "
-        "a cache that is there."
+        "lines in grey are a kernel y = a x, and one of the loads and stores of a sweep alone, in "
+        "the same process. Right: images of the 128³ cloud from a cache that is there."
     )
     return Section("Scaling", [Figure(path, caption), sizes_table(sizes), images_table(images)])
 

@@ -2,11 +2,13 @@
 
     python -m experiments.scaling.run [--full] [--force]
 
-Single scattering in grey, 32 directions, on procedural clouds up to 128^3 voxels (``--full``: up to
-256^3, and the paper's 512 x 150 x 350 thorax), each in a process of its own: seconds, voxels times
-directions per second, peak memory. The floor is a kernel y = a x in the same process: a step of a
-line would take as long if it moved 12 bytes and did nothing else. Then images of up to 512^2
-(``--full``: 1024^2) pixels, and the kernels of a pass. Writes output/scaling/results.json.
+Single scattering in grey, 256 directions, on procedural clouds up to 128^3 voxels (``--full``: up
+to 256^3, and the paper's 512 x 150 x 350 thorax), each in a process of its own: seconds, voxels
+times directions per second, peak memory. Two floors are measured in the same process. Stream, a
+kernel y = a x: a step of a line would take as long if it moved 12 bytes and did nothing else.
+Loads, a kernel of the loads and stores of a step alone: two words of the extinction, and the light
+of a voxel before and after. Then images of up to 512^2 (``--full``: 1024^2) pixels, and the kernels
+of a pass. Writes output/scaling/results.json.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.compare.worker import peak_memory
 from mitsuba_irrcache.loading import load_scene
 from mitsuba_irrcache.runtime import require_llvm
-from mitsuba_irrcache.solvers.sweep import BATCH
+from mitsuba_irrcache.solvers.sweep import BATCH, LARGEST_BATCH
 
 VARIANT = "llvm_ad_mono"
 #: Source and voxels along its longest side; 0: as the source has it.
@@ -44,15 +46,19 @@ QUICK_PIXELS = (128, 256, 512)
 FULL_PIXELS = (*QUICK_PIXELS, 1024)
 #: Of which images and kernels are measured.
 MIDDLE = ("procedural", 128)
-SAMPLES = BATCH
+SAMPLES = LARGEST_BATCH
 #: Samples per pixel of an image.
 SPP = 4
 REPEATS = 3
+#: Voxels from which on what a process takes is volumes, not kernels.
+MANY = 1 << 22
 #: Of which kernels are counted.
 PASSES = 5
 #: Of the floor: numbers in an array, and bytes that a step of a line moves.
 STREAM = 64 << 20
 STEP_BYTES = 12
+#: Of the other one: voxels of a slice that lines move by from one slice to the next.
+MOVED = 37
 
 
 def run(options: Options) -> None:
@@ -127,6 +133,7 @@ def growth(scene: Path) -> dict:
         "peak": peak,
         "peak_loaded": before,
         "bandwidth": bandwidth(),
+        "loads": loads(sides),
     }
 
 
@@ -203,6 +210,44 @@ def bandwidth() -> float:
     return 2 * 4 * STREAM / min(times[1:])
 
 
+def loads(sides: np.ndarray) -> float:
+    """Voxels times directions per second of a kernel that loads and stores what a line does, both
+    ways along lines through a box of so many voxels, and does nothing else; the best of 5.
+    """
+    slices, lines = int(sides[2]), int(sides[0] * sides[1])
+    step = lines + MOVED
+    words = dr.opaque(mi.UInt32, 1, slices * step + int(sides[0]))
+    light = dr.opaque(mi.Float, 1, slices * step)
+    numbers = [dr.opaque(mi.UInt32, n) for n in (slices, step, int(sides[0]))]
+    lanes = dr.arange(mi.UInt32, lines)
+    dr.eval(lanes)
+    times = []
+    for _ in range(6):  # the first one is compiled
+        dr.sync_thread()
+        started = time.perf_counter()
+        dr.eval(_loaded(words, light, lanes, *numbers), light)
+        dr.sync_thread()
+        times.append(time.perf_counter() - started)
+    return 2 * slices * lines / min(times[1:])
+
+
+@dr.syntax
+def _loaded(words, light, lanes, slices, step, row):
+    """The kernel of `loads`; what it reads of the extinction is in the result."""
+    there, back = mi.UInt32(lanes), lanes + (slices - 1) * step
+    found, k = mi.UInt32(0), mi.UInt32(0)
+    while dr.hint(k < slices, label="loads"):
+        for place in (there, there + row, back, back + row):
+            found = found ^ dr.gather(mi.UInt32, words, place)
+        ways = [dr.gather(mi.Float, light, place) for place in (there, back)]
+        dr.scatter(light, ways[0] * 0.5, there)
+        dr.scatter(light, ways[1] * 0.5, back)
+        there += step
+        back -= step
+        k += 1
+    return found
+
+
 def swept_sides(cache) -> np.ndarray:
     """Sides of the box of voxels that lines pass through: the least one with all active voxels."""
     places = np.stack(np.unravel_index(np.array(cache.active), cache.grid.shape))
@@ -226,14 +271,22 @@ def floor(row: dict) -> float:
     return row["bandwidth"] / STEP_BYTES
 
 
+def volumes(row: dict) -> float:
+    """Numbers per voxel, of four bytes, that the process took beyond those of the scene."""
+    return (row["peak"] - row["peak_loaded"]) / (4 * row["voxels"])
+
+
 def sizes_table(rows: list[dict]) -> Table:
     """Time, throughput and memory by size."""
-    head = ["voxels", "swept", "s", "M/s", "s, sweeps", "M/s, sweeps", "floor", "share", "peak MiB"]
+    head = ["voxels", "swept", "s", "M/s", "s, sweeps", "M/s, sweeps", "stream", "share"]
+    head += ["loads", "share", "peak MiB", "volumes"]
     cells = [
         [" x ".join(map(str, r["sides"])), f"{r['swept'] / r['voxels']:.0%}",
          f"{r['seconds']:.3f}", f"{rate(r, 'seconds') / 1e6:.0f}",
          f"{r['seconds_more']:.3f}", f"{rate(r) / 1e6:.0f}",
-         f"{floor(r) / 1e6:.0f}", f"{rate(r) / floor(r):.0%}", f"{r['peak'] / 2**20:.0f}"]
+         f"{floor(r) / 1e6:.0f}", f"{rate(r) / floor(r):.0%}",
+         f"{r['loads'] / 1e6:.0f}", f"{rate(r) / r['loads']:.0%}", f"{r['peak'] / 2**20:.0f}",
+         f"{volumes(r):.1f}" if r["voxels"] >= MANY else "—"]
         for r in rows
     ]  # fmt: skip
     title = f"{SAMPLES} directions; M/s: million voxels times directions per second, of those swept"

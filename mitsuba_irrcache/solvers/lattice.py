@@ -184,6 +184,7 @@ class Lattice:
                 # In place: a sum would be a second array.
                 dr.scatter_add(total, light, place)
             dr.eval(total)
+            del volume, light  # before the next axis has its own
         return total
 
     def scatter(self, volume: mi.Float, table: Table) -> None:

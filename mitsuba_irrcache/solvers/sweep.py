@@ -173,9 +173,12 @@ class Sweep:
         for channels in self._together(grey):
             found += self._solved(passes_of(channels), channels)
         layers: list[list] = [[] for _ in range(len(LAYERS) + cache.moments)]
+        # Channels with one factor in common are one array.
+        factors = {factor: dr.opaque(mi.Float, factor) for factor in map(float, colour)}
         for c in range(cache.channels):
+            factor = factors[float(colour[c])]
             for layer, phi in zip(layers, found[min(c, len(found) - 1)], strict=True):
-                layer.append(phi if phi is None else phi * dr.opaque(mi.Float, colour[c]))
+                layer.append(phi if phi is None else phi * factor)
         dr.eval(layers)
         light, moments = layers[: len(LAYERS)], layers[len(LAYERS) :]
         parts = [tuple(chain(*light)), (None,) * cache.channels]

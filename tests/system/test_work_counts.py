@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import weakref
 from collections import Counter
 
@@ -328,3 +329,30 @@ def test_only_single_scattering_keeps_one_number_per_voxel(scenes, kernels):
         history = kernels(lambda scene=scene: scene.integrator().prepare(scene))
         launches.append(sum(k["size"] == 44 * 44 and k["operation_count"] > 100 for k in history))
     assert launches[0] == 16 < launches[1]
+
+
+def stored() -> float:
+    """MiB of all arrays that are there."""
+    gc.collect()
+    dr.eval()
+    size, unit = re.search(
+        r"Storage\s*: ([\d.]+) (\w+) on device", dr.whos(as_string=True)
+    ).groups()
+    return float(size) * {"B": 2**-20, "KiB": 2**-10, "MiB": 1, "GiB": 2**10}[unit]
+
+
+def test_few_numbers_per_voxel_are_kept(scenes):
+    """Of single scattering in grey, beside the medium's own: two words that rays read, the light,
+    the numbers of the voxels that have some, and half a word of extinction that lines read: no more
+    than four.
+    """
+    to_world = scenes.placement()
+    density = scenes.texture((64, 64, 64), 0.2, 2.0, 1)
+    shape = scenes.boundary(scenes.medium(density, 0.8, to_world), to_world)
+    integrator = {"type": "irrcache", "solver": "sweep", "max_depth": 2, "cache_spp": 32}
+    scene = scenes.load(integrator, shape, emitter={"type": "constant"})
+    before = stored()
+    scenes.image(scene, spp=1)
+    assert scene.integrator().cache.grid.voxel_count == 64**3
+    kept = stored() - before
+    assert 2.5 < kept < 5  # in MiB, as a volume is; the copy for rays has a tenth more voxels

@@ -201,7 +201,8 @@ def test_packets_keep_other_grids_apart():
 
 
 @pytest.mark.parametrize(
-    ("kinds", "words"), [("1", 1), ("r", 1), ("1r", 2), ("3", 4), ("1R", 4), ("1ra", 4), ("1Ra", 4)]
+    ("kinds", "words"),
+    [("1", 1), ("r", 1), ("1r", 2), ("3", 2), ("1r1", 2), ("1R", 4), ("1ra", 4), ("1Ra", 4)],
 )
 def test_copies_take_few_words_per_voxel(kinds, words):
     grid = Grid((4, 5, 6), np.eye(4))
