@@ -47,7 +47,8 @@ GAUSS_LEGENDRE = (
     (0.5, 8 / 18),
     (0.5 + 0.3872983346, 5 / 18),
 )
-#: Optical depth of a step from which on matter is as opaque as matter can be.
+#: Optical depth of a step that counts for greater ones, too: what 16 bits tell of thin matter is
+#: measured by the densest.
 OPAQUE = 4096.0
 #: Below this optical depth what is absorbed is known from its series.
 THIN = 0.05
@@ -100,7 +101,6 @@ class Projection:
         needed = [medium.sigma_t]
         needed += [irradiance] if irradiance else []
         needed += [albedo] if irradiance or layered else []
-        # Of a step so long, a longer one counts as a long one.
         opaque = OPAQUE / length if length < dr.inf else dr.inf
         self.lookups = Lookups(needed, [opaque, *[dr.inf] * (len(needed) - 1)])
 
