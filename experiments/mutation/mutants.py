@@ -56,6 +56,20 @@ MUTANTS = (
         ("tests/unit/test_grid.py",),
     ),
     Mutant(
+        "what rays read of a volume always rounded down",
+        "packets.py",
+        " + (noise >> (32 - DROPPED))",
+        "",
+        ("tests/unit/test_grid.py",),
+    ),
+    Mutant(
+        "a bias of e^-x that adds up over steps",
+        "arithmetic.py",
+        "dr.fma(value, part, 1))",
+        "dr.fma(value, part, 0.9999998))",
+        ("tests/unit/test_arithmetic.py",),
+    ),
+    Mutant(
         "extinction of coarse caches shifted by half a voxel (sweep)",
         "solvers/lattice.py",
         "self.lower[k] * ratio[k] - 0.5, last",
