@@ -27,8 +27,8 @@ SCENE = """<scene version="3.0.0">
             <lookat origin="0, 0, -5" target="0, 0, 0" up="0, 1, 0"/>
         </transform>
         <film type="hdrfilm">
-            <integer name="width" value="24"/>
-            <integer name="height" value="16"/>
+            <integer name="width" value="48"/>
+            <integer name="height" value="32"/>
             <string name="pixel_format" value="rgba"/>
         </film>
     </sensor>
@@ -121,7 +121,10 @@ def test_stages(report):
 
 
 def test_errors(report):
-    """volpath's error is noise and falls with time as noise does; both agree on the picture."""
+    """volpath's error is noise and falls with time as noise does; both agree on the picture.
+
+    Of 1536 pixels either error is known to some 5 %.
+    """
     stock, _, ours = read(report)["measurements"]
     first, last = stock["snapshots"]
     fall = first["errors"]["rmse"] / last["errors"]["rmse"]
@@ -141,7 +144,7 @@ def test_json_csv_and_images_agree(report):
         assert float(row["rmse"]) == pytest.approx(snapshot["errors"]["rmse"])
         assert float(row["seconds"]) == pytest.approx(sum(snapshot["seconds"].values()))
         image = oiio.ImageBuf(str(report / snapshot["image"]))
-        assert (image.spec().width, image.spec().height, image.nchannels) == (24, 16, 3)
+        assert (image.spec().width, image.spec().height, image.nchannels) == (48, 32, 3)
         assert image.spec().format == oiio.FLOAT
 
 
