@@ -17,8 +17,8 @@ POWER_OF_TWO = (
     0.0012482289,
     0.00021565972,
 )
-#: From here on e^-x is 0.
-ENDLESS = 87.0
+#: From here on e^-x is 0; below, 1 - e^-x is known from its series.
+ENDLESS, THIN = 87.0, 0.05
 
 
 class Divisor:
@@ -82,3 +82,9 @@ def decay(x):
         value = dr.fma(value, part, factor)
     bits = dr.reinterpret_array(mi.Int32, dr.fma(value, part, 1)) + (mi.Int32(whole) << 23)
     return dr.select(x < ENDLESS, dr.reinterpret_array(mi.Float, bits), 0)
+
+
+def absorbed(depth, passed):
+    """1 - e^-depth without cancellation, where e^-depth, ``passed``, is known."""
+    series = dr.fma(depth, dr.fma(depth, dr.fma(depth, -1 / 24, 1 / 6), -1 / 2), 1)
+    return dr.select(depth < THIN, depth * series, 1 - passed)

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arithmetic import Divisor, unravelled
 from .conservation import conserving
 from .directional import Directional, DirectionalField
 from .errors import CacheFileError, IrrcacheError
@@ -520,7 +521,7 @@ def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], l
     meets.
     """
     nz, ny, nx = cells.shape
-    index = [occupied % nx, (occupied // nx) % ny, occupied // (nx * ny)]
+    index = unravelled(occupied, [Divisor(nx), Divisor(ny)])
     to_voxels = grid.coordinates.matrix @ np.linalg.inv(cells.coordinates.matrix)
     # Border cells reach beyond their own grid, whose values are clamped: here as far as the cache.
     corners = np.array(list(np.ndindex(2, 2, 2))) * grid.resolution

@@ -12,6 +12,7 @@ import itertools
 import drjit as dr
 import mitsuba as mi
 
+from .arithmetic import Divisor, unravelled
 from .grid import Extension, Grid, RootField
 from .transport import is_null
 
@@ -52,9 +53,8 @@ class Edges:
         """Whether surfaces cut the cells, and the planes g s + c = 0 that are tangent to them where
         they come nearest to the cells' centres; s are voxels from the first one's centre on.
         """
-        nx, ny = (mi.UInt32(n) for n in self.cells[:2])
-        row = cell // nx
-        first = mi.Point3f(cell - row * nx, row % ny, row // ny) + 0.5
+        sides = [Divisor(int(n) - 1) for n in self.grid.resolution[:2]]
+        first = mi.Point3f(*unravelled(cell, sides)) + 0.5
         middle = self.grid.world.point(first + 0.5)
         starts, ends = _table(0), _table(1)
         nearest, hit, normal = mi.Float(dr.inf), mi.Point3f(0), mi.Normal3f(0)

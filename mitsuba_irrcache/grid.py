@@ -150,7 +150,7 @@ class ConstantField:
         self.maximum = float(np.max(values)) * scale
 
     def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        return self.value
+        return type(self.value)(self.value)  # a copy: loops write to what they carry
 
 
 class GridField:

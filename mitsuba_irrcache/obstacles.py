@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arithmetic import Divisor, unravelled
 from .grid import Grid
 from .transport import MOST_CROSSINGS, is_null
 
@@ -104,12 +105,9 @@ def _met(scene, near, grid, lower, upper, axis, offset) -> mi.Shape | None:
     steps = grid.world.matrix[:3, :3]  # a voxel along each axis
     start = steps @ corner + grid.world.matrix[:3, 3]
     count = [int(upper[k] - lower[k]) + 1 for k in across]
-    lane = dr.arange(mi.UInt32, count[0] * count[1])
-    row = lane // dr.opaque(mi.UInt32, count[0])
+    places = unravelled(dr.arange(mi.UInt32, count[0] * count[1]), [Divisor(count[0])])
     p = _opaque(start)
-    for k, place, shift in zip(
-        across, (lane - row * dr.opaque(mi.UInt32, count[0]), row), offset, strict=True
-    ):
+    for k, place, shift in zip(across, places, offset, strict=True):
         place = dr.minimum(mi.Float(place) + _opaque([shift]).x, _opaque([sides[k]]).x)
         p = p + _opaque(steps[:, k]) * place
     met = _shapes_between(

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arithmetic import clipped, decay, greatest, least
+from .arithmetic import absorbed, clipped, decay, greatest, least
 from .boundary import safe_rcp
 from .directional import DirectionalField
 from .distance import chebyshev
@@ -50,8 +50,6 @@ GAUSS_LEGENDRE = (
 #: Optical depth of a step that counts for greater ones, too: what 16 bits tell of thin matter is
 #: measured by the densest.
 OPAQUE = 4096.0
-#: Below this optical depth what is absorbed is known from its series.
-THIN = 0.05
 #: Macrocells that rays look ahead for matter.
 REACH = 8
 
@@ -111,7 +109,6 @@ class Projection:
         """
         p, active = fields.ray(t), mi.Bool(True)
         sigma_t, *rest = fields.at(t, active)
-        sigma_t = type(sigma_t)(sigma_t)  # a constant's own value would be carried by loops
         known = [rest[-1]] if self.layered else []
         if not self.lit:
             return sigma_t, mi.Float(0), known
@@ -475,10 +472,7 @@ def exponential_weights(tau_a, tau_b, passed) -> tuple:
     for u, weight in GAUSS_LEGENDRE:
         depth = dr.fma(tau_a, u * (1 - 0.5 * u), tau_b * (0.5 * u * u))
         near = dr.fma(absorptance(depth), weight, near)
-    # Of both ends together, without cancellation.
-    mean = 0.5 * (tau_a + tau_b)
-    thin = mean * dr.fma(mean, dr.fma(mean, dr.fma(mean, -1 / 24, 1 / 6), -1 / 2), 1)
-    return near, greatest(dr.select(mean < THIN, thin, 1 - passed) - near, 0.0)
+    return near, greatest(absorbed(0.5 * (tau_a + tau_b), passed) - near, 0.0)
 
 
 def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:

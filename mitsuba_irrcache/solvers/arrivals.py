@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.arithmetic import Divisor
 from mitsuba_irrcache.directional import Directional
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
@@ -291,8 +292,8 @@ class Returning(Entering):
 
 def _coarser(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
     """The voxels of a coarser grid of the hierarchy in which those of the fine one lie."""
-    ratio = round((coarse.voxel_size / fine.voxel_size)[0])
-    result = coarse.index(*(p // dr.opaque(mi.UInt32, ratio) for p in fine.places(voxel)))
+    ratio = Divisor(round((coarse.voxel_size / fine.voxel_size)[0]))
+    result = coarse.index(*(ratio.split(place)[0] for place in fine.places(voxel)))
     dr.eval(result)
     return result
 

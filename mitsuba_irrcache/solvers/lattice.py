@@ -29,7 +29,14 @@ import numpy as np
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.solvers.empty import Emptiness
 from mitsuba_irrcache.solvers.extinction import Extinction
-from mitsuba_irrcache.solvers.layout import STANDARD, flat, joined, slicewise, strides_of
+from mitsuba_irrcache.solvers.layout import (
+    STANDARD,
+    flat,
+    joined,
+    layers_of,
+    slicewise,
+    strides_of,
+)
 from mitsuba_irrcache.solvers.lines import DIRECTION, INTEGERS, NUMBERS, ONE, add_copies, follow
 from mitsuba_irrcache.solvers.table import Group, Rows, Table
 
@@ -219,7 +226,7 @@ class Lattice:
             corners, words = self._corners(axis, sent is not None)
             for start in range(0, len(pairs), most):
                 group = Group(table, pairs[start : start + most])
-                lanes, row = self._lanes_of(len(group))
+                row, lanes = layers_of(self._lines, len(group))
                 copies = dr.opaque(mi.Float, 0, 2 * len(group) * voxels * (4 if sent else 1))
                 begin = row * dr.opaque(mi.UInt32, 2 * voxels)
                 empty = self._empty.slices if self._empty else None
@@ -247,13 +254,6 @@ class Lattice:
         corners = self._extinction.corners(axis, words)
         dr.eval(corners)
         return corners, words
-
-    def _lanes_of(self, count: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """Of each line of ``count`` pairs its number, and the pair's."""
-        lines = dr.opaque(mi.UInt32, self._lines)
-        lanes = dr.arange(mi.UInt32, self._lines * count)
-        row = lanes // lines
-        return lanes - row * lines, row
 
     def _launch(
         self, volume: mi.Float, scatters: bool, table: Table, axis: int, pairs: list[int]
@@ -285,7 +285,7 @@ class Lattice:
         most, (corners, words) = max(1, COPIES // voxels), self._corners(0, scatters)
         for start in range(0, len(pairs), most):
             group = Group(table, pairs[start : start + most])
-            lanes, row = self._lanes_of(len(group))
+            row, lanes = layers_of(self._lines, len(group))
             copies = dr.opaque(mi.Float, 0, dr.width(volume) * len(group))
             follow(
                 corners, words, None, copies, volume if scatters else None,

@@ -80,7 +80,7 @@ def voxels_of(count: int, channels: int) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def layers_of(voxels: int, count: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Of all values of an array that has ``count`` ones for each voxel, one layer after the other:
-    layer and voxel.
+    """Of all values of an array that has ``count`` ones for each voxel (or line), one layer after
+    the other: layer and voxel.
     """
     return Divisor(voxels).split(dr.arange(mi.UInt32, voxels * count))

@@ -5,13 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.arithmetic import clipped, decay, least
+from mitsuba_irrcache.arithmetic import absorbed, clipped, decay, least
 from mitsuba_irrcache.solvers.empty import CELL
 
 #: Positions within a voxel are integers below this: lines can be followed back without rounding.
 ONE = 1 << 24
-#: Voxels of less optical depth lose what its series tells.
-THIN = 0.03
 #: Parameters of a pair of directions.
 INTEGERS, NUMBERS = 22, 12
 #: Of these, the solid angle, and the last three: where light along the axis goes to, world space.
@@ -275,8 +273,7 @@ def _crossed(L: list, source: list, first, second, since, count, area) -> tuple[
     tau = dr.fma(second, 0.5, to_middle)
     passed = decay(tau)
     # Thin voxels lose little, but what they scatter is known from just that.
-    series = tau * dr.fma(tau, dr.fma(tau, 1 / 6, -1 / 2), 1)
-    share = dr.select(tau < THIN, series, 1 - passed)
+    share = absorbed(tau, passed)
     half = dr.sqrt(passed) if first is second else decay(to_middle)
     left, tally = [], []
     for x, sent in zip(L, source, strict=True):
