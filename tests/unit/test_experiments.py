@@ -14,7 +14,7 @@ from experiments.mutation.mutants import MUTANTS
 from experiments.mutation.run import PROJECT
 from experiments.options import FULL, QUICK, Options, Size
 from experiments.others import run as others_run
-from experiments.recording import LATE, STRIP, Recording, times
+from experiments.recording import LATE, STRIP, Recording, Session, display_error, times
 from experiments.store import Store, read_json
 from experiments.table1 import plot as table1_plot
 from experiments.table1.run import compared
@@ -173,8 +173,15 @@ def test_from_nothing_to_a_figure(rgb, monkeypatch, tmp_path):
     options = Options(Size(16, 16, 0.4, 0.4, 0.2), tmp_path)
     figure2_run.run(options)
     errors = read_json(tmp_path / "figure2" / "results.json")["path tracing"]
-    assert errors["display"][-1] < errors["display"][0]
+    assert errors["seconds"] == sorted(errors["seconds"])
     assert errors["own"][-1] == 0
+    # How much errors fall is up to the machine: these are the errors of what was recorded, and
+    # far below those of no picture at all.
+    session = Session.of("chest", options, methods.ALL)
+    (recording,), black = session.recordings, np.zeros((16, 16, 3))
+    shown = session.picked(recording, 1e3)
+    assert shown["display"] in errors["display"]
+    assert shown["display"] < 0.1 * display_error(black, session.truth)
     section = figure2_plot.plot(options)
     assert section.parts[0].path.stat().st_size > 0
     monkeypatch.setattr("experiments.recording.run_job", None)
