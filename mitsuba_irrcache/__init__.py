@@ -6,14 +6,23 @@ type="irrcache"/>`` available in every variant set from then on.
 
 from __future__ import annotations
 
-from . import runtime
+import gc
 
-runtime.prepare_llvm()  # before Dr.Jit is imported for the first time
+# What imports make stays. To look for garbage in it takes a tenth of a second.
+_collects = gc.isenabled()
+gc.disable()
+try:
+    from . import runtime
 
-from . import _register  # noqa: E402,F401
-from .cache import IrradianceCache  # noqa: E402
-from .errors import CacheFileError, IrrcacheError, UnsupportedSceneError  # noqa: E402
-from .progressive import render_progressive  # noqa: E402
+    runtime.prepare_llvm()  # before Dr.Jit is imported for the first time
+
+    from . import _register  # noqa: F401
+    from .cache import IrradianceCache
+    from .errors import CacheFileError, IrrcacheError, UnsupportedSceneError
+    from .progressive import render_progressive
+finally:
+    if _collects:
+        gc.enable()
 
 __version__ = "0.1.0"
 

@@ -21,6 +21,7 @@ from .grid import Affine, Grid, RootField
 from .lamps import Falloff
 from .macrocells import Macrocells
 from .survey import Survey
+from .symbolic import symbolic
 
 #: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
 #: independent of each other, the batches are: means and errors are statistics of batch means.
@@ -545,7 +546,7 @@ def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], l
     return first, last
 
 
-@dr.syntax
+@symbolic
 def _mark(cells: Macrocells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
     """The voxels that a lookup in the ``occupied`` cells can read."""
     (x0, y0, z0), (x1, y1, z1) = _supports(cells, occupied, grid)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -28,6 +29,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message = essence(error)
     print(f"irrcache: error: {message.removeprefix('irrcache: ')}", file=sys.stderr)
     return 1
+
+
+def command() -> int:
+    """`main` for a process that ends with it, as its exit status."""
+    status = main()
+    gc.freeze()  # all goes back to the system: nothing is searched for garbage first
+    return status
 
 
 #: Name, module and description of each command.

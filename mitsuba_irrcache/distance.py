@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .arithmetic import Divisor, unravelled
+from .symbolic import symbolic
 
 
 def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.UInt32:
@@ -22,7 +23,7 @@ def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.
     return distance
 
 
-@dr.syntax
+@symbolic
 def _along(distance: mi.UInt32, place: mi.Int32, side: mi.Int32, stride: mi.Int32) -> mi.UInt32:
     """One axis of the transform: the least of max(|k|, distance of the cell k further)."""
     index = dr.arange(mi.Int32, dr.width(distance))

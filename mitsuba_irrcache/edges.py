@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from .arithmetic import Divisor, unravelled
 from .grid import Extension, Grid, RootField
+from .symbolic import symbolic
 from .transport import is_null
 
 CORNERS = list(itertools.product((0, 1), repeat=3))
@@ -48,7 +49,7 @@ class Edges:
         dr.scatter(self._planes, kept, number)
         dr.eval(self._number, self._planes)
 
-    @dr.syntax
+    @symbolic
     def _cut(self, scene: mi.Scene, cell: mi.UInt32):
         """Whether surfaces cut the cells, and the planes g s + c = 0 that are tangent to them where
         they come nearest to the cells' centres; s are voxels from the first one's centre on.
@@ -82,7 +83,7 @@ class Edges:
         offset = dr.dot(normal, middle - hit) - dr.dot(steps, first)
         return nearest < dr.inf, steps.x, steps.y, steps.z, offset
 
-    @dr.syntax
+    @symbolic
     def corrected(self, field: RootField, p: mi.Point3f, phi: mi.Float | mi.Color3f, active):
         """``phi``, what ``field`` says at the world position ``p``; in a cell that is cut, from the
         voxels on the side of ``p`` alone.

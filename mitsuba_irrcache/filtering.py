@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from .layers import Layers, interleaved, luminance
+from .symbolic import symbolic
 from .uncertainty import PROBES, ROUNDS
 
 #: ``bilateral`` fades; ``fixed`` has one strength, as in the paper.
@@ -157,7 +158,7 @@ def _least_risk(
     return settings[least]
 
 
-@dr.syntax
+@symbolic
 def bilateral(
     packed: mi.Float,
     size: tuple[int, int],

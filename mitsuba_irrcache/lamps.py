@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from .grid import Grid
+from .symbolic import symbolic
 
 #: A lamp is not nearer to what the cache knows than this part of a voxel's shortest edge: less than
 #: the half edge that lies between voxel centres and a lamp beside a box.
@@ -147,7 +148,7 @@ class Falloff:
             near, far = dr.fma(strength, first, near), dr.fma(strength, last, far)
         return near, far
 
-    @dr.syntax
+    @symbolic
     def spread(self, voxel: mi.UInt32):
         """The mean of W over voxels, over W where their light is computed."""
         grid, total, k = self.places.grid, mi.Float(0), mi.UInt32(0)

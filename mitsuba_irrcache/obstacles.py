@@ -10,6 +10,7 @@ import numpy as np
 
 from .arithmetic import Divisor, unravelled
 from .grid import Grid
+from .symbolic import symbolic
 from .transport import MOST_CROSSINGS, is_null
 
 #: Rays that look for surfaces, per voxel and axis: through the corners and the middle of its face.
@@ -123,7 +124,7 @@ def _opaque(values: Sequence[float]) -> mi.Vector3f:
     return mi.Vector3f([dr.opaque(mi.Float, float(v)) for v in (*values, 0, 0)[:3]])
 
 
-@dr.syntax
+@symbolic
 def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
     """The first shapes between two points that are not null boundaries."""
     length = dr.norm(stop - start)

@@ -31,6 +31,7 @@ from .layers import Layers, luminance
 from .macrocells import Macrocells
 from .medium import MediumGrid
 from .packets import AlongRay, Lookups
+from .symbolic import symbolic
 from .uncertainty import UncertaintyField
 
 QUADRATURES = ("riemann", "trapezoid", "exponential")
@@ -159,7 +160,7 @@ class Projection:
         edges, irradiance = self._edges
         return edges.corrected(irradiance, p, phi, active)
 
-    @dr.syntax
+    @symbolic
     def march(
         self,
         ray: mi.Ray3f,

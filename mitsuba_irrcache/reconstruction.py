@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
+from .symbolic import symbolic
+
 
 class Samples:
     """What camera samples have seen, ``per_pixel`` of each pixel, one after the other, row by row;
@@ -94,7 +96,7 @@ def _gathered(samples: Samples) -> list[mi.Float]:
     return sums
 
 
-@dr.syntax
+@symbolic
 def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
     """What each row of samples adds to the columns of the rows of pixels from ``reach`` above it to
     as many below it, in turn: sums as of `reconstructed`, an array over rows of samples and columns

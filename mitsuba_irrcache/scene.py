@@ -18,6 +18,7 @@ from .medium import MediumGrid, bake, children
 from .phase import refuse_sharp
 from .similarity import take_away_peak
 from .surroundings import Surroundings
+from .symbolic import symbolic
 from .transport import MOST_CROSSINGS, is_null
 
 #: Rays that find out whether a shape is closed, and the share of them that may say it is not:
@@ -261,7 +262,7 @@ def _rays_through(shape: mi.Shape) -> mi.Ray3f:
     return mi.Ray3f(target - 1.1 * dr.norm(upper - lower) * direction, direction)
 
 
-@dr.syntax
+@symbolic
 def _count_crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
     """How rays cross a shape first (1: inwards, -1: outwards, 0: never), and all of these added;
     whether a medium begins or ends at an instance of this shape.

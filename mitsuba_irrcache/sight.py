@@ -19,6 +19,7 @@ from .medium import MediumGrid
 from .memory import give_back
 from .projection import Projection
 from .surroundings import Surroundings
+from .symbolic import symbolic
 from .transport import MOST_CROSSINGS, End, Start, behind, is_null, trace
 from .uncertainty import uncertainty_of
 
@@ -202,7 +203,7 @@ class Sight:
             alpha = 1 - dr.sum(clear) / dr.size_v(mi.Spectrum)
         return View(scattered, background, passed, alpha, gathered)
 
-    @dr.syntax
+    @symbolic
     def _straight(
         self,
         scene: mi.Scene,

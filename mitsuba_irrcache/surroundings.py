@@ -10,6 +10,7 @@ from .edges import Edges
 from .grid import Grid
 from .medium import MediumGrid
 from .survey import Survey
+from .symbolic import symbolic
 from .transport import MOST_CROSSINGS, Media, is_null
 
 #: Rays from each voxel that look for its medium.
@@ -48,7 +49,7 @@ class Surroundings:
         return pointer
 
 
-@dr.syntax
+@symbolic
 def _survey(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index: mi.UInt32):
     """Per voxel, of its rays: how many found each medium (none first), how many found ``medium``
     from some place in the voxel, how many met the back of a surface first.
@@ -82,7 +83,7 @@ def medium_at(scene: mi.Scene, position: np.ndarray) -> mi.MediumPtr:
     return probe(scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
 
 
-@dr.syntax
+@symbolic
 def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
     """The medium at ``p``, as the first shape along ``direction`` tells that has a medium; none
     where there is no such shape.
@@ -100,7 +101,7 @@ def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
     return pointer
 
 
-@dr.syntax
+@symbolic
 def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
     """Whether the first surface that is not null is met from behind."""
     ray, back = mi.Ray3f(p, direction), mi.Bool(False)

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .medium import MediumGrid
+from .symbolic import symbolic
 
 #: Ratio tracking continues below this transmittance by Russian roulette only.
 ROULETTE_BELOW = 0.1
@@ -20,7 +21,7 @@ def brightest(value: mi.Float | mi.Color3f) -> mi.Float:
     return value if isinstance(value, mi.Float) else dr.max(value)
 
 
-@dr.syntax
+@symbolic
 def free_flight(
     medium: MediumGrid,
     ray: mi.Ray3f,
@@ -77,7 +78,7 @@ def free_flight(
     return collided, t, weight, rng, emitted
 
 
-@dr.syntax
+@symbolic
 def transmittance(
     medium: MediumGrid, ray: mi.Ray3f, near: mi.Float, far: mi.Float, rng: mi.PCG32, active: mi.Bool
 ):

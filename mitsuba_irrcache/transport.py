@@ -19,6 +19,7 @@ import mitsuba as mi
 
 from .medium import MediumGrid
 from .phase import interaction
+from .symbolic import symbolic
 from .tracking import free_flight, transmittance
 
 #: Surfaces that a straight line may cross; two that coincide could otherwise hold it for ever.
@@ -104,7 +105,7 @@ def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
     return dr.select(a > 0, a / (a + b), 0)
 
 
-@dr.syntax
+@symbolic
 def visibility(
     scene: mi.Scene,
     media: Media,
@@ -137,7 +138,7 @@ def visibility(
     return dr.select(crossings < MOST_CROSSINGS, through, 0), rng
 
 
-@dr.syntax
+@symbolic
 def out_of(
     scene: mi.Scene,
     media: Media,
@@ -226,7 +227,7 @@ class End:
         self.p, self.direction, self.pointer, self.weight = p, direction, pointer, weight
 
 
-@dr.syntax
+@symbolic
 def trace(
     scene: mi.Scene,
     media: Media,

@@ -28,6 +28,7 @@ from mitsuba_irrcache.solvers.layout import joined
 from mitsuba_irrcache.solvers.scattering import Level
 from mitsuba_irrcache.solvers.table import Entering, Table
 from mitsuba_irrcache.surroundings import probe
+from mitsuba_irrcache.symbolic import symbolic
 from mitsuba_irrcache.transport import Start, out_of, trace
 
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
@@ -233,7 +234,7 @@ class Arrivals:
         return places, np.column_stack([self._first[rows], self._sides[rows]])
 
 
-@dr.syntax
+@symbolic
 def _one_of(edge, cell_b, cell_c, least_b, least_c, slope_b, slope_c, nb, nc, na, rng):
     """Of the lines of a cell, ``edge`` along either axis, one of those that meet the box: where it
     passes the first slice, and where along the axis it enters the box and leaves it.

@@ -9,6 +9,7 @@ import numpy as np
 from mitsuba_irrcache.arithmetic import Divisor, unravelled
 from mitsuba_irrcache.grid import Field, Grid, GridField
 from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.symbolic import symbolic
 
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
@@ -83,7 +84,7 @@ def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
     return values
 
 
-@dr.syntax
+@symbolic
 def _mean(medium, field, grid, index, points: int, cut: bool):
     """Means over points^3 places in the voxels ``index``."""
     corner, sides = mi.Point3f(*grid.places(index)), [Divisor(points)] * 2
@@ -103,7 +104,7 @@ def _mean(medium, field, grid, index, points: int, cut: bool):
     return [s / mi.Float(count) for s in sums]
 
 
-@dr.syntax
+@symbolic
 def _collided(medium, grid, index, parts: int, cut: bool):
     """Means of the albedo over the voxels ``index``, weighted by extinction: `RADAU` in so many
     ``parts`` along each axis.

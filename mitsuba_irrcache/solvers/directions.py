@@ -18,6 +18,7 @@ from numpy.polynomial.legendre import legval
 
 from mitsuba_irrcache.directional import spots_of
 from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.symbolic import symbolic
 
 _GOLDEN = (1 + 5**0.5) / 2
 #: One over the root of x^3 = x + 1: steps of it are spread evenly.
@@ -295,7 +296,7 @@ def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -
     return light
 
 
-@dr.syntax
+@symbolic
 def marched(medium: MediumGrid, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool):
     """Transmittance along ``ray`` up to ``distance``, by the midpoint rule with about two steps in
     a voxel; exact in a homogeneous medium.

@@ -7,13 +7,14 @@ import mitsuba as mi
 
 from mitsuba_irrcache.directional import Directional, added, nothing
 from mitsuba_irrcache.medium import MediumGrid
+from mitsuba_irrcache.symbolic import symbolic
 from mitsuba_irrcache.tracking import free_flight
 
 #: 2^32 over the root of x^3 = x + 1, and over its square: points that are spread evenly.
 STEPS = (3242174889, 2447445414)
 
 
-@dr.syntax
+@symbolic
 def emitted_light(
     medium: MediumGrid,
     position: mi.Point3f,

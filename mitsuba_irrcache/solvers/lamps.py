@@ -17,6 +17,7 @@ from mitsuba_irrcache.directional import Directional, added, nothing
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers.directions import marched
+from mitsuba_irrcache.symbolic import symbolic
 from mitsuba_irrcache.transport import visibility
 
 #: Solid angle of an emitter, on average over the voxels, from which on lines are relied upon to
@@ -135,7 +136,7 @@ def _shone(scene, medium, others, emitter, p, sample, rng) -> tuple:
     return dr.select(lit, light * passed, 0), record.d, rng
 
 
-@dr.syntax
+@symbolic
 def _sampled(scene, medium, others, emitters, p, count, samples, rng, directional):
     """The mean of samples of the irradiance from all of ``count`` lamps, and of its moments."""
     shift = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())

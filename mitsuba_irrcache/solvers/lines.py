@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.arithmetic import absorbed, clipped, decay, least
 from mitsuba_irrcache.solvers.empty import CELL
+from mitsuba_irrcache.symbolic import symbolic
 
 #: Positions within a voxel are integers below this: lines can be followed back without rounding.
 ONE = 1 << 24
@@ -66,7 +67,7 @@ class _Across:
         return dr.select(place < mi.Int32(self.last) * self.stride, self.stride, 0)
 
 
-@dr.syntax
+@symbolic
 def follow(
     corners: mi.UInt32,
     words: int,
@@ -213,7 +214,7 @@ def follow(
             active_back &= k_back < na
 
 
-@dr.syntax
+@symbolic
 def add_copies(volume: mi.Float, copies: mi.Float, voxels: int, count: int, kind: type) -> None:
     """Adds to the ``voxels`` of ``volume``, values of this ``kind``, those of ``count`` copies, one
     after the other.

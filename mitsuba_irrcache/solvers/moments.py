@@ -20,6 +20,7 @@ from mitsuba_irrcache.solvers.layout import joined, layers_of
 from mitsuba_irrcache.solvers.passes import ArrivingPass, Pass
 from mitsuba_irrcache.solvers.scattering import Level
 from mitsuba_irrcache.solvers.table import Group, Table
+from mitsuba_irrcache.symbolic import symbolic
 
 #: Highest degree of what is corrected on coarser grids.
 SMOOTH = 1
@@ -173,7 +174,7 @@ class DirectionalLevel(Level):
         return scattered
 
 
-@dr.syntax
+@symbolic
 def _with_light(moments, sums: list, copies, group, axis: int, grid, lower, upper, wanted):
     """``sums`` and the moments of the light that lines of a group have left."""
     voxels = dr.opaque(mi.UInt32, grid.voxel_count)
@@ -188,7 +189,7 @@ def _with_light(moments, sums: list, copies, group, axis: int, grid, lower, uppe
     return sums
 
 
-@dr.syntax
+@symbolic
 def _with_collisions(
     moments, received: list, lost: list, depth, copies, group, wanted, voxels: int
 ):
@@ -222,7 +223,7 @@ def _with_both(moments: Moments, sums: list, basis: list, there: mi.Float, back:
     ]
 
 
-@dr.syntax
+@symbolic
 def _send_out(moments, source, scattered, group, wanted, voxels: int):
     """Writes the radiance per optical depth that the ``wanted`` ones of so many voxels send along
     the lines of a group, and against them.

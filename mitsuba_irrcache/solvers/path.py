@@ -21,6 +21,7 @@ from mitsuba_irrcache.cache import BATCH, LAYERS, IrradianceCache
 from mitsuba_irrcache.lamps import Places
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.solvers import volume_path
+from mitsuba_irrcache.symbolic import symbolic
 from mitsuba_irrcache.tracking import free_flight, transmittance
 
 #: Paths in one kernel launch: enough to fill any machine, few enough to bound memory (about 100
@@ -251,7 +252,7 @@ class _Estimator:
         return (perf_counter() - started) * samples / (dr.width(voxels) * BATCH)
 
 
-@dr.syntax
+@symbolic
 def _estimate(
     scene: mi.Scene,
     medium: MediumGrid,
