@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
+from .arithmetic import Divisor
 from .symbolic import symbolic
 
 
@@ -73,16 +74,20 @@ def reconstructed(
     return [*sums, dr.opaque(mi.Float, per_pixel, pixels)]
 
 
+def _rows(width: int, height: int) -> tuple[mi.Int32, mi.Int32]:
+    """Row and column of each of so many pixels."""
+    row, column = Divisor(width).split(dr.arange(mi.UInt32, width * height))
+    return mi.Int32(row), mi.Int32(column)
+
+
 def _gathered(samples: Samples) -> list[mi.Float]:
     """The sums of `reconstructed`."""
     film, reach = samples.film, int(samples.film.rfilter().border_size())
     parts = _columns(samples, reach)
     dr.eval(parts)
     width, height = (int(n) for n in film.crop_size())
-    pixel, wide = dr.arange(mi.Int32, width * height), dr.opaque(mi.Int32, width)
-    high = dr.opaque(mi.Int32, height + 2 * samples.border)
-    row = pixel // wide
-    column = pixel - row * wide
+    wide, high = (dr.opaque(mi.Int32, n) for n in (width, height + 2 * samples.border))
+    row, column = _rows(width, height)
     sums = [mi.Float(0)] * (samples.channels + 1)
     for part, down in zip(parts, range(-reach, reach + 1), strict=True):
         of = row + (dr.opaque(mi.Int32, samples.border) - down)
@@ -105,22 +110,20 @@ def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
     film = samples.film
     filter_, width = film.rfilter(), int(film.crop_size().x)
     height = int(film.crop_size().y) + 2 * samples.border
-    wide, columns, count, edge = (
+    wide, count, edge = (
         dr.opaque(mi.Int32, n)
-        for n in (width + 2 * samples.border, width, samples.per_pixel, samples.border)
+        for n in (width + 2 * samples.border, samples.per_pixel, samples.border)
     )
     radius, first, last = filter_.radius(), dr.opaque(mi.Int32, -reach), dr.opaque(mi.Int32, reach)
     left, top = (dr.opaque(mi.Float, int(n) + 0.5) for n in film.crop_offset())
-    lane = dr.arange(mi.Int32, width * height)
-    row = lane // columns
-    column = lane - row * columns
+    row, column = _rows(width, height)
     x, y = mi.Float(column) + left, mi.Float(row - edge) + top
     rows = 2 * reach + 1
     sums = [
         [dr.zeros(mi.Float, width * height) for _ in range(samples.channels + 1)]
         for _ in range(rows)
     ]
-    dx, k = first + 0 * lane, 0 * lane
+    dx, k = first + 0 * row, 0 * row
     while dr.hint(dx <= last, label="samples of a pixel"):
         at = column + edge + dx
         inside = (at >= 0) & (at < wide)
