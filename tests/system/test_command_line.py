@@ -7,6 +7,8 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
+import sys
 
 import mitsuba as mi
 import numpy as np
@@ -98,6 +100,22 @@ def test_render(folder, capsys):
         assert part in text
     assert "max_depth = 2" in header.getattribute("irrcache:integrator")
     assert set(os.listdir(folder)) == {"scene.xml", "density.vol", "out.exr", "out.png"}
+
+
+def test_a_process_ends_with_all_that_it_had_to_say(folder):
+    """At once, with the image, the status and both outputs; nothing is found to be leaked."""
+
+    def process(scene: str) -> subprocess.CompletedProcess:
+        arguments = ["render", scene, "--spp", "2", "-o", "x.exr"]
+        command = [sys.executable, "-m", "mitsuba_irrcache", *arguments]
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+    done = process("scene.xml")
+    assert done.returncode == 0 and "wrote x.exr" in done.stdout
+    assert "leaked" not in done.stderr
+    assert OpenImageIO.ImageBuf(str(folder / "x.exr")).spec().width == 12
+    failed = process("other.xml")
+    assert failed.returncode == 1 and "there is no scene file" in failed.stderr
 
 
 def test_the_picture_is_mi_renders(folder):
