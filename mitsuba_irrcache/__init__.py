@@ -6,23 +6,14 @@ type="irrcache"/>`` available in every variant set from then on.
 
 from __future__ import annotations
 
-import gc
+from . import runtime
 
-# What imports make stays. To look for garbage in it takes a tenth of a second.
-_collects = gc.isenabled()
-gc.disable()
-try:
-    from . import runtime
+runtime.prepare_llvm()  # before Dr.Jit is imported for the first time
 
-    runtime.prepare_llvm()  # before Dr.Jit is imported for the first time
-
-    from . import _register  # noqa: F401
-    from .cache import IrradianceCache
-    from .errors import CacheFileError, IrrcacheError, UnsupportedSceneError
-    from .progressive import render_progressive
-finally:
-    if _collects:
-        gc.enable()
+from . import _register  # noqa: E402,F401
+from .cache import IrradianceCache  # noqa: E402
+from .errors import CacheFileError, IrrcacheError, UnsupportedSceneError  # noqa: E402
+from .progressive import render_progressive  # noqa: E402
 
 __version__ = "0.1.0"
 
