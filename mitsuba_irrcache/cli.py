@@ -39,8 +39,9 @@ def command() -> NoReturn:
     """
     status = main()
     with suppress(OSError):  # what cannot be written is reported by the usual end
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
         os._exit(status)
     sys.exit(status)
 
