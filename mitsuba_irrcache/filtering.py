@@ -15,7 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arithmetic import Divisor
 from .layers import Layers, interleaved, luminance
+from .reconstruction import pixel_of
 from .symbolic import symbolic
 from .uncertainty import PROBES, ROUNDS
 
@@ -135,9 +137,8 @@ def _least_risk(
     settings = [(stride, strength) for stride in STRIDES for strength in STRENGTHS]
     lane = dr.arange(mi.UInt32, count * len(settings))
     # How many pixels are valid may change with every image; no kernel may depend on it.
-    pixels = dr.opaque(mi.UInt32, count)
-    setting = lane // pixels
-    pixel = dr.gather(mi.UInt32, chosen, lane - setting * pixels)
+    setting, place = Divisor(count).split(lane)
+    pixel = dr.gather(mi.UInt32, chosen, place)
     stride, strength = (
         dr.gather(kind, kind(values), setting)
         for kind, values in zip((mi.Int32, mi.Float), zip(*settings, strict=True), strict=True)
@@ -173,8 +174,7 @@ def bilateral(
     width, height = (dr.opaque(mi.Int32, int(n)) for n in size)
     first = dr.opaque(mi.UInt32, which) * mi.UInt32(width * height)
     image, error = _unpack(packed, first + pixel, True)
-    y = mi.Int32(pixel) // width
-    x = mi.Int32(pixel) - y * width
+    x, y = pixel_of(pixel, int(size[0]))
     tap = mi.Int32(0)
     side, count = 2 * RADIUS + 1, len(image)
     total, norm = mi.Spectrum(0), mi.Float(0)

@@ -72,6 +72,7 @@ class Projection:
         uncertainty: UncertaintyField | None = None,
         directional: DirectionalField | None = None,
         edges: Edges | None = None,
+        falloff: Falloff | None = None,
     ) -> None:
         self.medium = medium
         self.lit = irradiance is not None
@@ -81,7 +82,7 @@ class Projection:
         self.uncertainty = uncertainty
         self.directional = directional
         #: how the light of lamps falls off, which the cache is without
-        self.falloff: Falloff | None = None
+        self.falloff = falloff
         #: surfaces that end the light, where there are any, and the light that they choose from
         self._edges = (edges, irradiance) if edges is not None else None
         albedo = _constant_if_it_is(medium.albedo)

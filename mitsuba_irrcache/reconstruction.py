@@ -74,10 +74,10 @@ def reconstructed(
     return [*sums, dr.opaque(mi.Float, per_pixel, pixels)]
 
 
-def _rows(width: int, height: int) -> tuple[mi.Int32, mi.Int32]:
-    """Row and column of each of so many pixels."""
-    row, column = Divisor(width).split(dr.arange(mi.UInt32, width * height))
-    return mi.Int32(row), mi.Int32(column)
+def pixel_of(index: mi.UInt32, width: int) -> mi.Vector2i:
+    """Column and row of the pixels with these numbers, where rows have ``width`` of them."""
+    row, column = Divisor(width).split(index)
+    return mi.Vector2i(mi.Int32(column), mi.Int32(row))
 
 
 def _gathered(samples: Samples) -> list[mi.Float]:
@@ -87,7 +87,7 @@ def _gathered(samples: Samples) -> list[mi.Float]:
     dr.eval(parts)
     width, height = (int(n) for n in film.crop_size())
     wide, high = (dr.opaque(mi.Int32, n) for n in (width, height + 2 * samples.border))
-    row, column = _rows(width, height)
+    column, row = pixel_of(dr.arange(mi.UInt32, width * height), width)
     sums = [mi.Float(0)] * (samples.channels + 1)
     for part, down in zip(parts, range(-reach, reach + 1), strict=True):
         of = row + (dr.opaque(mi.Int32, samples.border) - down)
@@ -116,7 +116,7 @@ def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
     )
     radius, first, last = filter_.radius(), dr.opaque(mi.Int32, -reach), dr.opaque(mi.Int32, reach)
     left, top = (dr.opaque(mi.Float, int(n) + 0.5) for n in film.crop_offset())
-    row, column = _rows(width, height)
+    column, row = pixel_of(dr.arange(mi.UInt32, width * height), width)
     x, y = mi.Float(column) + left, mi.Float(row - edge) + top
     rows = 2 * reach + 1
     sums = [

@@ -16,7 +16,7 @@ from .arithmetic import Divisor
 from .errors import IrrcacheError
 from .layers import interleaved
 from .memory import require_memory
-from .reconstruction import reconstructed
+from .reconstruction import pixel_of, reconstructed
 
 #: Camera samples in one kernel launch: bounds the memory that they and the sampler's state take.
 LANES = 1 << 22
@@ -177,12 +177,6 @@ class PixelPositions:
         bits = [dr.select(number % 2 == 1, ~b, b) for b in bits]
         bits = [dr.select(number < self.paired, b, 1 << 31) for b in bits]
         return mi.Point2f([mi.Float(b >> 8) * 2.0**-24 for b in bits])
-
-
-def pixel_of(index: mi.UInt32, width: int) -> mi.Vector2i:
-    """Column and row of the pixels with these numbers, where rows have ``width`` of them."""
-    row, column = Divisor(width).split(index)
-    return mi.Vector2i(mi.Int32(column), mi.Int32(row))
 
 
 def camera_ray(

@@ -44,19 +44,23 @@ def sight_of(
         return None
 
     def project(medium: MediumGrid, cache: IrradianceCache | None) -> Projection:
-        lit = cache is not None and cache.active_count and cache.samples
-        field = cache.field() if lit else None
-        if lit:
-            give_back(cache.grid.voxel_count)
-        uncertainty = uncertainty_of(cache) if lit and with_error else None
-        directional = cache.directional_field(field.channels) if lit else None
-        edges = cache.survey.edges if lit and cache.survey is not None else None
-        errors = uncertainty, directional, edges
-        projection = Projection(medium, field, quadrature, step, layered, *errors)
-        if lit:
-            projection.falloff = cache.falloff
-            del field  # it has been copied
-            give_back(cache.grid.voxel_count)
+        if cache is None or not (cache.active_count and cache.samples):
+            return Projection(medium, None, quadrature, step, layered)
+        field = cache.field()
+        give_back(cache.grid.voxel_count)
+        projection = Projection(
+            medium,
+            field,
+            quadrature,
+            step,
+            layered,
+            uncertainty=uncertainty_of(cache) if with_error else None,
+            directional=cache.directional_field(field.channels),
+            edges=cache.survey.edges if cache.survey is not None else None,
+            falloff=cache.falloff,
+        )
+        del field  # it has been copied
+        give_back(cache.grid.voxel_count)
         return projection
 
     projections = [project(part.medium, part.shown) for part in parts]

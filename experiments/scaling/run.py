@@ -37,6 +37,7 @@ from mitsuba_irrcache.compare.worker import peak_memory
 from mitsuba_irrcache.loading import load_scene
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.solvers.sweep import BATCH, LARGEST_BATCH
+from mitsuba_irrcache.symbolic import symbolic
 
 VARIANT = "llvm_ad_mono"
 #: Source and voxels along its longest side; 0: as the source has it.
@@ -231,7 +232,7 @@ def loads(sides: np.ndarray) -> float:
     return 2 * slices * lines / min(times[1:])
 
 
-@dr.syntax
+@symbolic
 def _loaded(words, light, lanes, slices, step, row):
     """The kernel of `loads`; what it reads of the extinction is in the result."""
     there, back = mi.UInt32(lanes), lanes + (slices - 1) * step

@@ -11,7 +11,8 @@ import numpy as np
 
 from mitsuba_irrcache.filtering import filter_illumination
 from mitsuba_irrcache.layers import AOVS, Layers, luminance
-from mitsuba_irrcache.rendering import PixelPositions, pixel_of
+from mitsuba_irrcache.reconstruction import pixel_of
+from mitsuba_irrcache.rendering import PixelPositions
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seen
 

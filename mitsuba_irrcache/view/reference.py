@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.rendering import pixel_of
+from mitsuba_irrcache.reconstruction import pixel_of
 from mitsuba_irrcache.surroundings import medium_at
 from mitsuba_irrcache.view.bands import Bands
 from mitsuba_irrcache.view.camera import Camera
