@@ -16,9 +16,8 @@ from .solvers import sweep
 
 #: Why something is as a property says.
 AS_TOLD = "as told"
-#: Optical depth of a voxel at the boundary of a medium from which on the pixels there are off by
-#: more than 10 % (a homogeneous cube; at half of it, by 5 %).
-DENSE_BORDER = 1.0
+#: Estimated error of the pixels at the boundary of a medium [%] from which on a warning is logged.
+LARGE_BORDER_ERROR = 3.0
 
 #: Voxels along the longest side of a cache among surfaces, unless told otherwise: shadows have more
 #: detail than coarse data.
@@ -26,10 +25,24 @@ AMONG_SURFACES = (32, 64)
 
 #: Voxels of a cache that ``resolution`` 0 leads to, at most; where light is known by its direction.
 MOST_VOXELS, MOST_DIRECTIONAL = 1 << 25, 1 << 21
-#: Optical depth of a cache voxel, where light collides, that ``resolution`` 0 keeps below by up to
-#: twice the voxels of the data along an axis: the light falls off within denser ones. On a CT head
-#: of 1.2 per voxel the error of single scattering falls from 0.7 to 0.3 % of the mean.
-DENSE_VOXEL, FINEST = 0.7, 2.0
+#: RMSE of the image, in % of its mean, that ``resolution`` 0 aims at by the estimates below, which
+#: are fits to images of random and smooth media of 0.3 to 100 optical depths per data voxel.
+TARGET_ERROR = 0.5
+#: Interpolation between cache voxels, r along an axis for each data voxel of the optical depth d,
+#: causes an error of about this many % times sqrt(d) / r^2.
+INTERPOLATION_ERROR = 1.3
+#: ... and r is at most this.
+MOST_PER_DATA_VOXEL = 4.0
+#: A medium whose boundary cuts through matter, with an optical depth d of a cache voxel there, has
+#: an error of about this many % times d^1.2.
+BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
+#: Voxels along the longest side that media get at least, whatever their data: so few cost next to
+#: nothing, and light has detail that a few data voxels lack. Matter with high contrast gets up to
+#: the second number, and one that the boundary cuts, or that is homogeneous, up to the third.
+FEWEST, CONTRASTED, BORDERED = 32, 64, 128
+#: Voxels of a cache that is finer than its data, at most: all orders of scattering in so many take
+#: half a minute on two cores.
+MOST_REFINED = 10_000_000
 #: Directions per voxel of the solver ``sweep``, unless told otherwise: for all orders of
 #: scattering, and among surfaces, whose light has the noise of the image's samples besides. Twice
 #: as many for single scattering of irradiance, where each is less work and blurs less.
@@ -124,47 +137,78 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     path per voxel.
     """
     data, frame = medium.sigma_t.grid, medium.frame
-    longest = np.linalg.norm(frame[:3, :3], axis=0).max()
-    per_path = 2 * longest * medium.sigma_t.maximum
     voxels = MOST_VOXELS if medium.phase is None else MOST_DIRECTIONAL
-    if not resolution and medium.surroundings is not None and solver == "path":
+    if resolution:
+        grid, reason = Grid.near_cubic(frame, resolution), AS_TOLD
+    elif medium.surroundings is not None and solver == "path":
         least, most = AMONG_SURFACES
-        count = np.ceil(per_path) if data is None else max(data.shape)
+        count = np.ceil(_per_path(medium)) if data is None else max(data.shape)
         grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
         reason = f"of the medium, {least} to {most} among surfaces"
-    elif resolution:
-        grid, reason = Grid.near_cubic(frame, resolution), AS_TOLD
-    elif data is None:
-        count = np.clip(np.ceil(per_path), 32, 96)
-        grid, reason = Grid.near_cubic(frame, int(count)), "two per mean free path, 32 to 96"
-    elif solver == "sweep" and data.voxel_count <= voxels:
-        sides, reason = _finer(medium.sigma_t, voxels), "of the medium"
-        if (sides > data.resolution).any():
-            reason = "finer than those of the medium, which is dense"
-        if not medium.alone and sides.max() < AMONG_SURFACES[0]:
-            sides = np.ceil(sides * (AMONG_SURFACES[0] / sides.max())).astype(int)
-            reason = f"finer than those of the medium, {AMONG_SURFACES[0]} among surfaces"
-        grid = Grid(tuple(int(n) for n in sides[::-1]), frame)
     else:
-        most = 128 if solver == "path" else round(voxels ** (1 / 3))
-        grid = Grid.near_cubic(frame, min(max(data.shape), most))
-        reason = f"of the medium, at most {most}"
+        grid, reason = _estimated_grid(medium, solver, voxels)
     return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
 
 
-def _finer(sigma_t: GridField, voxels: int) -> np.ndarray:
-    """Voxels along x, y, z that light needs to be known in: those of the data or, where they are
-    dense, more, but no more than so many ``voxels``.
+def _per_path(medium: MediumGrid) -> float:
+    """Voxels along the longest side, two per mean free path."""
+    longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
+    return 2 * longest * medium.sigma_t.maximum
+
+
+def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid, str]:
+    """The grid whose estimated error is `TARGET_ERROR`, with no more than so many ``voxels``, and
+    the reason for its size.
     """
+    data, frame = medium.sigma_t.grid, medium.frame
+    lengths = np.linalg.norm(frame[:3, :3], axis=0)
+    mean, border = _colliding_extinction(medium), _border_extinction(medium)
+    # Voxels along x, y, z that each criterion asks for.
+    wanted = {f"at least {FEWEST}": FEWEST * lengths / lengths.max()}
+    if data is not None:
+        ratio = np.ones(3)
+        if solver != "path":  # its noise in finer voxels exceeds the error of these
+            depth = mean * data.voxel_size
+            ratio = np.sqrt(INTERPOLATION_ERROR * np.sqrt(depth) / TARGET_ERROR)
+        ratio = np.clip(ratio, 1, MOST_PER_DATA_VOXEL)
+        dense = "finer than those of the medium, which is dense"
+        wanted[dense if ratio.max() > 1 else "of the medium"] = data.resolution * ratio
+    edge = (TARGET_ERROR / BORDER_ERROR) ** (1 / BORDER_ORDER)  # in optical depth
+    for reason, extinction, most in (
+        ("five per mean free path", mean, CONTRASTED),
+        ("five per mean free path at the boundary, which cuts the medium", border, BORDERED),
+    ):
+        counts = extinction * lengths / edge
+        wanted[reason] = counts * min(1, most / max(counts.max(), 1))
+    sides = np.max(list(wanted.values()), axis=0)
+    reason = max(wanted, key=lambda key: wanted[key].max())
+    limit = voxels
+    if data is not None and np.prod(sides) > data.voxel_count:
+        limit = min(voxels, max(MOST_REFINED, data.voxel_count))
+    most = 128 if solver == "path" else np.inf
+    for bound, message in (
+        ((limit / np.prod(sides)) ** (1 / 3), f"as fine as {limit} voxels allow"),
+        (most / sides.max(), f"of the medium, at most {most}"),
+    ):
+        if bound < 1:
+            sides, reason = sides * bound, message
+    # Rounded down: limits hold. Counts that are whole numbers but for rounding stay what they are.
+    sides = np.maximum(np.floor(sides + 1e-4), 1).astype(int)
+    return Grid(tuple(int(n) for n in sides[::-1]), frame), reason
+
+
+def _colliding_extinction(medium: MediumGrid) -> float:
+    """The mean extinction over collisions in even light, int sigma_t^2 / int sigma_t
+    [1/scene unit].
+    """
+    sigma_t = medium.sigma_t
+    if sigma_t.grid is None:
+        return sigma_t.maximum
     total, squares = dr.sum(sigma_t.data), dr.squared_norm(sigma_t.data)
     dr.eval(total, squares)
     if not total[0] > 0:
-        return sigma_t.grid.resolution
-    # Extinction on average over collisions in even light.
-    extinction = float(squares[0]) / float(total[0]) * float(sigma_t.scale[0])
-    factor = np.clip(extinction * sigma_t.grid.voxel_size / DENSE_VOXEL, 1, FINEST)
-    most = (voxels / sigma_t.grid.voxel_count) ** (1 / 3)
-    return np.floor(sigma_t.grid.resolution * np.minimum(factor, most)).astype(int)
+        return 0.0
+    return float(squares[0]) / float(total[0]) * float(sigma_t.scale[0])
 
 
 def choose_samples(cache: IrradianceCache, solver: str, medium: MediumGrid) -> int:
@@ -186,15 +230,16 @@ def swept_samples(max_depth: int, medium: MediumGrid) -> int:
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
-    """Tells where the cache is too coarse for matter that the boundary cuts: light falls off within
-    a fraction of a mean free path there, and nothing is known of it beyond the outermost voxels.
+    """Logs a warning where the cache is too coarse for matter that the boundary cuts: irradiance
+    falls off within a fraction of a mean free path there, and no voxel lies beyond.
     """
     depth = _border_extinction(medium) * grid.voxel_size.max()
-    if depth > DENSE_BORDER:
+    error = BORDER_ERROR * depth**BORDER_ORDER
+    if error > LARGE_BORDER_ERROR:
         mi.Log(
             mi.LogLevel.Warn,
             f"irrcache: dense matter reaches the boundary of the medium (optical depth {depth:.2g} "
-            "per cache voxel), whose light is known poorly in the outermost layer. Raise "
+            f"per cache voxel): errors of about {min(error, 100):.0f} % are expected there. Raise "
             "resolution, or leave two voxels of empty space around the matter.",
         )
 

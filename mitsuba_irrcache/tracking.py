@@ -1,7 +1,9 @@
-"""Null-collision tracking through a medium: free flights and transmittance, both unbiased.
+"""Transmittance and free flights through a medium.
 
-Tentative collisions are drawn with the majorant of the macrocell at hand. Functions return the
-random generator they advanced, since a recorded loop does not update its caller's copy.
+`optical_depth` is deterministic and exact. `free_flight` and `transmittance` are unbiased estimates
+by null-collision tracking: tentative collisions are drawn with the majorant of the macrocell at
+hand. Functions return the random generator they advanced, since a recorded loop does not update its
+caller's copy.
 """
 
 from __future__ import annotations
@@ -9,9 +11,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .boundary import safe_rcp
 from .medium import MediumGrid
 from .symbolic import symbolic
 
+#: Abscissae of two-point Gauss-Legendre quadrature over [0, 1]: exact for cubic polynomials.
+GAUSS_POINTS = (0.5 - 0.28867513, 0.5 + 0.28867513)
+#: Optical depth whose transmittance is 0 in single precision: nothing behind it matters.
+OPAQUE = 104.0
 #: Ratio tracking continues below this transmittance by Russian roulette only.
 ROULETTE_BELOW = 0.1
 
@@ -76,6 +83,66 @@ def free_flight(
         cell = dr.select(leaves, following, cell)
         active &= ~collides & (t < far)
     return collided, t, weight, rng, emitted
+
+
+@symbolic
+def optical_depth(
+    medium: MediumGrid, ray: mi.Ray3f, near: mi.Float, far: mi.Float, active: mi.Bool
+):
+    """int sigma_t dt along ``ray`` from ``near`` to ``far``, exact up to rounding, for each channel
+    of the extinction; beyond `OPAQUE` in all channels only a lower bound.
+
+    Between the planes through the voxel centres extinction is trilinear, so it is a cubic
+    polynomial of the distance along the ray: two Gauss points between two planes integrate it
+    exactly, whatever the optical depth of a voxel. Macrocells without extinction are skipped.
+    """
+    depth = medium.sigma_t.at_world(ray.o, False) * 0
+    active = mi.Bool(active) & (near < far)
+    if dr.hint(medium.homogeneous, mode="scalar"):
+        depth += medium.sigma_t.value * dr.select(active, far - near, 0)
+    else:
+        grid = medium.sigma_t.grid
+        # Coordinates in which the centre of voxel i is at i: these are the planes.
+        origin = mi.Vector3f(grid.coordinates.point(ray.o)) - 0.5
+        direction = grid.coordinates.vector(ray.d)
+        rcp = safe_rcp(direction)
+        forward = rcp > 0
+        last = mi.Vector3f(*(mi.Float(n) for n in grid.sides)) - 1
+        walk = medium.macrocells.walk(ray)
+        # A step that rounding makes shorter than this would not advance at all.
+        least = dr.fma(dr.abs(near) + dr.abs(far), 3e-7, 1e-30)
+        t = mi.Float(near)
+        while dr.hint(active, label="optical depth"):
+            middle = t + 4 * least
+            cell = walk.cell(middle)
+            empty = walk.majorant(cell, active) == 0
+            wall, _ = walk.exit(cell, middle)
+            place = dr.fma(direction, middle, origin)
+            # Outside of the outermost centres values are clamped: there is no plane until these.
+            plane = dr.select(forward, dr.floor(place) + 1, dr.ceil(place) - 1)
+            plane = dr.select(forward, dr.maximum(plane, 0), dr.minimum(plane, last))
+            beyond = dr.select(forward, plane > last, plane < 0)
+            crossing = dr.min(dr.select(beyond, dr.inf, (plane - origin) * rcp))
+            end = dr.minimum(dr.select(empty, wall, crossing), far)
+            end = dr.minimum(dr.maximum(end, t + least), far)
+            length = 0.5 * (end - t)
+            reads = active & ~empty
+            for point in GAUSS_POINTS:
+                sigma_t = medium.sigma_t.at_world(ray(dr.lerp(t, end, point)), reads)
+                depth += dr.select(reads, sigma_t * length, 0)
+            t = end
+            thinnest = dr.min(depth) if not isinstance(depth, mi.Float) else depth
+            active &= (t < far) & (thinnest < OPAQUE)
+    return depth
+
+
+def medium_transmittance(
+    medium: MediumGrid, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool
+) -> mi.Float | mi.Color3f:
+    """Transmittance of ``medium`` along ``ray`` up to ``distance``, without noise."""
+    hit, near, far = medium.intersect(ray)
+    near, far = dr.maximum(near, 0), dr.minimum(far, distance)
+    return dr.exp(-optical_depth(medium, ray, near, far, active & hit))
 
 
 @symbolic

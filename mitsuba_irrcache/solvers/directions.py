@@ -18,7 +18,7 @@ from numpy.polynomial.legendre import legval
 
 from mitsuba_irrcache.directional import spots_of
 from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.symbolic import symbolic
+from mitsuba_irrcache.tracking import medium_transmittance
 
 _GOLDEN = (1 + 5**0.5) / 2
 #: One over the root of x^3 = x + 1: steps of it are spread evenly.
@@ -290,30 +290,10 @@ def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -
     at.p = position
     record, light = emitter.sample_direction(at, mi.Point2f(0.5))
     lit = dr.max(light) > 0
-    light = light * marched(medium, mi.Ray3f(position, record.d), record.dist, lit)
+    light = light * medium_transmittance(medium, mi.Ray3f(position, record.d), record.dist, lit)
     light = dr.select(lit, light, 0)
     dr.eval(light)
     return light
-
-
-@symbolic
-def marched(medium: MediumGrid, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool):
-    """Transmittance along ``ray`` up to ``distance``, by the midpoint rule with about two steps in
-    a voxel; exact in a homogeneous medium.
-    """
-    hit, near, far = medium.intersect(ray)
-    near, far = dr.maximum(near, 0), dr.minimum(far, distance)
-    active = active & hit & (near < far)
-    length = dr.opaque(mi.Float, medium.shortest_edge / 2)
-    count = dr.clip(dr.ceil((far - near) / length), 1, 1 << 16)
-    step = (far - near) / count
-    depth = medium.sigma_t.at_world(ray.o, False) * 0
-    k = mi.Float(0)
-    while dr.hint(active, label="shadow rays"):
-        depth += medium.sigma_t.at_world(ray(dr.fma(k + 0.5, step, near)), active) * step
-        k += 1
-        active &= k < count
-    return dr.exp(-depth)
 
 
 def _sun(emitter: mi.Emitter) -> tuple[np.ndarray, np.ndarray]:

@@ -16,8 +16,8 @@ import numpy as np
 from mitsuba_irrcache.directional import Directional, added, nothing
 from mitsuba_irrcache.grid import Grid
 from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.solvers.directions import marched
 from mitsuba_irrcache.symbolic import symbolic
+from mitsuba_irrcache.tracking import medium_transmittance
 from mitsuba_irrcache.transport import visibility
 
 #: Solid angle of an emitter, on average over the voxels, from which on lines are relied upon to
@@ -132,7 +132,7 @@ def _shone(scene, medium, others, emitter, p, sample, rng) -> tuple:
     # The medium itself is marched through apart, without noise.
     passed, rng = visibility(scene, others, vertex, record.p, medium.pointer, rng, lit)
     lit &= dr.max(passed) > 0
-    passed *= marched(medium, mi.Ray3f(p, record.d), record.dist, lit)
+    passed *= medium_transmittance(medium, mi.Ray3f(p, record.d), record.dist, lit)
     return dr.select(lit, light * passed, 0), record.d, rng
 
 
