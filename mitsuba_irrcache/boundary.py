@@ -28,7 +28,11 @@ class Boundary:
     def __init__(self, kind: str, to_world: np.ndarray) -> None:
         self.kind = kind
         self.to_world = np.asarray(to_world, dtype=np.float64)
-        self._to_local = Affine(np.linalg.inv(self.to_world))
+        inverse = np.linalg.inv(self.to_world)
+        self._to_local = Affine(inverse)
+        transposed = np.eye(4)
+        transposed[:3, :3] = inverse[:3, :3].T
+        self._normals = Affine(transposed)  # normals transform by the inverse transpose
 
     @property
     def frame(self) -> np.ndarray:
@@ -56,6 +60,14 @@ class Boundary:
         origin = self._to_local.point(ray.o)
         direction = self._to_local.vector(ray.d)
         return _slabs(origin, direction) if self.kind == "box" else _sphere(origin, direction)
+
+    def outward_normal(self, p: mi.Point3f) -> mi.Normal3f:
+        """The unit normal that points outwards at ``p``, a position on the boundary."""
+        local = mi.Vector3f(self._to_local.point(p))
+        if self.kind == "box":
+            largest = dr.max(dr.abs(local))
+            local = dr.select(dr.abs(local) == largest, dr.sign(local), 0)
+        return mi.Normal3f(dr.normalize(self._normals.vector(local)))
 
 
 def _slabs(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:

@@ -6,9 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import half_space
 from .cache import IrradianceCache, active_voxels
 from .errors import IrrcacheError, UnsupportedSceneError
-from .grid import Grid, GridField
+from .grid import Grid
 from .layers import luminance
 from .medium import MediumGrid
 from .obstacles import boxes_meet, corners_of, obstacle
@@ -126,6 +127,29 @@ def _why_not_sweep(
     box = box if medium.emission is None else (np.zeros(3, int), grid.resolution)
     found = obstacle(scene, grid, *box)
     return found and f"{found} reaches into {name}"
+
+
+def needs_no_cache(
+    scene: mi.Scene, medium: MediumGrid, max_depth: int, resolution: int
+) -> str | None:
+    """Why `HalfSpace` is more accurate than a cache for ``medium``; None where it is not, or where
+    ``resolution`` asks for a cache.
+    """
+    if resolution or max_depth > half_space.MOST_ORDERS:
+        return None
+    error = half_space.series_error(medium)
+    if not np.isfinite(error) or not half_space.is_seen_from_outside(scene, medium):
+        return None
+    error *= max_depth != 2  # single scattering is exact
+    grid, _ = choose_grid(medium, 0, "sweep")
+    depth = medium.sigma_t.maximum * grid.voxel_size.max()
+    cached = BORDER_ERROR * depth**BORDER_ORDER
+    if cached <= max(error, 1.2 * TARGET_ERROR):
+        return None
+    return (
+        f"opaque (optical depth {depth:.2g} per voxel of a cache, which would cause an error of "
+        f"about {min(cached, 100):.0f} % instead of {error:.1f} %)"
+    )
 
 
 def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid, str]:

@@ -12,11 +12,18 @@ import drjit as dr
 import mitsuba as mi
 
 from .cache import BATCH, IrradianceCache, active_voxels, marked
-from .choices import choose_grid, choose_samples, swept_samples, warn_of_dense_border
+from .choices import (
+    choose_grid,
+    choose_samples,
+    needs_no_cache,
+    swept_samples,
+    warn_of_dense_border,
+)
 from .directional import Directional, sources_of
 from .errors import CacheFileError, IrrcacheError
 from .fingerprint import digests
 from .grid import Grid
+from .half_space import HalfSpace
 from .lamps import Falloff
 from .medium import MediumGrid
 from .memory import give_back, require_memory
@@ -67,8 +74,20 @@ class LitMedium:
         self._preview: IrradianceCache | None = None
         self._sweep: Sweep | None = None
         self.cache: IrradianceCache | None = None
-        if settings.max_depth not in (0, 1):
+        #: closed form in place of a cache; None where there is one, or nothing to be computed
+        self.half_space: HalfSpace | None = None
+        if settings.max_depth in (0, 1):
+            return
+        reason = needs_no_cache(scene, medium, settings.max_depth, settings.resolution)
+        if reason is None:
             self.cache = self._start_cache(scene, edited)
+            return
+        mi.Log(
+            mi.LogLevel.Info,
+            f'irrcache: medium "{medium.name}" is {reason}: its radiance is that of a half-space, '
+            "no cache is built. Set resolution for a cache.",
+        )
+        self.half_space = HalfSpace(scene, medium, settings.max_depth)
 
     @property
     def label(self) -> str:

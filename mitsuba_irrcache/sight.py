@@ -13,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .cache import IrradianceCache
+from .errors import IrrcacheError
+from .half_space import HalfSpace
 from .layers import luminance
 from .lit import CacheSettings, LitMedium
 from .medium import MediumGrid
@@ -66,7 +68,8 @@ def sight_of(
     projections = [project(part.medium, part.shown) for part in parts]
     medium = parts[0].medium
     if medium.alone:
-        return SimpleSight(projections[0], settings.max_depth, hide_emitters)
+        closed_form = parts[0].half_space
+        return SimpleSight(projections[0], settings.max_depth, hide_emitters, closed_form)
     depths = settings.max_depth, settings.rr_depth
     return Sight(medium.surroundings, projections, *depths, hide_emitters)
 
@@ -92,8 +95,16 @@ class View:
 class SimpleSight:
     """Camera rays through the one medium of a simple scene."""
 
-    def __init__(self, projection: Projection, max_depth: int, hide_emitters: bool) -> None:
+    def __init__(
+        self,
+        projection: Projection,
+        max_depth: int,
+        hide_emitters: bool,
+        half_space: HalfSpace | None = None,
+    ) -> None:
+        """``half_space`` computes the scattered radiance where there is no cache for it."""
         self.projection, self.medium = projection, projection.medium
+        self._half_space = half_space
         self.hide_emitters, self.lit = hide_emitters, max_depth != 0
 
     def look(
@@ -123,6 +134,13 @@ class SimpleSight:
         scattered, transmittance, gathered, emitted = self.projection.march(
             ray, near, far, background, 1 - sampler.next_1d(active), active & hit
         )
+        if self._half_space is not None:
+            if medium is not None:
+                raise IrrcacheError(
+                    f'irrcache: the sensor is inside of the opaque medium "{self.medium.name}", '
+                    "whose radiance is known outside only; set resolution for a cache."
+                )
+            scattered = self._half_space.radiance(ray, near, far, sampler, active & hit)
         if self.lit:
             background = self._left_of(transmittance, ray.d) * background + emitted
         alpha = mi.Float(1)

@@ -89,8 +89,8 @@ def free_flight(
 def optical_depth(
     medium: MediumGrid, ray: mi.Ray3f, near: mi.Float, far: mi.Float, active: mi.Bool
 ):
-    """int sigma_t dt along ``ray`` from ``near`` to ``far``, exact up to rounding, for each channel
-    of the extinction; beyond `OPAQUE` in all channels only a lower bound.
+    """Integral of sigma_t along ``ray`` from ``near`` to ``far``, exact up to rounding, for each
+    channel of the extinction; beyond `OPAQUE` in all channels only a lower bound.
 
     Between the planes through the voxel centres extinction is trilinear, so it is a cubic
     polynomial of the distance along the ray: two Gauss points between two planes integrate it
