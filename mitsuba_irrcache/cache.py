@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .arithmetic import Divisor, unravelled
+from .beams import Beam
 from .conservation import conserving
 from .directional import Directional, DirectionalField
 from .errors import CacheFileError, IrrcacheError
@@ -75,6 +76,8 @@ class IrradianceCache:
         self.directional: Directional | None = None
         #: how the light of lamps nearby falls off; None where there are none
         self.falloff: Falloff | None = None
+        #: spot lights, whose irradiance camera rays look up apart; the layers hold its means
+        self.beams: list[Beam] = []
         #: where voxels lie among surfaces; None where there are none
         self.survey: Survey | None = None
         #: samples taken per voxel from each random stream
@@ -91,7 +94,7 @@ class IrradianceCache:
     def lie_like(self, other: IrradianceCache) -> None:
         """Takes over what is known of the place of ``other``, another cache of the same medium."""
         self.directional, self.survey = other.directional, other.survey
-        self.falloff = other.falloff
+        self.falloff, self.beams = other.falloff, other.beams
 
     # ------------------------------------------------------------------ statistics
 
@@ -165,10 +168,13 @@ class IrradianceCache:
         return self._zeros if spread is None else spread / (n * (n - 1))
 
     def field(self) -> RootField:
-        """Phi for lookups, over the `falloff` if there is one: one channel where all channels agree
-        to the last bit. Its maximum is that of Phi, or more.
+        """Phi for lookups, without that of `beams`, and over the `falloff` if there is one: one
+        channel where all channels agree to the last bit. Its maximum is that of Phi, or more.
         """
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        brightest = [dr.max(m)[0] for m in means] if self.beams else []
+        for beam in self.beams:
+            means = [dr.maximum(m - e, 0) for m, e in zip(means, beam.irradiance, strict=False)]
         roots, variance = [dr.sqrt(m) for m in means], None
         if not self.correlated:  # neighbours that err alike do no harm to interpolation
             noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
@@ -189,6 +195,7 @@ class IrradianceCache:
         field = RootField(self.grid, values, channels, variance)
         if self.falloff is not None:
             field.maximum *= self.falloff.maximum(self.active)
+        field.maximum = max(field.maximum, *brightest, 0.0)
         return field
 
     def directional_field(self, channels: int) -> DirectionalField | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -93,9 +95,12 @@ class Falloff:
         ]
 
     @classmethod
-    def of(cls, scene: mi.Scene, grid: Grid) -> Falloff | None:
-        """That of the lamps of a scene that are near the voxels of ``grid``; None if none is."""
-        points = [p for e in point_lights(scene) for p in _of_point(e, grid)]
+    def of(cls, scene: mi.Scene, grid: Grid, others: Sequence[mi.Emitter] = ()) -> Falloff | None:
+        """That of the lamps of a scene that are near the voxels of ``grid``, but for ``others``;
+        None if none is.
+        """
+        lights = [e for e in point_lights(scene) if e not in others]
+        points = [p for e in lights for p in _of_point(e, grid)]
         points += [p for s in scene.shapes() if s.is_emitter() for p in _of_area(s, grid)]
         points.sort(key=lambda point: -point[1])
         points = points[:MOST_POINTS]

@@ -11,6 +11,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
+from .beams import beams_of
 from .cache import BATCH, IrradianceCache, active_voxels, marked
 from .choices import (
     choose_grid,
@@ -181,7 +182,8 @@ class LitMedium:
             grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
         )
         cache.survey, cache.directional = survey, directional
-        cache.falloff = Falloff.of(scene, grid)
+        cache.beams = beams_of(scene, medium, grid, active) if swept else []
+        cache.falloff = Falloff.of(scene, grid, [beam.emitter for beam in cache.beams])
         self.saved_samples = 0
         if not self.file:
             return cache

@@ -15,11 +15,14 @@ Rays read copies of the fields that are laid out for them, in 16 bits (`packets`
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .arithmetic import absorbed, clipped, decay, greatest, least
+from .beams import BeamAlongRays
 from .boundary import safe_rcp
 from .directional import DirectionalField
 from .distance import chebyshev
@@ -73,6 +76,7 @@ class Projection:
         directional: DirectionalField | None = None,
         edges: Edges | None = None,
         falloff: Falloff | None = None,
+        beams: Sequence[BeamAlongRays] = (),
     ) -> None:
         self.medium = medium
         self.lit = irradiance is not None
@@ -83,6 +87,8 @@ class Projection:
         self.directional = directional
         #: how the light of lamps falls off, which the cache is without
         self.falloff = falloff
+        #: spot lights, which are not in the irradiance
+        self._beams = list(beams)
         #: surfaces that end the light, where there are any, and the light that they choose from
         self._edges = (edges, irradiance) if edges is not None else None
         albedo = _constant_if_it_is(medium.albedo)
@@ -136,6 +142,8 @@ class Projection:
         phi = self._within_edges(p, phi, active)
         if self.falloff is not None:
             phi = phi * self.falloff.at(p)
+        for beam in self._beams:
+            phi = phi + beam.at(p, active)
         if self.directional is None:
             return phi
         view = self.seen_along(direction)
@@ -240,6 +248,9 @@ class Projection:
                 falloff = self.falloff.means(lamps, t, end)
                 near_light, far_light = near_light * falloff[0], far_light * falloff[1]
             radiance += transmittance * (near_light + far_light)
+            for beam in self._beams:
+                albedos = self._albedo_at(ray(t)), self._albedo_at(ray(end))
+                radiance += transmittance * beam.scattered(ray, t, end, weights, albedos)
             if dr.hint(self.layered, mode="scalar"):
                 gathered = _gather(
                     gathered,
@@ -268,6 +279,9 @@ class Projection:
             k += 1
             active &= (t < far) & (~empty | (wall < far))
         return radiance, mi.Spectrum(transmittance), gathered, emitted
+
+    def _albedo_at(self, p: mi.Point3f) -> mi.Spectrum:
+        return mi.Spectrum(self.medium.albedo.at_world(p))
 
     def _nowhere(self) -> tuple:
         """What `fetch` returns, of no place."""

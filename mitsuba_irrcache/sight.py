@@ -12,6 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .beams import BeamAlongRays
 from .cache import IrradianceCache
 from .errors import IrrcacheError
 from .half_space import HalfSpace
@@ -60,6 +61,7 @@ def sight_of(
             directional=cache.directional_field(field.channels),
             edges=cache.survey.edges if cache.survey is not None else None,
             falloff=cache.falloff,
+            beams=[BeamAlongRays(beam) for beam in cache.beams],
         )
         del field  # it has been copied
         give_back(cache.grid.voxel_count)

@@ -117,7 +117,8 @@ class Sweep:
         self._emitted: list[list[mi.Spectrum]] = []
         self._around: Around | None = None
         if medium.alone:
-            self._direct = [[e] for e in self._sky.near_light(medium, self._places)]
+            near = self._sky.near_light(medium, self._places)
+            self._direct = self._with_beams([[e] for e in near])
             return
         small, large = split(scene, grid, *box)
         self._around = Around(scene, medium, large, rr_depth, cache.directional)
@@ -167,7 +168,7 @@ class Sweep:
             seed = self.seed, number
             lattice, colour = self._lattices[0], np.ones(cache.channels)
             passes_of, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
-            self._direct = self._lamps.light(seed)
+            self._direct = self._with_beams(self._lamps.light(seed))
             grey = media == 1 and is_grey([*kinds, *chain(*self._direct, *self._emitted)])
         found = []
         for channels in self._together(grey):
@@ -326,9 +327,22 @@ class Sweep:
             dr.eval(phi)
         return phi
 
+    def _with_beams(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
+        """Irradiance of each point-like light, and of others behind these; that of spot lights as
+        means over the voxels.
+        """
+        beams = {id(beam.emitter): [beam.irradiance] for beam in self.cache.beams}
+        lights = self._sky.near
+        replaced = [beams.get(id(e), d) for e, d in zip(lights, direct, strict=False)]
+        return replaced + direct[len(lights) :]
+
     def _near_light(self, channel: int) -> list[mi.Float]:
         """Light at the active voxels that does not come along lines, on average over each."""
-        near = [irradiance[channel] * self._spread for irradiance, *_ in self._direct]
+        means = {id(beam.irradiance) for beam in self.cache.beams}
+        near = [
+            irradiance[channel] * (1 if id(irradiance) in means else self._spread)
+            for irradiance, *_ in self._direct
+        ]
         return near + [irradiance[channel] for irradiance, *_ in self._emitted]
 
 
