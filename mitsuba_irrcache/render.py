@@ -18,7 +18,7 @@ from tqdm import tqdm
 from . import __version__
 from .errors import IrrcacheError, origin
 from .images import check_output, write_image
-from .loading import has_cache, integrator_of, load_scene, parse_parameters
+from .loading import check_scene_file, has_cache, integrator_of, load_scene, parse_parameters
 from .progressive import Frame, render_progressive
 from .runtime import require_llvm
 from .variants import SUPPORTED
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Renders, and prints where the time went."""
-    source = Path(args.scene)
+    source = check_scene_file(args.scene)
     output = check_output(args.output or source.with_suffix(".exr"))
     if args.spp < 0:
         raise IrrcacheError(

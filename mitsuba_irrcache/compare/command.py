@@ -18,7 +18,8 @@ from pathlib import Path
 
 from mitsuba_irrcache import doctor
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.loading import parse_integrator, parse_parameters
+from mitsuba_irrcache.extras import require
+from mitsuba_irrcache.loading import check_scene_file, parse_integrator, parse_parameters
 from mitsuba_irrcache.versions import installed_version
 
 from .processes import WorkerError, run_job
@@ -83,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measures, writes the report and prints the tables; 1 if an integrator failed."""
-    _require_drawing()
+    require("matplotlib", "compare", "irrcache compare")
     job, budgets = _common_job(args), _budgets(args.budget)
     integrators = _integrators(args)
     folder = _check_folder(Path(args.output), args.overwrite)
@@ -213,9 +214,7 @@ def _scene_name(args: argparse.Namespace) -> str:
 
 
 def _common_job(args: argparse.Namespace) -> dict:
-    source = Path(args.scene)
-    if not source.is_file():
-        raise IrrcacheError(f'there is no scene file "{source}".')
+    source = check_scene_file(args.scene)
     return {
         "scene": str(source.resolve()),
         "parameters": parse_parameters(args.define),
@@ -284,13 +283,3 @@ def _now_and_then(name: str) -> Callable[[str], None]:
             print(f"{name}: {line}", flush=True)
 
     return report
-
-
-def _require_drawing() -> None:
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError:
-        raise IrrcacheError(
-            "irrcache compare draws with matplotlib, which is not installed. Remedy: "
-            f'{sys.executable} -m pip install "mitsuba_irrcache[compare]"'
-        ) from None

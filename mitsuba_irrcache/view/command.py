@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import importlib.util
 import signal
 import threading
 import webbrowser
@@ -13,6 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.extras import require
 from mitsuba_irrcache.loading import integrator_of, parse_parameters
 from mitsuba_irrcache.memory import free_at_once
 from mitsuba_irrcache.render import REPLACED, add_scene_options
@@ -46,10 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Shows it until Ctrl-C."""
-    if importlib.util.find_spec("viser") is None:
-        raise IrrcacheError(
-            'the viewer needs the package "viser": pip install "mitsuba_irrcache[view]".'
-        )
+    require("viser", "view", "irrcache view")
     if args.mode.startswith("llvm"):
         require_llvm()
     if args.output is not None and not args.output.absolute().parent.is_dir():

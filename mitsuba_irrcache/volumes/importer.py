@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +61,7 @@ def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
     _add_raw(parser.add_argument_group("raw files"))
     parser.add_argument("--series", metavar="UID", help="which series of a DICOM folder")
     parser.add_argument(
-        "--replace-nan", type=float, metavar="VALUE", help="put VALUE for NaN and infinite values"
+        "--replace-nan", type=_finite, metavar="VALUE", help="put VALUE for NaN and infinite values"
     )
     parser.add_argument(
         "--max-depth", type=int, default=2, help="default of the scene (2: single scattering)"
@@ -213,8 +216,8 @@ def _phantom(source: str) -> VolumeData:
         return make()
     try:
         x, y, z = _counts(size)
-    except (argparse.ArgumentTypeError, ValueError) as error:
-        raise IrrcacheError(f"phantom size {size!r}: give X,Y,Z, e.g. 128,96,128") from error
+    except argparse.ArgumentTypeError as error:
+        raise IrrcacheError(f"phantom size {error}") from None
     return make((z, y, x))
 
 
@@ -287,39 +290,68 @@ def _summary(
     return "\n".join(lines)
 
 
-def _numbers(text: str) -> tuple[float, ...]:
-    return tuple(_finite(part) for part in text.split(","))
+def _argument(wanted: str) -> Callable[[Callable[[str], Any]], Callable[[str], Any]]:
+    """Makes a converter of text a type for argparse, which says what is ``wanted``: the message of
+    argparse itself would show the name of the function.
+    """
+
+    def decorate(convert: Callable[[str], Any]) -> Callable[[str], Any]:
+        @functools.wraps(convert)
+        def converted(text: str) -> Any:
+            try:
+                return convert(text)
+            except ValueError:
+                shown = text if len(text) <= 60 else f"{text[:60]}..."
+                raise argparse.ArgumentTypeError(f"{shown!r} given; it must be {wanted}") from None
+
+        return converted
+
+    return decorate
 
 
-def _finite(text: str) -> float:
+def _finite_value(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+        raise ValueError
     return value
 
 
+@_argument("numbers separated by commas, for example 0.9 or 0.9,0.5,0.4")
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(_finite_value(part) for part in text.split(","))
+
+
+@_argument("a finite number")
+def _finite(text: str) -> float:
+    return _finite_value(text)
+
+
+@_argument("three whole numbers of voxels X,Y,Z, each at least 1, for example 40,32,24")
 def _counts(text: str) -> tuple[int, ...]:
     counts = tuple(int(part) for part in text.split(","))
-    if len(counts) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r}: give three counts X,Y,Z")
+    if len(counts) != 3 or min(counts) < 1:
+        raise ValueError
     return counts
 
 
+@_argument("some of the letters x, y, z")
 def _axes(text: str) -> str:
     if set(text) - set("xyz"):
-        raise argparse.ArgumentTypeError(f"{text!r}: give some of x, y, z")
+        raise ValueError
     return text
 
 
+@_argument("A:B, two numbers of which one may be left out, for example -100:500")
 def _interval(text: str) -> tuple[float, float]:
     low, separator, high = text.partition(":")
     if not separator:
-        raise argparse.ArgumentTypeError(f"{text!r}: give A:B")
+        raise ValueError
     return (float(low) if low else -math.inf, float(high) if high else math.inf)
 
 
+@_argument("X0:X1,Y0:Y1,Z0:Z1 in whole voxels, for example 10:50,:,0:20; a bare : keeps all")
 def _ranges(text: str) -> list[tuple[int | None, int | None]]:
     parts = text.split(",")
     if len(parts) != 3 or any(part.count(":") != 1 for part in parts):
-        raise argparse.ArgumentTypeError(f"{text!r}: give X0:X1,Y0:Y1,Z0:Z1; a bare : keeps all")
+        raise ValueError
     return [tuple(int(n) if n else None for n in part.split(":")) for part in parts]

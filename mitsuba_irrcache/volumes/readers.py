@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.volumes import images
 from mitsuba_irrcache.volumes.data import VolumeData
-from mitsuba_irrcache.volumes.dicom import read_dicom_series
 from mitsuba_irrcache.volumes.mitsuba_vol import read_vol
 from mitsuba_irrcache.volumes.raw import RawLayout, read_raw, read_raw_slices
 
@@ -62,6 +60,9 @@ def _read(
     name = single.name.lower()
     if name.endswith(".vol"):
         return _read_mitsuba(single)
+    # SimpleITK is needed for these formats only.
+    from mitsuba_irrcache.volumes import images
+
     if name.endswith(images.EXTENSIONS):
         return images.read_image(single)
     raise IrrcacheError(
@@ -87,6 +88,9 @@ def _expand(path: PathLike | Sequence[PathLike]) -> list[Path]:
 def _read_folder(folder: Path, series: str | None) -> VolumeData:
     if not any(folder.iterdir()):
         raise IrrcacheError(f"folder {folder} is empty; give a folder with a DICOM series")
+    # SimpleITK is needed for these formats only.
+    from mitsuba_irrcache.volumes.dicom import read_dicom_series
+
     return read_dicom_series(folder, series)
 
 

@@ -12,8 +12,8 @@ SKIN_THICKNESS = 2.0
 
 # Width in voxels over which the body blends into the air. This step of 1000 HU crosses all values
 # that a transfer function gives to lungs. Within one voxel it would be undersampled: the optical
-# depth of the skin would depend on where the surface lies between voxel centres, which shows as rings
-# like wood grain. Its standard deviation is 0.7 voxels, as of a scanner's blur.
+# depth of the skin would depend on where the surface lies between voxel centres, which shows as
+# rings like wood grain. Its standard deviation is 0.7 voxels, as of a scanner's blur.
 SKIN_SOFTNESS = 2.5
 
 # Subcutaneous fat: z, thickness in mm.
