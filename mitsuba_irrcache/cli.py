@@ -19,6 +19,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     interrupted).
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if any("\0" in argument for argument in arguments):
+        print("irrcache: error: an argument contains a null character.", file=sys.stderr)
+        return 1
     try:
         args = _parser(arguments).parse_args(arguments)
         return args.run(args)

@@ -16,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from . import __version__
+from .argument_types import whole
 from .errors import IrrcacheError, origin
 from .images import check_output, write_image
 from .loading import check_scene_file, has_cache, integrator_of, load_scene, parse_parameters
@@ -58,7 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-s", "--sensor", type=int, default=0, help="index of the sensor (default: 0)"
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the camera samples (default: 0)"
+        "--seed",
+        type=whole(0, 2**32 - 1),
+        default=0,
+        help="seed of the camera samples (default: 0)",
     )
     parser.add_argument(
         "--budget", type=float, metavar="SECONDS",

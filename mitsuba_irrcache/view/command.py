@@ -11,6 +11,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from mitsuba_irrcache.argument_types import whole
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.extras import require
 from mitsuba_irrcache.loading import integrator_of, parse_parameters
@@ -38,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--host", default="127.0.0.1",
         help="address to listen on; any other lets other machines in (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--port", type=int, default=8080, help="or the next one that is free")
+    parser.add_argument(
+        "--port", type=whole(1, 65535), default=8080, help="or the next one that is free"
+    )
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
     importer.add_options(parser, required=False)

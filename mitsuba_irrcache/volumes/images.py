@@ -48,6 +48,8 @@ def read_image(path: str | os.PathLike) -> VolumeData:
     path = Path(path)
     if not path.is_file():
         raise IrrcacheError(f"volume file {path} does not exist")
+    if not path.stat().st_size:
+        raise IrrcacheError(f"volume file {path} is empty; copy or export it again")
     if path.suffix == ".dcm":
         check_lengths(path)
     if path.suffix.lower() in (".mha", ".mhd"):

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import math
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from mitsuba_irrcache.argument_types import argument, finite, finite_number, whole
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes import processing
 from mitsuba_irrcache.volumes.data import VolumeData
@@ -61,10 +59,10 @@ def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
     _add_raw(parser.add_argument_group("raw files"))
     parser.add_argument("--series", metavar="UID", help="which series of a DICOM folder")
     parser.add_argument(
-        "--replace-nan", type=_finite, metavar="VALUE", help="put VALUE for NaN and infinite values"
+        "--replace-nan", type=finite, metavar="VALUE", help="put VALUE for NaN and infinite values"
     )
     parser.add_argument(
-        "--max-depth", type=int, default=2, help="default of the scene (2: single scattering)"
+        "--max-depth", type=whole(-1), default=2, help="default of the scene (2: single scattering)"
     )
     parser.add_argument(
         "--up", choices=("z", "y"), help="axis up in the picture (default: z; y for .vol)"
@@ -118,7 +116,7 @@ def _add_appearance(group: argparse._ArgumentGroup, required: bool) -> None:
     choice.add_argument("--transfer-function", metavar="FILE", help="a JSON file")
     choice.add_argument(
         "--density",
-        type=float,
+        type=finite,
         nargs="?",
         const=1.0,
         metavar="SCALE",
@@ -148,12 +146,12 @@ def _add_processing(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--isolate",
-        type=_finite,
+        type=finite,
         metavar="VALUE",
         help="keep the largest object above VALUE; -300 frees a patient of the table",
     )
     size = group.add_mutually_exclusive_group()
-    size.add_argument("--voxel-size", type=float, metavar="MM", help="resample to cubic voxels")
+    size.add_argument("--voxel-size", type=finite, metavar="MM", help="resample to cubic voxels")
     size.add_argument(
         "--longest", type=int, metavar="N", help="resample to N voxels along the longest side"
     )
@@ -171,7 +169,7 @@ def _add_raw(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--raw-type", default="uint8", help="e.g. uint16, float32 (default: uint8)")
     group.add_argument("--raw-endian", choices=("little", "big"), default="little")
     group.add_argument("--raw-spacing", type=_numbers, default=(1.0, 1.0, 1.0), metavar="X,Y,Z")
-    group.add_argument("--raw-offset", type=int, default=0, metavar="BYTES")
+    group.add_argument("--raw-offset", type=whole(0), default=0, metavar="BYTES")
 
 
 def _mapping(args: argparse.Namespace) -> TransferFunction | DensityMapping:
@@ -290,43 +288,12 @@ def _summary(
     return "\n".join(lines)
 
 
-def _argument(wanted: str) -> Callable[[Callable[[str], Any]], Callable[[str], Any]]:
-    """Makes a converter of text a type for argparse, which says what is ``wanted``: the message of
-    argparse itself would show the name of the function.
-    """
-
-    def decorate(convert: Callable[[str], Any]) -> Callable[[str], Any]:
-        @functools.wraps(convert)
-        def converted(text: str) -> Any:
-            try:
-                return convert(text)
-            except ValueError:
-                shown = text if len(text) <= 60 else f"{text[:60]}..."
-                raise argparse.ArgumentTypeError(f"{shown!r} given; it must be {wanted}") from None
-
-        return converted
-
-    return decorate
-
-
-def _finite_value(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError
-    return value
-
-
-@_argument("numbers separated by commas, for example 0.9 or 0.9,0.5,0.4")
+@argument("numbers separated by commas, for example 0.9 or 0.9,0.5,0.4")
 def _numbers(text: str) -> tuple[float, ...]:
-    return tuple(_finite_value(part) for part in text.split(","))
+    return tuple(finite_number(part) for part in text.split(","))
 
 
-@_argument("a finite number")
-def _finite(text: str) -> float:
-    return _finite_value(text)
-
-
-@_argument("three whole numbers of voxels X,Y,Z, each at least 1, for example 40,32,24")
+@argument("three whole numbers of voxels X,Y,Z, each at least 1, for example 40,32,24")
 def _counts(text: str) -> tuple[int, ...]:
     counts = tuple(int(part) for part in text.split(","))
     if len(counts) != 3 or min(counts) < 1:
@@ -334,14 +301,14 @@ def _counts(text: str) -> tuple[int, ...]:
     return counts
 
 
-@_argument("some of the letters x, y, z")
+@argument("some of the letters x, y, z")
 def _axes(text: str) -> str:
     if set(text) - set("xyz"):
         raise ValueError
     return text
 
 
-@_argument("A:B, two numbers of which one may be left out, for example -100:500")
+@argument("A:B, two numbers of which one may be left out, for example -100:500")
 def _interval(text: str) -> tuple[float, float]:
     low, separator, high = text.partition(":")
     if not separator:
@@ -349,7 +316,7 @@ def _interval(text: str) -> tuple[float, float]:
     return (float(low) if low else -math.inf, float(high) if high else math.inf)
 
 
-@_argument("X0:X1,Y0:Y1,Z0:Z1 in whole voxels, for example 10:50,:,0:20; a bare : keeps all")
+@argument("X0:X1,Y0:Y1,Z0:Z1 in whole voxels, for example 10:50,:,0:20; a bare : keeps all")
 def _ranges(text: str) -> list[tuple[int | None, int | None]]:
     parts = text.split(",")
     if len(parts) != 3 or any(part.count(":") != 1 for part in parts):
