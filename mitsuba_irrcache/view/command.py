@@ -37,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--host", default="127.0.0.1",
-        help="address to listen on; any other lets other machines in (default: %(default)s)",
+        help="address to listen on; any other lets other machines in, with the token in the "
+        "address that is printed (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--port", type=whole(1, 65535), default=8080, help="or the next one that is free"
@@ -61,9 +62,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> None:
-    from mitsuba_irrcache.view.server import Server, is_local
+    from mitsuba_irrcache.view.access import check_host, is_local
+    from mitsuba_irrcache.view.server import Server
     from mitsuba_irrcache.view.session import Session
 
+    check_host(args.host)
     free_at_once()
     document, appearance = _document(args)
     session, server = Session(document), None
@@ -73,7 +76,11 @@ def _show(args: argparse.Namespace) -> None:
         server = Server(session, args.host, args.port, args.output, appearance)
         print(f"irrcache view: {server.address} (Ctrl-C ends it)", flush=True)
         if not is_local(args.host):
-            print("irrcache view: other machines can connect, and change what is seen", flush=True)
+            print(
+                "irrcache view: whoever knows the address can connect and change what is seen; on "
+                f"other machines: {server.address_from_elsewhere}",
+                flush=True,
+            )
         if not args.no_browser:
             webbrowser.open(server.address)
         _wait()
