@@ -13,6 +13,7 @@ from mitsuba_irrcache.argument_types import argument, finite, finite_number, who
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes import processing
 from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.detached import OPTION
 from mitsuba_irrcache.volumes.raw import RawLayout
 from mitsuba_irrcache.volumes.readers import read_volume
 from mitsuba_irrcache.volumes.scene import SceneSettings, write_scene
@@ -57,6 +58,14 @@ def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
     _add_appearance(parser.add_argument_group(f"appearance ({needed})"), required)
     _add_processing(parser.add_argument_group("processing, in this order"))
     _add_raw(parser.add_argument_group("raw files"))
+    parser.add_argument(
+        OPTION,
+        action="append",
+        default=[],
+        metavar="FOLDER",
+        help="where a header (NRRD, MetaImage) may name data files, beside its own folder; "
+        "repeatable",
+    )
     parser.add_argument("--series", metavar="UID", help="which series of a DICOM folder")
     parser.add_argument(
         "--replace-nan", type=finite, metavar="VALUE", help="put VALUE for NaN and infinite values"
@@ -197,6 +206,7 @@ def _read(args: argparse.Namespace) -> VolumeData:
         raw=raw,
         series=args.series,
         replace_nan=args.replace_nan,
+        data_folders=args.data_folder,
     )
 
 

@@ -24,6 +24,7 @@ def read_volume(
     raw: RawLayout | None = None,
     series: str | None = None,
     replace_nan: float | None = None,
+    data_folders: Sequence[PathLike] = (),
 ) -> VolumeData:
     """Read a scalar volume with its placement.
 
@@ -33,16 +34,21 @@ def read_volume(
         raw: the layout of raw files.
         series: SeriesInstanceUID, for DICOM folders with several.
         replace_nan: value to put in the place of NaN and infinite ones.
+        data_folders: where voxels may lie that a header (NRRD, MetaImage) keeps in other files,
+            beside its own folder.
 
     Raises:
         IrrcacheError: anything that cannot be read as a finite scalar volume.
     """
-    volume = _read(path, raw, series)
+    volume = _read(path, raw, series, data_folders)
     return replace(volume, values=_finite(volume, replace_nan))
 
 
 def _read(
-    path: PathLike | Sequence[PathLike], raw: RawLayout | None, series: str | None
+    path: PathLike | Sequence[PathLike],
+    raw: RawLayout | None,
+    series: str | None,
+    data_folders: Sequence[PathLike],
 ) -> VolumeData:
     paths = _expand(path)
     if raw is not None:
@@ -64,7 +70,7 @@ def _read(
     from mitsuba_irrcache.volumes import images
 
     if name.endswith(images.EXTENSIONS):
-        return images.read_image(single)
+        return images.read_image(single, data_folders)
     raise IrrcacheError(
         f"{single} has an extension that is not supported; give .vol, "
         f"{', '.join(images.EXTENSIONS)}, a DICOM folder, or --raw-shape X,Y,Z for a raw file"
