@@ -169,11 +169,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         require_llvm()
         check_versions()
         super().__init__(props)
+        props = self._properties = given.Record(props)
+        max_depth = given.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0")
         self._hide_emitters = given.flag(props, "hide_emitters", False)
         self._filter = given.choice(props, "filter", "none", FILTERS)
         self._aovs = parse_aovs(given.text(props, "aovs"))
         self._settings = CacheSettings(
-            max_depth=given.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0"),
+            max_depth=max_depth,
             rr_depth=given.integer(props, "rr_depth", 5, 1, "at least 1"),
             solver=given.choice(props, "solver", "auto", SOLVERS),
             resolution=given.integer(props, "resolution", 0, 0, "0 (chosen) or a number of voxels"),
@@ -453,17 +455,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return self._volpath
 
     def to_string(self) -> str:
-        s = self._settings
-        return (
-            f"IrradianceCachingIntegrator[\n  max_depth = {s.max_depth},\n  rr_depth = "
-            f"{s.rr_depth},\n"
-            f"  hide_emitters = {str(self._hide_emitters).lower()},\n  solver = {s.solver},\n"
-            f"  resolution = {s.resolution},\n  cache_spp = {self.cache_spp},\n  cache_seed = "
-            f"{s.seed},\n"
-            f"  quadrature = {self._quadrature},\n  step = {self._step:g},\n  filter = "
-            f"{self._filter},\n  aovs = {', '.join(f'{n}:{k}' for n, k in self._aovs.items())},\n"
-            f'  cache_file = "{s.file}"\n]'
-        )
+        """All properties, as they are: the record of how an image was made."""
+        aovs = ", ".join(f"{name}:{kind}" for name, kind in self._aovs.items())
+        values = self._properties.values | {"cache_spp": self.cache_spp, "aovs": aovs}
+        return f"IrradianceCachingIntegrator[\n{given.described(values)}\n]"
 
 
 mi.register_integrator("irrcache", IrradianceCachingIntegrator)

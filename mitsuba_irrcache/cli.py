@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import NoReturn
 
 from .errors import IrrcacheError, essence, origin
+from .extras import missing_package
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -18,9 +19,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     interrupted).
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    args = _parser(arguments).parse_args(arguments)
+    if any("\0" in argument for argument in arguments):
+        print("irrcache: error: an argument contains a null character.", file=sys.stderr)
+        return 1
     try:
+        args = _parser(arguments).parse_args(arguments)
         return args.run(args)
+    except ModuleNotFoundError as error:
+        missing = _missing_package(error, arguments)
+        if missing is None:
+            raise
+        message = str(missing)
     except (IrrcacheError, OSError) as error:
         message = str(error)
     except (KeyboardInterrupt, RuntimeError) as error:  # the latter is how Mitsuba reports both
@@ -46,14 +55,21 @@ def command() -> NoReturn:
     sys.exit(status)
 
 
-#: Name, module and description of each command.
+#: Name, module, description and extra of each command; the extra has all packages that it needs.
 COMMANDS = (
-    ("render", "render", "render a scene with irrcache"),
-    ("view", "view.command", "look at a scene or a volume in the browser"),
-    ("compare", "compare.command", "measure error against time of any integrators"),
-    ("import", "volumes.importer", "make a scene of a CT, MR or other volume"),
-    ("doctor", "doctor", "check this machine and say what to install"),
+    ("render", "render", "render a scene with irrcache", ""),
+    ("view", "view.command", "look at a scene or a volume in the browser", "view"),
+    ("compare", "compare.command", "measure error against time of any integrators", "compare"),
+    ("import", "volumes.importer", "make a scene of a CT, MR or other volume", "volumes"),
+    ("doctor", "doctor", "check this machine and say what to install", ""),
 )
+
+
+def _missing_package(error: ModuleNotFoundError, arguments: Sequence[str]) -> Exception | None:
+    """What to say where an import failed below a command; None if no package is to be installed."""
+    extra = {name: extra for name, _, _, extra in COMMANDS}
+    name = arguments[0] if arguments and arguments[0] in extra else ""
+    return missing_package(error, f"irrcache {name}".strip(), extra.get(name, ""))
 
 
 def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
@@ -64,7 +80,7 @@ def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
         prog="irrcache", description="Irradiance caching for participating media in Mitsuba 3."
     )
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for name, path, text in COMMANDS:
+    for name, path, text, _ in COMMANDS:
         command = commands.add_parser(name, help=text)
         if arguments and arguments[0] == name:
             module = import_module(f".{path}", __package__)

@@ -20,7 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from mitsuba_irrcache import runtime, versions
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.extras import remedy
 from mitsuba_irrcache.memory import available_memory
+from mitsuba_irrcache.variants import SUPPORTED, require_variant
 
 DEFAULT_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
@@ -78,7 +81,16 @@ def examine(variants: list[str]) -> dict[str, Any]:
     Returns:
         JSON-serialisable; ``ok`` tells whether one of the variants works and all packages are new
         enough, ``remedies`` what to do otherwise.
+
+    Raises:
+        IrrcacheError: a variant that this Mitsuba does not have.
     """
+    built = _built_variants()
+    unknown = [variant for variant in variants if variant not in built]
+    if unknown:
+        raise IrrcacheError(
+            f'this Mitsuba has no variant "{unknown[0]}"; it has {", ".join(built)}.'
+        )
     packages = examine_packages()
     trials = {variant: try_variant(variant) for variant in variants}
     ok = any(trial["works"] for trial in trials.values())
@@ -88,7 +100,7 @@ def examine(variants: list[str]) -> dict[str, Any]:
         "llvm": examine_llvm(),
         "cuda": examine_cuda(),
         "kernel_cache": examine_kernel_cache(),
-        "variants": {"built": _built_variants(), "tried": trials},
+        "variants": {"built": built, "tried": trials},
         "remedies": _remedies(packages, trials, ok),
         "ok": ok and all(package["ok"] for package in packages if package["needed_by"] == ""),
     }
@@ -117,7 +129,7 @@ def examine_packages() -> list[dict[str, Any]]:
             "ok": versions.is_satisfied(requirement),
             "needed_by": extra,
         }
-        for extra in ("", "volumes", "compare", "test")
+        for extra in ("", *versions.extras())
         for requirement in versions.requirements(extra)
     ]
 
@@ -169,9 +181,15 @@ def examine_kernel_cache() -> dict[str, Any]:
 def try_variant(variant: str) -> dict[str, Any]:
     """Compile a kernel and render a sphere with a variant, in a process of its own.
 
+    One that irrcache does not run in does not work, whatever Mitsuba can do with it.
+
     Returns:
         ``works``, the ``seconds`` it took, and in ``problem`` the last thing it said otherwise.
     """
+    try:
+        require_variant(variant)
+    except IrrcacheError as error:
+        return {"works": False, "seconds": 0.0, "problem": str(error)}
     start = time.perf_counter()
     # A kernel from the cache would hide that LLVM cannot compile it.
     with tempfile.TemporaryDirectory(prefix="irrcache-doctor-") as cache:
@@ -192,7 +210,9 @@ def as_text(report: dict[str, Any]) -> str:
         verdict = "works" if trial["works"] else f"does not work: {trial['problem']}"
         lines.append(f"  {variant:14} {verdict} ({trial['seconds']} s)")
     lines.append(f"  {'built':14} {', '.join(report['variants']['built'])}")
-    lines += ["", *(report["remedies"] or ["All is well."])]
+    lines += ["", *report["remedies"]]
+    if report["ok"] and not report["remedies"]:
+        lines.append("All is well.")
     return "\n".join(lines)
 
 
@@ -229,10 +249,13 @@ def _remedies(packages: list[dict], trials: dict[str, dict], ok: bool) -> list[s
         remedies.append(f"Packages: {sys.executable} -m pip install --upgrade {wanted}")
     if ok:
         return remedies
-    if any(variant.startswith("llvm") for variant in trials):
+    tried = [variant for variant in trials if variant in SUPPORTED]
+    if any(variant.startswith("llvm") for variant in tried):
         remedies.append(f"LLVM: {runtime.llvm_remedy()}")
-    if any(variant.startswith("cuda") for variant in trials):
+    if any(variant.startswith("cuda") for variant in tried):
         remedies.append("CUDA: an NVIDIA GPU with a current driver is needed for cuda_* variants.")
+    if len(tried) < len(trials):
+        remedies.append(f"Variant: name one that irrcache runs in: {', '.join(SUPPORTED)}.")
     return remedies
 
 
@@ -327,7 +350,9 @@ def _verdict(package: dict[str, Any]) -> str:
         return ""
     if package["version"]:
         return "TOO OLD"
-    return "not installed" if package["needed_by"] else "MISSING"
+    if not package["needed_by"]:
+        return "MISSING"
+    return f"not installed; if wanted: {remedy(package['needed_by'])}"
 
 
 def _llvm_lines(llvm: dict[str, Any]) -> list[str]:

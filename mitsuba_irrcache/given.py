@@ -17,6 +17,37 @@ from .errors import IrrcacheError
 SHOWN = 60
 
 
+class Record:
+    """Properties that note what is read of them, and with which value: the list of all properties
+    that a plugin has.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self._props = props
+        #: every property that was read, by its name: as given, or its default
+        self.values: dict[str, object] = {}
+
+    def get(self, name: str, default: object) -> object:
+        self.values[name] = value = self._props.get(name, default)
+        return value
+
+
+def described(values: dict[str, object]) -> str:
+    """Properties as Mitsuba's plugins print theirs: a line each."""
+    lines = [f"{name} = {_shown(value)}" for name, value in values.items()]
+    return ",\n".join(f"  {line}".replace("\n", "\n  ") for line in lines)
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    return f'"{value}"' if value == "" else str(value)
+
+
 def integer(props: mi.Properties, name: str, default: int, least: int, wanted: str) -> int:
     """A number of at least ``least``, below 2^31."""
     return checked_integer(name, props.get(name, default), least, wanted)

@@ -24,6 +24,8 @@ def check_output(path: str | Path) -> Path:
         raise IrrcacheError(f'the output "{path}" must end in .exr (a PNG is written beside it).')
     if not path.parent.is_dir():
         raise IrrcacheError(f'cannot write "{path}": the folder "{path.parent}" does not exist.')
+    if path.is_dir():
+        raise IrrcacheError(f'cannot write "{path}": it is a folder; name a file.')
     if not os.access(path.parent, os.W_OK):
         raise IrrcacheError(f'cannot write "{path}": no permission to write to "{path.parent}".')
     return path

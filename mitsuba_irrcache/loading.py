@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -42,6 +43,26 @@ def load_scene(
             _replace_integrator(state, integrator, path)
         scene = mi.parser.instantiate(config, state)
     return scene[0] if isinstance(scene, list) else scene
+
+
+def check_scene_file(path: str | Path) -> Path:
+    """The path of a scene file that can be read; raises IrrcacheError for anything else."""
+    path = Path(path)
+    try:
+        found, folder, readable = path.is_file(), path.is_dir(), os.access(path, os.R_OK)
+    except (OSError, ValueError) as error:  # a name too long, or with a NUL
+        raise IrrcacheError(f'"{str(path)[:80]!s}" is no name of a scene file: {error}.') from None
+    if folder:
+        inside = sorted(p.name for p in path.glob("*.xml"))[:5]
+        there = f", for example {path / inside[0]}" if inside else ""
+        raise IrrcacheError(f'the scene "{path}" is a folder; name an XML file{there}.')
+    if not found:
+        raise IrrcacheError(f'there is no scene file "{path}".')
+    if not readable:
+        raise IrrcacheError(f'no permission to read the scene file "{path}".')
+    if not path.stat().st_size:
+        raise IrrcacheError(f'the scene file "{path}" is empty.')
+    return path
 
 
 def scene_text(
@@ -157,8 +178,7 @@ def _quoted(value: object) -> str:
 def _parse(
     path: Path, parameters: dict[str, str] | None
 ) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
-    if not path.is_file():
-        raise IrrcacheError(f'there is no scene file "{path}".')
+    check_scene_file(path)
     config = mi.parser.ParserConfig(mi.variant())
     return config, mi.parser.parse_file(config, str(path), **(parameters or {}))
 

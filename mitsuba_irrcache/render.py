@@ -16,9 +16,10 @@ import numpy as np
 from tqdm import tqdm
 
 from . import __version__
+from .argument_types import whole
 from .errors import IrrcacheError, origin
 from .images import check_output, write_image
-from .loading import has_cache, integrator_of, load_scene, parse_parameters
+from .loading import check_scene_file, has_cache, integrator_of, load_scene, parse_parameters
 from .progressive import Frame, render_progressive
 from .runtime import require_llvm
 from .variants import SUPPORTED
@@ -58,7 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-s", "--sensor", type=int, default=0, help="index of the sensor (default: 0)"
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the camera samples (default: 0)"
+        "--seed",
+        type=whole(0, 2**32 - 1),
+        default=0,
+        help="seed of the camera samples (default: 0)",
     )
     parser.add_argument(
         "--budget", type=float, metavar="SECONDS",
@@ -74,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Renders, and prints where the time went."""
-    source = Path(args.scene)
+    source = check_scene_file(args.scene)
     output = check_output(args.output or source.with_suffix(".exr"))
     if args.spp < 0:
         raise IrrcacheError(

@@ -44,6 +44,14 @@ def requirements(extra: str = "") -> list[Requirement]:
     ]
 
 
+def extras() -> list[str]:
+    """Names of this package's extras, in the order in which it declares them."""
+    try:
+        return list(metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or [])
+    except metadata.PackageNotFoundError:
+        return []
+
+
 def installed_version(name: str) -> str | None:
     """The version of a package, or None where it is not installed.
 

@@ -79,7 +79,7 @@ class Window:
         page.on("pageerror", lambda error: self.console.append(("error", str(error))))
         page.add_init_script(_HOOKS)
         self.opened = time.time()
-        page.goto(f"{address}?fixedDpr=1")
+        page.goto(f"{address}{'&' if '?' in address else '?'}fixedDpr=1")
 
     @property
     def errors(self) -> list[str]:

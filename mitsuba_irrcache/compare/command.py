@@ -16,9 +16,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import mitsuba as mi
+
 from mitsuba_irrcache import doctor
+from mitsuba_irrcache.argument_types import finite, seconds, whole
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.loading import parse_integrator, parse_parameters
+from mitsuba_irrcache.extras import require
+from mitsuba_irrcache.loading import check_scene_file, parse_integrator, parse_parameters
 from mitsuba_irrcache.versions import installed_version
 
 from .processes import WorkerError, run_job
@@ -49,18 +53,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
         help="value of a $parameter of the scene; repeatable",
     )  # fmt: skip
-    add("-s", "--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    add("-s", "--sensor", type=whole(0), default=0, help="index of the sensor (default: 0)")
     add(
         "--reference", default=DEFAULT_REFERENCE, metavar="NAME{KEY=VALUE,...}",
         help="unbiased integrator that makes the reference (default: %(default)s)",
     )  # fmt: skip
     effort = parser.add_mutually_exclusive_group()
     effort.add_argument(
-        "--reference-spp", type=int, default=0, metavar="N",
+        "--reference-spp", type=whole(0), default=0, metavar="N",
         help="samples per pixel of each of the two halves of the reference",
     )  # fmt: skip
     effort.add_argument(
-        "--reference-seconds", type=float, default=0.0, metavar="S",
+        "--reference-seconds", type=seconds, default=0.0, metavar="S",
         help=f"time for the reference (default: {REFERENCE_SHARE} times the longest budget)",
     )  # fmt: skip
     add(
@@ -69,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add(
         "--exposure",
-        type=float,
+        type=finite,
         default=0.0,
         metavar="EV",
         help="brightness of the pictures, stops",
@@ -83,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measures, writes the report and prints the tables; 1 if an integrator failed."""
-    _require_drawing()
+    require("matplotlib", "compare", "irrcache compare")
     job, budgets = _common_job(args), _budgets(args.budget)
     integrators = _integrators(args)
     folder = _check_folder(Path(args.output), args.overwrite)
@@ -213,9 +217,9 @@ def _scene_name(args: argparse.Namespace) -> str:
 
 
 def _common_job(args: argparse.Namespace) -> dict:
-    source = Path(args.scene)
-    if not source.is_file():
-        raise IrrcacheError(f'there is no scene file "{source}".')
+    source = check_scene_file(args.scene)
+    if args.mode not in mi.variants():
+        raise IrrcacheError(f'-m is "{args.mode}"; this Mitsuba has {", ".join(mi.variants())}.')
     return {
         "scene": str(source.resolve()),
         "parameters": parse_parameters(args.define),
@@ -284,13 +288,3 @@ def _now_and_then(name: str) -> Callable[[str], None]:
             print(f"{name}: {line}", flush=True)
 
     return report
-
-
-def _require_drawing() -> None:
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError:
-        raise IrrcacheError(
-            "irrcache compare draws with matplotlib, which is not installed. Remedy: "
-            f'{sys.executable} -m pip install "mitsuba_irrcache[compare]"'
-        ) from None

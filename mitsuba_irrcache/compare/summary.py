@@ -107,6 +107,16 @@ def time_to(curve: Curve, target: float) -> Reached:
     return Reached(float(t[k - 1] * (t[k] / t[k - 1]) ** share), "measured")
 
 
+def nearest(curve: Curve, budget: float) -> tuple[float, float] | None:
+    """Error and seconds of the first image after a ``budget``, or else of the last one; None if
+    there is no image. It is what there is to show where `equal_time` has no error.
+    """
+    if not len(curve.seconds):
+        return None
+    k = min(int(np.searchsorted(curve.seconds, budget)), len(curve.seconds) - 1)
+    return float(curve.shown[k]), float(curve.seconds[k])
+
+
 def _error_at(curve: Curve, budget: float) -> float | None:
     t = curve.seconds
     if not len(t) or not t[0] / TOLERANCE <= budget <= t[-1] * TOLERANCE:

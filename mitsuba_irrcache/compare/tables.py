@@ -8,7 +8,7 @@ import numpy as np
 
 from .results import Measurement
 from .scores import METRICS
-from .summary import Curve, Reached, equal_error, equal_time, targets
+from .summary import Curve, Reached, equal_error, equal_time, nearest, targets
 
 STAGES = ("import", "load", "kernels", "cache", "image", "filter")
 
@@ -43,13 +43,15 @@ def equal_time_table(curves: list[Curve], budgets: list[float]) -> Table:
     for r, (budget, errors) in enumerate(
         zip(sorted(budgets), equal_time(curves, budgets), strict=True)
     ):
-        rows.append([f"{budget:g} s", *("—" if e is None else percent(e) for e in errors)])
+        cells = [_at(c, e, budget) for c, e in zip(curves, errors, strict=True)]
+        rows.append([f"{budget:g} s", *cells])
         known = [e for e in errors if e is not None]
         best |= {(r, c + 1) for c, e in enumerate(errors) if len(known) > 1 and e == min(known)}
     note = (
         "RMSE in units of the mean radiance of the reference, whose own noise is removed. "
-        "Interpolated between snapshots. A dash: no image by then, or none so late. Kernels "
-        "are compiled beforehand."
+        "Interpolated between snapshots. In brackets: the time of the image that is nearest, where "
+        "there is none by then, or none so late; it takes no part in who is best. A dash: no image "
+        "at all. Kernels are compiled beforehand."
     )
     return Table("Error after equal time", ["budget", *_names(curves)], rows, note, best)
 
@@ -128,6 +130,14 @@ def seconds(value: float) -> str:
 
 def _names(curves: list[Curve]) -> list[str]:
     return [curve.integrator for curve in curves]
+
+
+def _at(curve: Curve, error: float | None, budget: float) -> str:
+    """The error after a budget; if there is none, that of another image, with its real time."""
+    if error is not None:
+        return percent(error)
+    found = nearest(curve, budget)
+    return "—" if found is None else f"{percent(found[0])} ({seconds(found[1])} s)"
 
 
 def _reached(reached: Reached) -> str:

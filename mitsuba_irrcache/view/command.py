@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import importlib.util
 import signal
 import threading
 import webbrowser
@@ -12,7 +11,9 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from mitsuba_irrcache.argument_types import whole
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.extras import require
 from mitsuba_irrcache.loading import integrator_of, parse_parameters
 from mitsuba_irrcache.memory import free_at_once
 from mitsuba_irrcache.render import REPLACED, add_scene_options
@@ -36,9 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--host", default="127.0.0.1",
-        help="address to listen on; any other lets other machines in (default: %(default)s)",
+        help="address to listen on; any other lets other machines in, with the token in the "
+        "address that is printed (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--port", type=int, default=8080, help="or the next one that is free")
+    parser.add_argument(
+        "--port", type=whole(1, 65535), default=8080, help="or the next one that is free"
+    )
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
     importer.add_options(parser, required=False)
@@ -46,10 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Shows it until Ctrl-C."""
-    if importlib.util.find_spec("viser") is None:
-        raise IrrcacheError(
-            'the viewer needs the package "viser": pip install "mitsuba_irrcache[view]".'
-        )
+    require("viser", "view", "irrcache view")
     if args.mode.startswith("llvm"):
         require_llvm()
     if args.output is not None and not args.output.absolute().parent.is_dir():
@@ -61,9 +62,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> None:
-    from mitsuba_irrcache.view.server import Server, is_local
+    from mitsuba_irrcache.view.access import check_host, is_local
+    from mitsuba_irrcache.view.server import Server
     from mitsuba_irrcache.view.session import Session
 
+    check_host(args.host)
     free_at_once()
     document, appearance = _document(args)
     session, server = Session(document), None
@@ -73,7 +76,11 @@ def _show(args: argparse.Namespace) -> None:
         server = Server(session, args.host, args.port, args.output, appearance)
         print(f"irrcache view: {server.address} (Ctrl-C ends it)", flush=True)
         if not is_local(args.host):
-            print("irrcache view: other machines can connect, and change what is seen", flush=True)
+            print(
+                "irrcache view: whoever knows the address can connect and change what is seen; on "
+                f"other machines: {server.address_from_elsewhere}",
+                flush=True,
+            )
         if not args.no_browser:
             webbrowser.open(server.address)
         _wait()

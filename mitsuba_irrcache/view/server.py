@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import io
-import ipaddress
 import logging
 import math
+import socket
 import threading
+import warnings
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import viser
 import viser._messages as messages
 
+from mitsuba_irrcache.view.access import Access, check_host, guarded, is_own_page, is_wildcard
 from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.view.panel import LightPanel
 from mitsuba_irrcache.view.session import Session
@@ -21,8 +22,6 @@ from mitsuba_irrcache.view.transfer_panel import TransferPanel
 from mitsuba_irrcache.view.visitor import Visitor
 
 LOG = logging.getLogger(__name__)
-
-LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
 class Server:
@@ -37,7 +36,11 @@ class Server:
         appearance: Appearance | None = None,
     ) -> None:
         self.session, self.host = session, host
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets; so do we
+        check_host(host)
+        ignore_closed_connections()
+        self._access = Access(host)
+        # It greets; so do we.
+        with contextlib.redirect_stdout(io.StringIO()), guarded(self._access):
             self._server = viser.ViserServer(host, port, label="irrcache", verbose=False)
         self.port = self._server.get_port()
         self._keep_to_ourselves()
@@ -62,9 +65,19 @@ class Server:
 
     @property
     def address(self) -> str:
-        """To be opened in a browser; the picture is made for the pixels of the screen."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}/"
+        """To be opened in a browser on this machine."""
+        if is_wildcard(self.host):
+            return self._address_at("::1" if ":" in self.host else "127.0.0.1")
+        return self._address_at(self.host)
+
+    @property
+    def address_from_elsewhere(self) -> str:
+        """To be opened in a browser on another machine."""
+        return self._address_at(socket.gethostname() if is_wildcard(self.host) else self.host)
+
+    def _address_at(self, host: str) -> str:
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/{self._access.query()}"
 
     def stop(self) -> None:
         """Closes all windows."""
@@ -105,30 +118,15 @@ class Server:
 
         async def check(connection: object) -> None:
             live = websockets._live_connections[connection.client_id]
-            if not is_own_page(live.request.headers, self.host):
+            if not is_own_page(live.request.headers, self._access):
                 LOG.warning("a page of another site was refused")
                 await live.close(1008, "pages of other sites are refused")
 
         websockets._client_connect_cb.insert(0, check)
 
 
-def is_own_page(headers: dict[str, str], host: str) -> bool:
-    """Whether a browser's request comes from the page that was served here: its origin is the host
-    that it asks, and on this machine alone that has no name but those of this machine. Programs
-    send no origin.
+def ignore_closed_connections() -> None:
+    """Ends viser's warnings of messages for a browser that has gone: it may go at any time, and
+    until the server hears of it, pictures are sent.
     """
-    origin = headers.get("Origin")
-    if origin is None:
-        return True
-    asked = urlsplit(f"//{headers.get('Host', '')}")
-    own = urlsplit(origin)
-    if (own.scheme, own.netloc) != ("http", asked.netloc):
-        return False
-    return not is_local(host) or (asked.hostname or "") in LOCAL
-
-
-def is_local(host: str) -> bool:
-    """Whether only this machine can connect to ``host``."""
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
+    warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)

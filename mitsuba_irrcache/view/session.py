@@ -170,10 +170,12 @@ class Session:
             self._ready.set()
         while not self._stopped:
             try:
+                # Read before the step: a camera may come to rest during it.
+                rest = self._until_rest
                 if not self._step():
                     with self._news:
                         if not (self._is_called or self._closed or self._is_work_waiting):
-                            self._news.wait(self._until_rest)
+                            self._news.wait(rest)
             except Superseded:
                 continue
             except Exception as error:
@@ -229,7 +231,8 @@ class Session:
     @property
     def _until_rest(self) -> float | None:
         """Seconds until a camera that moves may have come to rest; None where none moves."""
-        waits = [w.moved + REST_SECONDS - monotonic() for w in self._windows if w.is_moving]
+        windows = list(self._windows)
+        waits = [w.moved + REST_SECONDS - monotonic() for w in windows if w.is_moving]
         return max(min(waits), 1e-3) if waits else None
 
     def _reserve(self, change: int) -> None:
@@ -317,10 +320,11 @@ class Session:
             while not self._is_called:
                 if self._show_moving():
                     continue
-                if any(w.is_moving for w in self._windows):
+                rest = self._until_rest
+                if rest is not None:
                     with self._news:
                         if not (self._is_work_waiting or self._is_called):
-                            self._news.wait(self._until_rest)
+                            self._news.wait(rest)
                 elif not self._show_resting(first=True):
                     return
         raise Superseded

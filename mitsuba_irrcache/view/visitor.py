@@ -40,6 +40,7 @@ class Visitor:
         self._encoder = ThreadPoolExecutor(1)
         self._lock = threading.Lock()
         self._waiting: Picture | None = None
+        self._gone = False
         self._noted = 0.0
         self._view: View | None = None
         self._look = Look()
@@ -50,6 +51,7 @@ class Visitor:
 
     def close(self) -> None:
         """The browser has gone."""
+        self._gone = True
         self.session.close(self.window)
         self._encoder.shutdown(wait=False, cancel_futures=True)
 
@@ -157,6 +159,8 @@ class Visitor:
         """Sends the newest picture; older ones that were not sent yet never are."""
         with self._lock:
             picture, self._waiting = self._waiting, None
+        if self._gone:
+            return
         quality = MOVING_QUALITY if picture.moving else RESTING_QUALITY
         kind = "png" if picture.final else "jpeg"
         self.client.scene.set_background_image(picture.pixels, kind, jpeg_quality=quality)

@@ -6,6 +6,7 @@ import gzip
 import os
 import re
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,24 @@ import SimpleITK
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.detached import data_files
 from mitsuba_irrcache.volumes.dicom_lengths import check_lengths
 
-EXTENSIONS = (".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd", ".dcm")
+_READERS = {
+    ".nrrd": "NrrdImageIO",
+    ".nhdr": "NrrdImageIO",
+    ".nii": "NiftiImageIO",
+    ".nii.gz": "NiftiImageIO",
+    ".mha": "MetaImageIO",
+    ".mhd": "MetaImageIO",
+    ".dcm": "GDCMImageIO",
+}
+EXTENSIONS = tuple(_READERS)
 # Deflate cannot shrink anything further than this (zlib.net/zlib_tech.html).
 _BEST_DEFLATE_RATIO = 1032
 _COMPRESSED = re.compile(
     rb"^(?:encoding:\s*(?:gz|gzip|bz2|bzip2)|CompressedData\s*=\s*True)\s*$", re.I | re.M
 )
-_DETACHED = re.compile(rb"^(?:data ?file:\s*|ElementDataFile\s*=\s*)(.+?)\s*$", re.I | re.M)
 _DIMENSIONS = re.compile(rb"^\s*NDims\s*[=:]\s*([-+]?\d+)", re.M)
 _MOST_DIMENSIONS = 10
 _COMPONENT_BYTES = {
@@ -38,26 +48,39 @@ _COMPONENT_BYTES = {
 }
 
 
-def read_image(path: str | os.PathLike) -> VolumeData:
+def read_image(
+    path: str | os.PathLike, data_folders: Sequence[str | os.PathLike] = ()
+) -> VolumeData:
     """Read one image file; spacing, origin and direction are kept (LPS, mm).
+
+    Args:
+        path: the image file.
+        data_folders: where voxels may lie that a header keeps in other files, beside its folder.
 
     Raises:
         IrrcacheError: missing or truncated file, a header that promises more than the file can
-            hold (found before anything is allocated), or an image that is no scalar volume.
+            hold (found before anything is allocated), one that names a data file elsewhere, or an
+            image that is no scalar volume.
     """
     path = Path(path)
     if not path.is_file():
         raise IrrcacheError(f"volume file {path} does not exist")
+    if not path.stat().st_size:
+        raise IrrcacheError(f"volume file {path} is empty; copy or export it again")
     if path.suffix == ".dcm":
         check_lengths(path)
     if path.suffix.lower() in (".mha", ".mhd"):
         _check_dimensions(path)
+    formats = (".nrrd", ".nhdr", ".mha", ".mhd")
+    data = data_files(path, data_folders) if path.suffix.lower() in formats else [path]
     reader = SimpleITK.ImageFileReader()
+    # The contents do not choose another format, whose data files were not looked for.
+    reader.SetImageIO(_reader_of(path))
     reader.SetFileName(str(path))
     try:
         reader.ReadImageInformation()
         _check_scalar_volume(path, reader)
-        _check_file_holds(path, _image_bytes(path, reader))
+        _check_file_holds(path, data, _image_bytes(path, reader))
         image = reader.Execute()
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1]
@@ -107,7 +130,13 @@ def _image_bytes(path: Path, reader: SimpleITK.ImageFileReader) -> int:
     return count * _COMPONENT_BYTES.get(reader.GetPixelID(), 1)
 
 
-def _check_file_holds(path: Path, image_bytes: int) -> None:
+def _reader_of(path: Path) -> str:
+    """The name of SimpleITK's reader of a format."""
+    name = path.name.lower()
+    return next(reader for extension, reader in _READERS.items() if name.endswith(extension))
+
+
+def _check_file_holds(path: Path, data: Sequence[Path], image_bytes: int) -> None:
     """Compare what the header promises with the file, and unpack a ``.gz`` once to its end."""
     if path.suffix == ".dcm":
         # The pixel data may be compressed by any codec.
@@ -119,27 +148,11 @@ def _check_file_holds(path: Path, image_bytes: int) -> None:
         return
     with path.open("rb") as stream:
         header = stream.read(64 * 1024)
-    data = path if path.suffix == ".nii" else _data_file(path, header)
-    if data is None:
-        return
-    stored = data.stat().st_size
+    stored = sum(file.stat().st_size for file in data)
     if _COMPRESSED.search(header):
-        _check_ratio(data, stored, image_bytes)
+        _check_ratio(data[0], stored, image_bytes)
     elif stored < image_bytes:
-        _raise_truncated(data, stored, image_bytes)
-
-
-def _data_file(path: Path, header: bytes) -> Path | None:
-    """Where an NRRD or MetaImage header says its voxels are; None for a list of files."""
-    detached = _DETACHED.search(header)
-    if detached is None or detached[1].upper() == b"LOCAL":
-        return path
-    if detached[1].upper().startswith(b"LIST") or b"%" in detached[1]:
-        return None
-    data = path.parent / os.fsdecode(detached[1])
-    if not data.is_file():
-        raise IrrcacheError(f"{path} names a data file {data} that does not exist; put it there")
-    return data
+        _raise_truncated(data[0], stored, image_bytes)
 
 
 def _check_ratio(path: Path, stored: int, image_bytes: int) -> None:

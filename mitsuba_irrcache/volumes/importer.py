@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsuba_irrcache.argument_types import argument, finite, finite_number, whole
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes import processing
 from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.detached import OPTION
 from mitsuba_irrcache.volumes.raw import RawLayout
 from mitsuba_irrcache.volumes.readers import read_volume
 from mitsuba_irrcache.volumes.scene import SceneSettings, write_scene
@@ -56,12 +58,20 @@ def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
     _add_appearance(parser.add_argument_group(f"appearance ({needed})"), required)
     _add_processing(parser.add_argument_group("processing, in this order"))
     _add_raw(parser.add_argument_group("raw files"))
+    parser.add_argument(
+        OPTION,
+        action="append",
+        default=[],
+        metavar="FOLDER",
+        help="where a header (NRRD, MetaImage) may name data files, beside its own folder; "
+        "repeatable",
+    )
     parser.add_argument("--series", metavar="UID", help="which series of a DICOM folder")
     parser.add_argument(
-        "--replace-nan", type=float, metavar="VALUE", help="put VALUE for NaN and infinite values"
+        "--replace-nan", type=finite, metavar="VALUE", help="put VALUE for NaN and infinite values"
     )
     parser.add_argument(
-        "--max-depth", type=int, default=2, help="default of the scene (2: single scattering)"
+        "--max-depth", type=whole(-1), default=2, help="default of the scene (2: single scattering)"
     )
     parser.add_argument(
         "--up", choices=("z", "y"), help="axis up in the picture (default: z; y for .vol)"
@@ -115,7 +125,7 @@ def _add_appearance(group: argparse._ArgumentGroup, required: bool) -> None:
     choice.add_argument("--transfer-function", metavar="FILE", help="a JSON file")
     choice.add_argument(
         "--density",
-        type=float,
+        type=finite,
         nargs="?",
         const=1.0,
         metavar="SCALE",
@@ -145,12 +155,12 @@ def _add_processing(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--isolate",
-        type=_finite,
+        type=finite,
         metavar="VALUE",
         help="keep the largest object above VALUE; -300 frees a patient of the table",
     )
     size = group.add_mutually_exclusive_group()
-    size.add_argument("--voxel-size", type=float, metavar="MM", help="resample to cubic voxels")
+    size.add_argument("--voxel-size", type=finite, metavar="MM", help="resample to cubic voxels")
     size.add_argument(
         "--longest", type=int, metavar="N", help="resample to N voxels along the longest side"
     )
@@ -168,7 +178,7 @@ def _add_raw(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--raw-type", default="uint8", help="e.g. uint16, float32 (default: uint8)")
     group.add_argument("--raw-endian", choices=("little", "big"), default="little")
     group.add_argument("--raw-spacing", type=_numbers, default=(1.0, 1.0, 1.0), metavar="X,Y,Z")
-    group.add_argument("--raw-offset", type=int, default=0, metavar="BYTES")
+    group.add_argument("--raw-offset", type=whole(0), default=0, metavar="BYTES")
 
 
 def _mapping(args: argparse.Namespace) -> TransferFunction | DensityMapping:
@@ -196,6 +206,7 @@ def _read(args: argparse.Namespace) -> VolumeData:
         raw=raw,
         series=args.series,
         replace_nan=args.replace_nan,
+        data_folders=args.data_folder,
     )
 
 
@@ -213,8 +224,8 @@ def _phantom(source: str) -> VolumeData:
         return make()
     try:
         x, y, z = _counts(size)
-    except (argparse.ArgumentTypeError, ValueError) as error:
-        raise IrrcacheError(f"phantom size {size!r}: give X,Y,Z, e.g. 128,96,128") from error
+    except argparse.ArgumentTypeError as error:
+        raise IrrcacheError(f"phantom size {error}") from None
     return make((z, y, x))
 
 
@@ -287,39 +298,37 @@ def _summary(
     return "\n".join(lines)
 
 
+@argument("numbers separated by commas, for example 0.9 or 0.9,0.5,0.4")
 def _numbers(text: str) -> tuple[float, ...]:
-    return tuple(_finite(part) for part in text.split(","))
+    return tuple(finite_number(part) for part in text.split(","))
 
 
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
-    return value
-
-
+@argument("three whole numbers of voxels X,Y,Z, each at least 1, for example 40,32,24")
 def _counts(text: str) -> tuple[int, ...]:
     counts = tuple(int(part) for part in text.split(","))
-    if len(counts) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r}: give three counts X,Y,Z")
+    if len(counts) != 3 or min(counts) < 1:
+        raise ValueError
     return counts
 
 
+@argument("some of the letters x, y, z")
 def _axes(text: str) -> str:
     if set(text) - set("xyz"):
-        raise argparse.ArgumentTypeError(f"{text!r}: give some of x, y, z")
+        raise ValueError
     return text
 
 
+@argument("A:B, two numbers of which one may be left out, for example -100:500")
 def _interval(text: str) -> tuple[float, float]:
     low, separator, high = text.partition(":")
     if not separator:
-        raise argparse.ArgumentTypeError(f"{text!r}: give A:B")
+        raise ValueError
     return (float(low) if low else -math.inf, float(high) if high else math.inf)
 
 
+@argument("X0:X1,Y0:Y1,Z0:Z1 in whole voxels, for example 10:50,:,0:20; a bare : keeps all")
 def _ranges(text: str) -> list[tuple[int | None, int | None]]:
     parts = text.split(",")
     if len(parts) != 3 or any(part.count(":") != 1 for part in parts):
-        raise argparse.ArgumentTypeError(f"{text!r}: give X0:X1,Y0:Y1,Z0:Z1; a bare : keeps all")
+        raise ValueError
     return [tuple(int(n) if n else None for n in part.split(":")) for part in parts]

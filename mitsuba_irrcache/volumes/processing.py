@@ -1,4 +1,8 @@
-"""Operations on volumes before they become a medium: crop, clip, rescale, resample, bake."""
+"""Operations on volumes before they become a medium: crop, clip, rescale, resample, bake.
+
+SciPy belongs to an extra and is imported where it is used: the options of a command can be shown
+without it.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage
 from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError
@@ -91,6 +94,8 @@ def isolate(volume: VolumeData, threshold: float) -> VolumeData:
     Raises:
         IrrcacheError: nothing thicker than four voxels lies above ``threshold``.
     """
+    from scipy import ndimage
+
     values = np.asarray(volume.values)
     above = values > threshold
     # What goes on beyond the border of the volume is not thin there.
@@ -210,6 +215,8 @@ def _check_memory(size: Size, bytes_per_voxel: int, supersample: int = 1) -> Non
 
 def _antialiased(values: np.ndarray, size: Size) -> np.ndarray:
     """Values smoothed along the axes that lose resolution; a half-width of half the new voxel."""
+    from scipy import ndimage
+
     factors = np.array(values.shape) / np.array(size[::-1])
     sigma = np.maximum(0.0, (factors - 1.0) / 2.0)
     if not sigma.any():
@@ -222,6 +229,8 @@ def _sample_slices(values: np.ndarray, size: Size, first: int, last: int) -> np.
 
     Only the source slices that they touch are read; float32 ``(last - first, y, x)``.
     """
+    from scipy import ndimage
+
     x, y, z = size
     step = np.array(values.shape) / (z, y, x)
     start = step * (first + 0.5, 0.5, 0.5) - 0.5

@@ -95,6 +95,8 @@ def read_raw_slices(paths: Sequence[str | os.PathLike], layout: RawLayout) -> Vo
 
 def _check_bytes(path: Path, layout: RawLayout, shape: tuple[int, ...]) -> None:
     """Compare a file's size with the layout before mapping or reading it."""
+    if path.is_dir():
+        raise IrrcacheError(f"raw file {path} is a folder; name its files, for example {path}/*")
     if not path.is_file():
         raise IrrcacheError(f"raw file {path} does not exist")
     count = int(np.prod(shape, dtype=object))

@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.volumes import images
 from mitsuba_irrcache.volumes.data import VolumeData
-from mitsuba_irrcache.volumes.dicom import read_dicom_series
 from mitsuba_irrcache.volumes.mitsuba_vol import read_vol
 from mitsuba_irrcache.volumes.raw import RawLayout, read_raw, read_raw_slices
 
@@ -26,6 +24,7 @@ def read_volume(
     raw: RawLayout | None = None,
     series: str | None = None,
     replace_nan: float | None = None,
+    data_folders: Sequence[PathLike] = (),
 ) -> VolumeData:
     """Read a scalar volume with its placement.
 
@@ -35,16 +34,21 @@ def read_volume(
         raw: the layout of raw files.
         series: SeriesInstanceUID, for DICOM folders with several.
         replace_nan: value to put in the place of NaN and infinite ones.
+        data_folders: where voxels may lie that a header (NRRD, MetaImage) keeps in other files,
+            beside its own folder.
 
     Raises:
         IrrcacheError: anything that cannot be read as a finite scalar volume.
     """
-    volume = _read(path, raw, series)
+    volume = _read(path, raw, series, data_folders)
     return replace(volume, values=_finite(volume, replace_nan))
 
 
 def _read(
-    path: PathLike | Sequence[PathLike], raw: RawLayout | None, series: str | None
+    path: PathLike | Sequence[PathLike],
+    raw: RawLayout | None,
+    series: str | None,
+    data_folders: Sequence[PathLike],
 ) -> VolumeData:
     paths = _expand(path)
     if raw is not None:
@@ -62,8 +66,11 @@ def _read(
     name = single.name.lower()
     if name.endswith(".vol"):
         return _read_mitsuba(single)
+    # SimpleITK is needed for these formats only.
+    from mitsuba_irrcache.volumes import images
+
     if name.endswith(images.EXTENSIONS):
-        return images.read_image(single)
+        return images.read_image(single, data_folders)
     raise IrrcacheError(
         f"{single} has an extension that is not supported; give .vol, "
         f"{', '.join(images.EXTENSIONS)}, a DICOM folder, or --raw-shape X,Y,Z for a raw file"
@@ -87,6 +94,9 @@ def _expand(path: PathLike | Sequence[PathLike]) -> list[Path]:
 def _read_folder(folder: Path, series: str | None) -> VolumeData:
     if not any(folder.iterdir()):
         raise IrrcacheError(f"folder {folder} is empty; give a folder with a DICOM series")
+    # SimpleITK is needed for these formats only.
+    from mitsuba_irrcache.volumes.dicom import read_dicom_series
+
     return read_dicom_series(folder, series)
 
 

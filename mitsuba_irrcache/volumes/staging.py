@@ -52,11 +52,15 @@ def staged_files(folder: str | os.PathLike, names: set[str], overwrite: bool) ->
         overwrite: replace files of these names; on a failure the old ones are put back.
 
     Raises:
-        IrrcacheError: ``folder`` does not exist, or holds one of ``names`` already.
+        IrrcacheError: ``folder`` does not exist, or holds one of ``names`` already; or one of these
+            is a folder, which is never replaced, since it may hold anything.
     """
     folder = Path(folder).absolute()
     if not folder.is_dir():
         raise IrrcacheError(f"folder {folder} does not exist; create it")
+    folders = sorted(name for name in names if (folder / name).is_dir())
+    if folders:
+        raise IrrcacheError(f"{folder / folders[0]} is a folder and is not replaced; name a file")
     taken = sorted(name for name in names if (folder / name).exists())
     if taken and not overwrite:
         raise IrrcacheError(

@@ -247,6 +247,8 @@ def load_transfer_function(path: str | os.PathLike) -> TransferFunction:
         IrrcacheError: the file is missing, no JSON, or describes no transfer function.
     """
     path = Path(path)
+    if path.is_dir():
+        raise IrrcacheError(f"transfer function {path} is a folder; name a JSON file")
     if not path.is_file():
         raise IrrcacheError(f"transfer function {path} does not exist")
     try:

@@ -44,7 +44,7 @@ def started(tmp_path_factory):
     with viewer(arguments, folder / "log.txt") as address:
         yield address, folder
     log = (folder / "log.txt").read_text()
-    assert not re.search("Traceback|rror|leaked", log), log
+    assert not re.search("Traceback|rror|leaked|Warning", log), log
 
 
 def settled(window: Window) -> np.ndarray:
@@ -140,7 +140,7 @@ def test_pages_of_other_sites_are_refused(started):
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
 
-    from mitsuba_irrcache.view.server import is_own_page
+    from mitsuba_irrcache.view.access import Access, is_own_page
 
     address = started[0].replace("http", "ws")
 
@@ -156,6 +156,7 @@ def test_pages_of_other_sites_are_refused(started):
     assert answers(started[0].rstrip("/"))
     assert not answers("http://example.org")
     assert not answers(started[0].rstrip("/").replace("http", "https"))
-    assert is_own_page({"Origin": "http://localhost:80", "Host": "localhost:80"}, "127.0.0.1")
-    assert not is_own_page({"Origin": "http://a.org:80", "Host": "a.org:80"}, "127.0.0.1")
-    assert is_own_page({"Origin": "http://a.org:80", "Host": "a.org:80"}, "0.0.0.0")
+    local = Access("127.0.0.1")
+    assert is_own_page({"Origin": "http://localhost:80", "Host": "localhost:80"}, local)
+    assert not is_own_page({"Origin": "http://a.org:80", "Host": "a.org:80"}, local)
+    assert not is_own_page({"Origin": "http://a.org:80", "Host": "a.org:80"}, Access("0.0.0.0"))

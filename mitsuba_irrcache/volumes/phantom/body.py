@@ -10,6 +10,12 @@ from mitsuba_irrcache.volumes.phantom.distance import Ellipsoid
 
 SKIN_THICKNESS = 2.0
 
+# Width in voxels over which the body blends into the air. This step of 1000 HU crosses all values
+# that a transfer function gives to lungs. Within one voxel it would be undersampled: the optical
+# depth of the skin would depend on where the surface lies between voxel centres, which shows as
+# rings like wood grain. Its standard deviation is 0.7 voxels, as of a scanner's blur.
+SKIN_SOFTNESS = 2.5
+
 # Subcutaneous fat: z, thickness in mm.
 FAT_THICKNESS = ((0, 15), (100, 11), (200, 8), (280, 7), (330, 5))
 
@@ -25,7 +31,8 @@ def paint_body(canvas: Canvas) -> None:
     """Paint skin, subcutaneous fat, muscle, and the fat between the muscles and in the armpits."""
     region = canvas.region(anatomy.WHOLE)
     distance = skin_distance(region)
-    canvas.paint(region, distance, anatomy.SKIN)
+    # Beyond the surface, too: the air that is blended in below needs skin under all of its edge.
+    canvas.paint(region, distance - np.float32(SKIN_SOFTNESS * canvas.edge), anatomy.SKIN)
     distance += np.float32(SKIN_THICKNESS)
     canvas.paint(region, distance, anatomy.FAT)
     heights, thickness = np.transpose(FAT_THICKNESS)
@@ -34,6 +41,7 @@ def paint_body(canvas: Canvas) -> None:
     _paint_fascia(canvas)
     armpits = [Ellipsoid((s * 128, 2, 228), (12, 30, 34)) for s in (anatomy.RIGHT, anatomy.LEFT)]
     canvas.paint_solids(armpits, anatomy.FAT)
+    canvas.paint(region, -skin_distance(region), anatomy.AIR, SKIN_SOFTNESS)
 
 
 def _paint_fascia(canvas: Canvas) -> None:

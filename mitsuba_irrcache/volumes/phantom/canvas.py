@@ -97,10 +97,15 @@ class Canvas:
             np.minimum(target, solid.distance(part.x, part.y, part.z, self.edge), out=target)
         return region, distance
 
-    def paint(self, region: Region, distance: np.ndarray, tissue: Tissue) -> None:
-        """Cover what lies within ``distance`` <= 0 with ``tissue``, blended over ``edge``."""
-        touched = distance < self.edge / 2
-        coverage = np.minimum(0.5 - distance[touched] / self.edge, 1)
+    def paint(
+        self, region: Region, distance: np.ndarray, tissue: Tissue, softness: float = 1.0
+    ) -> None:
+        """Cover what lies within ``distance`` <= 0 with ``tissue``, blended over ``softness`` times
+        ``edge``.
+        """
+        edge = softness * self.edge
+        touched = distance < edge / 2
+        coverage = np.minimum(0.5 - distance[touched] / edge, 1)
         colour = tissue.mean + tissue.grain * self._texture[region.slices][touched]
         values = self.values[region.slices]
         before = values[touched]

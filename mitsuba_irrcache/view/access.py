@@ -1,0 +1,177 @@
+"""Who may connect to the viewer: by the host that a request names, a token, and its page."""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import http
+import ipaddress
+import secrets
+import socket
+from collections.abc import Iterator, Mapping
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs, urlsplit
+
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from mitsuba_irrcache.errors import IrrcacheError
+
+LOCAL = ("localhost", "127.0.0.1", "::1")
+
+
+class Access:
+    """Decides about requests to a server that listens on ``host``.
+
+    Every request must name a host that can only be this machine. A page of another site whose name
+    was pointed at this machine (DNS rebinding) names its own. Where other machines can connect,
+    each request needs the ``token`` as well: in the address of the page, which is answered with a
+    cookie that the browser sends along with everything else.
+    """
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        self.token = "" if is_local(host) else secrets.token_urlsafe(24)
+
+    def refusal(self, path: str, headers: Mapping[str, str]) -> str:
+        """Why a request is refused; "" if it is not."""
+        if not self.is_own_host(headers.get("Host", "")):
+            return "The viewer does not answer to this host name. Use the address that it printed."
+        if self.token and not (self._has_token(path) or self._has_cookie(headers)):
+            return "The token is missing. Use the whole address that irrcache view printed."
+        return ""
+
+    def is_own_host(self, asked: str) -> bool:
+        """Whether the value of a Host header names this machine: it is an IP address, which cannot
+        be rebound, or one of the machine's names. Where only this machine can connect, it must be
+        one of the local names.
+        """
+        name = _host_name(asked)
+        if is_local(self.host):
+            return name in LOCAL
+        with contextlib.suppress(ValueError):
+            ipaddress.ip_address(name)
+            return True
+        own = {"localhost", self.host, socket.gethostname(), socket.getfqdn()}
+        return name in {o.lower() for o in own}
+
+    def query(self) -> str:
+        """What an address needs after its path."""
+        return f"?token={self.token}" if self.token else ""
+
+    def cookie(self, path: str) -> str:
+        """The Set-Cookie header that answers a request with the token; "" for others."""
+        if not (self.token and self._has_token(path)):
+            return ""
+        return f"{self._cookie_name}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+    @property
+    def _cookie_name(self) -> str:
+        """One of its own for every viewer: browsers send cookies to all ports of a host."""
+        return f"irrcache_{self.token[:8]}"
+
+    def _has_token(self, path: str) -> bool:
+        given = parse_qs(urlsplit(path).query).get("token", [""])
+        return self._is_token(given[0])
+
+    def _has_cookie(self, headers: Mapping[str, str]) -> bool:
+        try:
+            cookies = SimpleCookie(headers.get("Cookie", ""))
+        except CookieError:
+            return False
+        found = cookies.get(self._cookie_name)
+        return found is not None and self._is_token(found.value)
+
+    def _is_token(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self.token.encode())
+
+
+@contextlib.contextmanager
+def guarded(access: Access) -> Iterator[None]:
+    """A server of viser that is made in this block asks ``access`` about every request.
+
+    Viser takes no handler for requests: the function that starts its server is wrapped meanwhile.
+    """
+    serve = websockets.asyncio.server.serve
+
+    def guarded_serve(*args: object, process_request: object = None, **kwargs: object) -> object:
+        def checked(connection: object, request: Request) -> Response | None:
+            why = access.refusal(request.path, request.headers)
+            if why:
+                return _text(http.HTTPStatus.FORBIDDEN, why)
+            response = process_request(connection, request) if process_request else None
+            cookie = access.cookie(request.path)
+            if response is not None and cookie:
+                response.headers["Set-Cookie"] = cookie
+                response.headers["Referrer-Policy"] = "no-referrer"
+                response.headers["Cache-Control"] = "no-store"
+            return response
+
+        return serve(*args, process_request=checked, **kwargs)
+
+    websockets.asyncio.server.serve = guarded_serve
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve
+
+
+def is_own_page(headers: Mapping[str, str], access: Access) -> bool:
+    """Whether a browser's request comes from the page that was served here: its origin is the host
+    that it asks, which is this machine. Programs send no origin.
+    """
+    origin = headers.get("Origin")
+    if origin is None:
+        return True
+    asked, own = headers.get("Host", ""), urlsplit(origin)
+    return (own.scheme, own.netloc) == ("http", asked) and access.is_own_host(asked)
+
+
+def is_local(host: str) -> bool:
+    """Whether only this machine can connect to ``host``."""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+def is_wildcard(host: str) -> bool:
+    """Whether ``host`` stands for all addresses of this machine."""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_unspecified
+    return False
+
+
+def check_host(host: str) -> None:
+    """Raises IrrcacheError unless this machine can listen on ``host``: viser would try port after
+    port without end.
+    """
+    try:
+        if not host:
+            raise OSError("it is empty")
+        for family, kind, protocol, _, address in socket.getaddrinfo(
+            host, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        ):
+            with socket.socket(family, kind, protocol) as trial:
+                trial.bind(address)
+    except (OSError, UnicodeError) as error:
+        raise IrrcacheError(
+            f'--host is "{host}", where this machine cannot listen ({error}); give 127.0.0.1 for '
+            "this machine alone, 0.0.0.0 for all its networks, or one of its own addresses."
+        ) from None
+
+
+def _host_name(asked: str) -> str:
+    """The name in a Host header, without the port, in lower case; "" if it is malformed."""
+    try:
+        return (urlsplit(f"//{asked}").hostname or "").rstrip(".")
+    except ValueError:
+        return ""
+
+
+def _text(status: http.HTTPStatus, text: str) -> Response:
+    body = f"{text}\n".encode()
+    headers = Headers(
+        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+    )
+    return Response(status.value, status.phrase, headers, body)

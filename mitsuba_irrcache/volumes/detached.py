@@ -1,0 +1,93 @@
+"""Data files that a header names: NRRD and MetaImage may keep their voxels in other files.
+
+A header comes from somebody else, and could name any file of this machine: its contents would then
+be in a picture or a scene that is passed on. So a header may name files of its own folder only, and
+of folders that the user has allowed.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from mitsuba_irrcache.errors import IrrcacheError
+
+OPTION = "--data-folder"
+#: More files than any volume has slices.
+_MOST_FILES = 1 << 16
+_FIELDS = {
+    "nrrd": re.compile(rb"^[ \t]*data[ \t]*file[ \t]*:[ \t]*([^\r\n]*)", re.I | re.M),
+    # Not at the start of a line alone: MetaIO does not read line by line.
+    "meta": re.compile(rb"ElementDataFile\s*[=:][ \t]*([^\r\n]*)"),
+}
+_PATTERN = re.compile(r"(?P<name>.*%0?\d{0,2}d.*?)\s+(?P<numbers>-?\d+(?:\s+-?\d+){2,3})\s*")
+
+
+def data_files(path: Path, allowed: Sequence[str | os.PathLike] = ()) -> list[Path]:
+    """The files in which ``path``, an NRRD or MetaImage, has its voxels; ``path`` itself if these
+    follow the header.
+
+    Args:
+        path: the image file.
+        allowed: folders, beside that of ``path``, in which data files may lie, at any depth.
+
+    Raises:
+        IrrcacheError: a data file that is missing or lies elsewhere, links and ``..`` followed.
+    """
+    kind = "meta" if path.suffix.lower() in (".mha", ".mhd") else "nrrd"
+    files: list[Path] = []
+    # All names in all of the file: one that its reader passes over must not hide another.
+    with (
+        path.open("rb") as stream,
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as contents,
+    ):
+        end = contents.find(b"\n\n") if kind == "nrrd" else -1  # the voxels of an NRRD follow
+        header = contents[:end] if end >= 0 else contents
+        for field in _FIELDS[kind].finditer(header):
+            following = header[field.end() :]
+            for name in _names(path, os.fsdecode(field[1].strip()), following):
+                files.append(path if name is None else _checked(path, name, allowed))
+    return files or [path]
+
+
+def _names(path: Path, value: str, following: bytes) -> list[str | None]:
+    """The names that one field stands for; None for the header's own file."""
+    if value.upper() == "LOCAL":
+        return [None]
+    if value.upper().split(" ")[0] == "LIST":
+        lines = os.fsdecode(following).splitlines()
+        return [line.strip() for line in lines if line.strip()]
+    if "%" not in value:
+        return [value]
+    found = _PATTERN.fullmatch(value)
+    first, last, step, *_ = map(int, found["numbers"].split()) if found else (0, 0, 0)
+    if not found or not step or abs(last - first) // abs(step) >= _MOST_FILES:
+        raise IrrcacheError(
+            f'{path} names its data files by "{value}"; give name%03d.raw FIRST LAST STEP'
+        )
+    if found["name"].replace("%%", "").count("%") != 1:
+        raise IrrcacheError(f'{path} names its data files by "{value}"; give one number to fill in')
+    end = last + (1 if step > 0 else -1)
+    return [found["name"] % number for number in range(first, end, step)]
+
+
+def _checked(path: Path, name: str, allowed: Sequence[str | os.PathLike]) -> Path:
+    """The data file of this ``name``, which exists and lies where it may."""
+    file = path.parent / name
+    try:
+        real = file.resolve()
+        folders = [Path(folder).resolve() for folder in (path.parent, *allowed)]
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, or no name at all
+        raise IrrcacheError(f"{path} names a data file {name!r}, which is none: {error}") from None
+    # "~" begins a full path for MetaIO.
+    if name.startswith("~") or not any(real.is_relative_to(folder) for folder in folders):
+        raise IrrcacheError(
+            f"{path} names a data file {file} outside of its own folder, which is not read; if you "
+            f"trust the header, give {OPTION} {real.parent}"
+        )
+    if not real.is_file():
+        raise IrrcacheError(f"{path} names a data file {file} that does not exist; put it there")
+    return file

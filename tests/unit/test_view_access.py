@@ -1,0 +1,193 @@
+"""Who may connect to the viewer, and that its thread wakes when a camera comes to rest."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import urllib.error
+import urllib.request
+import warnings
+from time import monotonic
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser")
+import viser
+from viser import _messages as messages
+from viser.infra._async_message_buffer import AsyncMessageBuffer
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.view.access import Access, check_host, guarded
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.server import Server, ignore_closed_connections
+from mitsuba_irrcache.view.session import Session, Superseded
+from mitsuba_irrcache.view.window import View
+
+CAMERA = Camera((0.0, -5.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
+
+
+@pytest.fixture(params=["127.0.0.1", "0.0.0.0"])
+def served(request):
+    """A server of viser with what decides about its requests, and its port."""
+    access = Access(request.param)
+    with guarded(access):
+        server = viser.ViserServer(request.param, 8750, verbose=False)
+    yield access, server.get_port()
+    server.stop()
+
+
+def page(port: int, path: str = "/", **headers: str) -> tuple[int, str]:
+    """Status and cookie of a page."""
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=10) as response:
+            return response.status, response.headers.get("Set-Cookie", "")
+    except urllib.error.HTTPError as error:
+        return error.code, error.headers.get("Set-Cookie", "")
+
+
+def connects(port: int, path: str = "/", host: str = "", **headers: str) -> bool:
+    """Whether a window's connection is accepted."""
+    protocol = [f"viser-v{viser.__version__}"]
+    try:
+        with connect(
+            f"ws://{host or '127.0.0.1'}:{port}{path}",
+            additional_headers=headers,
+            subprotocols=protocol,
+            max_size=None,
+            sock=socket.create_connection(("127.0.0.1", port)),
+        ) as connection:
+            connection.recv(timeout=5)
+            return True
+    except InvalidStatus as refused:
+        assert refused.response.status_code == 403
+        return False
+
+
+def test_a_token_is_needed_where_other_machines_can_connect(served):
+    access, port = served
+    if access.host == "127.0.0.1":
+        assert access.token == "" and page(port) == (200, "") and connects(port)
+        return
+    assert len(access.token) >= 32 and access.token != Access("0.0.0.0").token
+    assert page(port) == (403, "") and not connects(port)
+    wrong = access.token[:-1] + ("a" if access.token[-1] != "a" else "b")
+    assert page(port, f"/?token={wrong}") == (403, "")
+    assert not connects(port, f"/?token={wrong}")
+    status, cookie = page(port, f"/{access.query()}&fixedDpr=1")
+    assert status == 200 and "HttpOnly" in cookie and "SameSite=Strict" in cookie
+    pair = cookie.partition(";")[0]
+    assert page(port, Cookie=pair)[0] == 200 and connects(port, Cookie=pair)
+    name = pair.partition("=")[0]
+    for forged in (f"{name}={wrong}", f"{name}=", "token", "a=b; =;;", f"other={access.token}"):
+        assert page(port, Cookie=forged)[0] == 403
+        assert not connects(port, Cookie=forged)
+
+
+def test_names_that_another_site_may_have_given_to_this_machine_are_refused(served):
+    """DNS rebinding: the address is ours, the Host header the site's; the token does not help."""
+    access, port = served
+    for host in ("evil.example.org", "127.0.0.1.example.org", "localhost.example.org", "["):
+        assert page(port, f"/{access.query()}", Host=f"{host}:{port}")[0] == 403
+    assert not connects(port, f"/{access.query()}", host="evil.example.org")
+    assert page(port, f"/{access.query()}", Host=f"localhost:{port}")[0] == 200
+    if access.host == "0.0.0.0":
+        for host in ("192.0.2.7", "[2001:db8::1]", socket.gethostname()):
+            assert page(port, f"/{access.query()}", Host=f"{host}:{port}")[0] == 200
+
+
+def test_the_address_has_the_token(monkeypatch):
+    """As it is printed; a wildcard is no address."""
+    server = Server.__new__(Server)
+    server.host, server.port, server._access = "0.0.0.0", 8080, Access("0.0.0.0")
+    query = f"/?token={server._access.token}"
+    assert server.address == f"http://127.0.0.1:8080{query}"
+    assert server.address_from_elsewhere == f"http://{socket.gethostname()}:8080{query}"
+    server.host, server._access = "::1", Access("::1")
+    assert server.address == server.address_from_elsewhere == "http://[::1]:8080/"
+
+
+@pytest.mark.parametrize(
+    "host", ["", "no-such-host.invalid", "300.1.1.1", "192.0.2.7", "a\u0100" * 99]
+)
+def test_hosts_that_cannot_be_listened_on_are_refused(host):
+    """Viser itself would never return."""
+    with pytest.raises(IrrcacheError, match="--host"):
+        check_host(host)
+    for good in ("127.0.0.1", "localhost", "0.0.0.0"):
+        check_host(good)
+
+
+def test_messages_for_a_closed_window_are_no_warnings():
+    """A browser may go while its picture is sent."""
+    loop = asyncio.new_event_loop()
+    buffer = AsyncMessageBuffer(loop, persistent_messages=False)
+    buffer.set_done()
+    update = messages.GuiUpdateMessage("id", {"content": "moving"})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        buffer.push(update)
+        assert len(caught) == 1  # what viser would print
+        ignore_closed_connections()
+        buffer.push(update)
+        warnings.warn("something else", UserWarning, stacklevel=1)
+        assert len(caught) == 2
+    loop.close()
+
+
+@pytest.fixture
+def moving(monkeypatch):
+    """A session whose one camera moves, and the timeouts with which its thread waits."""
+    session, waited = Session(None, "llvm_ad_rgb"), []
+    window = session.open(lambda picture: None)
+    window.want(View(CAMERA, (40, 30)))
+    window.fresh = False
+
+    def begin() -> None:
+        window.moved = monotonic()
+
+    def wait(timeout: float | None = None) -> None:
+        waited.append(timeout)
+        session._stopped = True
+
+    monkeypatch.setattr(session._news, "wait", wait)
+    monkeypatch.setattr(session, "_begin", begin)
+    begin()
+    return session, window, waited
+
+
+def test_a_camera_that_comes_to_rest_during_a_step_is_waited_for(moving, monkeypatch):
+    """The thread must not sleep without end where a camera comes to rest after it was seen to move:
+    the picture would stay as coarse as that of a moving camera.
+    """
+    session, window, waited = moving
+
+    def step() -> bool:
+        window.moved = -np.inf
+        return False
+
+    monkeypatch.setattr(session, "_step", step)
+    session._run()
+    (timeout,) = waited
+    assert timeout is not None and 0 < timeout < 1
+
+
+@pytest.mark.parametrize("looks", range(1, 5))
+def test_a_camera_that_comes_to_rest_while_the_solver_waits(moving, monkeypatch, looks):
+    """The same between launches of the solver, after any number of looks at the camera."""
+    session, window, waited = moving
+    session._shown, seen = object(), []
+
+    def is_moving(self) -> bool:
+        seen.append(self)
+        return len(seen) <= looks
+
+    monkeypatch.setattr(type(window), "is_moving", property(is_moving))
+    monkeypatch.setattr(session, "_show_resting", lambda first: False)
+    with contextlib.suppress(Superseded):
+        session._pause()
+    assert None not in waited
