@@ -278,8 +278,8 @@ SLIPS = (
     Mutant(
         "the brightest light of a cache without what lamps add (cache)",
         "cache.py",
-        "            field.maximum *= self.falloff.maximum(self.active)\n",
-        "",
+        "field.maximum *= self.falloff.maximum(self.active)",
+        "field.maximum *= 1",
         (CACHE, LAMPS, "tests/unit/test_brightest_light.py"),
     ),
     Mutant(

@@ -58,3 +58,21 @@ def test_a_bright_spot_of_the_sky_through_a_medium(scenes):
         seen.append(scenes.image(scene, spp=4)[..., -3:].mean())
     assert seen[0] > 20
     assert seen[1] / seen[0] == pytest.approx(np.exp(-2 * 0.9), rel=2e-3)
+
+
+def test_light_scattered_once_from_narrow_lights(scenes):
+    """Extinction times albedo times the phase function of the medium without its peak is that of
+    the medium as the scene has it: Henyey and Greenstein's formula.
+    """
+    medium = scenes.medium(1.3, 0.7) | {"phase": PHASE}
+    scene = scenes.load({"type": "irrcache", "solver": "auto"}, scenes.boundary(medium), 8)
+    found = bake_media(scene)[0]
+    assert found.phase.forward > 0.1
+    cosine = np.linspace(-0.99, 0.99, 50)
+    towards = mi.Vector3f(np.float32([np.sqrt(1 - cosine**2), 0 * cosine, cosine]))
+    # Light that comes from ``towards`` and is seen along a ray there goes on by the angle between.
+    gain = np.array(found.phase.gain(mi.Point3f(0), mi.Vector3f(0, 0, 1), towards), np.float64)
+    scattered = float(found.sigma_t.value[0] * found.albedo.value[0]) * gain
+    g = PHASE["g"]
+    expected = 1.3 * 0.7 * (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5
+    np.testing.assert_allclose(scattered, expected, rtol=1e-4)
