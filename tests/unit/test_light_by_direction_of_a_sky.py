@@ -59,8 +59,8 @@ def test_a_bright_side_is_as_bright_as_it_is(scenes):
 
 def test_an_even_part_of_a_sky_favours_no_side(scenes):
     """Beside a spot, to which almost all bright directions go, the sky is even: in each pass as
-    much light comes from all sides about it, to 2.5 % in the root mean square, as the weights of the
-    directions have it. Alike weights leave 4 % and more.
+    much light comes from all sides about it, to 2.5 % in the root mean square, as the weights of
+    the directions have it. Alike weights leave 4 % and more.
     """
     pixels = np.ones((32, 64))
     pixels[15:17, 31:33] = 3e4
