@@ -136,7 +136,7 @@ SLIPS = (
         "lamps.py",
         "lamp + self._least * away, p)",
         "p + self._least * away, p)",
-        (LAMPS, "tests/system/test_lamps.py"),
+        ("tests/unit/test_places_beside_lamps.py",),
     ),
     Mutant(
         "halves of slices exchanged (extinction)",
