@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from experiments.mutation.mutants import CACHE, PROJECTION, SWEEP, UNBIASED, Mutant
 
+BOUNDS = "tests/system/test_no_access_out_of_bounds.py"
 LATTICE = "tests/unit/test_lattice.py"
 SCATTERING = "tests/unit/test_scattering.py"
 LINE_DIRECTIONS = "tests/unit/test_directions_of_lines.py"
@@ -38,7 +39,7 @@ SLIPS = (
         "solvers/lattice.py",
         "(stride, lower[k], upper[k] - 1)",
         "(stride, lower[k], upper[k])",
-        (LATTICE,),
+        (BOUNDS,),
     ),
     Mutant(
         "directions of lines against their axis not turned (lattice)",
@@ -192,7 +193,7 @@ SLIPS = (
         "projection.py",
         "bend = 0.5 * (sigma_a - sigma_b) * length",
         "bend = 0.5 * (sigma_b - sigma_a) * length",
-        (EMISSION,),
+        ("tests/unit/test_emission_of_a_segment.py",),
     ),
     Mutant(
         "behind a null surface a medium is seen from the camera on (sight)",
@@ -213,7 +214,7 @@ SLIPS = (
         "packets.py",
         "max(n - 2, 0)) for n in sides",
         "max(n - 1, 0)) for n in sides",
-        (GRID,),
+        (BOUNDS,),
     ),
     Mutant(
         "macrocells without the voxel above them",
