@@ -4,7 +4,7 @@ a wrong neighbour, a missing factor, exchanged axes, a normalisation for cubic v
 
 from __future__ import annotations
 
-from experiments.mutation.mutants import CACHE, PROJECTION, SWEEP, UNBIASED, Mutant
+from experiments.mutation.mutants import CACHE, PROJECTION, UNBIASED, Mutant
 
 BOUNDS = "tests/system/test_no_access_out_of_bounds.py"
 LATTICE = "tests/unit/test_lattice.py"
@@ -20,7 +20,6 @@ EMISSION = "tests/system/test_emission.py"
 LAYERS = "tests/system/test_layers.py"
 GRID = "tests/unit/test_grid.py"
 MACROCELLS = "tests/unit/test_macrocells.py"
-EDGES = "tests/unit/test_edges.py"
 VOLUME_FILES = "tests/unit/test_volumes_files.py"
 PROCESSING = "tests/unit/test_volumes_processing.py"
 TRANSFER = "tests/unit/test_volumes_transfer.py"
@@ -82,13 +81,6 @@ SLIPS = (
         "scale = ratio * sides / grid.resolution",
         "scale = np.ones(3)",
         (COARSER,),
-    ),
-    Mutant(
-        "depths of collisions by the longest edge of a voxel (scattering)",
-        "solvers/scattering.py",
-        "size = float(self.grid.voxel_size.min())",
-        "size = float(self.grid.voxel_size.max())",
-        (SCATTERING, SWEEP),
     ),
     Mutant(
         "coarse corrections moved by half a voxel (scattering)",
@@ -235,7 +227,7 @@ SLIPS = (
         "edges.py",
         "mi.Vector3f([mi.Float(n - 1) for n in self.cells])",
         "mi.Vector3f([mi.Float(n) for n in self.cells])",
-        (EDGES,),
+        (BOUNDS,),
     ),
     Mutant(
         "lines enter half a slice later (arrivals)",

@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid, GridField
+from mitsuba_irrcache.edges import Edges
+from mitsuba_irrcache.grid import Grid, GridField, RootField
 from mitsuba_irrcache.packets import Lookups
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -59,6 +60,17 @@ def test_lookups(reported, shape):
             dr.eval([field.at_world(p) for field in fields])
 
     assert not reported(action)
+
+
+def test_lookups_beside_surfaces(reported):
+    """In cells that a surface cuts, up to the far corner of the grid, and beyond."""
+    grid, rng = Grid((3, 4, 5), np.eye(4)), np.random.default_rng(2)
+    ball = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.6}
+    edges = Edges(mi.load_dict({"type": "scene", "ball": ball}), grid)
+    field = RootField(grid, mi.Float(np.float32(rng.random(60) + 0.5)), 1)
+    p = mi.Point3f(np.float32(rng.choice([-0.5, 0.0, 0.4, 1.0, 1.2, 1.5], (3, 500))))
+    active = dr.full(mi.Bool, True, 500)
+    assert not reported(lambda: dr.eval(edges.corrected(field, p, field.at_world(p), active)))
 
 
 HG = {"type": "hg", "g": 0.5}
