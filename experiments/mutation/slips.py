@@ -241,7 +241,7 @@ SLIPS = (
         "transport.py",
         "far = dr.minimum(si.t, ray.maxt)",
         "far = dr.minimum(si.t, dr.inf)",
-        ("tests/unit/test_transport.py", UNBIASED),
+        ("tests/unit/test_visibility_within_a_medium.py",),
     ),
     Mutant(
         "emitters sampled one vertex too late (transport)",
