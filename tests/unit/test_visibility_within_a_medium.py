@@ -22,7 +22,8 @@ def test_transmittance_between_two_places(scenes, varies):
     density = 1.5 * np.ones((4, 4, 8), np.float32)
     density[..., 4:] = 0.5  # beyond x = 0, linear in between over a quarter
     shape = scenes.boundary(scenes.medium(density if varies else 1.1, 0.5, place), place)
-    scene = scenes.load({"type": "volpath"}, shape, 2)
+    beside = {"type": "sphere", "center": [0, 4, 0]}
+    scene = scenes.load({"type": "volpath"}, shape, 2, beside=beside)
     (medium,) = bake_media(scene)
     vertex = dr.zeros(mi.Interaction3f, count)
     vertex.p = mi.Point3f(-0.6, 0.1, 0.2)
