@@ -1,6 +1,6 @@
 """No kernel reads or writes outside of its arrays: Dr.Jit checks every access in its debug mode.
 
-What is read there is random: it may weigh nothing for years, and then be NaN.
+What is read there is arbitrary: with a weight of 0 it changes nothing, unless it is NaN.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from mitsuba_irrcache.compare.metrics import discretisation_error, noise
 
 
 @pytest.mark.parametrize(("own", "reference"), [(0.0, 0.3), (0.2, 0.0), (0.2, 0.3)])
-def test_noise_of_runs_and_reference_is_told_from_a_common_error(own, reference):
+def test_noise_is_separated_from_the_common_error(own, reference):
     """Pixels off by 0.1 in both runs, noise of each run, and of each half of the reference."""
     rng, shape = np.random.default_rng(1), (256, 256, 3)
     truth = rng.uniform(0, 1, shape)
