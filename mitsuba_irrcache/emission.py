@@ -74,7 +74,9 @@ class Emission:
         """For each of a medium's macrocells whether there may be light in it."""
         if self.grid is None or cells.count == 1:
             return dr.full(mi.Bool, True, cells.count)
-        own = SimpleNamespace(macrocells=Macrocells.build(self.field, None))
+        own = SimpleNamespace(
+            macrocells=Macrocells.build(self.field, None), sigma_t=self.field, boundary=None
+        )
         nz, ny, nx = cells.shape
         place = np.linalg.inv(cells.coordinates.matrix) @ np.diag([nx, ny, nz, 1.0])
         grid = Grid(cells.shape, place)

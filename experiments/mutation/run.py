@@ -20,6 +20,8 @@ from functools import partial
 from pathlib import Path
 
 from experiments.mutation.mutants import MUTANTS, Mutant
+from experiments.mutation.outside import OUTSIDE
+from experiments.mutation.slips import SLIPS
 from experiments.options import parser_of
 from experiments.store import Store
 from mitsuba_irrcache.compare.tables import Table
@@ -29,6 +31,7 @@ PARTS = ("mitsuba_irrcache", "integrators", "scenes", "tests", "experiments", "p
 #: Packages that an installation maps into another one: in a copy they are links.
 MAPPED = ("integrators", "scenes")
 SURVIVED = "survived"
+ALL = (*MUTANTS, *OUTSIDE, *SLIPS)
 
 
 def main() -> int:
@@ -41,7 +44,7 @@ def main() -> int:
     store = Store(folder / "results.json", args.force)
     rows = {
         mutant.name: store.row(mutant.name, partial(verdict, mutant))
-        for mutant in MUTANTS
+        for mutant in ALL
         if args.only in mutant.name
     }
     print(tabulated(rows).as_text())

@@ -10,7 +10,7 @@ import pytest
 from experiments import analysis, methods, scenes
 from experiments.figure2 import plot as figure2_plot
 from experiments.figure2 import run as figure2_run
-from experiments.mutation.mutants import MUTANTS
+from experiments.mutation.run import ALL as MUTANTS
 from experiments.mutation.run import PROJECT
 from experiments.options import FULL, QUICK, Options, Size
 from experiments.others import run as others_run

@@ -1,0 +1,372 @@
+"""Mutants that an ordinary slip makes, spread over all modules: an index off by one, a wrong sign,
+a wrong neighbour, a missing factor, exchanged axes, a normalisation for cubic voxels only.
+"""
+
+from __future__ import annotations
+
+from experiments.mutation.mutants import CACHE, PROJECTION, UNBIASED, Mutant
+
+BOUNDS = "tests/system/test_no_access_out_of_bounds.py"
+LATTICE = "tests/unit/test_lattice.py"
+SCATTERING = "tests/unit/test_scattering.py"
+LINE_DIRECTIONS = "tests/unit/test_directions_of_lines.py"
+SKIES = "tests/unit/test_light_by_direction_of_a_sky.py"
+COARSER = "tests/unit/test_coarser_levels.py"
+MEANS = "tests/unit/test_means_over_voxels.py"
+LAMPS = "tests/unit/test_lamps.py"
+SURFACES = "tests/system/test_surfaces.py"
+AMONG_SURFACES = "tests/system/test_sweep_among_surfaces.py"
+EMISSION = "tests/system/test_emission.py"
+LAYERS = "tests/system/test_layers.py"
+GRID = "tests/unit/test_grid.py"
+MACROCELLS = "tests/unit/test_macrocells.py"
+VOLUME_FILES = "tests/unit/test_volumes_files.py"
+PROCESSING = "tests/unit/test_volumes_processing.py"
+TRANSFER = "tests/unit/test_volumes_transfer.py"
+METRICS_OF_RUNS = "tests/unit/test_common_error_of_two_runs.py"
+
+SLIPS = (
+    Mutant(
+        "the way back begins a slice too far (lattice)",
+        "solvers/lattice.py",
+        "(int(self.sides[axis]) - 1) * slope",
+        "int(self.sides[axis]) * slope",
+        (LATTICE,),
+    ),
+    Mutant(
+        "sharpening takes the last voxel of a box for an inner one (lattice)",
+        "solvers/lattice.py",
+        "(stride, lower[k], upper[k] - 1)",
+        "(stride, lower[k], upper[k])",
+        (BOUNDS,),
+    ),
+    Mutant(
+        "directions of lines against their axis not turned (lattice)",
+        "solvers/lattice.py",
+        "directions[i] * np.sign(velocity[axis])",
+        "directions[i]",
+        (LINE_DIRECTIONS,),
+    ),
+    Mutant(
+        "lines that begin next to a side pass half a slice at least (lines)",
+        "solvers/lines.py",
+        "dr.select(voxel == self.entry, least(near, 0.5), 0.5)",
+        "dr.select(voxel == self.entry, dr.maximum(near, 0.5), 0.5)",
+        (LATTICE,),
+    ),
+    Mutant(
+        "lines that enter between slices collide in half a slice (lines)",
+        "solvers/lines.py",
+        "to_middle = dr.select(since < 1, since, 0.5) * first",
+        "to_middle = 0.5 * first",
+        ("tests/unit/test_light_of_lines_in_matter.py",),
+    ),
+    Mutant(
+        "passes take the rows of the pass behind them (passes)",
+        "solvers/passes.py",
+        "np.cumsum([0] + [len(row[0]) for row in rows])",
+        "np.cumsum([len(row[0]) for row in rows])",
+        (AMONG_SURFACES,),
+    ),
+    Mutant(
+        "coarse extinction as if made of eight voxels always (scattering)",
+        "solvers/scattering.py",
+        "total / len(children)",
+        "total / 8",
+        (COARSER,),
+    ),
+    Mutant(
+        "coarser grids of odd sides squeezed into the box (scattering)",
+        "solvers/scattering.py",
+        "scale = ratio * sides / grid.resolution",
+        "scale = np.ones(3)",
+        (COARSER,),
+    ),
+    Mutant(
+        "coarse corrections moved by half a voxel (scattering)",
+        "solvers/scattering.py",
+        "(mi.Float(at) + 0.5) * dr.opaque",
+        "mi.Float(at) * dr.opaque",
+        (COARSER,),
+    ),
+    Mutant(
+        "voxels send the same light both ways (moments)",
+        "solvers/moments.py",
+        "even - odd, place + step",
+        "even + odd, place + step",
+        (LINE_DIRECTIONS,),
+    ),
+    Mutant(
+        "even directions without their own weights beside bright ones (directions)",
+        "solvers/directions.py",
+        "            angle[: len(plain)] *= weights * uniform\n",
+        "",
+        (SKIES,),
+    ),
+    Mutant(
+        "density of bright directions without that of their opposites (directions)",
+        "solvers/directions.py",
+        "for sign in (1, -1):",
+        "for sign in (1,):",
+        (SKIES,),
+    ),
+    Mutant(
+        "solid angle of lamps by the distance, not its square (lamps of the sweep)",
+        "solvers/lamps.py",
+        "cosine / (dr.square(distance) * found.pdf)",
+        "cosine / (distance * found.pdf)",
+        ("tests/unit/test_solid_angle_of_lamps.py",),
+    ),
+    Mutant(
+        "each lamp as bright as their mean (lamps of the sweep)",
+        "solvers/lamps.py",
+        "weight = mi.Float(count) / mi.Float(samples)",
+        "weight = 1 / mi.Float(samples)",
+        ("tests/unit/test_light_of_several_lamps.py",),
+    ),
+    Mutant(
+        "places pushed away from lamps from where they are (lamps)",
+        "lamps.py",
+        "lamp + self._least * away, p)",
+        "p + self._least * away, p)",
+        ("tests/unit/test_places_beside_lamps.py",),
+    ),
+    Mutant(
+        "halves of slices exchanged (extinction)",
+        "solvers/extinction.py",
+        "halves[0] | halves[1] << 16",
+        "halves[1] | halves[0] << 16",
+        (LATTICE,),
+    ),
+    Mutant(
+        "extinction at the border interpolated with the next row's (extinction)",
+        "solvers/extinction.py",
+        "int(sides[k]) - 1)",
+        "int(sides[k]))",
+        (LATTICE,),
+    ),
+    Mutant(
+        "blocks of voxels with their axes exchanged (baking)",
+        "solvers/baking.py",
+        "np.ndindex(*block[::-1])",
+        "np.ndindex(*block)",
+        (MEANS,),
+    ),
+    Mutant(
+        "blocks of voxels that do not fill the grid (baking)",
+        "solvers/baking.py",
+        "block = np.where(data.resolution % block == 0, block, 1)",
+        "block = np.where(data.resolution % block >= 0, block, 1)",
+        (MEANS,),
+    ),
+    Mutant(
+        "rays skip one macrocell too many",
+        "projection.py",
+        "wall = c + clearance",
+        "wall = c + clearance + 1",
+        (PROJECTION,),
+    ),
+    Mutant(
+        "errors of a segment are those of its near end",
+        "projection.py",
+        "near * a + far * b for",
+        "near * a + far * a for",
+        ("tests/unit/test_errors_along_a_ray.py",),
+    ),
+    Mutant(
+        "what rays know of a lamp is that of the whole ray, not the segment",
+        "projection.py",
+        "self.falloff.means(lamps, t, end)",
+        "self.falloff.means(lamps, near, end)",
+        ("tests/system/test_lamps.py",),
+    ),
+    Mutant(
+        "emission of a segment bent to the wrong side",
+        "projection.py",
+        "bend = 0.5 * (sigma_a - sigma_b) * length",
+        "bend = 0.5 * (sigma_b - sigma_a) * length",
+        ("tests/unit/test_emission_of_a_segment.py",),
+    ),
+    Mutant(
+        "behind a null surface a medium is seen from the camera on (sight)",
+        "sight.py",
+        "            near = dr.select(crosses, far, near)\n",
+        "",
+        ("tests/unit/test_null_surfaces_in_a_medium.py",),
+    ),
+    Mutant(
+        "depth of media behind others as if these were clear (sight)",
+        "sight.py",
+        "old + scale * new for",
+        "old + new for",
+        ("tests/unit/test_null_surfaces_in_a_medium.py",),
+    ),
+    Mutant(
+        "the last voxel interpolated with the next row's first (packets)",
+        "packets.py",
+        "max(n - 2, 0)) for n in sides",
+        "max(n - 1, 0)) for n in sides",
+        (BOUNDS,),
+    ),
+    Mutant(
+        "macrocells without the voxel above them",
+        "macrocells.py",
+        "for k in range(size + 2)",
+        "for k in range(size + 1)",
+        (MACROCELLS,),
+    ),
+    Mutant(
+        "the last macrocell ends at its wall",
+        "macrocells.py",
+        "cell >= limits, cell <= 0)",
+        "cell > limits, cell <= 0)",
+        (MACROCELLS,),
+    ),
+    Mutant(
+        "no cell at the far border of a cut grid (edges)",
+        "edges.py",
+        "mi.Vector3f([mi.Float(n - 1) for n in self.cells])",
+        "mi.Vector3f([mi.Float(n) for n in self.cells])",
+        (BOUNDS,),
+    ),
+    Mutant(
+        "lines enter half a slice later (arrivals)",
+        "solvers/arrivals.py",
+        "b, c = dr.fma(a - 0.5, slope_b, b)",
+        "b, c = dr.fma(a, slope_b, b)",
+        (LINE_DIRECTIONS,),
+    ),
+    Mutant(
+        "media behind a lamp in its way (transport)",
+        "transport.py",
+        "far = dr.minimum(si.t, ray.maxt)",
+        "far = dr.minimum(si.t, dr.inf)",
+        ("tests/unit/test_visibility_within_a_medium.py",),
+    ),
+    Mutant(
+        "emitters sampled one vertex too late (transport)",
+        "transport.py",
+        "(depth + 1 < max_depth)",
+        "(depth < max_depth)",
+        ("tests/unit/test_transport.py",),
+    ),
+    Mutant(
+        "emission beyond the wall of a macrocell (tracking)",
+        "tracking.py",
+        "end = dr.minimum(dr.select(leaves, wall, candidate), shines_to)",
+        "end = dr.minimum(candidate, shines_to)",
+        (EMISSION,),
+    ),
+    Mutant(
+        "early images take the same samples again (path)",
+        "solvers/path.py",
+        "self._estimator.sums(voxels, 0, 2, self.size, more)",
+        "self._estimator.sums(voxels, 0, 2, 0, more)",
+        ("tests/unit/test_rendering.py", "tests/system/test_progressive.py"),
+    ),
+    Mutant(
+        "a lamp in the medium shaded by what is behind it (path)",
+        "solvers/path.py",
+        "dr.minimum(far, record.dist)",
+        "dr.minimum(far, dr.inf)",
+        (UNBIASED, "tests/system/test_lamps.py"),
+    ),
+    Mutant(
+        "the brightest light of a cache without what lamps add (cache)",
+        "cache.py",
+        "field.maximum *= self.falloff.maximum(self.active)",
+        "field.maximum *= 1",
+        ("tests/unit/test_brightest_light.py",),
+    ),
+    Mutant(
+        "light extrapolated without a limit (grid)",
+        "grid.py",
+        "dr.clip(outermost / dr.select(known, other, 1), 1 / STEEPEST, STEEPEST)",
+        "outermost / dr.select(known, other, 1)",
+        (GRID,),
+    ),
+    Mutant(
+        "voxels half a voxel below matter are not active (cache)",
+        "cache.py",
+        "dr.floor(c - extent - 0.5 - 1e-3)",
+        "dr.floor(c - extent + 1e-3)",
+        (CACHE,),
+    ),
+    Mutant(
+        "width of the fixed filter by pixels without a medium, too",
+        "filtering.py",
+        "/ dr.count(valid)",
+        "/ dr.width(valid)",
+        ("tests/unit/test_filter_symmetry_and_rejection.py",),
+    ),
+    Mutant(
+        "crop windows filtered as if they were not moved (reconstruction)",
+        "reconstruction.py",
+        "int(n) + 0.5) for n in film.crop_offset()",
+        "0.5) for n in film.crop_offset()",
+        ("tests/unit/test_reconstruction.py",),
+    ),
+    Mutant(
+        "light scattered once as if no peak had been taken away (phase functions)",
+        "phase.py",
+        "4 * dr.pi / (1 - self.forward) * value[0]",
+        "4 * dr.pi * value[0]",
+        ("tests/unit/test_unscattered_light.py",),
+    ),
+    Mutant(
+        "axes exchanged of cells that a flame reaches (emission)",
+        "emission.py",
+        "np.diag([nx, ny, nz, 1.0])",
+        "np.diag([nz, ny, nx, 1.0])",
+        ("tests/unit/test_segments_of_a_ray.py",),
+    ),
+    Mutant(
+        "lamps blurred by twice their size (directional)",
+        "directional.py",
+        "dr.exp(-0.5 * variance)",
+        "dr.exp(-variance)",
+        ("tests/unit/test_directional.py",),
+    ),
+    Mutant(
+        "a volume's axes as rows of its placement (DICOM)",
+        "volumes/dicom.py",
+        "np.linalg.norm(stack)], axis=1)",
+        "np.linalg.norm(stack)], axis=0)",
+        (VOLUME_FILES,),
+    ),
+    Mutant(
+        "a cropped volume moved along the wrong axes",
+        "volumes/processing.py",
+        "@ (x0, y0, z0, 1.0)",
+        "@ (z0, y0, x0, 1.0)",
+        (PROCESSING,),
+    ),
+    Mutant(
+        "colours of percentiles without their lower end (transfer functions)",
+        "volumes/transfer.py",
+        "colour_values=low + self.colour_values",
+        "colour_values=self.colour_values",
+        (TRANSFER,),
+    ),
+    Mutant(
+        "spacing of a grid file with its axes exchanged (readers)",
+        "volumes/readers.py",
+        "values.shape[2::-1]",
+        "values.shape[:3]",
+        (VOLUME_FILES,),
+    ),
+    Mutant(
+        "two runs compared with the same half of a reference (metrics)",
+        "compare/metrics.py",
+        "np.mean((x - a) * (y - b), dtype",
+        "np.mean((x - a) * (y - a), dtype",
+        (METRICS_OF_RUNS,),
+    ),
+    Mutant(
+        "noise of a difference taken for that of one run (metrics)",
+        "compare/metrics.py",
+        "_root(0.5 * np.mean(",
+        "_root(np.mean(",
+        (METRICS_OF_RUNS,),
+    ),
+)

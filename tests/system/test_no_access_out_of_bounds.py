@@ -1,0 +1,101 @@
+"""No kernel reads or writes outside of its arrays: Dr.Jit checks every access in its debug mode.
+
+What is read there is arbitrary: with a weight of 0 it changes nothing, unless it is NaN.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.edges import Edges
+from mitsuba_irrcache.grid import Grid, GridField, RootField
+from mitsuba_irrcache.packets import Lookups
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+@pytest.fixture
+def reported(capfd):
+    """Runs an action in debug mode: what Dr.Jit reports."""
+
+    def run(action) -> str:
+        level = dr.log_level()
+        capfd.readouterr()
+        dr.set_log_level(dr.LogLevel.Warn)
+        try:
+            with dr.scoped_set_flag(dr.JitFlag.Debug):
+                action()
+                dr.sync_thread()
+        finally:
+            dr.set_log_level(level)
+        lines = "".join(capfd.readouterr()).splitlines()
+        return "\n".join(line for line in lines if "out-of-bounds" in line)
+
+    return run
+
+
+def test_the_check_finds_one(reported):
+    """A read behind the end, and a write."""
+    values = mi.Float([1, 2, 3, 4])
+    assert reported(lambda: dr.eval(dr.gather(mi.Float, values, mi.UInt32([1, 4]))))
+    assert reported(lambda: dr.scatter(values, mi.Float(1), mi.UInt32([1, 9])) or dr.eval(values))
+
+
+@pytest.mark.parametrize("shape", [(4, 5, 6), (1, 7, 1), (1, 1, 1)], ids=str)
+def test_lookups(reported, shape):
+    """Of one field and of two, in the grid, on its border, and beyond."""
+    grid, rng = Grid(shape, np.eye(4)), np.random.default_rng(1)
+    count = grid.voxel_count
+    grey = GridField(grid, mi.Float(np.float32(rng.random(count))), 1)
+    colour = GridField(grid, mi.Float(np.float32(rng.random(3 * count))), 3)
+    places = rng.choice([-0.5, 0.0, 0.3, 0.999999, 1.0, 1.5], (3, 2000))
+    p = mi.Point3f(np.float32(places))
+
+    def action() -> None:
+        for fields in ([grey], [grey, colour]):
+            dr.eval(Lookups(fields).at_world(p, mi.Bool(True)))
+            dr.eval([field.at_world(p) for field in fields])
+
+    assert not reported(action)
+
+
+def test_lookups_beside_surfaces(reported):
+    """In cells that a surface cuts, up to the far corner of the grid, and beyond."""
+    grid, rng = Grid((3, 4, 5), np.eye(4)), np.random.default_rng(2)
+    ball = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.6}
+    edges = Edges(mi.load_dict({"type": "scene", "ball": ball}), grid)
+    field = RootField(grid, mi.Float(np.float32(rng.random(60) + 0.5)), 1)
+    p = mi.Point3f(np.float32(rng.choice([-0.5, 0.0, 0.4, 1.0, 1.2, 1.5], (3, 500))))
+    active = dr.full(mi.Bool, True, 500)
+    assert not reported(lambda: dr.eval(edges.corrected(field, p, field.at_world(p), active)))
+
+
+HG = {"type": "hg", "g": 0.5}
+SCENES = {
+    "single scattering": ({"max_depth": 2}, {}, {}),
+    "by direction": ({}, {"phase": HG}, {}),
+    "with layers": ({"aovs": "noise,bias,depth", "filter": "bilateral"}, {}, {}),
+    "path": ({"solver": "path", "max_depth": 3, "aovs": "noise"}, {}, {}),
+    "lamp inside": (
+        {}, {}, {"emitter": {"type": "point", "position": [0.3, 0.2, 0.1], "intensity": 2.0}},
+    ),
+    "surfaces": ({}, {}, {"ball": {"type": "sphere", "center": [0, -2.2, 0], "radius": 1.0}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("settings", "medium", "objects"), SCENES.values(), ids=SCENES)
+def test_images(scenes, reported, settings, medium, objects):
+    """Small caches of odd sides over a cloud with empty parts, turned, of oblong voxels."""
+    density = scenes.texture((7, 5, 9), 0.0, 4.0, 3)
+    density[:3, :3] = 0
+    place = scenes.placement((2.0, 1.5, 1.0), turn=20)
+    albedo = scenes.texture((7, 5, 9, 3), 0.5, 1.0, 4)
+    shape = scenes.boundary(scenes.medium(density, albedo, place, **medium), place)
+    integrator = {"type": "irrcache", "solver": "auto", "resolution": 11, "cache_spp": 128}
+    if settings.get("solver") == "path":
+        integrator["cache_spp"] = 16
+    scene = scenes.load(integrator | settings, shape, 6, **objects)
+    assert not reported(lambda: scenes.image(scene, spp=2))

@@ -1,0 +1,31 @@
+"""The brightest light of a cache, by which rays end early: no less than any that is looked up."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.cache import BATCH, IrradianceCache
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.lamps import Falloff
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+@pytest.mark.parametrize("correlated", [True, False])
+@pytest.mark.parametrize("lamp", [(0.5, 0.5, 0.5), (0.47, 0.62, 0.5)], ids=str)
+def test_maximum_is_reached_by_no_voxel(lamp, correlated):
+    """Light of a lamp in the medium, and at the centres of voxels what the cache holds there."""
+    grid, voxels = Grid((8, 8, 8), np.eye(4)), mi.UInt32(np.arange(512, dtype=np.uint32))
+    light = {"type": "point", "position": list(lamp), "intensity": 3.0}
+    cache = IrradianceCache(grid, voxels, 1, -1, correlated=correlated)
+    cache.falloff = Falloff.of(mi.load_dict({"type": "scene", "lamp": light}), grid)
+    places = cache.falloff.places.of(voxels)
+    way = np.array(places, np.float64) - np.array(lamp)[:, None]
+    phi = 3 / np.sum(way**2, axis=0)
+    cache.add(0, 2 * BATCH, [((cache.real(2 * phi), None), (cache.real(0 * phi),))])
+    field = cache.field()
+    found = np.array(field.at_world(places) * cache.falloff.at(places), np.float64)
+    np.testing.assert_allclose(found, phi, rtol=0.35)
+    assert field.maximum >= 0.999 * found.max()

@@ -1,0 +1,70 @@
+"""Coarser grids of the hierarchy: they lie where the finer one does, hold as much matter, and what
+goes there and back stays where it was; of voxels of any proportions.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.scattering import Level
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+#: Voxels along z, y, x, and the edges of one along x, y, z.
+GRIDS = {
+    "cubes": ((24, 22, 26), (1.0, 1.0, 1.0)),
+    "1:1:5": ((8, 24, 22), (1.0, 1.0, 5.0)),
+    "rods": ((6, 9, 26), (1.0, 3.0, 2.5)),
+    "odd sides": ((21, 25, 23), (1.0, 1.2, 0.9)),
+}
+
+
+def level_of(scenes, shape, edges, sigma_t: np.ndarray, evenly: bool) -> Level:
+    sides = np.array(shape)[::-1] * edges
+    grid = Grid(shape, scenes.placement(tuple(sides), turn=20))
+    values = mi.Float(np.float32(sigma_t).ravel())
+    lattice = Lattice(grid, values, np.zeros(3, int), grid.resolution)
+    return Level(values, mi.Float(np.full(values.shape[0], 0.8, np.float32)), lattice, evenly)
+
+
+def centres(level: Level) -> np.ndarray:
+    """World positions of the voxels (n, 3)."""
+    return np.array(level.grid.centers(level.lattice.wanted), np.float64).T
+
+
+@pytest.mark.parametrize("evenly", [False, True])
+@pytest.mark.parametrize(("shape", "edges"), GRIDS.values(), ids=GRIDS)
+def test_matter_stays_where_it_is(scenes, shape, edges, evenly):
+    """The mass of each coarse voxel, extinction times volume, is that of the fine voxels whose
+    centres lie in it: in the world, beyond the end of odd sides too.
+    """
+    sigma_t = np.random.default_rng(3).uniform(0.0, 2.0, shape)
+    level = level_of(scenes, shape, edges, sigma_t, evenly)
+    coarser = level.coarser
+    to_voxels = coarser.grid.coordinates.matrix
+    x, y, z = np.floor(centres(level) @ to_voxels[:3, :3].T + to_voxels[:3, 3]).astype(int).T
+    assert min(x.min(), y.min(), z.min()) == 0
+    voxel = np.ravel_multi_index((z, y, x), coarser.grid.shape)
+    mass = sigma_t.ravel() * np.prod(level.grid.voxel_size)
+    expected = np.bincount(voxel, mass, coarser.grid.voxel_count)
+    found = np.array(coarser.sigma_t, np.float64) * np.prod(coarser.grid.voxel_size)
+    assert len(found) < 0.7 * sigma_t.size
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("evenly", [False, True])
+@pytest.mark.parametrize(("shape", "edges"), GRIDS.values(), ids=GRIDS)
+def test_what_changes_evenly_comes_back(scenes, shape, edges, evenly):
+    """A linear function of the position, in even matter, restricted to the coarser grid and
+    interpolated: itself, but for the voxels beside the border.
+    """
+    level = level_of(scenes, shape, edges, np.ones(shape), evenly)
+    values = centres(level) @ np.array([0.5, -0.3, 0.8])
+    values = np.float32(values - values.min() + 1)
+    found = np.array(level.prolong(level.restrict(mi.Float(values)))).reshape(shape)
+    inner = tuple(slice(2, max(n - 3, 3)) for n in shape)
+    np.testing.assert_allclose(found[inner], values.reshape(shape)[inner], rtol=1e-4)

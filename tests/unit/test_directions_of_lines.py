@@ -1,0 +1,139 @@
+"""The direction of light that lines carry: each way, against the axis too."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.directional import Directional
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.phase import Phase
+from mitsuba_irrcache.solvers.arrivals import Arrivals
+from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.lines import ONE
+from mitsuba_irrcache.solvers.moments import DirectionalLevel, Moments
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SHAPE = (5, 7, 5)
+MIDDLE = (2, 3, 2)
+#: Two of each octant, of all dominant axes.
+WAYS = np.array(
+    [
+        s * np.roll([0.8, 0.5, 0.3], k)
+        for k in (0, 1, 2)
+        for s in np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, -1]])
+    ]
+)
+WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
+
+
+def moments_of(g: float, order: int = 2) -> Moments:
+    return Moments(Directional(Phase(None, g ** np.arange(32), 1.0), []), order)
+
+
+def lines(extinction: float) -> Lattice:
+    grid = Grid(SHAPE, np.diag([1.0, 1.4, 1.0, 1]))
+    sigma_t = dr.full(mi.Float, extinction, grid.voxel_count)
+    return Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
+
+
+def harmonics(moments: Moments, towards: np.ndarray) -> np.ndarray:
+    """What light from there adds to each moment."""
+    basis = moments.basis(mi.Vector3f(*towards.tolist()))
+    return np.array([np.array(y).ravel()[0] for y in basis], np.float64)
+
+
+@pytest.mark.parametrize("way", WAYS, ids=lambda w: ",".join(f"{x:.1f}" for x in w))
+@pytest.mark.parametrize("back", [False, True])
+def test_moments_of_light_through_nothing(way, back):
+    """Light that goes along a direction comes from its opposite, whichever of both is named first
+    and whatever the sign of its largest component.
+    """
+    moments, light = moments_of(0.5), np.array([[0.0, 2.0]] if back else [[2.0, 0.0]])
+    found = moments.carry(lines(0.0), way[None], light, np.array([[0.3, 0.6]]))
+    found = np.array(found, np.float64).reshape(moments.count, -1)
+    expected = 2 * harmonics(moments, way if back else -way)
+    np.testing.assert_allclose(found, np.broadcast_to(expected[:, None], found.shape), atol=1e-5)
+
+
+def centred(level: DirectionalLevel, ways: np.ndarray) -> np.ndarray:
+    """Offsets with which the lines of these directions go through the middle of the middle voxel:
+    the set of all lines is symmetric about it.
+    """
+    velocities = ways @ level.grid.coordinates.matrix[:3, :3].T
+    offsets = []
+    for velocity in velocities:
+        axis = int(np.abs(velocity).argmax())
+        across = [k for k in range(3) if k != axis]
+        half = (level.grid.resolution[axis] - 1) / 2
+        offsets.append([(0.5 - half * velocity[k] / velocity[axis]) % 1 for k in across])
+    return np.array(offsets)
+
+
+def test_light_that_a_voxel_scatters_goes_on_forward():
+    """Of one voxel that light comes to along an oblique direction, and that scatters forwards with
+    g = 0.5, along all lines: what voxels receive is mirrored about it if the light comes from the
+    opposite side, and the voxels ahead receive 4 pi p of the angle, those behind likewise.
+    """
+    moments, of_matter = moments_of(0.5), lines(0.2)
+    fields = dr.full(mi.Float, 0.2, of_matter.count), dr.full(mi.Float, 1.0, of_matter.count)
+    level = DirectionalLevel(*fields, of_matter, moments=moments)
+    ways = WAYS[:15]
+    table = ways, np.zeros((15, 2)), np.full(15, 2 * np.pi / 15), centred(level, ways)
+    heading, received = np.array([0.6, 0.48, 0.64]), []
+    for sign in (1, -1):
+        phi = np.zeros((moments.count, *SHAPE))
+        phi[(slice(None), *MIDDLE)] = harmonics(moments, -sign * heading)
+        light, _ = level.scatter(mi.Float(phi.ravel().tolist()), of_matter.table(*table))
+        received.append(np.array(light, np.float64).reshape(phi.shape)[0])
+    ahead, behind = received
+    np.testing.assert_allclose(np.flip(behind), ahead, rtol=2e-3, atol=1e-5 * ahead.max())
+    at = np.moveaxis(np.indices(SHAPE)[::-1], 0, -1) - np.array(MIDDLE)[::-1]
+    cosine = (at * level.grid.voxel_size) @ heading
+    forwards = (cosine > 0) & (ahead > 0)
+    assert ahead[forwards].sum() > 3 * behind[forwards].sum()
+    # What lines see of the voxel is in proportion to p truncated to the moments that there are.
+    lit = ahead + behind > 1e-6
+    lit[MIDDLE] = False
+    share = (ahead - behind)[lit] / (ahead + behind)[lit]
+    mean = [(1 + 5 * 0.25 * 0.5 * (3 * c * c - 1), 3 * 0.5 * c) for c in ways @ heading]
+    bounds = max(abs(odd / even) for even, odd in mean)
+    assert np.abs(share).max() == pytest.approx(bounds, rel=0.05)
+
+
+class Nothing:
+    """What is around a medium where that does not matter."""
+
+    shines, directional = False, None
+
+
+def test_paths_begin_on_their_lines(scenes, monkeypatch):
+    """Followed on from where its path begins, each line passes the middle of all slices at the
+    places of the lattice: a whole number of voxels from the first line.
+    """
+    monkeypatch.setattr(
+        "mitsuba_irrcache.solvers.arrivals._follow",
+        lambda *args: (None, None, None, mi.UInt32(0), None),
+    )
+    grid = Grid((12, 10, 8), scenes.placement((1.0, 3.0, 2.0), turn=35))
+    lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])
+    lattice = Lattice(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
+    offsets = np.random.default_rng(3).random((len(WAYS), 2))
+    rows = WAYS, np.zeros((len(WAYS), 2, 3)), np.ones(len(WAYS)), offsets
+    found = Arrivals(Nothing, lattice, rows, True, (0, 0, 0))
+    number, _, hit, ray, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (0, 0, 0))
+    row, hit = np.array(number) // 2, np.array(hit)
+    start = np.array(grid.coordinates.point(ray.o), np.float64)[:, hit].T
+    velocities = WAYS @ grid.coordinates.matrix[:3, :3].T
+    assert hit.sum() > 1000
+    for i, velocity in enumerate(velocities):
+        own = start[row[hit] == i]
+        axis = int(np.abs(velocity).argmax())
+        for k, offset in zip([k for k in range(3) if k != axis], offsets[i], strict=True):
+            slope = round(velocity[k] / velocity[axis] * ONE) / ONE
+            first = own[:, k] + slope * (lower[axis] + 0.5 - own[:, axis])
+            away = (first - offset + 0.5) % 1 - 0.5
+            assert np.quantile(np.abs(away), 0.95) < 5e-3

@@ -1,0 +1,56 @@
+"""Roots that keep the light of the voxels, at every voxel of a grid: whatever the side it is on,
+and whatever lies beside it.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.conservation import conserving
+from mitsuba_irrcache.grid import Grid
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SHAPE = (6, 5, 7)
+RNG = np.random.default_rng(11)
+LIGHT = RNG.uniform(0.1, 4.0, SHAPE)
+KNOWN = RNG.random(SHAPE) < 0.8
+
+
+def kept(light: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The roots made of ``light``, both (z, y, x)."""
+    roots = mi.Float(np.float32(np.sqrt(light)).ravel())
+    found = conserving(Grid(light.shape, np.eye(4)), roots, mi.Bool(known.ravel()))
+    return np.array(found).reshape(light.shape)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_mirrored_light_has_mirrored_roots(axis):
+    """No end of an axis differs from the other, and no neighbour from the opposite one."""
+    mirrored = kept(np.flip(LIGHT, axis), np.flip(KNOWN, axis))
+    np.testing.assert_allclose(mirrored, np.flip(kept(LIGHT, KNOWN), axis), rtol=1e-5)
+
+
+def test_values_that_are_not_known_do_not_matter():
+    """Any values at the unknown voxels give the same roots at all others."""
+    results = [kept(np.where(KNOWN, LIGHT, other), KNOWN)[KNOWN] for other in (0.0, 1.0, 1e4)]
+    np.testing.assert_array_equal(results[0], results[1])
+    np.testing.assert_array_equal(results[0], results[2])
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("count", "lit"), [(3, 1), (5, 1), (5, 3), (4, 2)])
+def test_one_lit_voxel_of_a_row_keeps_its_light(axis, count, lit):
+    """Interpolated roots rise and fall linearly between the lit voxel and its dark neighbours, so
+    their square has the integral r^2 (1/3 + 1/3): this is the light of the voxel, also where it is
+    next to the last one of either end.
+    """
+    shape = np.ones(3, int)
+    shape[2 - axis] = count
+    light = np.zeros(count)
+    light[lit] = 2.5
+    roots = kept(light.reshape(shape), np.ones(shape, bool)).ravel()
+    assert np.flatnonzero(roots).tolist() == [lit]
+    assert 2 / 3 * roots[lit] ** 2 == pytest.approx(2.5, rel=1e-5)

@@ -1,0 +1,59 @@
+"""What lines leave in voxels while they scatter, in even matter, where each line is known."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.solvers import lattice
+from mitsuba_irrcache.solvers.lattice import Lattice
+from mitsuba_irrcache.solvers.lines import ONE
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SHAPE = (6, 9, 7)
+WAYS = np.array([[0.9, 0.3, 0.2], [-0.5, 0.8, 0.4], [0.5, -0.6, 0.9], [1.0, 0.9, -0.8]])
+WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
+
+
+@pytest.fixture(params=["together", "apart"], autouse=True)
+def mode(request, monkeypatch):
+    """One launch for all directions, or one for each."""
+    if request.param == "apart":
+        monkeypatch.setattr(lattice, "SMALL", 0)
+
+
+def behind_the_entry(grid: Grid, way: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """World lengths (z, y, x) of the lines from where they enter the grid up to the middle of each
+    slice.
+    """
+    velocity = grid.coordinates.matrix[:3, :3] @ way
+    axis = int(np.abs(velocity).argmax())
+    at = np.moveaxis(np.indices(grid.shape)[::-1], 0, -1) + 0.5
+    for k, start in zip([k for k in range(3) if k != axis], offset, strict=True):
+        slope = round(velocity[k] / velocity[axis] * ONE)
+        steps = (at[..., axis] - 0.5).astype(int)
+        at[..., k] += (int(start * ONE) + steps * slope) % ONE / ONE - 0.5
+    entry = np.where(velocity > 0, 0, grid.resolution)
+    return ((at - entry) / velocity).min(axis=-1)
+
+
+@pytest.mark.parametrize("way", WAYS, ids=lambda w: ",".join(f"{x:.1f}" for x in w))
+@pytest.mark.parametrize("back", [0, 1])
+def test_light_that_enters_is_less_by_what_it_has_passed(way, back):
+    """e^-tau from the point of entry, which may be between two slices, and in proportion to it the
+    light that collides: with sigma_t of 0.5 to 1 per voxel.
+    """
+    grid, sigma_t = Grid(SHAPE, np.diag([1.4, 1.8, 1.2, 1])), 4.0
+    count = grid.voxel_count
+    lines = Lattice(grid, dr.full(mi.Float, sigma_t, count), np.zeros(3, int), grid.resolution)
+    light, offset = np.zeros((1, 2)), np.array([[0.35, 0.8]])
+    light[0, back] = 3.0
+    volume = dr.opaque(mi.Float, 0, count * 4)
+    lines.scatter(volume, lines.table(way[None], light, np.ones(1), offset))
+    received = np.array(volume, np.float64).reshape(*SHAPE, 4)[..., 1]
+    length = behind_the_entry(grid, -way if back else way, offset[0])
+    np.testing.assert_allclose(received, 3 * np.exp(-sigma_t * length), rtol=2e-3)

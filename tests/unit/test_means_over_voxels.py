@@ -1,0 +1,49 @@
+"""Fields of a medium in voxels that are larger than those of the data, of any proportions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.scene import bake_scene
+from mitsuba_irrcache.solvers.baking import baked, detail_of
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SHAPE = (4, 6, 12)  # z, y, x
+
+
+def medium_of(scenes, density: np.ndarray):
+    place = scenes.placement((2.4, 1.2, 0.8), turn=20)
+    shape = scenes.boundary(scenes.medium(density, 0.5, place), place)
+    return bake_scene(scenes.load({"type": "volpath"}, shape))
+
+
+@pytest.mark.parametrize("block", [(1, 2, 3), (4, 1, 2), (2, 3, 1), (2, 1, 6)], ids=str)
+def test_blocks_are_means_of_their_voxels(scenes, block):
+    """NumPy's means over blocks of so many voxels along z, y, x."""
+    density = scenes.texture(SHAPE, 0.0, 3.0, 9)
+    medium = medium_of(scenes, density)
+    sides = tuple(n // k for n, k in zip(SHAPE, block, strict=True))
+    (found,) = baked(medium, medium.sigma_t, Grid(sides, medium.frame))
+    parts = density.reshape(sides[0], block[0], sides[1], block[1], sides[2], block[2])
+    expected = parts.mean(axis=(1, 3, 5), dtype=np.float64)
+    np.testing.assert_allclose(np.array(found).reshape(sides), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(12, 12, 12), (15, 8, 21), (9, 25, 7), (3, 3, 30)], ids=str)
+@pytest.mark.parametrize("cache", [(2, 2, 2), (4, 3, 5), (3, 1, 2)], ids=str)
+def test_lines_see_whole_voxels_of_the_data(scenes, shape, cache):
+    """Along each axis a voxel of what lines see is one of the cache, or so many of the data without
+    rest, and on average it holds what the data do.
+    """
+    density = scenes.texture(shape, 0.0, 3.0, 9)
+    medium = medium_of(scenes, density)
+    grid = Grid(cache, medium.frame)
+    detail = detail_of(medium, grid)
+    data = np.array(shape)
+    assert detail.shape == cache or not (data % np.array(detail.shape)).any()
+    if detail.shape != cache:
+        (found,) = baked(medium, medium.sigma_t, detail)
+        assert np.mean(np.array(found)) == pytest.approx(density.mean(), rel=1e-4)

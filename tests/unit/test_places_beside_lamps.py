@@ -1,0 +1,34 @@
+"""Where light is computed in voxels that a lamp is in: not too near it, and no farther away."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.lamps import LEAST, Places
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+@pytest.mark.parametrize("aside", [0.0, 1e-3, 0.03, 0.2, 0.6])
+def test_places_keep_away_from_lamps(scenes, aside):
+    """A lamp ``aside`` of a voxel's centre in oblong voxels: the centre is moved straight away from
+    it up to a quarter of the shortest edge, and all others stay.
+    """
+    grid = Grid((5, 6, 7), scenes.placement((7.0, 3.0, 10.0), turn=25))
+    index = mi.UInt32(np.arange(grid.voxel_count, dtype=np.uint32))
+    centres = np.array(grid.centers(index), np.float64).T
+    lamp = centres[100] + aside * np.array([0.48, -0.6, 0.64])
+    light = {"type": "point", "position": lamp.tolist(), "intensity": 1.0}
+    found = np.array(Places(mi.load_dict({"type": "scene", "l": light}), grid).of(index)).T
+    least = LEAST * grid.voxel_size.min()
+    before, after = (np.linalg.norm(p - lamp, axis=1) for p in (centres, found))
+    near = before < least
+    assert near.sum() == (aside < least)
+    np.testing.assert_allclose(after[near], least, rtol=1e-3)
+    np.testing.assert_allclose(found[~near], centres[~near], atol=1e-6)
+    if aside:
+        moved = (found - lamp)[near] / least
+        np.testing.assert_allclose(moved, ((centres - lamp) / before[:, None])[near], atol=5e-3)

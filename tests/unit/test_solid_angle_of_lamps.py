@@ -1,0 +1,39 @@
+"""Which lamps are small as seen from a medium: by the solid angle that they fill."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.solvers import lamps
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+def seen(lamp: dict, scale: float) -> tuple[float, list, list]:
+    """The solid angle of a lamp from a small box about the origin, and whether it is small, or
+    large; all lengths times ``scale``.
+    """
+    place = lamp.pop("to_world")
+    to_world = mi.ScalarTransform4f().scale(scale) @ place
+    shape = lamp | {"to_world": to_world, "emitter": {"type": "area"}}
+    scene = mi.load_dict({"type": "scene", "lamp": shape})
+    frame = np.diag([0.02 * scale] * 3 + [1.0])
+    frame[:3, 3] = -0.01 * scale
+    grid = Grid((4, 4, 4), frame)
+    box = np.zeros(3, int), grid.resolution
+    (emitter,) = scene.emitters()
+    return lamps._solid_angle(emitter, grid, *box), *lamps.split(scene, grid, *box)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("distance", [0.7, 1.5, 4.0])
+def test_solid_angle_of_a_disc(distance, scale):
+    """2 pi (1 - cos) of a disc of radius 1, whatever the unit of length."""
+    place = mi.ScalarTransform4f().translate([0, 0, distance])
+    angle, small, large = seen({"type": "disk", "to_world": place}, scale)
+    expected = 2 * np.pi * (1 - distance / np.hypot(distance, 1))
+    assert angle == pytest.approx(expected, rel=0.05)
+    assert (len(small), len(large)) == ((1, 0) if expected < lamps.LARGE else (0, 1))

@@ -1,0 +1,38 @@
+"""What passes between two places in one medium: matter behind the second is not in the way."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.scene import bake_media
+from mitsuba_irrcache.transport import visibility
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+@pytest.mark.parametrize("varies", [False, True])
+def test_transmittance_between_two_places(scenes, varies):
+    """e^-tau of the way between them, in a box that goes on behind both; of a grid on average over
+    estimates, to 4 standard errors.
+    """
+    count, place = 1 << 14, scenes.placement()
+    density = 1.5 * np.ones((4, 4, 8), np.float32)
+    density[..., 4:] = 0.5  # beyond x = 0, linear in between over a quarter
+    shape = scenes.boundary(scenes.medium(density if varies else 1.1, 0.5, place), place)
+    beside = {"type": "sphere", "center": [0, 4, 0]}
+    scene = scenes.load({"type": "volpath"}, shape, 2, beside=beside)
+    (medium,) = bake_media(scene)
+    vertex = dr.zeros(mi.Interaction3f, count)
+    vertex.p = mi.Point3f(-0.6, 0.1, 0.2)
+    through, _ = visibility(
+        scene, medium.surroundings.media, vertex, mi.Point3f(0.5, 0.1, 0.2),
+        mi.MediumPtr(medium.pointer), mi.PCG32(count), mi.Bool(True),
+    )  # fmt: skip
+    found = np.array(through.x + dr.zeros(mi.Float, count), np.float64)
+    depth = 0.6 * 1.5 + 0.5 * 0.5 if varies else 1.1 * 1.1
+    error = found.std() / np.sqrt(count)
+    assert error < 0.01
+    assert abs(found.mean() - np.exp(-depth)) < 4 * error + 1e-3
