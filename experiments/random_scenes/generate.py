@@ -11,7 +11,7 @@ absolute length that would matter in smaller scenes.
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -45,6 +45,7 @@ EMITTERS = (
     "point far", "spot", "spot inside", "rectangle near", "rectangle far", "disk near",
     "sphere near", "sphere far", "mesh near", "rectangle inside",
 )  # fmt: skip
+ENVIRONMENTS = {"constant", "sun in envmap", "turned envmap"}
 CAMERAS = ("outside", "outside", "outside", "outside, turned", "close", "inside")
 SURROUNDINGS = (
     "none", "none", "none", "none", "none", "ground", "room", "second medium", "ball beside",
@@ -88,7 +89,8 @@ class RandomScene:
             "contrast": pick("contrast", CONTRASTS), "depth": pick("depth", DEPTHS),
             "albedo": pick("albedo", ALBEDOS), "tint": pick("tint", TINTS),
             "phase": pick("phase", PHASES), "boundary": pick("boundary", BOUNDARIES),
-            "sky": emitter != "constant" and pick("sky", (True, False, False)),
+            # Mitsuba has one environment at most.
+            "sky": not ENVIRONMENTS & {emitter} and pick("sky", (True, False, False)),
             "camera": pick("camera", CAMERAS), "surroundings": pick("surroundings", SURROUNDINGS),
             "max_depth": pick("max_depth", MAX_DEPTHS),
         }  # fmt: skip
@@ -96,7 +98,16 @@ class RandomScene:
             drawn["albedo"] = "0.9"  # the paths of volpath would be too long for a reference
         if drawn["phase"] == "hg 0.8":
             drawn["max_depth"] = -1  # refused at other depths
-        return cls(seed, index, emitter=emitter, **drawn)
+        case = cls(seed, index, emitter=emitter, **drawn)
+        return replace(case, depth=case._renderable_depth())
+
+    def _renderable_depth(self) -> float:
+        """The optical depth, less where volpath would be wrong: between the grid and a boundary
+        that is larger, its exp(-majorant length) underflows, and 0 / 0 counts as 0 there.
+        """
+        if self.boundary != "cube, smaller grid" or self.grid is None:
+            return self.depth
+        return float(f"{self.depth * min(1, 40 / self.voxels().max()):.2g}")
 
     def describe(self) -> str:
         """One line for a table."""
@@ -260,7 +271,6 @@ class RandomScene:
         if kind == "constant":
             light = {"type": "constant", "radiance": _rgb(*colour)}
         elif "envmap" in self.emitter:
-            found.pop("sky", None)  # there may be but one environment
             light = self._envmap(random)
         elif kind == "directional":
             irradiance = _rgb(*(3 * colour))
@@ -344,6 +354,8 @@ class RandomScene:
             target = np.array([0.1, 0.0, 1.0]) * SIDE
         if self.surroundings == "room" and self.camera != "inside":
             origin, fov = np.array([0.2, 0.3, -3.4]) * SIDE, 45.0
+        if self.surroundings in ("second medium", "ball beside") and self.camera != "inside":
+            fov = 58.0  # they are to be seen
         film = {
             "type": "hdrfilm", "width": PIXELS, "height": PIXELS, "component_format": "float32",
             "rfilter": {"type": "box"},

@@ -9,7 +9,7 @@ separates the noise of the cache from its bias. The reference is rendered by vol
 where it is cheaper) in two independent halves. A pilot chooses its samples: the noise of a pixel is
 to be 4 % of the mean radiance in each half, which makes that of the mean much less than a third of
 a percent; all of the reference gets about ``--seconds``. A scene whose mean is not known to a third
-of a percent by then counts as undecided.
+of a percent by then counts as undecided; where that of the volume alone is not, it says so.
 
 Printed are the difference of the means; the RMSE, the noise of the reference removed by
 mean((x - a)(x - b)); what of it is bias, by mean((x - a)(y - b)), with a bound that it exceeds by
@@ -42,7 +42,7 @@ from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import IrrcacheError, essence, origin
 
 #: Samples per pixel of an image by irrcache, of the pilot's images, and their number.
-SPP, PILOT_SPP, PILOTS = 64, 16, 4
+SPP, PILOT_SPP, PILOTS = 256, 16, 4
 #: Most samples per pixel of one image of the reference: bounds memory.
 LARGEST_SPP = 1024
 BLOCK = 4
@@ -206,7 +206,11 @@ def verdict(row: dict) -> str:
     if found:
         kinds = [f for f in found if f.removesuffix(" of volume") == f or f.split()[0] not in found]
         return "DISAGREES: " + ", ".join(kinds)
-    return "undecided" if row["noise"] > MEAN_NOISE else "agrees"
+    if total_noise(row) > MEAN_NOISE:
+        return "undecided"
+    if volume > 0.01 and total_noise(row) > MEAN_NOISE * volume:
+        return "agrees, volume undecided"
+    return "agrees"
 
 
 def total_noise(row: dict) -> float:
@@ -277,12 +281,14 @@ def main() -> None:
         row = store.row(key, partial(compute, case, args.seconds, folder))
         print(" | ".join(line(key, row)), flush=True)
     rows = {str(n): store.rows[str(n)] for n in numbers if str(n) in store.rows}
-    wrong = {k: row for k, row in rows.items() if verdict(row) not in ("agrees", "refused")}
+    wrong = {
+        k: row for k, row in rows.items() if not verdict(row).startswith(("agrees", "refused"))
+    }
     print(f"\n{table(rows, 'Random scenes').as_text()}")
     print(f"\n{table(wrong, 'Scenes that do not agree').as_text()}")
     counts: dict[str, int] = {}
     for row in rows.values():
-        word = verdict(row).partition(":")[0]
+        word = verdict(row).partition(":")[0].partition(",")[0]
         counts[word] = counts.get(word, 0) + 1
     print("\n" + ", ".join(f"{word}: {count}" for word, count in sorted(counts.items())))
 
