@@ -52,6 +52,8 @@ SURROUNDINGS = (
     "ball inside",
 )  # fmt: skip
 MAX_DEPTHS = (2, -1, -1, 3, 2, -1, 5, 1)
+#: A lamp in view has more noise than all that the medium scatters.
+HIDES_EMITTERS = (True, False, True)
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ class RandomScene:
     camera: str
     surroundings: str
     max_depth: int
+    hide_emitters: bool
 
     @classmethod
     def draw(cls, seed: int, index: int) -> RandomScene:
@@ -93,6 +96,7 @@ class RandomScene:
             "sky": not ENVIRONMENTS & {emitter} and pick("sky", (True, False, False)),
             "camera": pick("camera", CAMERAS), "surroundings": pick("surroundings", SURROUNDINGS),
             "max_depth": pick("max_depth", MAX_DEPTHS),
+            "hide_emitters": pick("hide_emitters", HIDES_EMITTERS),
         }  # fmt: skip
         if drawn["depth"] > 40 and drawn["albedo"] in ("0.99", "1"):
             drawn["albedo"] = "0.9"  # the paths of volpath would be too long for a reference
@@ -120,10 +124,11 @@ class RandomScene:
         tint = "" if len(set(self.tint)) == 1 else f", rgb {':'.join(f'{t:g}' for t in self.tint)}"
         around = "" if self.surroundings == "none" else f", {self.surroundings}"
         sky = " + sky" if self.sky else ""
+        hidden = ", hide_emitters" if self.hide_emitters else ""
         return (
             f"{matter}, depth {self.depth:g}{tint}, albedo {self.albedo}, {self.phase}, "
             f"{self.boundary}, {self.emitter}{sky}, camera {self.camera}{around}, "
-            f"max_depth {self.max_depth}"
+            f"max_depth {self.max_depth}{hidden}"
         )
 
     def as_dict(self) -> dict:
@@ -138,6 +143,11 @@ class RandomScene:
     def stream(self, name: str) -> np.random.Generator:
         """Random numbers of a part of the scene."""
         return _stream(self.seed, name, self.index)
+
+    @property
+    def properties(self) -> dict:
+        """Those of the integrator that say what is to be seen."""
+        return {"max_depth": self.max_depth, "hide_emitters": self.hide_emitters}
 
     def build(self, integrator: dict, folder: Path) -> dict:
         """The dictionary for `mi.load_dict`; meshes are written to ``folder``."""

@@ -4,12 +4,13 @@
         [--budget 480] [--force]
 
 Each scene (see generate.py) is loaded by `mi.load_dict`, its integrator ``irrcache`` with nothing
-set but ``max_depth``, and rendered twice, with another ``cache_seed`` the second time, which
-separates the noise of the cache from its bias. The reference is rendered by volpath (volpathmis
-where it is cheaper) in two independent halves. A pilot chooses its samples: the noise of a pixel is
-to be 4 % of the mean radiance in each half, which makes that of the mean much less than a third of
-a percent; all of the reference gets about ``--seconds``. A scene whose mean is not known to a third
-of a percent by then counts as undecided; where that of the volume alone is not, it says so.
+set but ``max_depth`` and ``hide_emitters``, and rendered twice, with another ``cache_seed`` the
+second time, which separates the noise of the cache from its bias. The reference is rendered by
+volpath (volpathmis where it is cheaper) in two independent halves. A pilot chooses its samples: the
+noise of a pixel is to be 4 % of the mean radiance in each half, which makes that of the mean much
+less than a third of a percent; all of the reference gets about ``--seconds``. A scene whose mean is
+not known to a third of a percent by then counts as undecided; where that of the volume alone is
+not, it says so.
 
 Printed are the difference of the means; the RMSE, the noise of the reference removed by
 mean((x - a)(x - b)); what of it is bias, by mean((x - a)(y - b)), with a bound that it exceeds by
@@ -25,6 +26,7 @@ after ``--budget`` seconds: run it again for the others.
 from __future__ import annotations
 
 import gc
+import json
 import time
 from functools import partial
 from pathlib import Path
@@ -42,7 +44,7 @@ from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import IrrcacheError, essence, origin
 
 #: Samples per pixel of an image by irrcache, of the pilot's images, and their number.
-SPP, PILOT_SPP, PILOTS = 256, 16, 4
+SPP, PILOT_SPP, PILOTS = 128, 16, 4
 #: Most samples per pixel of one image of the reference: bounds memory.
 LARGEST_SPP = 1024
 BLOCK = 4
@@ -69,7 +71,7 @@ def compute(case: RandomScene, seconds: float, folder: Path) -> dict:
 def load(case: RandomScene, integrator: str, folder: Path, **settings) -> mi.Scene:
     """The scene, its cache cold."""
     gc.collect()
-    plugin = {"type": integrator, "max_depth": case.max_depth} | settings
+    plugin = {"type": integrator} | case.properties | settings
     return mi.load_dict(case.build(plugin, folder))
 
 
@@ -113,8 +115,7 @@ def reference_of(case: RandomScene, seconds: float, folder: Path) -> dict:
         np.mean([picture(scene, spp, 1000 + 2 * i + half) for i in range(count)], axis=0)
         for half in range(2)
     )
-    direct = mi.load_dict(case.build({"type": judge, "max_depth": 1}, folder))
-    unscattered = picture(direct, 256, 7)
+    unscattered = picture(load(case, judge, folder, max_depth=1), 256, 7)
     return {"a": a, "b": b, "unscattered": unscattered, "judge": judge, "spp": 2 * spp * count}
 
 
@@ -256,6 +257,11 @@ def table(rows: dict[str, dict], title: str) -> Table:
     return Table(title, [*head, "cold s", "about"], [line(k, row) for k, row in rows.items()])
 
 
+def json_of(case: RandomScene) -> dict:
+    """What a file of results says of a scene."""
+    return json.loads(json.dumps(case.as_dict()))
+
+
 def main() -> None:
     """Computes the rows that are missing, as many as the budget lets."""
     parser = parser_of(__doc__)
@@ -270,14 +276,13 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     store, started = Store(folder / f"{args.seed}.json"), time.perf_counter()
     numbers = range(args.count) if args.only is None else args.only
-    if args.force:
-        store.rows = {k: v for k, v in store.rows.items() if int(k) not in numbers}
     for number in numbers:
-        key = str(number)
+        key, case = str(number), RandomScene.draw(args.seed, number)
+        if args.force or store.rows.get(key, {}).get("drawn") != json_of(case):
+            store.rows.pop(key, None)  # asked for, or of another version of this scene
         if key not in store.rows and time.perf_counter() - started > args.budget:
             print(f"{number}: not computed yet; run again")
             continue
-        case = RandomScene.draw(args.seed, number)
         row = store.row(key, partial(compute, case, args.seconds, folder))
         print(" | ".join(line(key, row)), flush=True)
     rows = {str(n): store.rows[str(n)] for n in numbers if str(n) in store.rows}
