@@ -20,7 +20,8 @@ camera without being scattered (volpath at depth 1). A scene *disagrees* where o
 renderings, is beyond three standard errors (4.5 for the worst of 64 blocks) and beyond LIMITS.
 
 Rows are kept in output/random_scenes/<seed>.json, images beside them as .npz; no scene is begun
-after ``--budget`` seconds: run it again for the others.
+after ``--budget`` seconds: run it again for the others, and with more ``--seconds`` for those that
+are undecided.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ SIGMAS = {"mean": 3.0, "bias": 3.0, "block": 4.5}
 
 def compute(case: RandomScene, seconds: float, folder: Path) -> dict:
     """All that is known of a scene."""
-    row = {"about": case.describe(), "drawn": case.as_dict()}
+    row = {"about": case.describe(), "drawn": case.as_dict(), "seconds_granted": seconds}
     ours = ours_of(case, folder)
     if "failed" in ours:
         return row | ours
@@ -257,9 +258,11 @@ def table(rows: dict[str, dict], title: str) -> Table:
     return Table(title, [*head, "cold s", "about"], [line(k, row) for k, row in rows.items()])
 
 
-def json_of(case: RandomScene) -> dict:
-    """What a file of results says of a scene."""
-    return json.loads(json.dumps(case.as_dict()))
+def is_outdated(row: dict | None, case: RandomScene, seconds: float) -> bool:
+    """Whether a row is of another version of its scene, or undecided and more time is granted."""
+    if row is None or row["drawn"] != json.loads(json.dumps(case.as_dict())):
+        return True
+    return verdict(row) == "undecided" and row["seconds_granted"] < seconds
 
 
 def main() -> None:
@@ -278,8 +281,8 @@ def main() -> None:
     numbers = range(args.count) if args.only is None else args.only
     for number in numbers:
         key, case = str(number), RandomScene.draw(args.seed, number)
-        if args.force or store.rows.get(key, {}).get("drawn") != json_of(case):
-            store.rows.pop(key, None)  # asked for, or of another version of this scene
+        if args.force or is_outdated(store.rows.get(key), case, args.seconds):
+            store.rows.pop(key, None)
         if key not in store.rows and time.perf_counter() - started > args.budget:
             print(f"{number}: not computed yet; run again")
             continue

@@ -4,6 +4,7 @@ where there are some.
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import mitsuba as mi
@@ -56,7 +57,7 @@ def test_mitsuba_loads_all_scenes(drawn, tmp_path):
         scene = mi.load_dict(case.build({"type": "volpath"}, tmp_path))
         shapes = {shape.id(): shape for shape in scene.shapes()}
         assert shapes["boundary"].interior_medium() is not None
-        assert len(scene.emitters()) == 1 + ("+ sky" in case.describe())
+        assert len(scene.emitters()) == 1 + case.sky
         medium = scene.sensors()[0].get_medium()
         assert (medium is not None) == (case.camera == "inside")
         emitting = shapes.get("light")
@@ -179,6 +180,17 @@ def test_an_error_that_another_cache_has_not_is_noise():
 
 def test_what_the_reference_does_not_resolve_is_undecided():
     assert run.verdict(rendered(0.0, noise=0.3)) == "undecided"
+
+
+def test_rows_are_computed_again_when_they_have_to_be(drawn):
+    case = drawn[3]
+    row = rendered(0.0, noise=0.3)
+    row |= {"drawn": json.loads(json.dumps(case.as_dict())), "seconds_granted": 5}
+    assert not run.is_outdated(row, case, 5)
+    assert run.is_outdated(row, case, 6)  # it is undecided
+    assert run.is_outdated(None, case, 5)
+    assert run.is_outdated(row, drawn[4], 5)
+    assert not run.is_outdated(row | rendered(0.0), case, 6)
 
 
 def test_images_that_are_not_finite_and_failures_are_told():
