@@ -12,6 +12,7 @@ from .grid import Grid, GridField
 from .layers import luminance
 from .medium import MediumGrid
 from .obstacles import boxes_meet, corners_of, obstacle
+from .scene import media_of
 from .solvers import sweep
 
 #: Why something is as a property says.
@@ -37,6 +38,34 @@ SWEPT, SWEPT_AMONG_SURFACES = 128, 64
 #: The same among surfaces where the phase function has a forward peak: 128 leave an error of 1.5 %
 #: under a sky with a wide sun, these 0.9 %.
 SWEPT_SHARP = 256
+
+#: Largest over smallest channel of the extinction from which on ``volpathmis`` needs less time than
+#: ``volpath`` for the same error. Measured on a glass ball full of fog: 1.4 times as much time at
+#: 1 : 1.5, 0.8 times at 1 : 2, 0.6 times at 1 : 3, a fortieth at 1 : 10.
+CHROMATIC = 1.8
+
+
+def choose_stock(scene: mi.Scene) -> tuple[str, str]:
+    """The integrator of Mitsuba that renders a scene without a cache, and why."""
+    media = {*media_of(scene)}
+    if not media:
+        return "volpath", "there is no medium"
+    ratio = max(_chromaticity(scene, medium) for medium in media)
+    if ratio > CHROMATIC:
+        return "volpathmis", f"extinction differs between the channels, 1 : {ratio:.2g}"
+    return "volpath", "extinction is about the same in all channels"
+
+
+def _chromaticity(scene: mi.Scene, medium: mi.Medium) -> float:
+    """The largest channel of a medium's extinction over the smallest one, on average over it."""
+    rng = mi.PCG32(4096)
+    lower, upper = mi.Point3f(scene.bbox().min), mi.Point3f(scene.bbox().max)
+    at = dr.zeros(mi.MediumInteraction3f, 4096)
+    u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    at.p = lower + u * (upper - lower)
+    sigma_t = np.array(medium.get_scattering_coefficients(at, True)[2], dtype=np.float64)
+    sums = sigma_t.reshape(dr.size_v(mi.Spectrum), -1).sum(axis=1)
+    return float(sums.max() / max(sums.min(), 1e-6 * sums.max())) if sums.max() > 0 else 1.0
 
 
 def choose_solver(
