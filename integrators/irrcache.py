@@ -408,7 +408,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return film
 
     def _render_empty(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
-        """A scene without media to be seen, by Mitsuba's own integrator: all of the image is background."""
+        """A scene without media to be seen, by Mitsuba's own integrator: all is background."""
         film = sensor.film()
         check_film(film, spp or sensor.sampler().sample_count(), 0, at_once=True)
         self._fallback().render(scene, sensor, seed, spp)

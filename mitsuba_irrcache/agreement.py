@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .boundary import inward_share
+from .boundary import orientation
 from .errors import UnsupportedSceneError
 from .symbolic import symbolic
 from .transport import MOST_CROSSINGS, is_null
@@ -38,6 +38,9 @@ DISSENT, DISPUTED = 3, 2
 #: Share of walks that may go wrong with no place disputed: edges cost some. More of them do where
 #: surfaces are closer together than rays are moved.
 ASTRAY = 0.05
+#: Share of rays that do not leave a shape as they enter it, or meet its back first, from which on
+#: that shape alone is at fault.
+OPEN = 0.5
 #: Mitsuba's rays leave a surface at (1 + largest coordinate) times this.
 RAY_OFFSET = 9e-5
 
@@ -276,6 +279,12 @@ class _Names:
         media = [m for s in shapes for m in (s.interior_medium(), s.exterior_medium())]
         self._media = {_number(mi.MediumPtr(m)): m for m in media if m is not None}
 
+    def is_alone(self, number: int) -> bool:
+        """Whether no other shape has the interior medium of this one."""
+        interior = self.shapes[number].interior_medium()
+        others = (s for n, s in self.shapes.items() if n != number)
+        return all(interior not in (s.interior_medium(), s.exterior_medium()) for s in others)
+
     def medium(self, number: int) -> str:
         """A medium as messages call it."""
         return f'medium "{self._media[number].id()}"' if number in self._media else "no medium"
@@ -305,6 +314,9 @@ def _refuse_dispute(scene: mi.Scene, names: _Names, votes: Counter) -> None:
     known = [side for side in dict.fromkeys(sides) if side in names.shapes]
     if len(known) == 1:
         _refuse_single(scene, names, known[0], {one, other} - {0})
+    for side in known:
+        if names.is_alone(side) and max(orientation(scene, names.shapes[side])) > OPEN:
+            _refuse_single(scene, names, side, set())
     first, second = (names.shape(side) for side in sides)
     raise UnsupportedSceneError(
         f"irrcache: {first} and {second} disagree about the medium between them: the one says "
@@ -326,7 +338,8 @@ def _refuse_single(scene: mi.Scene, names: _Names, number: int, media: set[int])
             "medium as its interior; or take the exterior away. Otherwise render this scene with "
             '"volpath".'
         )
-    if inward_share(scene, names.shapes[number]) > 0.9:
+    inwards, _ = orientation(scene, names.shapes[number])
+    if inwards > 0.9:
         raise UnsupportedSceneError(
             f"irrcache: the normals of {names.shape(number)} point inwards, so Mitsuba puts its "
             "interior medium outside of it, which would be rendered wrongly. Mirror its to_world "

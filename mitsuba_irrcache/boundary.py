@@ -150,34 +150,39 @@ def rays_through(shape: mi.Shape) -> mi.Ray3f:
     return mi.Ray3f(target - 1.1 * dr.norm(upper - lower) * direction, direction)
 
 
-def inward_share(scene: mi.Scene, shape: mi.Shape) -> float:
-    """Of rays from outside that meet ``shape``, whatever they pass before, the share that meets the
-    back of it first.
+def orientation(scene: mi.Scene, shape: mi.Shape) -> tuple[float, float]:
+    """Of rays from outside that meet ``shape``, whatever they pass before: the share that meets the
+    back of it first, and that of rays that do not leave it as often as they enter.
     """
-    met, back = _sides(scene, mi.ShapePtr(shape), rays_through(shape))
-    return int(dr.count(met & back)[0]) / max(int(dr.count(met)[0]), 1)
+    first, depth = _crossings(scene, mi.ShapePtr(shape), rays_through(shape))
+    dr.eval(first, depth)
+    met = max(int(dr.count(first != 0)[0]), 1)
+    return int(dr.count(first < 0)[0]) / met, int(dr.count(depth != 0)[0]) / met
 
 
 @symbolic
-def _sides(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
-    """Whether rays meet ``shape``, and whether its back first."""
-    ray, met, back = mi.Ray3f(ray), mi.Bool(False), mi.Bool(False)
+def _crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
+    """How rays cross ``shape`` first (1: inwards, -1: outwards, 0: never), and the sum over all
+    crossings.
+    """
+    ray, first, depth = mi.Ray3f(ray), mi.Int32(0), mi.Int32(0)
     crossings, active = mi.UInt32(0), mi.Bool(True)
-    while dr.hint(active, label="sides"):
+    while dr.hint(active, label="crossings"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        here = active & (si.shape == shape)
-        met |= here
-        back |= here & (dr.dot(si.n, ray.d) > 0)
+        step = dr.select(dr.dot(si.n, ray.d) < 0, mi.Int32(1), -1)
+        step = dr.select(active & (si.shape == shape), step, 0)
+        first = dr.select(first == 0, step, first)
+        depth += step
         ray = si.spawn_ray(ray.d)
         crossings += 1
-        active &= ~here & (crossings < MOST_SHAPES)
-    return met, back
+        active &= crossings < MOST_SHAPES
+    return first, depth
 
 
 def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
     """Refuses a convex shape whose normals do not point outwards everywhere."""
-    inwards = inward_share(scene, shape)
+    inwards, _ = orientation(scene, shape)
     if inwards > INWARDS:
         some = "the normals" if inwards > 1 - INWARDS else f"{inwards:.0%} of the normals"
         raise UnsupportedSceneError(
