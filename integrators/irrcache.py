@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache import given
+from mitsuba_irrcache.agreement import check_sensor
 from mitsuba_irrcache.build import CacheBuilder, CacheSettings
 from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.choices import choose_stock
@@ -393,6 +394,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _render(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
         medium = sensor.get_medium()
+        check_sensor(scene, sensor)  # it may have moved, or be no part of the scene
 
         def radiance(sampler, ray, weight, active) -> tuple:
             found = self._radiance(scene, sampler, ray, medium, weight, active)

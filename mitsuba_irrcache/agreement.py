@@ -41,6 +41,9 @@ ASTRAY = 0.05
 #: Share of rays that do not leave a shape as they enter it, or meet its back first, from which on
 #: that shape alone is at fault.
 OPEN = 0.5
+#: The same of rays that meet the back of a shape first, from which on it is inside out; it is 0.5
+#: for a flat one.
+INWARDS = 0.6
 #: Mitsuba's rays leave a surface at (1 + largest coordinate) times this.
 RAY_OFFSET = 9e-5
 
@@ -56,10 +59,8 @@ def check_media_agree(scene: mi.Scene) -> None:
     if not shapes:
         return
     # An exterior medium that is bounded by no shape may well be what is outside of everything.
-    inner = [s.interior_medium() for s in shapes]
-    closed = all(s.exterior_medium() in (None, *inner) for s in shapes)
-    outside = dr.opaque(mi.Bool, closed)
-    origin, direction, pointer, known = _starts(scene, shapes)
+    outside = _nothing_is_outside(shapes)
+    origin, direction, pointer, known = _starts(scene, shapes, bool(outside[0]))
     wrong, met, place, *near = _walk(
         scene, mi.Ray3f(origin, direction), pointer, known, outside, dr.opaque(mi.UInt32, EVENTS)
     )
@@ -81,6 +82,50 @@ def check_media_agree(scene: mi.Scene) -> None:
         _refuse_close(scene, names, *pair)
 
 
+def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
+    """Raises UnsupportedSceneError for a sensor that says it is in a medium, and is not.
+
+    ``volpath`` then carries this medium up to the first shape, without bounds, and shows no
+    environment behind it.
+    """
+    medium = sensor.get_medium()
+    if medium is None:
+        return
+    shapes = [s for s in scene.shapes() if _bounds(s)]
+    ray, _ = _camera_rays(sensor, RAYS)
+    code, found, shape = _claims(scene, mi.Ray3f(ray.o, ray.d))
+    outside = _nothing_is_outside(shapes)
+    known = (code == _CLAIM) | (code == _ESCAPE) & outside
+    wrong = known & (found != mi.MediumPtr(medium))
+    number = dr.reinterpret_array(mi.UInt32, shape)
+    dr.eval(known, wrong, number)
+    if int(dr.count(wrong)[0]) <= 0.5 * max(int(dr.count(known)[0]), 1):
+        return
+    named = Counter(np.array(number)[np.array(wrong)].tolist()).most_common(1)[0][0]
+    by = _Names(shapes, scene.shapes()).shape(named)
+    raise UnsupportedSceneError(
+        f'irrcache: sensor "{sensor.id()}" has the medium "{medium.id()}", but it is not in it, by '
+        f"{by}. Take the medium away from the sensor, name the one that it is in, or move it. "
+        'Otherwise render this scene with "volpath", where the medium then reaches up to the next '
+        "shape."
+    )
+
+
+def _nothing_is_outside(shapes: list[mi.Shape]) -> mi.Bool:
+    """Whether it is known that there is no medium outside of all shapes: an exterior medium that
+    fills no shape may well be there.
+    """
+    filled = [s.interior_medium() for s in shapes]
+    return dr.opaque(mi.Bool, all(s.exterior_medium() in (None, *filled) for s in shapes))
+
+
+def _camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """Rays all over the film of a sensor."""
+    rng = mi.PCG32(count)
+    film, aperture = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
+    return sensor.sample_ray(sensor.shutter_open(), 0.5, film, aperture)
+
+
 def described(shape: mi.Shape) -> str:
     """A shape as messages call it."""
     return f'shape "{shape.id()}" ({shape.class_name()})'
@@ -91,11 +136,12 @@ def _bounds(shape: mi.Shape) -> bool:
 
 
 def _starts(
-    scene: mi.Scene, shapes: list[mi.Shape]
+    scene: mi.Scene, shapes: list[mi.Shape], outside: bool
 ) -> tuple[mi.Point3f, mi.Vector3f, mi.MediumPtr, mi.Bool]:
     """Rays from outside through the bounds of each shape, and from the sensors; the medium that
-    they carry, and whether it is known. A sensor without one may be in a medium without saying so:
-    ``volpath`` renders that as if it was in none, and so does irrcache.
+    they carry, and whether it is known: ``outside``, that there is none. A sensor without one may
+    be in a medium without saying so: ``volpath`` renders that as if it was in none, and so does
+    irrcache.
     """
     boxes = np.array([[s.bbox().min, s.bbox().max] for s in shapes], dtype=np.float64).reshape(
         -1, 6
@@ -118,11 +164,9 @@ def _starts(
     size = np.linalg.norm(boxes[:, 3:].max(axis=0) - boxes[:, :3].min(axis=0))
     origin = lower + u * (upper - lower) - dr.opaque(mi.Float, 1.1 * float(size)) * direction
     none = dr.zeros(mi.MediumPtr)
-    parts = [(count, origin, direction, none, True)]
+    parts = [(count, origin, direction, none, outside)]
     for sensor in scene.sensors():
-        rng = mi.PCG32(SENSOR_WALKS)
-        film, aperture = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
-        start, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film, aperture)
+        start, _ = _camera_rays(sensor, SENSOR_WALKS)
         medium = sensor.get_medium()
         pointer = none if medium is None else mi.MediumPtr(medium)
         parts.append((SENSOR_WALKS, start.o, start.d, pointer, medium is not None))
@@ -293,7 +337,7 @@ class _Names:
         """A shape as messages call it, with the media on both sides."""
         shape = self.shapes.get(number)
         if shape is None:
-            return "a shape"
+            return "the outside of all shapes"
         sides = {"interior": shape.interior_medium(), "exterior": shape.exterior_medium()}
         said = " and ".join(f'{k} medium "{m.id()}"' for k, m in sides.items() if m is not None)
         return f"{described(shape)}" + (f" with {said}" if said else "")
@@ -339,7 +383,7 @@ def _refuse_single(scene: mi.Scene, names: _Names, number: int, media: set[int])
             '"volpath".'
         )
     inwards, _ = orientation(scene, names.shapes[number])
-    if inwards > 0.9:
+    if inwards > INWARDS:
         raise UnsupportedSceneError(
             f"irrcache: the normals of {names.shape(number)} point inwards, so Mitsuba puts its "
             "interior medium outside of it, which would be rendered wrongly. Mirror its to_world "

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .agreement import RAY_OFFSET, check_media_agree, described
+from .agreement import RAY_OFFSET, check_media_agree, check_sensor, described
 from .boundary import Boundary, boundary_of, rays_through
 from .emission import Emission, place_emission
 from .emitters import check_placement
@@ -47,6 +47,8 @@ def bake_media(scene: mi.Scene, emission: Emission | None = None) -> list[Medium
             _check_distance(medium.id(), np.abs([lower, upper]).max(), finest)
     for emitter in scene.emitters():
         check_placement(emitter)
+    for sensor in scene.sensors():
+        check_sensor(scene, sensor)
     boundary = simple_boundary(scene)
     if boundary is not None and _is_isotropic(*media):
         grids = [_bake_simple(scene, boundary)]

@@ -23,10 +23,10 @@ from experiments.options import Options, begin, parser_of
 from experiments.store import Store
 from mitsuba_irrcache.errors import IrrcacheError, origin
 
-PIXELS, BLOCK = 32, 4
+PIXELS, BLOCK = 24, 4
 #: Images, and samples per pixel of each.
-OURS, OUR_SPP = 4, 64
-THEIRS, THEIR_SPP = 8, 256
+OURS, OUR_SPP = 2, 64
+THEIRS, THEIR_SPP = 4, 256
 DEPTH = {"max_depth": -1, "rr_depth": 50}
 #: What counts as different: so many standard errors, and this part of the mean radiance.
 SIGMAS, PART = 4.0, 0.01
@@ -34,7 +34,7 @@ SIGMAS, PART = 4.0, 0.01
 
 def measure(objects: dict) -> dict:
     """A row: the message of a scene that is refused, or differences and what noise explains."""
-    ours = {"type": "irrcache", "resolution": 24, "cache_spp": 256} | DEPTH
+    ours = {"type": "irrcache", "resolution": 16, "cache_spp": 64} | DEPTH
     try:
         mine = [
             image(scene(objects, ours | {"cache_seed": seed}, PIXELS), OUR_SPP, seed)
