@@ -61,17 +61,21 @@ def check_media_agree(scene: mi.Scene) -> None:
     # An exterior medium that is bounded by no shape may well be what is outside of everything.
     outside = _nothing_is_outside(shapes)
     origin, direction, pointer, known = _starts(scene, shapes, bool(outside[0]))
-    wrong, met, place, *near = _walk(
+    wrong, met, lost, place, *near = _walk(
         scene, mi.Ray3f(origin, direction), pointer, known, outside, dr.opaque(mi.UInt32, EVENTS)
     )
     near = [dr.reinterpret_array(mi.UInt32, shape) for shape in near]
-    dr.eval(wrong, met, place, near)
+    lost = dr.reinterpret_array(mi.UInt32, lost)
+    dr.eval(wrong, met, lost, place, near)
     count, walks = int(dr.count(wrong)[0]), int(dr.count(met)[0])
+    names = _Names(shapes, scene.shapes())
+    (lane, *_) = np.nonzero(np.array(lost))
+    if len(lane) > ASTRAY * walks:
+        _refuse_infinite(names, int(np.array(lost)[lane[0]]))
     if not count:
         return
     chosen = np.unique(np.linspace(0, count - 1, min(count, PLACES)).astype(np.uint32))
     found = dr.gather(mi.UInt32, dr.compress(wrong), mi.UInt32(chosen))
-    names = _Names(shapes, scene.shapes())
     votes = _examine(scene, dr.gather(mi.Point3f, place, found), outside)
     disputes = [v for v in votes if _dissent(v) >= DISSENT]
     if len(disputes) >= min(DISPUTED, len(chosen)):
@@ -202,13 +206,14 @@ def _walk(
 ):
     """Random walks that carry a medium as ``volpath`` does. Whether a shape contradicts it, whether
     any shape with media was met, a place on the flight that led to the contradiction, the shape
-    that contradicts, and the one before.
+    that contradicts, and the one before. If something may be ``outside`` of all shapes: the medium
+    that is carried to infinity.
     """
     ray, pointer, known = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(known)
     rng = mi.PCG32(dr.width(ray))
     wrong, met, place = mi.Bool(False), mi.Bool(False), mi.Point3f(0)
     contradicts, before = dr.zeros(mi.ShapePtr), dr.zeros(mi.ShapePtr)
-    last = mi.Point3f(ray.o)
+    last, lost = mi.Point3f(ray.o), dr.zeros(mi.MediumPtr)
     event, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="walks"):
         si = scene.ray_intersect(ray, active)
@@ -217,7 +222,9 @@ def _walk(
         claim = si.target_medium(-ray.d)
         now = transition & known & (claim != pointer)
         # Outside of everything there is no medium.
-        now |= active & ~hit & known & outside & (pointer != None)  # noqa: E711
+        escapes = active & ~hit & known & (pointer != None)  # noqa: E711
+        now |= escapes & outside
+        lost = dr.select(escapes & ~outside, pointer, lost)
         wrong |= now
         met |= transition
         # Close to one end of the flight or the other: what is small there fills much of the view.
@@ -249,7 +256,7 @@ def _walk(
         ray.d = dr.select(turns, anywhere, direction)
         event += 1
         active &= hit & ~now & (event < events)
-    return wrong, met, place, contradicts, before
+    return wrong, met, lost, place, contradicts, before
 
 
 def _lets_through(flags: mi.UInt32) -> mi.Bool:
@@ -394,6 +401,16 @@ def _refuse_single(scene: mi.Scene, names: _Names, number: int, media: set[int])
         "its medium other than in turn, and take it to infinity, or lose it within. (Mitsuba "
         "merges meshes that bound the same medium into one shape.) Close it, or move its parts "
         'apart by a thousandth of their size. Otherwise render this scene with "volpath".'
+    )
+
+
+def _refuse_infinite(names: _Names, medium: int) -> None:
+    """The error for a medium that rays take to infinity."""
+    raise UnsupportedSceneError(
+        f"irrcache: {names.medium(medium)} is the exterior of shapes and fills none, and rays take "
+        "it out of the scene: volpath then shows no light from there. Put a closed shape with a "
+        "null BSDF, such as a cube, around everything that has it as its interior. Otherwise "
+        'render this scene with "volpath".'
     )
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .agreement import described
 from .cache import IrradianceCache, active_voxels
 from .errors import IrrcacheError, UnsupportedSceneError
 from .grid import Grid, GridField
@@ -14,6 +17,7 @@ from .medium import MediumGrid
 from .obstacles import boxes_meet, corners_of, obstacle
 from .scene import media_of
 from .solvers import sweep
+from .transport import is_null
 
 #: Why something is as a property says.
 AS_TOLD = "as told"
@@ -138,10 +142,27 @@ def _why_not_sweep(
     for other in medium.surroundings.media.grids:
         if other is not medium and boxes_meet(grid, *box, corners_of(other.frame)):
             return f'medium "{other.name}" reaches into {name}'
+    hole = _hole(scene, medium, grid, box)
+    if hole:
+        return f"{hole} is a hole in {name}, or bounds another medium in it"
     # What shines where no matter is, nothing may stand before either.
     box = box if medium.emission is None else (np.zeros(3, int), grid.resolution)
     found = obstacle(scene, grid, *box)
     return found and f"{found} reaches into {name}"
+
+
+def _hole(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
+    """A shape behind whose null surface ``medium`` ends, among the voxels of the ``box``."""
+    for shape in scene.shapes():
+        outer = shape.exterior_medium()
+        null = shape.bsdf() is not None and is_null(int(shape.bsdf().flags()))
+        if outer is None or not null or not dr.all(mi.MediumPtr(outer) == medium.pointer):
+            continue
+        ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
+        corners = np.array(list(itertools.product(*ends.T)))
+        if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
+            return described(shape)
+    return None
 
 
 def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid, str]:
