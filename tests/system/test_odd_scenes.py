@@ -87,6 +87,19 @@ def test_scaled_emitters_far_away_are_refused(scenes, kind, place, solver):
         mi.render(scene, spp=1)
 
 
+@pytest.mark.parametrize("place", [np.diag([0.2, 0.5, 1, 1]), SHEAR], ids=["uneven", "sheared"])
+def test_cylinders_that_shine_are_round(scenes, place):
+    """Mitsuba's samples of others have two thirds of the light that rays find."""
+    lamp = {"type": "cylinder", "to_world": mi.ScalarTransform4f().translate([0, 3, 0])}
+    lamp["emitter"] = {"type": "area", "radiance": 2.0}
+    shape = scenes.boundary(scenes.medium(1.0, 0.8))
+    settings = {"type": "irrcache", "solver": "auto", "resolution": 8, "cache_spp": 32}
+    mi.render(scenes.load(settings, shape, 4, lamp=lamp), spp=1)
+    lamp["to_world"] = lamp["to_world"] @ mi.ScalarTransform4f(place)
+    with pytest.raises(RuntimeError, match=r'shape "lamp".*not round.*same scale'):
+        mi.render(scenes.load(settings, shape, 4, lamp=lamp), spp=1)
+
+
 def box_without_a_face() -> mi.Mesh:
     """With all eight corners."""
     params = mi.traverse(mi.load_dict({"type": "cube"}))
