@@ -127,7 +127,8 @@ def _camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
     """Rays all over the film of a sensor."""
     rng = mi.PCG32(count)
     film, aperture = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
-    return sensor.sample_ray(sensor.shutter_open(), 0.5, film, aperture)
+    # Some sensors have no `sample_ray`.
+    return sensor.sample_ray_differential(sensor.shutter_open(), 0.5, film, aperture)
 
 
 def described(shape: mi.Shape) -> str:
