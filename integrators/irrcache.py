@@ -12,8 +12,10 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache import given
+from mitsuba_irrcache.agreement import check_sensor
 from mitsuba_irrcache.build import CacheBuilder, CacheSettings
 from mitsuba_irrcache.cache import IrradianceCache
+from mitsuba_irrcache.choices import choose_stock
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.filtering import FILTERS, filter_illumination
 from mitsuba_irrcache.layers import AOVS, Layers, parse_aovs
@@ -140,8 +142,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     box or sphere, and light from far away or from points, nothing has to be ray traced. The
     solver ``sweep`` can be used for media in boxes or spheres with neither surfaces nor other media
     among their voxels; where there are surfaces, with ``max_depth`` 2 or -1.
-    Media without bounds and sharp phase functions are refused by name. What glass encloses is
-    rendered as ``volpath`` does, and so is a scene without media.
+    Media without bounds and sharp phase functions are refused by name, and so are boundaries that
+    overlap or contradict each other. A scene without media, or with glass around all of them, is
+    rendered by ``volpath`` or, where extinction differs much between the channels, ``volpathmis``.
 
     Phase functions may be ``isotropic``, ``hg`` with |g| up to 0.58, ``rayleigh``, or others that
     depend on the scattering angle alone and are as broad. Where one is not isotropic, the cache
@@ -200,7 +203,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._stopping = Stopping()
         self._sight: SimpleSight | Sight | None = None
         self._revision = 0  # of the builder, when the sight was made
-        self._volpath: mi.Integrator | None = None
+        #: Mitsuba's own integrators, by name, for scenes without a medium to be seen, and the one
+        #: that was chosen for the scene as it is
+        self._stock: dict[str, mi.Integrator] = {}
+        self._chosen = "volpath"
         #: seconds that stages of the last image took, of those that can be told apart
         self.seconds: dict[str, float] = {}
         #: called with (stage, done, total) while the cache is built; what it raises ends the build
@@ -253,6 +259,17 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         if self._revision != self._builder.revision:
             self._sight = self._make_sight()
             self._revision = self._builder.revision
+            if self._sight is None:
+                self._choose_stock(scene)
+
+    def _choose_stock(self, scene: mi.Scene) -> None:
+        """Chooses the integrator for a scene without a medium to be seen, and logs that."""
+        self._chosen, reason = choose_stock(scene)
+        mi.Log(
+            mi.LogLevel.Info,
+            f"irrcache: no medium can be seen, so no cache is used: {self._chosen} renders this "
+            f"scene ({reason}).",
+        )
 
     def _log_what_is_missing(self) -> None:
         done, target = self._builder.done, self._builder.target
@@ -266,8 +283,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def cancel(self) -> None:
         """Ends the rendering that is in progress, in whatever thread, with what there is."""
         self._stopping.cancel()
-        if self._volpath is not None:
-            self._volpath.cancel()
+        for integrator in self._stock.values():
+            integrator.cancel()
 
     def should_stop(self) -> bool:
         """Whether rendering was cancelled, or reached its ``timeout``."""
@@ -379,6 +396,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _render(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
         medium = sensor.get_medium()
+        check_sensor(scene, sensor)  # it may have moved, or be no part of the scene
 
         def radiance(sampler, ray, weight, active) -> tuple:
             found = self._radiance(scene, sampler, ray, medium, weight, active)
@@ -394,7 +412,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return film
 
     def _render_empty(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
-        """A scene without media, by volpath: all of the image is background."""
+        """A scene without media to be seen, by Mitsuba's own integrator: all is background."""
         film = sensor.film()
         check_film(film, spp or sensor.sampler().sample_count(), 0, at_once=True)
         self._fallback().render(scene, sensor, seed, spp)
@@ -442,17 +460,17 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return (view.scattered + view.background) * weight, view.alpha, layers
 
     def _fallback(self) -> mi.Integrator:
-        if self._volpath is None:
-            self._volpath = mi.load_dict(
+        if self._chosen not in self._stock:
+            self._stock[self._chosen] = mi.load_dict(
                 {
-                    "type": "volpath",
+                    "type": self._chosen,
                     "max_depth": self._settings.max_depth,
                     "rr_depth": self._settings.rr_depth,
                     "hide_emitters": self._hide_emitters,
                     "timeout": self._timeout,
                 }
             )
-        return self._volpath
+        return self._stock[self._chosen]
 
     def to_string(self) -> str:
         """All properties, as they are: the record of how an image was made."""

@@ -15,9 +15,13 @@ import numpy as np
 
 from .errors import UnsupportedSceneError
 from .grid import Affine
+from .symbolic import symbolic
 
 #: Vertices of a mesh that may still be a box: corners that are almost the same are one.
 MOST_VERTICES = 256
+#: Rays that find out on which side of a shape its normals are, what they may cross, and the share
+#: of them that may err: at edges.
+ORIENTATION_RAYS, MOST_SHAPES, INWARDS = 256, 256, 0.02
 
 
 class Boundary:
@@ -109,12 +113,14 @@ def boundary_of(scene: mi.Scene, shape: mi.Shape) -> Boundary:
     """
     boundary = None
     if shape.class_name() == "Sphere":
-        matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64)
-        boundary = Boundary("sphere", matrix.reshape(4, 4))
-    elif shape.is_mesh():
+        boundary = Boundary("sphere", _sphere_frame(shape))
+    elif shape.is_mesh() and "vertex_positions" in mi.traverse(shape):  # rectangles have none
         vertices = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64)
         frame = _box_frame(vertices.reshape(-1, 3))
-        boundary = None if frame is None else Boundary("box", frame)
+        area = float(np.ravel(shape.surface_area())[0])
+        # A face may be missing, or be there twice.
+        if frame is not None and abs(_box_area(frame) - area) < 1e-3 * area:
+            boundary = Boundary("box", frame)
     name = f'shape "{shape.id()}" ({shape.class_name()})'
     if boundary is None:
         raise UnsupportedSceneError(
@@ -122,20 +128,80 @@ def boundary_of(scene: mi.Scene, shape: mi.Shape) -> Boundary:
             "or a mesh of that "
             'form) and spheres are supported so far; bound the medium by a cube, or use "volpath".'
         )
-    if _normal_points_inwards(scene, boundary):
-        raise UnsupportedSceneError(
-            f"irrcache: the normals of {name} point inwards, so Mitsuba puts its interior medium "
-            "outside of it; "
-            "mirror its to_world once more (or drop flip_normals)."
-        )
+    _check_normals(scene, shape, name)
     return boundary
 
 
-def _normal_points_inwards(scene: mi.Scene, boundary: Boundary) -> bool:
-    center = mi.Point3f(*(float(v) for v in boundary.to_world[:3, 3]))
-    direction = dr.normalize(mi.Vector3f(*(float(v) for v in boundary.to_world[:3, 0])))
-    hit = scene.ray_intersect(mi.Ray3f(center, direction))
-    return bool((hit.is_valid() & (dr.dot(hit.n, direction) < 0))[0])
+def _sphere_frame(shape: mi.Shape) -> np.ndarray:
+    """``to_world`` of the unit sphere: spheres in Mitsuba are round, whatever ``to_world`` is, and
+    its first column is their radius.
+    """
+    matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    radius = np.linalg.norm(matrix[:3, 0])
+    if np.abs(np.linalg.norm(matrix[:3, :3], axis=0) - radius).max() <= 1e-4 * radius:
+        return matrix
+    frame = np.diag([radius, radius, radius, 1.0])
+    frame[:3, 3] = matrix[:3, 3]
+    return frame
+
+
+def _box_area(frame: np.ndarray) -> float:
+    """The surface of the image of [-1, 1]^3."""
+    x, y, z = 2 * frame[:3, :3].T
+    return 2 * sum(float(np.linalg.norm(np.cross(*pair))) for pair in ((x, y), (y, z), (z, x)))
+
+
+def rays_through(shape: mi.Shape) -> mi.Ray3f:
+    """Rays from outside through the bounding box of a shape."""
+    rng = mi.PCG32(ORIENTATION_RAYS)
+    lower, upper = mi.Point3f(shape.bbox().min), mi.Point3f(shape.bbox().max)
+    u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    target = lower + u * (upper - lower)
+    sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+    direction = mi.warp.square_to_uniform_sphere(sample)
+    return mi.Ray3f(target - 1.1 * dr.norm(upper - lower) * direction, direction)
+
+
+def orientation(scene: mi.Scene, shape: mi.Shape) -> tuple[float, float]:
+    """Of rays from outside that meet ``shape``, whatever they pass before: the share that meets the
+    back of it first, and that of rays that do not leave it as often as they enter.
+    """
+    first, depth = _crossings(scene, mi.ShapePtr(shape), rays_through(shape))
+    dr.eval(first, depth)
+    met = max(int(dr.count(first != 0)[0]), 1)
+    return int(dr.count(first < 0)[0]) / met, int(dr.count(depth != 0)[0]) / met
+
+
+@symbolic
+def _crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
+    """How rays cross ``shape`` first (1: inwards, -1: outwards, 0: never), and the sum over all
+    crossings.
+    """
+    ray, first, depth = mi.Ray3f(ray), mi.Int32(0), mi.Int32(0)
+    crossings, active = mi.UInt32(0), mi.Bool(True)
+    while dr.hint(active, label="crossings"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        step = dr.select(dr.dot(si.n, ray.d) < 0, mi.Int32(1), -1)
+        step = dr.select(active & (si.shape == shape), step, 0)
+        first = dr.select(first == 0, step, first)
+        depth += step
+        ray = si.spawn_ray(ray.d)
+        crossings += 1
+        active &= crossings < MOST_SHAPES
+    return first, depth
+
+
+def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
+    """Refuses a convex shape whose normals do not point outwards everywhere."""
+    inwards, _ = orientation(scene, shape)
+    if inwards > INWARDS:
+        some = "the normals" if inwards > 1 - INWARDS else f"{inwards:.0%} of the normals"
+        raise UnsupportedSceneError(
+            f"irrcache: {some} of {name} point inwards, so Mitsuba puts its interior medium "
+            "outside of it; "
+            "mirror its to_world once more (or drop flip_normals)."
+        )
 
 
 def _box_frame(vertices: np.ndarray) -> np.ndarray | None:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from . import half_space
+from .agreement import described
 from .cache import IrradianceCache, active_voxels
 from .errors import IrrcacheError, UnsupportedSceneError
 from .grid import Grid
 from .layers import luminance
 from .medium import MediumGrid
 from .obstacles import boxes_meet, corners_of, obstacle
+from .scene import media_of
 from .solvers import sweep
+from .transport import is_null
 
 #: Why something is as a property says.
 AS_TOLD = "as told"
@@ -51,6 +56,34 @@ SWEPT, SWEPT_AMONG_SURFACES = 128, 64
 #: The same among surfaces where the phase function has a forward peak: 128 leave an error of 1.5 %
 #: under a sky with a wide sun, these 0.9 %.
 SWEPT_SHARP = 256
+
+#: Largest over smallest channel of the extinction from which on ``volpathmis`` needs less time than
+#: ``volpath`` for the same error. Measured on a glass ball full of fog: 1.4 times as much time at
+#: 1 : 1.5, 0.8 times at 1 : 2, 0.6 times at 1 : 3, a fortieth at 1 : 10.
+CHROMATIC = 1.8
+
+
+def choose_stock(scene: mi.Scene) -> tuple[str, str]:
+    """The integrator of Mitsuba that renders a scene without a cache, and why."""
+    media = {*media_of(scene)}
+    if not media:
+        return "volpath", "there is no medium"
+    ratio = max(_chromaticity(scene, medium) for medium in media)
+    if ratio > CHROMATIC:
+        return "volpathmis", f"extinction differs between the channels, 1 : {ratio:.2g}"
+    return "volpath", "extinction is about the same in all channels"
+
+
+def _chromaticity(scene: mi.Scene, medium: mi.Medium) -> float:
+    """The largest channel of a medium's extinction over the smallest one, on average over it."""
+    rng = mi.PCG32(4096)
+    lower, upper = mi.Point3f(scene.bbox().min), mi.Point3f(scene.bbox().max)
+    at = dr.zeros(mi.MediumInteraction3f, 4096)
+    u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    at.p = lower + u * (upper - lower)
+    sigma_t = np.array(medium.get_scattering_coefficients(at, True)[2], dtype=np.float64)
+    sums = sigma_t.reshape(dr.size_v(mi.Spectrum), -1).sum(axis=1)
+    return float(sums.max() / max(sums.min(), 1e-6 * sums.max())) if sums.max() > 0 else 1.0
 
 
 def choose_solver(
@@ -123,6 +156,9 @@ def _why_not_sweep(
     for other in medium.surroundings.media.grids:
         if other is not medium and boxes_meet(grid, *box, corners_of(other.frame)):
             return f'medium "{other.name}" reaches into {name}'
+    hole = _hole(scene, medium, grid, box)
+    if hole:
+        return f"{hole} is a hole in {name}, or bounds another medium in it"
     # What shines where no matter is, nothing may stand before either.
     box = box if medium.emission is None else (np.zeros(3, int), grid.resolution)
     found = obstacle(scene, grid, *box)
@@ -150,6 +186,20 @@ def needs_no_cache(
         f"opaque (optical depth {depth:.2g} per voxel of a cache, which would cause an error of "
         f"about {min(cached, 100):.0f} % instead of {error:.1f} %)"
     )
+
+
+def _hole(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
+    """A shape behind whose null surface ``medium`` ends, among the voxels of the ``box``."""
+    for shape in scene.shapes():
+        outer = shape.exterior_medium()
+        null = shape.bsdf() is not None and is_null(int(shape.bsdf().flags()))
+        if outer is None or not null or not dr.all(mi.MediumPtr(outer) == medium.pointer):
+            continue
+        ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
+        corners = np.array(list(itertools.product(*ends.T)))
+        if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
+            return described(shape)
+    return None
 
 
 def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid, str]:

@@ -31,3 +31,16 @@ def essence(error: BaseException) -> str:
     error = origin(error)
     raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", str(error), re.MULTILINE)
     return raised[-1] if raised else str(error).strip()
+
+
+def explained(error: RuntimeError) -> None:
+    """Puts the cause of an error that Dr.Jit has wrapped into its own message: ours as it is, which
+    names the remedy, others behind the message.
+    """
+    cause = origin(error)
+    if cause is error or not isinstance(cause, Exception):
+        return
+    if isinstance(cause, IrrcacheError):
+        error.args = (str(cause),)
+    elif str(cause) not in str(error):
+        error.args = (f"{error} The cause: {type(cause).__name__}: {cause}",)

@@ -11,8 +11,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .boundary import Boundary, boundary_of
+from .agreement import RAY_OFFSET, check_media_agree, check_sensor, described
+from .boundary import Boundary, boundary_of, rays_through
 from .emission import Emission, place_emission
+from .emitters import check_placement
 from .errors import UnsupportedSceneError
 from .medium import MediumGrid, bake, children
 from .phase import refuse_sharp
@@ -21,12 +23,8 @@ from .surroundings import Surroundings
 from .symbolic import symbolic
 from .transport import MOST_CROSSINGS, is_null
 
-#: Rays that find out whether a shape is closed, and the share of them that may say it is not:
-#: edges are hit twice, or not at all.
-CLOSED_RAYS, CLOSED_TOLERANCE = 1024, 0.05
-#: Mitsuba's rays leave a surface at (1 + largest coordinate) times this, ...
-RAY_OFFSET = 9e-5
-#: ... which should not exceed this part of the shortest side of a medium.
+#: The distance at which Mitsuba's rays leave a surface should not exceed this part of the shortest
+#: side of a medium.
 LARGEST_OFFSET = 0.002
 #: Steps between positions in single precision that a side of a medium, and a voxel, must have.
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
@@ -47,6 +45,10 @@ def bake_media(scene: mi.Scene, emission: Emission | None = None) -> list[Medium
             lower, upper = (np.array(p) for p in (shape.bbox().min, shape.bbox().max))
             finest = (upper - lower).max() / STEPS_OF_A_SIDE
             _check_distance(medium.id(), np.abs([lower, upper]).max(), finest)
+    for emitter in scene.emitters():
+        check_placement(emitter)
+    for sensor in scene.sensors():
+        check_sensor(scene, sensor)
     boundary = simple_boundary(scene)
     if boundary is not None and _is_isotropic(*media):
         grids = [_bake_simple(scene, boundary)]
@@ -131,8 +133,13 @@ def bake_general(
     a simple scene there is but one, which is ``alone``.
     """
     shapes, grids, seen = scene.shapes(), [], []
-    for shape in shapes:
-        _check_shape(scene, shape)
+    if not alone:
+        for shape in shapes:
+            _check_shape(scene, shape)
+        for medium, filled in media_of(scene).items():
+            if not filled and medium.class_name() != "HeterogeneousMedium":
+                _refuse_unbounded(medium, shapes)
+        check_media_agree(scene)
     for medium, filled in media_of(scene).items():
         exact = _exact_boundary(scene, filled)
         grid = bake(medium, exact or Boundary("box", _extent(medium, filled)))
@@ -195,93 +202,61 @@ def _extent(medium: mi.Medium, filled: list[mi.Shape]) -> np.ndarray:
     if medium.class_name() == "HeterogeneousMedium":
         box = children(medium)["sigma_t"].bbox()
         boxes.append((np.array(box.min), np.array(box.max)))
-    name = f'medium "{medium.id()}" ({medium.class_name()})'
     if not boxes or not np.isfinite(boxes).all():
-        _refuse(
-            f"{name} fills no shape: it would reach to infinity, and a cache cannot",
-            " Put a large shape with a null BSDF around the scene that has it as its interior.",
-        )
+        _refuse_unbounded(medium, [])
     lower = np.max([b[0] for b in boxes], axis=0).astype(np.float64)
     upper = np.min([b[1] for b in boxes], axis=0).astype(np.float64)
     if not (lower < upper).all():
+        name = f'medium "{medium.id()}" ({medium.class_name()})'
         _refuse(f"the grid of {name} lies outside of the shapes that it fills, or these are flat")
     frame = np.diag([*(0.5 * (upper - lower)), 1.0])
     frame[:3, 3] = 0.5 * (lower + upper)
     return frame
 
 
+def _refuse_unbounded(medium: mi.Medium, shapes: list[mi.Shape]) -> None:
+    """The error for a medium that nothing bounds."""
+    around = [s for s in shapes if s.exterior_medium() == medium]
+    role = ""
+    if around:
+        more = f" and of {len(around) - 1} more" if len(around) > 1 else ""
+        role = f"is the exterior of {described(around[0])}{more}, and "
+    _refuse(
+        f'medium "{medium.id()}" ({medium.class_name()}) {role}fills no shape: it would reach to '
+        "infinity, and a cache cannot",
+        " Put a closed shape with a null BSDF, such as a cube, around everything that has it as "
+        "its interior. Walls and objects within that shape need neither interior nor exterior, "
+        "since rays that they send back stay in the medium; only glass does.",
+    )
+
+
 def _check_shape(scene: mi.Scene, shape: mi.Shape) -> None:
-    name = f'shape "{shape.id()}" ({shape.class_name()})'
     if shape.class_name() == "Instance" and _has_media(scene, shape):
         _refuse(
-            f"{name} is an instance of shapes with media, of which there is no telling where they "
-            "are",
+            f"{described(shape)} is an instance of shapes with media, of which there is no "
+            "telling where they are",
             " Place these shapes in the scene themselves.",
         )
-    if shape.interior_medium() is None:
-        return
-    hit, inwards, open_ = _crossings(scene, shape)
-    if inwards > 0.5 * hit:
-        _refuse(
-            f"the normals of {name} point inwards, so Mitsuba puts its interior medium outside of "
-            "it",
-            " Mirror its to_world once more, or toggle flip_normals.",
-        )
-    if inwards + open_ > CLOSED_TOLERANCE * hit:
-        _refuse(
-            f"{name} is not closed, or has a face in common with another shape: {inwards + open_} "
-            f"of {hit} rays do not leave it as they entered, so its interior medium has no bounds",
-            " Close it, or move the shapes apart by a thousandth of their size.",
-        )
-
-
-def _crossings(scene: mi.Scene, shape: mi.Shape) -> tuple[int, int, int]:
-    """Of rays from outside through ``shape``: those that meet it, those that meet its inside first,
-    and other ones that do not leave it as often as they enter.
-    """
-    first, depth, _ = _count_crossings(scene, mi.ShapePtr(shape), _rays_through(shape))
-    inwards = first < 0
-    open_ = (first > 0) & (depth != 0)
-    return tuple(int(dr.count(c)[0]) for c in (first != 0, inwards, open_))
 
 
 def _has_media(scene: mi.Scene, instance: mi.Shape) -> bool:
     """Whether rays through an instance come into a medium there."""
-    *_, inside = _count_crossings(scene, mi.ShapePtr(instance), _rays_through(instance))
-    return bool(dr.any(inside))
-
-
-def _rays_through(shape: mi.Shape) -> mi.Ray3f:
-    """From outside through the bounding box of a shape."""
-    rng = mi.PCG32(CLOSED_RAYS)
-    lower, upper = mi.Point3f(shape.bbox().min), mi.Point3f(shape.bbox().max)
-    u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-    target = lower + u * (upper - lower)
-    sample = mi.Point2f(rng.next_float32(), rng.next_float32())
-    direction = mi.warp.square_to_uniform_sphere(sample)
-    return mi.Ray3f(target - 1.1 * dr.norm(upper - lower) * direction, direction)
+    return bool(dr.any(_meets_media(scene, mi.ShapePtr(instance), rays_through(instance))))
 
 
 @symbolic
-def _count_crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
-    """How rays cross a shape first (1: inwards, -1: outwards, 0: never), and all of these added;
-    whether a medium begins or ends at an instance of this shape.
-    """
+def _meets_media(scene: mi.Scene, instance: mi.ShapePtr, ray: mi.Ray3f):
+    """Whether a medium begins or ends at an instance along rays."""
     ray, inside = mi.Ray3f(ray), mi.Bool(False)
-    first, depth = mi.Int32(0), mi.Int32(0)
     crossings, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="crossings"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        inside |= active & (si.instance == shape) & si.is_medium_transition()
-        step = dr.select(dr.dot(si.n, ray.d) < 0, mi.Int32(1), -1)
-        step = dr.select(active & (si.shape == shape), step, 0)
-        first = dr.select(first == 0, step, first)
-        depth += step
+        inside |= active & (si.instance == instance) & si.is_medium_transition()
         ray = si.spawn_ray(ray.d)
         crossings += 1
-        active &= crossings < MOST_CROSSINGS
-    return first, depth, inside
+        active &= ~inside & (crossings < MOST_CROSSINGS)
+    return inside
 
 
 def _warn_of_scale(scene: mi.Scene, grids: list[MediumGrid]) -> None:

@@ -228,8 +228,9 @@ EXTRAS = {
         "copy.*instance",
     ),
     "phase function": (
-        f'<shape type="sphere" id="other"> {NULL} <medium name="interior" type="homogeneous" '
-        'id="haze"> <phase type="hg"> <float name="g" value="0.95"/> </phase> </medium> </shape>',
+        f'<shape type="sphere" id="other"> <point name="center" value="9, 0, 0"/> {NULL} '
+        '<medium name="interior" type="homogeneous" id="haze"> <phase type="hg"> '
+        '<float name="g" value="0.95"/> </phase> </medium> </shape>',
         "haze.*HGPhaseFunction",
     ),
 }
