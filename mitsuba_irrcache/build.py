@@ -45,8 +45,6 @@ class CacheBuilder:
         self.revision = 0
         #: the media of the scene that can be seen, each with its cache
         self.parts: list[LitMedium] = []
-        # Not the scene itself: it owns the integrator, and neither would ever be freed.
-        self._scene_id = 0
         self._snapshot: Snapshot | None = None
         self._saves_when_filled = True
         #: whether the first two batches may be shown in pieces; see `path.Opening`
@@ -79,10 +77,10 @@ class CacheBuilder:
     def fit(self, scene: mi.Scene) -> None:
         """Makes the media fit ``scene``, with empty caches where the old ones do not hold."""
         volume = self._emission if isinstance(self._emission, mi.Volume) else None
-        snapshot = Snapshot(scene, volume)
+        snapshot = Snapshot(scene, volume, self._snapshot)
         changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
         if self._snapshot is None or changes:
-            edited = bool(changes) and id(scene) == self._scene_id
+            edited = bool(changes) and snapshot.shares_objects_with(self._snapshot)
             if edited:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
@@ -103,7 +101,7 @@ class CacheBuilder:
                 )
                 for medium in media
             ]
-            self._scene_id, self._snapshot = id(scene), snapshot
+            self._snapshot = snapshot
 
     def _baked_emission(self) -> Emission | None:
         if self._emission is None:
