@@ -12,7 +12,6 @@ import numpy as np
 from .grid import Field
 from .medium import MediumGrid
 
-
 #: Arrays of up to so many bytes are compared by their contents, all of them up to the second number
 #: of bytes in a scene; of larger arrays, so many values are.
 SMALL, SMALL_IN_ALL, SAMPLED = 1 << 17, 1 << 19, 1 << 12

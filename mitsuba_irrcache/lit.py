@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +24,9 @@ from .memory import give_back, require_memory
 from .solvers import path, sweep
 from .solvers.directional_sweep import DirectionalSweep, least_batch
 from .solvers.sweep import Sweep
+
+#: Held by the thread that writes a cache file.
+_SAVING = Lock()
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,9 @@ class LitMedium:
         """
         if early and self.solver == "path" and not self.is_dark and not self.cache.samples:
             return self._open(scene, samples, progress)
+        closed = self._opening is not None and not early and self.close()
         if self.cache is None or self.cache.samples >= self.target(samples):
-            return False
+            return closed
         self._fill(scene, self.target(samples) - self.cache.samples, progress)
         if not self.is_dark and not self.cache.is_finite:
             self.cache, self._sweep = self._start_cache(scene, edited=False), None
@@ -278,8 +283,9 @@ class LitMedium:
         if cache.samples <= self.saved_samples:
             return
         try:
-            if not self._is_ahead(file):
-                cache.save(file)
+            with _SAVING:  # no other thread writes the file between looking and writing
+                if not self._is_ahead(file):
+                    cache.save(file)
             self.saved_samples = cache.samples
         except IrrcacheError as error:
             mi.Log(
