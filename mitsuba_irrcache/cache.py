@@ -22,6 +22,7 @@ from .conservation import conserving
 from .directional import Directional, DirectionalField
 from .errors import CacheFileError, IrrcacheError
 from .files import atomic_write
+from .fingerprint import differing
 from .grid import Affine, Grid, RootField
 from .lamps import Falloff
 from .macrocells import Macrocells
@@ -314,11 +315,10 @@ class IrradianceCache:
 
         Raises IrrcacheError if the two do not describe the same light, or share a seed.
         """
-        for name in sorted(self.fingerprint.keys() | other.fingerprint.keys()):
-            if self.fingerprint.get(name) != other.fingerprint.get(name):
-                raise IrrcacheError(
-                    f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
-                )
+        for name in differing(self.fingerprint, other.fingerprint):
+            raise IrrcacheError(
+                f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
+            )
         alike = ("max_depth", "channels", "batch", "correlated", "moments")
         if self.grid.shape != other.grid.shape or any(
             getattr(self, name) != getattr(other, name) for name in alike

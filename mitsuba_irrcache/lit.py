@@ -16,7 +16,7 @@ from .cache import BATCH, IrradianceCache, active_voxels, marked
 from .choices import choose_grid, choose_samples, swept_samples, warn_of_dense_border
 from .directional import Directional, sources_of
 from .errors import CacheFileError, IrrcacheError
-from .fingerprint import digests
+from .fingerprint import differing, digests
 from .grid import Grid
 from .lamps import Falloff
 from .medium import MediumGrid
@@ -198,10 +198,8 @@ class LitMedium:
                 )
             return cache
         stored = IrradianceCache.load(file)
-        differing = [
-            k for k in cache.fingerprint if stored.fingerprint.get(k) != cache.fingerprint[k]
-        ]
-        if not differing:
+        others = differing(cache.fingerprint, stored.fingerprint)
+        if not others:
             _check_like(cache, stored, file)
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
@@ -210,7 +208,7 @@ class LitMedium:
         if edited:
             mi.Log(
                 mi.LogLevel.Warn,
-                f'irrcache: the scene was edited ({", ".join(differing)}): "{file}" keeps the '
+                f'irrcache: the scene was edited ({", ".join(others)}): "{file}" keeps the '
                 "light of before.",
             )
             cache.fingerprint = {}
@@ -218,11 +216,11 @@ class LitMedium:
         detail = (
             f" ({stored.fingerprint.get('settings')} in the file, {cache.fingerprint['settings']} "
             "here)"
-            if differing == ["settings"]
+            if others == ["settings"]
             else ""
         )
         raise CacheFileError(
-            f'irrcache: cache_file "{file}" belongs to another scene: {", ".join(differing)} '
+            f'irrcache: cache_file "{file}" belongs to another scene: {", ".join(others)} '
             f"differ{detail}. "
             "Delete the file, or give this scene a cache_file of its own."
         )
@@ -301,7 +299,7 @@ class LitMedium:
         if not Path(file).exists():
             return False
         fingerprint, samples = IrradianceCache.description_of(file)
-        if fingerprint != self.cache.fingerprint:
+        if differing(fingerprint, self.cache.fingerprint):
             raise CacheFileError(f'"{file}" has come to hold the light of another scene')
         return samples >= self.cache.samples
 
@@ -309,12 +307,12 @@ class LitMedium:
 def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> None:
     """Raises CacheFileError if a file says of itself what it is not."""
     alike = ("active_count", "channels", "correlated", "max_depth", "moments")
-    differing = [name for name in alike if getattr(cache, name) != getattr(stored, name)]
+    unlike = [name for name in alike if getattr(cache, name) != getattr(stored, name)]
     if stored.grid.shared(cache.grid) is not cache.grid:
-        differing.append("grid")
-    if differing:
+        unlike.append("grid")
+    if unlike:
         raise CacheFileError(
-            f'irrcache: cache_file "{file}" contradicts itself: {", ".join(differing)} do not fit '
+            f'irrcache: cache_file "{file}" contradicts itself: {", ".join(unlike)} do not fit '
             "its fingerprint. Delete it."
         )
 
