@@ -178,6 +178,7 @@ class _Run:
         self.schedule = Schedule(targets.seconds, targets.times)
         self._opening = OPENING  # samples up to which passes may be smaller than a batch
         self.error = math.nan
+        self._is_last = False  # whether the frame before shows what was asked for
 
     def begin(self) -> None:
         """Makes the cache, or finds it, with a first pass if it needs one."""
@@ -208,8 +209,10 @@ class _Run:
             started = perf_counter()  # waiting for other threads does not count
             tensor, filtering = image()
             dr.sync_thread()
+            # Another thread may refine the cache as soon as it can.
+            samples, self._is_last = self._samples, self._has_arrived
         self.schedule.note_image(perf_counter() - started, filtering)
-        return Frame(tensor, self._samples, self.error, dict(self.schedule.seconds))
+        return Frame(tensor, samples, self.error, dict(self.schedule.seconds))
 
     def next_pass(self) -> int:
         """Samples per voxel of the next pass; 0 when it is time for an image."""
@@ -226,7 +229,7 @@ class _Run:
     @property
     def is_over(self) -> bool:
         """Whether the frame that was just made is the last one."""
-        return self._has_arrived or self.schedule.is_over
+        return self._is_last or self.schedule.is_over
 
     @property
     def _samples(self) -> int:
