@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache import render_progressive
+from mitsuba_irrcache.cache import IrradianceCache
 from mitsuba_irrcache.files import atomic_write
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -49,11 +51,27 @@ def make(scenes):
     def scene(solver="path", seed=1, **settings) -> mi.Scene:
         settings = {"solver": solver, "resolution": 3, "cache_spp": 32} | settings
         cloud = scenes.medium(scenes.texture((3, 3, 3), 0, 2, seed), 0.8, scenes.placement())
-        shape, sensor = scenes.boundary(cloud), scenes.description({}, None, size=6)["sensor"]
-        others = {f"sensor{i}": sensor for i in range(1, THREADS)}  # each with a film of its own
+        shape = scenes.boundary(cloud)
+        # Films of different sizes: Mitsuba makes one object of equal ones.
+        others = {
+            f"sensor{i}": scenes.description({}, None, size=6 + i)["sensor"]
+            for i in range(1, THREADS)
+        }
         return scenes.load({"type": "irrcache"} | settings, shape, size=6, **others)
 
     return scene
+
+
+@pytest.fixture
+def slow_sums(monkeypatch):
+    """Between what a solver has computed and its addition to a cache, other threads have time."""
+    add = IrradianceCache.add
+
+    def slowly(cache: IrradianceCache, *args: object) -> None:
+        time.sleep(0.02)
+        add(cache, *args)
+
+    monkeypatch.setattr(IrradianceCache, "add", slowly)
 
 
 def image(scene: mi.Scene, **options) -> np.ndarray:
@@ -62,12 +80,14 @@ def image(scene: mi.Scene, **options) -> np.ndarray:
 
 @pytest.mark.parametrize("films", ["one film", "several films"])
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_one_scene_in_several_threads(make, solver, films):
+def test_one_scene_in_several_threads(make, slow_sums, solver, films):
     """A fresh cache, each time: it is built once, of one random stream."""
-    expected = [image(make(solver), seed=seed) for seed in range(THREADS)]
+    sensors = range(THREADS) if films == "several films" else [0] * THREADS
+    alone = make(solver)
+    assert len({sensor.film() for sensor in alone.sensors()}) == THREADS
+    expected = [image(alone, sensor=i, seed=seed) for seed, i in enumerate(sensors)]
     for _ in range(REPETITIONS):
         scene = make(solver)
-        sensors = range(THREADS) if films == "several films" else [0] * THREADS
         renders = [
             lambda i=i, seed=seed, c=scene: image(c, sensor=i, seed=seed)
             for seed, i in enumerate(sensors)
