@@ -21,7 +21,7 @@ SMALL, SMALL_IN_ALL, SAMPLED = 1 << 17, 1 << 19, 1 << 12
 #: An ingredient of `digests` that is compared with a tolerance; rays for each shape, and how far
 #: their means may be apart.
 RESPONSES, PROBES, TOLERANCE = "responses of surfaces", 512, 1e-4
-#: In a description, what is no property of the object: a mesh's name, the scene's bounds, addresses.
+#: In a description, what is no property of the object: a mesh's name, the scene's bounds, address.
 _ELSEWHERE = re.compile(
     r"\A\w+\[\s*name = [^\n]*|\bbsphere = \w+\[.*?\n *\],?|0x[0-9a-f]+", re.DOTALL
 )
