@@ -20,8 +20,8 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.filtering import FILTERS, filter_illumination
 from mitsuba_irrcache.layers import AOVS, Layers, parse_aovs
 from mitsuba_irrcache.progressive import Frame, Targets, frames
-from mitsuba_irrcache.projection import QUADRATURES, Projection
-from mitsuba_irrcache.rendering import check_film, fill_film, planes, render_film
+from mitsuba_irrcache.projection import QUADRATURES
+from mitsuba_irrcache.rendering import check_film, exclusive, fill_film, planes, render_film
 from mitsuba_irrcache.runtime import require_llvm
 from mitsuba_irrcache.sight import Sight, SimpleSight, sight_of
 from mitsuba_irrcache.stopping import Stopped, Stopping
@@ -215,19 +215,22 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     @property
     def cache(self) -> IrradianceCache | None:
         """The irradiance cache of the last scene rendered; None before, and where none is
-        needed. Of a scene with several media there are as many: see ``caches``.
+        needed. Of a scene with several media there are as many: see ``caches``. While another
+        thread renders with this integrator, this waits.
         """
-        if len(self._builder.parts) > 1:
-            names = ", ".join(f'"{name}"' for name in self.caches)
+        caches = self.caches
+        if len(caches) > 1:
+            names = ", ".join(f'"{name}"' for name in caches)
             raise IrrcacheError(
                 f"irrcache: the scene has several media, each with a cache: caches[...] of {names}."
             )
-        return self._builder.cache
+        return next(iter(caches.values()), None)
 
     @property
     def caches(self) -> dict[str, IrradianceCache | None]:
         """The irradiance caches of the last scene rendered, by the ids of their media."""
-        return {part.medium.name: part.cache for part in self._builder.parts}
+        with self._builder.lock:
+            return {part.medium.name: part.cache for part in self._builder.parts}
 
     @property
     def cache_spp(self) -> int:
@@ -248,19 +251,29 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             callback.put("emission", self._emission, mi.ParamFlags.NonDifferentiable)
 
     def prepare(self, scene: mi.Scene) -> None:
-        """Builds or completes the cache for ``scene``, unless it is up to date."""
+        """Builds or completes the cache for ``scene``, unless it is up to date. Of several threads
+        one does; the others wait for it.
+        """
+        self._prepared(scene)
+
+    def _prepared(self, scene: mi.Scene) -> SimpleSight | Sight | None:
+        """What sees the cache of ``scene``, complete; None where there is no medium to be seen."""
         require_same_variant(self._variant, mi.variant())
-        self._stopping.begin(self._timeout)
-        try:
-            with dr.suspend_grad():
-                self._builder.update(scene, self._stopping.checked(self.progress))
-        except Stopped:
-            self._log_what_is_missing()
-        if self._revision != self._builder.revision:
-            self._sight = self._make_sight()
-            self._revision = self._builder.revision
-            if self._sight is None:
-                self._choose_stock(scene)
+        with self._builder.lock:
+            self._stopping.begin(self._timeout)
+            try:
+                with dr.suspend_grad():
+                    self._builder.update(scene, self._stopping.checked(self.progress))
+            except Stopped:
+                self._log_what_is_missing()
+            if self._revision != self._builder.revision:
+                self._sight = self._make_sight()
+                # What a thread has scattered into an array, only this thread can evaluate.
+                dr.eval()
+                self._revision = self._builder.revision
+                if self._sight is None:
+                    self._choose_stock(scene)
+            return self._sight
 
     def _choose_stock(self, scene: mi.Scene) -> None:
         """Chooses the integrator for a scene without a medium to be seen, and logs that."""
@@ -303,11 +316,6 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         )
 
     @property
-    def _projection(self) -> Projection:
-        """The one that tells of layers what all do."""
-        return self._sight.projection
-
-    @property
     def _layered(self) -> bool:
         """Whether anything is asked for that the radiance alone cannot tell."""
         return bool(self._aovs) or self._filter != "none"
@@ -332,12 +340,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """Radiance along ``ray``, for wrappers such as ``aov``; alpha is rounded at random to be a
         mask.
         """
-        self.prepare(scene)
-        if self._sight is None:
+        sight = self._prepared(scene)
+        if sight is None:
             radiance, valid, _ = self._fallback().sample(scene, sampler, ray, medium, active)
             return radiance, valid, self._aov_values(Layers.background_only(radiance))
         radiance, alpha, layers = self._radiance(
-            scene, sampler, ray, medium, mi.Spectrum(1), mi.Bool(active)
+            sight, scene, sampler, ray, medium, mi.Spectrum(1), mi.Bool(active)
         )
         return radiance, sampler.next_1d(active) < alpha, self._aov_values(layers)
 
@@ -353,12 +361,14 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         check_film(sensor.film(), spp, len(self.aov_names()))  # before the work of a cache
-        with dr.suspend_grad():
-            self.prepare(scene)
-            if self._sight is None:
+        # Threads wait for each other where they share the integrator, whose cache one of them may
+        # refine, or the film, which has room for one image.
+        with dr.suspend_grad(), self._builder.lock, exclusive(sensor.film()):
+            sight = self._prepared(scene)
+            if sight is None:
                 film = self._render_empty(scene, sensor, seed, spp)
             else:
-                film = self._render(scene, sensor, seed, spp)
+                film = self._render(sight, scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -394,15 +404,22 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def render_backward(self, *args: object, **kwargs: object) -> None:
         raise NotImplementedError(_NO_GRADIENTS)
 
-    def _render(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
+    def _render(
+        self,
+        sight: SimpleSight | Sight,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seed: int,
+        spp: int,
+    ) -> mi.Film:
         medium = sensor.get_medium()
         check_sensor(scene, sensor)  # it may have moved, or be no part of the scene
 
         def radiance(sampler, ray, weight, active) -> tuple:
-            found = self._radiance(scene, sampler, ray, medium, weight, active)
+            found = self._radiance(sight, scene, sampler, ray, medium, weight, active)
             return *found[:2], found[2].channels() if found[2] else []
 
-        count = self._projection.channel_count
+        count = sight.projection.channel_count
         names = [f"layer.{i}" for i in range(count)]
         film = render_film(sensor, radiance, seed, spp, self.should_stop, names)
         if not count:
@@ -441,6 +458,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _radiance(
         self,
+        sight: SimpleSight | Sight,
         scene: mi.Scene,
         sampler: mi.Sampler,
         ray: mi.Ray3f,
@@ -451,10 +469,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """Radiance times ``weight``, alpha, and the layers of the radiance if they are asked
         for.
         """
-        view = self._sight.look(scene, sampler, mi.Ray3f(ray), medium, active)
+        view = sight.look(scene, sampler, mi.Ray3f(ray), medium, active)
         layers = None
         if self._layered:
-            layers = self._projection.layers(
+            layers = sight.projection.layers(
                 view.scattered, view.transmittance, view.gathered, view.background, weight
             )
         return (view.scattered + view.background) * weight, view.alpha, layers

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from threading import RLock
 from time import perf_counter
 
 import drjit as dr
@@ -30,14 +31,29 @@ CHECKPOINT_SHARE = 0.1
 Progress = Callable[[str, int, int], None]
 
 
+@dataclass(eq=False)
+class Stage:
+    """How far a progressive run has the caches built: ``samples`` per voxel (0: it has not begun),
+    and whether the first two batches may be shown in pieces.
+    """
+
+    samples: int = 0
+    early: bool = False
+
+
 class CacheBuilder:
-    """Keeps the media and caches of one scene up to date, and does no work twice."""
+    """Keeps the media and caches of one scene up to date, and does no work twice.
+
+    Threads may share it: whatever changes media or caches does so under its ``lock``. Who needs
+    several of its attributes to fit each other holds the lock while reading them.
+    """
 
     def __init__(
         self, settings: CacheSettings, emission: object = None, emission_scale: float = 1.0
     ) -> None:
         """``emission`` is what `emission.bake_emission` takes; None: media do not shine."""
         self.settings = settings
+        self.lock = RLock()
         self._emission, self._emission_scale = emission, emission_scale
         #: samples per voxel to build up to (0: chosen); a higher number refines the caches
         self.samples = settings.samples
@@ -45,10 +61,9 @@ class CacheBuilder:
         self.revision = 0
         #: the media of the scene that can be seen, each with its cache
         self.parts: list[LitMedium] = []
-        # Not the scene itself: it owns the integrator, and neither would ever be freed.
-        self._scene_id = 0
         self._snapshot: Snapshot | None = None
-        self._saves_when_filled = True
+        self._stages: list[Stage] = []
+        self._checkpointed = 0  # runs that save the caches themselves
         #: whether the first two batches may be shown in pieces; see `path.Opening`
         self.early = False
         #: its action is called often while the solver ``sweep`` is at work, between launches: other
@@ -72,17 +87,22 @@ class CacheBuilder:
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
         """Makes media and caches fit ``scene``."""
-        self.fit(scene)
-        for number, part in enumerate(self.parts):
-            self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
+        with self.lock:
+            self.fit(scene)
+            for number, part in enumerate(self.parts):
+                self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
 
     def fit(self, scene: mi.Scene) -> None:
         """Makes the media fit ``scene``, with empty caches where the old ones do not hold."""
+        with self.lock:
+            self._fit(scene)
+
+    def _fit(self, scene: mi.Scene) -> None:
         volume = self._emission if isinstance(self._emission, mi.Volume) else None
-        snapshot = Snapshot(scene, volume)
+        snapshot = Snapshot(scene, volume, self._snapshot)
         changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
         if self._snapshot is None or changes:
-            edited = bool(changes) and id(scene) == self._scene_id
+            edited = bool(changes) and snapshot.shares_objects_with(self._snapshot)
             if edited:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
@@ -90,7 +110,7 @@ class CacheBuilder:
             self.revision += 1
             media = bake_media(scene, self._baked_emission())
             wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
-            settings = replace(self.settings, samples=self.samples)
+            settings = replace(self.settings, samples=self._wanted)
             self.parts = [
                 LitMedium(
                     scene,
@@ -103,7 +123,7 @@ class CacheBuilder:
                 )
                 for medium in media
             ]
-            self._scene_id, self._snapshot = id(scene), snapshot
+        self._snapshot = snapshot
 
     def _baked_emission(self) -> Emission | None:
         if self._emission is None:
@@ -113,24 +133,47 @@ class CacheBuilder:
     def _refine(self, scene: mi.Scene, part: LitMedium, progress: path.Progress | None) -> None:
         changed = True  # the solver may be stopped half-way
         try:
-            changed = part.refine(scene, self.samples, self.early, progress)
+            early = self.early or any(stage.early for stage in self._stages)
+            changed = part.refine(scene, self._wanted, early, progress)
         finally:
             self.revision += changed
         if changed:
             dr.sync_thread()
-            if self._saves_when_filled:
+            if not self._checkpointed:
                 part.save()
 
     def save(self) -> None:
         """Writes the caches to their files, where they have ones that have fewer samples."""
-        for part in self.parts:
-            part.save()
+        with self.lock:
+            for part in self.parts:
+                part.save()
 
     def close(self) -> None:
         """Ends `early`; incomplete batches are dropped."""
-        self.early = False
-        for part in self.parts:
-            self.revision += part.close()
+        with self.lock:
+            self.early = False
+            if any(stage.early for stage in self._stages):
+                return  # another thread shows them
+            for part in self.parts:
+                self.revision += part.close()
+
+    @contextmanager
+    def stage(self) -> Iterator[Stage]:
+        """What this gives says how far caches are built while it lasts, in place of ``samples``."""
+        stage = Stage()
+        with self.lock:
+            self._stages.append(stage)
+        try:
+            yield stage
+        finally:
+            with self.lock:
+                self._stages.remove(stage)
+                self.close()
+
+    @property
+    def _wanted(self) -> int:
+        """Samples per voxel that are wanted now; 0: chosen."""
+        return max((stage.samples for stage in self._stages), default=0) or self.samples
 
     @property
     def done(self) -> int:
@@ -151,7 +194,7 @@ class CacheBuilder:
     @property
     def target(self) -> int:
         """Samples per voxel that `update` builds up to, the most of all caches."""
-        return max((p.target(self.samples) for p in self.parts if p.cache is not None), default=0)
+        return max((p.target(self._wanted) for p in self.parts if p.cache is not None), default=0)
 
     @property
     def is_dark(self) -> bool:
@@ -177,12 +220,14 @@ class CacheBuilder:
                 ended = perf_counter()
                 took = ended - started
 
-        self._saves_when_filled = False
+        with self.lock:
+            self._checkpointed += 1
         try:
             yield checkpoint
         finally:
-            self._saves_when_filled = True
-            self.save()
+            with self.lock:
+                self._checkpointed -= 1
+                self.save()
 
 
 def _of_the_caches(progress: Progress | None, number: int, count: int) -> path.Progress | None:

@@ -4,9 +4,14 @@ loaded.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zipfile
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
+from threading import RLock
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +23,7 @@ from .conservation import conserving
 from .directional import Directional, DirectionalField
 from .errors import CacheFileError, IrrcacheError
 from .files import atomic_write
+from .fingerprint import differing
 from .grid import Affine, Grid, RootField
 from .lamps import Falloff
 from .macrocells import Macrocells
@@ -33,9 +39,22 @@ BATCH = 8
 SPARSE, FINE = 0.3, 2
 
 LAYERS = ("uncollided", "scattered")
-FORMAT = "mitsuba_irrcache 2"
-WITH_MOMENTS = "mitsuba_irrcache 3"  # of light by its direction
+FORMAT = "mitsuba_irrcache 4"
+WITH_MOMENTS = "mitsuba_irrcache 5"  # of light by its direction
 ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description
+#: What a file may say at most: samples of a stream, and of a batch.
+MOST_SAMPLES, LARGEST_BATCH = 1 << 31, 1 << 16
+
+
+def _consistent(method: Callable) -> Callable:
+    """Lets a method of a cache see its sums and its number of samples as they belong together."""
+
+    @wraps(method)
+    def call(self: IrradianceCache, *args: Any, **kwargs: Any) -> Any:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return call
 
 
 class IrradianceCache:
@@ -64,6 +83,7 @@ class IrradianceCache:
         see `directional`. ``correlated``: whether all voxels share their samples, and so their
         errors. Such batches are few: sums are kept in float32 then, else in float64.
         """
+        self._lock = RLock()
         self.grid = grid
         self.batch = batch  #: samples per batch
         self.active = active
@@ -104,21 +124,25 @@ class IrradianceCache:
         return sum(self.streams.values())
 
     @property
+    @_consistent
     def irradiance(self) -> mi.TensorXf:
         """Phi, both layers, (z, y, x, channel)."""
         return self._tensor([a + b for a, b in zip(self._means(0), self._means(1), strict=True)])
 
     @property
+    @_consistent
     def uncollided(self) -> mi.TensorXf:
         """Phi of scattering order 0, (z, y, x, channel)."""
         return self._tensor(self._means(0))
 
     @property
+    @_consistent
     def scattered(self) -> mi.TensorXf:
         """Phi of the scattering orders 1 and above, (z, y, x, channel)."""
         return self._tensor(self._means(1))
 
     @property
+    @_consistent
     def standard_error(self) -> mi.TensorXf:
         """Standard error of ``irradiance``, (z, y, x, channel); NaN before there are two batches of
         samples.
@@ -131,6 +155,7 @@ class IrradianceCache:
             ]
         )
 
+    @_consistent
     def mean_and_error(self) -> tuple[mi.Float, mi.Float]:
         """Irradiance and its standard error at the active voxels, means over the channels (which
         share their samples: their errors add). The error is 0 before there are two batches.
@@ -141,6 +166,7 @@ class IrradianceCache:
         return sum(means) / self.channels, sum(errors) / self.channels
 
     @property
+    @_consistent
     def relative_error(self) -> float:
         """Root mean square of the voxels' standard errors, in units of the mean irradiance; NaN
         before there are two batches of samples. It falls as the root of the samples.
@@ -153,6 +179,7 @@ class IrradianceCache:
         return float(dr.sqrt(dr.mean(dr.square(error)))[0] / scale) if scale > 0 else 0.0
 
     @property
+    @_consistent
     def is_finite(self) -> bool:
         """Whether all light is a number in single precision."""
         pairs = zip(self._means(0), self._means(1), strict=True)
@@ -167,6 +194,7 @@ class IrradianceCache:
         n, spread = self._batch_count, self._spreads[channel]
         return self._zeros if spread is None else spread / (n * (n - 1))
 
+    @_consistent
     def field(self) -> RootField:
         """Phi for lookups, without that of `beams`, and over the `falloff` if there is one: one
         channel where all channels agree to the last bit. Its maximum is that of Phi, or more.
@@ -198,6 +226,7 @@ class IrradianceCache:
         field.maximum = max(field.maximum, *brightest, 0.0)
         return field
 
+    @_consistent
     def directional_field(self, channels: int) -> DirectionalField | None:
         """The moments for lookups, where there are any."""
         if not self.moments:
@@ -245,6 +274,7 @@ class IrradianceCache:
 
     # ------------------------------------------------------------------ growing
 
+    @_consistent
     def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
         """Adds ``samples`` per voxel of the stream ``seed``.
 
@@ -279,6 +309,7 @@ class IrradianceCache:
             result.append(_sum([self._spreads[c], spread]))
         return _sums(self._totals, totals), result
 
+    @_consistent
     def note_samples(self, seed: int, samples: int) -> None:
         """Counts samples whose contribution is already in (or exactly zero)."""
         self.streams = self._streams_with(seed, samples)
@@ -291,11 +322,10 @@ class IrradianceCache:
 
         Raises IrrcacheError if the two do not describe the same light, or share a seed.
         """
-        for name in sorted(self.fingerprint.keys() | other.fingerprint.keys()):
-            if self.fingerprint.get(name) != other.fingerprint.get(name):
-                raise IrrcacheError(
-                    f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
-                )
+        for name in differing(self.fingerprint, other.fingerprint):
+            raise IrrcacheError(
+                f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
+            )
         alike = ("max_depth", "channels", "batch", "correlated", "moments")
         if self.grid.shape != other.grid.shape or any(
             getattr(self, name) != getattr(other, name) for name in alike
@@ -312,14 +342,18 @@ class IrradianceCache:
                 "their samples are the "
                 "same, not independent; make one of them with another cache_seed."
             )
-        self._totals, self._spreads = self._merged(
-            other._totals, other._spreads, other.samples // other.batch
-        )
-        self._moments = _sums(self._moments, other._moments)
-        self.streams |= other.streams
+        with other._lock:  # one after the other: two caches may be merged into each other
+            totals, spreads, moments = other._totals, other._spreads, other._moments
+            streams = other.streams
+        with self._lock:
+            count = sum(streams.values()) // other.batch
+            self._totals, self._spreads = self._merged(totals, spreads, count)
+            self._moments = _sums(self._moments, moments)
+            self.streams = self.streams | streams
 
     # ------------------------------------------------------------------ files
 
+    @_consistent
     def save(self, path: str | Path) -> None:
         """Writes the cache with all its statistics; the file appears whole or not at all."""
         description = {
@@ -334,15 +368,17 @@ class IrradianceCache:
             "streams": {str(seed): n for seed, n in self.streams.items()},
             "fingerprint": self.fingerprint,
         }
+        arrays = {
+            "active": np.array(self.active),
+            "totals": self._plain(self._totals),
+            "spreads": self._plain(self._spreads),
+            **({"moments": self._plain(self._moments, np.float32)} if self.moments else {}),
+        }
+        description["values"] = _digest_of_arrays(arrays)
+        description["digest"] = _digest_of_description(description)
+        encoded = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
         with atomic_write(path) as file:
-            np.savez(
-                file,
-                description=np.frombuffer(json.dumps(description).encode(), dtype=np.uint8),
-                active=np.array(self.active),
-                totals=self._plain(self._totals),
-                spreads=self._plain(self._spreads),
-                **({"moments": self._plain(self._moments, np.float32)} if self.moments else {}),
-            )
+            np.savez(file, description=encoded, **arrays)
 
     def _plain(self, values: list, kind: type | None = None) -> np.ndarray:
         return np.array([np.array(self._zeros if v is None else v, kind) for v in values])
@@ -372,6 +408,7 @@ class IrradianceCache:
         """Fingerprint of a file and its samples per voxel, without its arrays; raises as `load`."""
         try:
             description = json.loads(_read_arrays(Path(path), ())["description"].tobytes())
+            _check_digest(description)
             return dict(description["fingerprint"]), sum(_streams(description).values())
         except Exception as error:  # as in `load`
             raise _unreadable(path, error) from error
@@ -405,8 +442,15 @@ class IrradianceCache:
         if min(values.min(initial=0) for values in (totals, spreads)) < 0:
             raise ValueError("it holds light that is negative")
         streams, batch = _streams(description), int(description["batch"])
-        if batch < 1 or any(n % batch for n in streams.values()):
+        smallest, largest = (1, LARGEST_BATCH) if correlated else (BATCH, BATCH)
+        if not smallest <= batch <= largest or any(n % batch for n in streams.values()):
             raise ValueError(f"samples {streams} in batches of {batch}")
+        batches = sum(streams.values()) // batch
+        if (batches < 1 and totals.any()) or (batches < 2 and spreads.any()):
+            raise ValueError(f"more light than {batches} batches of samples can have")
+        _check_digest(description)
+        if _digest_of_arrays(arrays) != description["values"]:
+            raise ValueError("its values are not those that were saved")
         cache = cls(
             grid,
             mi.UInt32(active),
@@ -486,9 +530,30 @@ def _unreadable(path: str | Path, error: Exception) -> CacheFileError:
 def _streams(description: dict) -> dict[int, int]:
     """Samples by seed."""
     streams = {int(seed): int(n) for seed, n in description["streams"].items()}
-    if min(streams.values(), default=0) < 0:
-        raise ValueError(f"samples {streams}")
+    if any(seed < 0 or not 0 <= n <= MOST_SAMPLES for seed, n in streams.items()):
+        raise ValueError(f"samples {streams}; a stream has 0 to {MOST_SAMPLES}")
     return streams
+
+
+def _digest_of_arrays(arrays: dict[str, np.ndarray]) -> str:
+    """SHA-256 of the arrays of a file beside its description."""
+    sha = hashlib.sha256()
+    for name in sorted(arrays.keys() - {"description"}):
+        values = np.ascontiguousarray(arrays[name])
+        sha.update(f"{name} {values.dtype.str} {values.shape};".encode())
+        sha.update(values.data)
+    return sha.hexdigest()
+
+
+def _digest_of_description(description: dict) -> str:
+    """SHA-256 of all that a file says of itself."""
+    said = {key: value for key, value in description.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def _check_digest(description: dict) -> None:
+    if _digest_of_description(description) != description["digest"]:
+        raise ValueError("its description is not the one that was saved")
 
 
 def _read_arrays(path: Path, names: tuple[str, ...] = ARRAYS) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +16,7 @@ from .errors import IrrcacheError
 #: Seconds after which a temporary file that nobody has written to is left over from a process that
 #: was killed.
 ABANDONED = 3600.0
+_MASKING = threading.Lock()
 
 
 @contextmanager
@@ -60,6 +62,10 @@ def _remove_abandoned(folder: Path, prefix: str, suffix: str) -> None:
 
 
 def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
+    """The mask of the process. Reading it means setting it, for all threads: two that did this at
+    once could leave it at 0.
+    """
+    with _MASKING:
+        mask = os.umask(0o077)  # a file that another thread makes meanwhile is nobody else's
+        os.umask(mask)
     return mask

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +23,7 @@ from .choices import (
 )
 from .directional import Directional, sources_of
 from .errors import CacheFileError, IrrcacheError
-from .fingerprint import digests
+from .fingerprint import differing, digests
 from .grid import Grid
 from .half_space import HalfSpace
 from .lamps import Falloff
@@ -31,6 +32,9 @@ from .memory import give_back, require_memory
 from .solvers import path, sweep
 from .solvers.directional_sweep import DirectionalSweep, least_batch
 from .solvers.sweep import Sweep
+
+#: Held by the thread that writes a cache file.
+_SAVING = Lock()
 
 
 @dataclass(frozen=True)
@@ -130,8 +134,9 @@ class LitMedium:
         """
         if early and self.solver == "path" and not self.is_dark and not self.cache.samples:
             return self._open(scene, samples, progress)
+        closed = self._opening is not None and not early and self.close()
         if self.cache is None or self.cache.samples >= self.target(samples):
-            return False
+            return closed
         self._fill(scene, self.target(samples) - self.cache.samples, progress)
         if not self.is_dark and not self.cache.is_finite:
             self.cache, self._sweep = self._start_cache(scene, edited=False), None
@@ -214,10 +219,8 @@ class LitMedium:
                 )
             return cache
         stored = IrradianceCache.load(file)
-        differing = [
-            k for k in cache.fingerprint if stored.fingerprint.get(k) != cache.fingerprint[k]
-        ]
-        if not differing:
+        others = differing(cache.fingerprint, stored.fingerprint)
+        if not others:
             _check_like(cache, stored, file)
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
@@ -226,7 +229,7 @@ class LitMedium:
         if edited:
             mi.Log(
                 mi.LogLevel.Warn,
-                f'irrcache: the scene was edited ({", ".join(differing)}): "{file}" keeps the '
+                f'irrcache: the scene was edited ({", ".join(others)}): "{file}" keeps the '
                 "light of before.",
             )
             cache.fingerprint = {}
@@ -234,11 +237,11 @@ class LitMedium:
         detail = (
             f" ({stored.fingerprint.get('settings')} in the file, {cache.fingerprint['settings']} "
             "here)"
-            if differing == ["settings"]
+            if others == ["settings"]
             else ""
         )
         raise CacheFileError(
-            f'irrcache: cache_file "{file}" belongs to another scene: {", ".join(differing)} '
+            f'irrcache: cache_file "{file}" belongs to another scene: {", ".join(others)} '
             f"differ{detail}. "
             "Delete the file, or give this scene a cache_file of its own."
         )
@@ -299,8 +302,9 @@ class LitMedium:
         if cache.samples <= self.saved_samples:
             return
         try:
-            if not self._is_ahead(file):
-                cache.save(file)
+            with _SAVING:  # no other thread writes the file between looking and writing
+                if not self._is_ahead(file):
+                    cache.save(file)
             self.saved_samples = cache.samples
         except IrrcacheError as error:
             mi.Log(
@@ -316,7 +320,7 @@ class LitMedium:
         if not Path(file).exists():
             return False
         fingerprint, samples = IrradianceCache.description_of(file)
-        if fingerprint != self.cache.fingerprint:
+        if differing(fingerprint, self.cache.fingerprint):
             raise CacheFileError(f'"{file}" has come to hold the light of another scene')
         return samples >= self.cache.samples
 
@@ -324,12 +328,12 @@ class LitMedium:
 def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> None:
     """Raises CacheFileError if a file says of itself what it is not."""
     alike = ("active_count", "channels", "correlated", "max_depth", "moments")
-    differing = [name for name in alike if getattr(cache, name) != getattr(stored, name)]
+    unlike = [name for name in alike if getattr(cache, name) != getattr(stored, name)]
     if stored.grid.shared(cache.grid) is not cache.grid:
-        differing.append("grid")
-    if differing:
+        unlike.append("grid")
+    if unlike:
         raise CacheFileError(
-            f'irrcache: cache_file "{file}" contradicts itself: {", ".join(differing)} do not fit '
+            f'irrcache: cache_file "{file}" contradicts itself: {", ".join(unlike)} do not fit '
             "its fingerprint. Delete it."
         )
 

@@ -17,7 +17,7 @@ from time import perf_counter
 import drjit as dr
 import mitsuba as mi
 
-from .build import CacheBuilder, Progress
+from .build import CacheBuilder, Progress, Stage
 from .cache import BATCH
 from .errors import IrrcacheError
 from .stopping import Stopped
@@ -148,10 +148,9 @@ def frames(
     """The frames of a run. ``image`` renders one with the cache as it is, and says how many of the
     seconds it took were spent on a filter.
     """
-    own = builder.samples
-    with builder.checkpoints() as checkpoint:
+    with builder.checkpoints() as checkpoint, builder.stage() as stage:
         try:
-            run = _Run(builder, scene, targets, progress)
+            run = _Run(builder, stage, scene, targets, progress)
             run.begin()
             while True:
                 while samples := run.next_pass():
@@ -161,36 +160,39 @@ def frames(
                     return
         except Stopped:
             return
-        finally:
-            builder.samples = own
-            builder.close()
 
 
 class _Run:
     """What the stages of a run do, and how long they take."""
 
     def __init__(
-        self, builder: CacheBuilder, scene: mi.Scene, targets: Targets, progress: Progress | None
+        self,
+        builder: CacheBuilder,
+        stage: Stage,
+        scene: mi.Scene,
+        targets: Targets,
+        progress: Progress | None,
     ) -> None:
-        self.builder, self.scene, self.progress = builder, scene, progress
+        self.builder, self.stage, self.scene, self.progress = builder, stage, scene, progress
         self.targets = targets
         self.schedule = Schedule(targets.seconds, targets.times)
         self._opening = OPENING  # samples up to which passes may be smaller than a batch
         self.error = math.nan
+        self._is_last = False  # whether the frame before shows what was asked for
 
     def begin(self) -> None:
         """Makes the cache, or finds it, with a first pass if it needs one."""
-        own = self.builder.samples
-        goal = self.targets.cache_spp if self.targets.given else own
-        self.builder.early = not 0 < goal < OPENING
-        self._update(FIRST if self.builder.early else goal, lambda: None)
+        goal = self.targets.cache_spp if self.targets.given else self.builder.samples
+        self.stage.early = not 0 < goal < OPENING
+        self._update(FIRST if self.stage.early else goal, lambda: None)
         if self.builder.cache is not None and self.builder.solver != "path":
             self._opening = 0
             self.schedule.batch = self.schedule.first = self.builder.cache.batch
         self.goal = self.targets.cache_spp or math.inf
         if not self.targets.given and self.builder.cache is not None:
-            first, self.builder.samples = self.builder.samples, own
-            self.goal, self.builder.samples = self.builder.target, first
+            with self.builder.lock:
+                first, self.stage.samples = self.stage.samples, 0
+                self.goal, self.stage.samples = self.builder.target, first
 
     def refine(self, samples: int, checkpoint: Callable[[], None]) -> None:
         """A pass of so many samples per voxel."""
@@ -203,11 +205,14 @@ class _Run:
 
     def frame(self, image: Callable[[], tuple[mi.TensorXf, float]]) -> Frame:
         """An image of the cache as it is."""
-        started = perf_counter()
-        tensor, filtering = image()
-        dr.sync_thread()
+        with self.builder.lock:
+            started = perf_counter()  # waiting for other threads does not count
+            tensor, filtering = image()
+            dr.sync_thread()
+            # Another thread may refine the cache as soon as it can.
+            samples, self._is_last = self._samples, self._has_arrived
         self.schedule.note_image(perf_counter() - started, filtering)
-        return Frame(tensor, self._samples, self.error, dict(self.schedule.seconds))
+        return Frame(tensor, samples, self.error, dict(self.schedule.seconds))
 
     def next_pass(self) -> int:
         """Samples per voxel of the next pass; 0 when it is time for an image."""
@@ -224,7 +229,7 @@ class _Run:
     @property
     def is_over(self) -> bool:
         """Whether the frame that was just made is the last one."""
-        return self._has_arrived or self.schedule.is_over
+        return self._is_last or self.schedule.is_over
 
     @property
     def _samples(self) -> int:
@@ -238,13 +243,14 @@ class _Run:
         return exact or self._samples >= self.goal or self.builder.is_dark
 
     def _update(self, samples: int, checkpoint: Callable[[], None]) -> None:
-        started, old, before = perf_counter(), self.builder.cache, self._samples
-        self.builder.samples = samples
-        self.builder.update(self.scene, self.progress)
-        cache = self.builder.cache
-        if cache is not old:
-            before = self.builder.saved_samples  # what a new one has, it has from its file
-        self.error = self.builder.relative_error
+        with self.builder.lock:
+            self.stage.samples = samples
+            started, old, before = perf_counter(), self.builder.cache, self._samples
+            self.builder.update(self.scene, self.progress)
+            cache = self.builder.cache
+            if cache is not old:
+                before = self.builder.saved_samples  # what a new one has, it has from its file
+            self.error = self.builder.relative_error
         checkpoint()
         self.schedule.note_pass(max(self._samples - before, 0), perf_counter() - started)
 

@@ -7,7 +7,9 @@ and put on the film afterwards.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from threading import Lock, RLock
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +28,29 @@ TOO_MANY = 1 << 32
 #: (sampler, ray, the sensor's weight of it, active) -> radiance, alpha, values of the further
 #: channels; the weight is in the radiance
 RadianceFunction = Callable[..., tuple]
+
+#: The films that threads render to or wait for: each with its lock, and with how many there are.
+_films: dict[mi.Film, tuple[RLock, int]] = {}
+_films_lock = Lock()
+
+
+@contextmanager
+def exclusive(film: mi.Film) -> Iterator[None]:
+    """While this lasts, other threads that ask for the same ``film`` wait: it has room for one
+    image.
+    """
+    with _films_lock:
+        lock, users = _films.get(film, (None, 0))
+        lock = lock or RLock()
+        _films[film] = lock, users + 1
+    try:
+        with lock:
+            yield
+    finally:
+        with _films_lock:
+            lock, users = _films.pop(film)
+            if users > 1:
+                _films[film] = lock, users - 1
 
 
 def render_film(

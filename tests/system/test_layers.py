@@ -432,7 +432,7 @@ def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
         monkeypatch.setattr(irrcache, name, forbidden)
     scene = noisy(scenes, {"cache_spp": 8}, size=6)
     assert scenes.image(scene, spp=1).shape == (6, 6, 3)
-    assert scene.integrator()._projection.channel_count == 0
+    assert scene.integrator()._sight.projection.channel_count == 0
 
 
 def test_layers_without_errors_project_none(scenes, monkeypatch):
@@ -443,7 +443,7 @@ def test_layers_without_errors_project_none(scenes, monkeypatch):
     scene = noisy(scenes, {"cache_spp": 8, "aovs": "colour,depth", "filter": "fixed"}, size=6)
     scenes.image(scene, spp=1)
     assert scene.integrator().cache.samples == 8
-    assert scene.integrator()._projection.channel_count == 4 * dr.size_v(mi.Spectrum) + 2
+    assert scene.integrator()._sight.projection.channel_count == 4 * dr.size_v(mi.Spectrum) + 2
 
 
 def test_mono(mono, scenes):
