@@ -253,6 +253,8 @@ def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid,
         ("five per mean free path at the boundary, which cuts the medium", border, BORDERED),
     ):
         counts = extinction * lengths / edge
+        if solver == "path":
+            most = CONTRASTED  # the work grows with the voxels
         wanted[reason] = counts * min(1, most / max(counts.max(), 1))
     sides = np.max(list(wanted.values()), axis=0)
     reason = max(wanted, key=lambda key: wanted[key].max())

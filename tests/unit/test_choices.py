@@ -29,31 +29,69 @@ def chosen(values: np.ndarray, edges=(1.0, 1.0, 1.0), solver="sweep") -> tuple[i
     return choose_grid(medium(values, edges), 0, solver)[0].shape
 
 
+def in_air(count: int, sigma_t: float) -> np.ndarray:
+    """A cube of matter with some empty voxels around it, which the boundary does not cut."""
+    values = np.zeros((count, count, count))
+    inner = slice(count // 8, -(count // 8))
+    values[inner, inner, inner] = sigma_t
+    return values
+
+
 def test_thin_data_keep_their_voxels():
-    assert chosen(np.full((4, 6, 8), 3.0)) == (4, 6, 8)  # 0.75 per voxel along z at most
-    assert chosen(np.zeros((4, 6, 8))) == (4, 6, 8)
+    assert chosen(in_air(40, 2.0)) == (40, 40, 40)  # 0.05 per voxel
+    assert chosen(np.zeros((40, 48, 56))) == (40, 48, 56)
+    assert chosen(np.full((40, 48, 56), 1.0)) == (40, 48, 56)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (4, 6, 8)])
+def test_few_data_get_more_voxels(shape):
+    """Light has detail that few data lack; so many voxels cost next to nothing."""
+    assert chosen(np.full(shape, 1.0)) == (32, 32, 32)
+    assert chosen(np.full(shape, 1.0), (1.0, 0.5, 0.25)) == (max(8, shape[0]), 16, 32)
 
 
 def test_dense_data_get_finer_voxels_where_it_counts():
-    """Along each axis as far as its optical depth asks for, at most twice; ``path`` does not."""
-    assert chosen(np.full((10, 10, 10), 12.0)) == (17, 17, 17)  # 1.2 per voxel
-    assert chosen(np.full((10, 10, 10), 100.0)) == (20, 20, 20)
-    assert chosen(np.full((10, 10, 10), 6.0), (1.0, 1.0, 2.0)) == (17, 10, 10)
-    assert chosen(np.full((10, 10, 10), 100.0), solver="path") == (10, 10, 10)
+    """Along each axis as far as its optical depth asks for, at most four times; ``path``, whose
+    noise is larger than that error, does not.
+    """
+    thin, dense, opaque = (chosen(in_air(40, 40 * depth)) for depth in (0.1, 1.0, 1000.0))
+    assert thin == (40, 40, 40)
+    assert dense == (64, 64, 64)  # sqrt(1.3 / 0.5) for each of the data
+    assert opaque == (160, 160, 160)
+    assert chosen(in_air(40, 40.0), (1.0, 1.0, 2.0)) == (76, 64, 64)
+    assert chosen(in_air(40, 40000.0), solver="path") == (64, 64, 64)
+
+
+def test_contrast_and_a_cut_boundary_ask_for_voxels():
+    """Five per mean free path where light collides, up to 64; up to 128 at the boundary."""
+    speck = np.zeros((4, 4, 4))
+    speck[1:3, 1:3, 1:3] = 8.0
+    assert chosen(speck) == (40, 40, 40)
+    assert chosen(100 * speck) == (64, 64, 64)
+    assert chosen(np.full((4, 4, 4), 15.0)) == (75, 75, 75)
+    assert chosen(np.full((4, 4, 4), 500.0)) == (128, 128, 128)
+
+
+def test_homogeneous_media_get_what_their_data_would():
+    """A homogeneous medium, and the same matter on a grid."""
+    for sigma_t in (0.5, 10.0, 1000.0):
+        grid = medium(np.full((4, 4, 4), sigma_t))
+        same = MediumGrid(ConstantField(np.array([sigma_t])), grid.albedo, grid.boundary)
+        assert choose_grid(same, 0, "sweep")[0].shape == choose_grid(grid, 0, "sweep")[0].shape
 
 
 def test_a_little_bone_in_much_air():
     """What counts is the matter where light collides, not the mean of the volume."""
-    values = np.full((10, 10, 10), 0.01)
-    values[4:6, 4:6, 4:6] = 12.0
-    assert chosen(values) == (15, 15, 15)
+    values = np.full((40, 40, 40), 0.01)
+    values[16:24, 16:24, 16:24] = 40.0
+    assert chosen(values) == (64, 64, 64)
 
 
 def test_finer_voxels_have_a_limit(monkeypatch):
-    monkeypatch.setattr(choices, "MOST_VOXELS", 2500)
-    shape = chosen(np.full((10, 10, 10), 100.0))
-    assert shape == (13, 13, 13)
-    assert chosen(np.full((20, 20, 20), 100.0)) == (14, 14, 14)
+    monkeypatch.setattr(choices, "MOST_REFINED", 70000)
+    assert chosen(in_air(40, 40000.0)) == (41, 41, 41)
+    monkeypatch.setattr(choices, "MOST_VOXELS", 30000)
+    assert chosen(in_air(40, 40000.0)) == (31, 31, 31)
 
 
 @pytest.mark.parametrize(
