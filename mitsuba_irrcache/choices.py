@@ -46,6 +46,9 @@ BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
 #: nothing, and light has detail that a few data voxels lack. Matter with high contrast gets up to
 #: the second number, and one that the boundary cuts, or that is homogeneous, up to the third.
 FEWEST, CONTRASTED, BORDERED = 32, 64, 128
+#: The same for the solver ``path``, whose work grows with the voxels and whose noise is about as
+#: large as the first of these, the error that it aims at.
+PATH_TARGET_ERROR, PATH_FEWEST, PATH_MOST = 1.0, 16, 32
 #: Voxels of a cache that is finer than its data, at most: all orders of scattering in so many take
 #: half a minute on two cores.
 MOST_REFINED = 10_000_000
@@ -238,30 +241,33 @@ def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid,
     lengths = np.linalg.norm(frame[:3, :3], axis=0)
     mean, border = _colliding_extinction(medium), _border_extinction(medium)
     # Voxels along x, y, z that each criterion asks for.
-    wanted = {f"at least {FEWEST}": FEWEST * lengths / lengths.max()}
+    by_path = solver == "path"
+    target = PATH_TARGET_ERROR if by_path else TARGET_ERROR
+    fewest = PATH_FEWEST if by_path else FEWEST
+    wanted = {f"at least {fewest}": fewest * lengths / lengths.max()}
     if data is not None:
         ratio = np.ones(3)
-        if solver != "path":  # its noise in finer voxels exceeds the error of these
+        if not by_path:  # its noise in finer voxels exceeds the error of these
             depth = mean * data.voxel_size
-            ratio = np.sqrt(INTERPOLATION_ERROR * np.sqrt(depth) / TARGET_ERROR)
+            ratio = np.sqrt(INTERPOLATION_ERROR * np.sqrt(depth) / target)
         ratio = np.clip(ratio, 1, MOST_PER_DATA_VOXEL)
         dense = "finer than those of the medium, which is dense"
         wanted[dense if ratio.max() > 1 else "of the medium"] = data.resolution * ratio
-    edge = (TARGET_ERROR / BORDER_ERROR) ** (1 / BORDER_ORDER)  # in optical depth
+    edge = (target / BORDER_ERROR) ** (1 / BORDER_ORDER)  # in optical depth
+    per_path = f"{1 / edge:.0f} per mean free path"
     for reason, extinction, most in (
-        ("five per mean free path", mean, CONTRASTED),
-        ("five per mean free path at the boundary, which cuts the medium", border, BORDERED),
+        (per_path, mean, CONTRASTED),
+        (f"{per_path} at the boundary, which cuts the medium", border, BORDERED),
     ):
         counts = extinction * lengths / edge
-        if solver == "path":
-            most = CONTRASTED  # the work grows with the voxels
+        most = PATH_MOST if by_path else most
         wanted[reason] = counts * min(1, most / max(counts.max(), 1))
     sides = np.max(list(wanted.values()), axis=0)
     reason = max(wanted, key=lambda key: wanted[key].max())
     limit = voxels
     if data is not None and np.prod(sides) > data.voxel_count:
         limit = min(voxels, max(MOST_REFINED, data.voxel_count))
-    most = 128 if solver == "path" else np.inf
+    most = 128 if by_path else np.inf
     for bound, message in (
         ((limit / np.prod(sides)) ** (1 / 3), f"as fine as {limit} voxels allow"),
         (most / sides.max(), f"of the medium, at most {most}"),

@@ -8,7 +8,7 @@ import pytest
 
 pytestmark = pytest.mark.usefixtures("mono")
 
-SIGMA_T, ALBEDO, SIZE, PER_SIDE, POINTS = 0.8, 0.9, 16, 16, 600
+SIGMA_T, ALBEDO, SIZE, PER_SIDE, POINTS = 0.8, 0.9, 16, 24, 600
 ORIGIN, TARGET = np.array([0.3, 1.4, 0.1]), np.array([-0.1, 0.0, 0.05])
 
 
@@ -54,8 +54,8 @@ def single(scene: mi.Scene) -> np.ndarray:
 
 @pytest.mark.parametrize(("cutoff", "rmse"), [(7.0, 0.04), (30.0, 0.015)])
 def test_single_scattering(scenes, cutoff, rmse):
-    """With 16 voxels along the cube, of which a beam of 7 degrees has one or two across; what is left
-    is the noise of both where rays cross the beam next to the light: 45 times as bright as the
+    """With 16 voxels along the cube, of which a beam of 7 degrees has one or two across; what is
+    left is the noise of both where rays cross the beam next to the light: 45 times as bright as the
     image's mean. As an irradiance interpolated between voxels, the beam was 7 % too dark.
     """
     scene = fog(scenes, cutoff, 16)

@@ -59,7 +59,9 @@ def test_dense_data_get_finer_voxels_where_it_counts():
     assert dense == (64, 64, 64)  # sqrt(1.3 / 0.5) for each of the data
     assert opaque == (160, 160, 160)
     assert chosen(in_air(40, 40.0), (1.0, 1.0, 2.0)) == (76, 64, 64)
-    assert chosen(in_air(40, 40000.0), solver="path") == (64, 64, 64)
+    assert chosen(in_air(40, 40000.0), solver="path") == (40, 40, 40)
+    assert chosen(np.full((4, 4, 4), 500.0), solver="path") == (32, 32, 32)
+    assert chosen(np.full((1, 1, 1), 1.0), solver="path") == (16, 16, 16)
 
 
 def test_contrast_and_a_cut_boundary_ask_for_voxels():
