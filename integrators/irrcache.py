@@ -63,10 +63,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - resolution
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
-         0: the voxels of the data, up to twice as many along each axis where they are dense, at
-         most 2^25 of them, for ``path`` at most 128 along a side; two per mean free path, 32 to 96,
-         in a homogeneous medium; for ``path`` 32 to 64 along a side where there are surfaces or
-         several media.
+         0: chosen from an estimate of the error, 0.5 % of the mean radiance (``path``: 1 %): the
+         voxels of the data, up to four times as many along each axis where they are optically
+         thick, at least 32 along the longest side (``path``: 16), up to 64 or 128 where the
+         contrast is high or the boundary cuts through matter; at most 2^25, for ``path`` 128 along
+         a side, and 32 to 64 where there are surfaces or several media. An opaque homogeneous
+         medium in a box or sphere gets no cache: its radiance is that of a half-space.
          (Default: 0)
 
      * - cache_spp

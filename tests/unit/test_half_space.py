@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import mitsuba_irrcache
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.half_space import TABLE, _higher_orders, chandrasekhar_h
 
@@ -148,3 +149,18 @@ def test_a_light_inside_of_the_medium_gets_a_cache(scenes):
     scene = opaque(scenes, "sphere", 0.8, {"max_depth": 2, "cache_spp": 1}, size=4, lamp=light)
     mi.render(scene, spp=1)
     assert scene.integrator().cache is not None
+
+
+def test_layers_and_progressive_images(scenes):
+    """Colour times illumination plus background is the image; no samples of a cache are awaited."""
+    scene = opaque(
+        scenes, "sphere", 0.8, {"aovs": "colour,illumination,background,noise"}, 8, emitter=SKY
+    )
+    image = seen(scene, 4)
+    colour, illumination, background = image[..., 3:6], image[..., 6:9], image[..., 9:12]
+    np.testing.assert_allclose(colour * illumination + background, image[..., :3], atol=1e-5)
+    assert (image[..., 12:] == 0).all() and illumination.max() > 0
+    frames = list(mitsuba_irrcache.render_progressive(scene, spp=2, cache_spp=64))
+    assert len(frames) == 1
+    last = np.array(frames[-1].image)[..., :3]
+    assert last.mean() == pytest.approx(image[..., :3].mean(), rel=0.05)
