@@ -247,8 +247,8 @@ MUTANTS = (
     Mutant(
         "light in the voxel of a lamp as in its middle (sweep)",
         "solvers/sweep.py",
-        "irradiance[channel] * self._spread for irradiance",
-        "irradiance[channel] for irradiance",
+        "(1 if id(irradiance) in means else self._spread)",
+        "1",
         ("tests/system/test_lamps.py",),
     ),
     Mutant(
