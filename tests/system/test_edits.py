@@ -281,6 +281,19 @@ def test_writing_through_a_view_shows(scenes):
         old = found
 
 
+def test_data_written_without_set_dirty_are_refused(scenes):
+    """Mitsuba looks up a copy of the data, which it makes anew in ``params.update``."""
+    scene = loaded(scenes, "lights", "path")
+    image(scene)
+    params, key = mi.traverse(scene), "shape.interior_medium.sigma_t.data"
+    params[key].array.numpy()[:] *= 0.7
+    with pytest.raises(RuntimeError, match=r"edited in place.*set_dirty.*update"):
+        image(scene)
+    params.set_dirty(key)
+    params.update()
+    np.testing.assert_array_equal(image(scene), image_without_past(scene))
+
+
 CAMERA_EDITS = {
     "sensor.to_world": lambda v: mi.ScalarTransform4f().look_at([4, 0, 3], [0, 0, 0], [0, 1, 0]),
     "sensor.x_fov": lambda v: 20.0,
