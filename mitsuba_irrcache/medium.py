@@ -285,5 +285,7 @@ def volume_error(name: str) -> UnsupportedSceneError:
     """For volumes whose values between the voxels are not those that are expected."""
     return UnsupportedSceneError(
         f"irrcache: {name} does not interpolate as expected. Only trilinear, clamped volumes are "
-        'supported: use filter_type "trilinear" and wrap_mode "clamp", or render with "volpath".'
+        'supported: use filter_type "trilinear" and wrap_mode "clamp", or render with "volpath". '
+        "If its data were edited in place, as through a NumPy view, Mitsuba still looks up a copy "
+        'of the old ones: call params.set_dirty("....data") with their key, and params.update().'
     )

@@ -11,6 +11,8 @@ of them tell all there is to know.
 
 from __future__ import annotations
 
+from functools import cache
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -102,7 +104,7 @@ def phase_of(medium: mi.Medium, boundary: Boundary, name: str) -> Phase | None:
     plugin = medium.phase_function()
     if plugin.class_name() == "IsotropicPhaseFunction":
         return None
-    cosines, weights = np.polynomial.legendre.leggauss(NODES)
+    cosines, weights = _gauss_legendre()
     values, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], NODES), cosines)
     known = np.polynomial.legendre.legvander(cosines, MOMENTS - 1)
     moments = 2 * np.pi * (weights * values) @ known
@@ -111,6 +113,12 @@ def phase_of(medium: mi.Medium, boundary: Boundary, name: str) -> Phase | None:
         return None
     ends, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], 2), np.array([-1.0, 1.0]))
     return Phase(plugin, moments / moments[0], 4 * np.pi * max(values.max(), ends.max()))
+
+
+@cache
+def _gauss_legendre() -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights on [-1, 1]. Computing them takes longer than all else here."""
+    return np.polynomial.legendre.leggauss(NODES)
 
 
 def _evaluate(

@@ -51,7 +51,7 @@ def _placement(v: np.ndarray) -> mi.ScalarTransform4f:
 
 
 def _turned(factor: float) -> Callable:
-    return lambda kind, v: kind(_placement(v).rotate([0.3, 1, 0.2], 40 * factor))
+    return lambda kind, v: kind(_placement(v).rotate([0.48, 0.64, 0.6], 40 * factor))
 
 
 def _smaller(factor: float) -> Callable:
