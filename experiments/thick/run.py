@@ -10,12 +10,14 @@ processor time of a cold image. volpath's rays leave a surface at an absolute di
 2e-4 here: its images of 300 mean free paths across are too dark by 2 % under a sky, by 9 % in the
 sun; these rows are marked.
 
-Rows are kept in output/thick/results.json. No data are needed.
+Rows and references are kept in output/thick; ``--force`` forgets the rows. No data are needed.
 """
 
 from __future__ import annotations
 
+import re
 from functools import partial
+from pathlib import Path
 from time import process_time
 
 import mitsuba as mi
@@ -30,16 +32,22 @@ PIXELS, BLOCK, SPP = 48, 4, 256
 OFFSET, TRUSTED = 1.8e-4, 0.01
 
 
-def measure(objects: dict, depth: int, seconds: float) -> dict:
-    """A row."""
-    reference = mi.load_dict(
-        scene(objects, {"type": "volpath", "max_depth": depth, "rr_depth": 50}, PIXELS)
-    )
+def reference(objects: dict, depth: int, seconds: float) -> np.ndarray:
+    """Two independent images (2, y, x, channel) of volpath, of so many ``seconds`` together."""
+    integrator = {"type": "volpath", "max_depth": depth, "rr_depth": 50}
+    loaded = mi.load_dict(scene(objects, integrator, PIXELS))
     halves, count, begun = [0.0, 0.0], 0, process_time()
     while count < 2 or count % 2 or process_time() - begun < seconds:
-        halves[count % 2] += image(reference, 64, 1000 + count)
+        halves[count % 2] += image(loaded, 64, 1000 + count)
         count += 1
-    a, b = (half / (count // 2) for half in halves)
+    return np.array(halves) / (count // 2)
+
+
+def measure(objects: dict, depth: int, seconds: float, file: Path) -> dict:
+    """A row; the reference is kept in ``file``."""
+    if not file.exists():
+        np.save(file, reference(objects, depth, seconds))
+    a, b = np.load(file)
     ours = mi.load_dict(scene(objects, {"type": "irrcache", "max_depth": depth}, PIXELS))
     begun = process_time()
     x = image(ours, SPP, 1)
@@ -94,7 +102,8 @@ def run() -> None:
         for name, (objects, depth) in cases().items():
             key = f"{kind}: {name}"
             if args.only in key:
-                row = store.row(key, partial(measure, objects, depth, args.seconds))
+                file = options.folder("thick") / f"{re.sub('[^0-9a-z]+', '-', key)}.npy"
+                row = store.row(key, partial(measure, objects, depth, args.seconds, file))
                 print(line(key, row), flush=True)
 
 
