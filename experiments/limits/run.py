@@ -28,9 +28,9 @@ from experiments.options import begin, parser_of
 from experiments.store import Store
 from mitsuba_irrcache.errors import IrrcacheError, origin
 
-#: Resolutions with samples per voxel; the last two with several seeds. With few samples the images of
-#: ``path`` are too dark by up to 1 %, 5 % in narrow beams: what is between noisy voxels is not
-#: linear in them.
+#: Resolutions with samples per voxel; the last two with several seeds. With few samples images of
+#: ``path`` are too dark, by up to 1 %, 5 % in narrow beams: roots of light are interpolated between
+#: voxels, and the mean root of noisy values is less than the root of their mean.
 SWEEP = ((16, 512), (32, 512), (64, 512), (128, 512))
 PATH = ((16, 64), (32, 64), (64, 64))
 #: Of sweeps that take long: with light by its direction, or of many orders.
