@@ -140,8 +140,7 @@ CERTAIN, SURVIVE = 6, 0.8
 def orders(case: Case, paths: int, seed: int = 0, with_control: bool = True) -> tuple[float, float]:
     """The mean of the image for any ``max_depth``, and its standard error: delta tracking from the
     camera, with light from the emitter at every collision as in `single`, whose result is the
-    control variate if wanted. Unlike volpath it has no offsets of rays, which make an error of
-    0.1 % at dense borders.
+    control variate if wanted. Unlike volpath it has no offsets of rays.
     """
     scene = case.scene()
     extinction = Extinction(case.extinction())
