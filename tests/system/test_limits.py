@@ -1,6 +1,6 @@
-"""Images converge to the exact ones: coarse grids of high contrast, each emitter and phase function,
-both solvers. The references are those of experiments/limits: quadrature of single scattering, and
-paths of all orders, without any code of irrcache.
+"""Images converge to the exact ones: coarse grids of high contrast, each kind of emitter and phase
+function, both solvers. The references are those of experiments/limits: quadrature of single
+scattering, and paths of all orders, without any code of irrcache.
 """
 
 from __future__ import annotations
@@ -17,14 +17,18 @@ from experiments.limits.reference import orders, single
 pytestmark = pytest.mark.usefixtures("mono")
 
 SPP = 64
-#: Point-like lights, and phase functions: their light has hardly any noise with ``sweep``.
-POINTS = "point outside", "point beside", "point inside", "spot wide", "spot narrow"
-PHASES = "isotropic", "hg 0.3", "hg 0.6", "hg -0.4", "rayleigh"
+#: Point-like lights, whose light has hardly any noise with ``sweep``.
+POINTS = [
+    Case(emitter, phase)
+    for phase in ("isotropic", "hg 0.6", "rayleigh")
+    for emitter in ("point outside", "point beside", "point inside", "spot wide", "spot narrow")
+]
+POINTS += [Case("point outside", phase) for phase in ("hg 0.3", "hg -0.4")]
 #: Resolution, samples per voxel, and the largest relative error of the mean: 0.1 % where so many
 #: voxels leave no more, and where the noise of the directions is small enough.
 SWEEP = {
     Case("directional"): (128, 256, 0.001),
-    Case("directional", "hg 0.6"): (80, 32, 0.003),
+    Case("directional", "rayleigh"): (96, 128, 0.003),
     Case("constant"): (96, 512, 0.003),
     Case("constant", "rayleigh"): (64, 512, 0.003),
     Case("rectangle far"): (64, 512, 0.003),
@@ -38,12 +42,12 @@ PATH = {
     Case("constant"): (64, 64, 0.003),
     Case("point inside"): (64, 64, 0.002),
     Case("point outside"): (64, 64, 0.003),
-    Case("rectangle near"): (64, 64, 0.003),
+    Case("rectangle near"): (64, 32, 0.003),
 }
 #: Of all orders, by ``sweep``.
 ORDERS = {
     Case("constant", max_depth=-1): (64, 128, 0.003),
-    Case("point outside", "hg 0.6", max_depth=-1): (48, 128, 0.003),
+    Case("point outside", max_depth=-1): (64, 128, 0.003),
 }
 
 
@@ -59,13 +63,11 @@ def error(case: Case, expected: float, **integrator) -> float:
     return float(np.mean(np.array(image)[..., 0], dtype=np.float64) / expected - 1)
 
 
-@pytest.mark.parametrize("phase", PHASES)
-@pytest.mark.parametrize("emitter", POINTS)
-def test_sweep_of_point_like_lights(emitter, phase):
+@pytest.mark.parametrize("case", POINTS, ids=lambda case: case.name)
+def test_sweep_of_point_like_lights(case):
     """Errors fall with the square of the resolution: what those of two leave in the limit, and at
     the finer one.
     """
-    case = Case(emitter, phase)
     settings = {"solver": "sweep", "cache_spp": 32}
     coarse, fine = (error(case, exact(case), resolution=n, **settings) for n in (32, 64))
     assert abs(fine + (fine - coarse) / 3) < 0.001
@@ -90,14 +92,16 @@ def test_path(case):
 def test_all_orders(case):
     resolution, samples, bound = ORDERS[case]
     expected, noise = orders(case, 1 << 21)
-    assert noise < bound / 3 * expected, "too noisy to say"
+    assert noise < bound / 2 * expected, "too noisy to say"
     settings = {"solver": "sweep", "resolution": resolution, "cache_spp": samples}
     assert abs(error(case, expected, **settings)) < bound
 
 
-def test_the_references_agree():
-    """Quadrature, and paths that end after their first collision but for the control variate."""
-    case = Case("directional", "hg 0.6", max_depth=2)
-    expected, noise = orders(case, 1 << 16)
-    assert expected == pytest.approx(exact(case), rel=1e-3)
-    assert noise < 1e-3 * expected
+@pytest.mark.parametrize(
+    "case", [Case("directional", "hg 0.6"), Case("constant", "rayleigh", "3x5x2")]
+)
+def test_the_references_agree(case):
+    """Quadrature, and paths that end after their first collision."""
+    expected, noise = orders(case, 1 << 20, with_control=False)
+    assert noise < 2e-3 * expected, "too noisy to say"
+    assert abs(expected - exact(case)) < 3 * noise
