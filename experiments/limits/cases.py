@@ -79,7 +79,7 @@ EMITTERS = {
 PHASES = {
     "isotropic": {"type": "isotropic"},
     "hg 0.3": {"type": "hg", "g": 0.3},
-    "hg 0.6": {"type": "hg", "g": 0.58},
+    "hg 0.58": {"type": "hg", "g": 0.58},
     "hg -0.4": {"type": "hg", "g": -0.4},
     "hg 0.85": {"type": "hg", "g": 0.85},
     "rayleigh": {"type": "rayleigh"},
@@ -147,11 +147,11 @@ def cases() -> list[Case]:
     """All: every emitter with every phase function and depth that matters to it."""
     found = [Case(emitter) for emitter in EMITTERS]
     found += [replace(c, grid=grid) for grid in ("3x5x2", "1x1x6") for c in found[:10:3]]
-    for phase in ("hg 0.3", "hg 0.6", "hg -0.4", "rayleigh"):
+    for phase in ("hg 0.3", "hg 0.58", "hg -0.4", "rayleigh"):
         found += [Case(emitter, phase) for emitter in EMITTERS]
     for depth in (-1, 3):
         found += [Case(emitter, max_depth=depth) for emitter in EMITTERS if "view" not in emitter]
-    for phase in ("hg 0.3", "hg 0.6", "rayleigh", "hg 0.85"):
+    for phase in ("hg 0.3", "hg 0.58", "rayleigh", "hg 0.85"):
         emitters = "constant", "envmap", "directional", "point outside", "rectangle near"
         found += [Case(emitter, phase, max_depth=-1) for emitter in emitters]
     return found

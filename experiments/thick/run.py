@@ -51,10 +51,10 @@ def measure(objects: dict, depth: int, seconds: float, file: Path) -> dict:
     ours = mi.load_dict(scene(objects, {"type": "irrcache", "max_depth": depth}, PIXELS))
     begun = process_time()
     x = image(ours, SPP, 1)
-    row = {
-        "seconds": process_time() - begun,
-        "offset": OFFSET * objects["shape"]["interior"]["scale"],
-    }
+    seconds, interior = process_time() - begun, objects["shape"]["interior"]
+    # The grids of `cases` are empty or thin where rays enter them.
+    offset = OFFSET * interior["scale"] if interior["type"] == "homogeneous" else 0.0
+    row = {"seconds": seconds, "offset": offset}
     scale = 0.5 * (a.mean() + b.mean())
     squared = ((x - a) * (x - b)).mean()
     apart = blocks(x - 0.5 * (a + b))
