@@ -44,7 +44,7 @@ def check_placement(emitter: mi.Emitter) -> None:
 
 
 def _check_shape(emitter: mi.Emitter) -> None:
-    """Refuses a cylinder that shines and is not round: Mitsuba samples it as if it was, and
+    """Refuses an emissive cylinder that is not round: Mitsuba samples it as if it was, and
     ``volpath`` converges to a mixture of that and of what rays meet.
     """
     shape = emitter.get_shape()

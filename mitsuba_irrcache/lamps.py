@@ -96,9 +96,7 @@ class Falloff:
 
     @classmethod
     def of(cls, scene: mi.Scene, grid: Grid, others: Sequence[mi.Emitter] = ()) -> Falloff | None:
-        """That of the lamps of a scene that are near the voxels of ``grid``, but for ``others``;
-        None if none is.
-        """
+        """The falloff of lamps near the voxels of ``grid``, except ``others``; None without any."""
         lights = [e for e in point_lights(scene) if e not in others]
         points = [p for e in lights for p in _of_point(e, grid)]
         points += [p for s in scene.shapes() if s.is_emitter() for p in _of_area(s, grid)]

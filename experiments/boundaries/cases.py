@@ -289,7 +289,7 @@ def lights() -> dict[str, dict]:
         | lamp("sphere", placed((0.2, 0.1, 0), (0.2, 0.6, 0.1))),
         "point inside": {"a": bound(fog())} | none
         | {"point": {"type": "point", "position": [0.3, 0.2, 0], "intensity": 2.0}},
-        "boundary that shines": {"a": bound(fog(), kind="sphere")
+        "emissive boundary": {"a": bound(fog(), kind="sphere")
                                  | {"emitter": {"type": "area", "radiance": 0.5}}},
     }  # fmt: skip
 

@@ -58,7 +58,7 @@ class Extinction:
 
 
 def phase_value(name: str, cosine: mi.Float) -> mi.Float:
-    """The phase function; ``cosine`` is 1 where light goes straight on."""
+    """The phase function; ``cosine`` is 1 for forward scattering."""
     phase = PHASES[name]
     if phase["type"] == "hg":
         g = phase["g"]

@@ -33,7 +33,7 @@ from mitsuba_irrcache.errors import IrrcacheError, origin
 #: vanishes with the noise of the samples; probably since roots of light are interpolated.
 SWEEP = ((16, 512), (32, 512), (64, 512), (128, 512))
 PATH = ((16, 64), (32, 64), (64, 64))
-#: Of sweeps that take long: with light by its direction, or of many orders.
+#: Settings of slow sweeps: anisotropic phase functions, or many orders of scattering.
 LONG_SWEEP = SWEEP[:3]
 #: Steps at the second but last resolution, beside 1.
 STEPS = (0.5, 0.25)

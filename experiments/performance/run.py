@@ -250,7 +250,7 @@ def stock_row(case: Case, integrator: str, wanted: float) -> dict:
 
 
 def unscattered_row(case: Case, integrator: str) -> dict:
-    """Mean of what is seen of the emitters through the volume."""
+    """The mean radiance of the emitters behind the volume, attenuated by it."""
     scene = case.load(specify(integrator, max_depth=1))
     return {"mean": float(picture(scene, UNSCATTERED_SPP, 0)[0].mean())}
 

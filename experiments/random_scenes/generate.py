@@ -146,7 +146,7 @@ class RandomScene:
 
     @property
     def properties(self) -> dict:
-        """Those of the integrator that say what is to be seen."""
+        """The properties of the integrator that determine what is visible."""
         return {"max_depth": self.max_depth, "hide_emitters": self.hide_emitters}
 
     def build(self, integrator: dict, folder: Path) -> dict:

@@ -223,7 +223,7 @@ def test_every_parameter_that_is_assigned_shows(scenes, world, solver):
             assign(params, key, edited(original, factor, plugin))
             params.update()
             found = image(scene)
-            # Of a transformation that is assigned anew, Mitsuba rounds the inverse otherwise.
+            # Mitsuba rounds the inverse of an assigned transformation differently.
             same = factor == 1 and not is_transform(original)
             expected = first if same else image_without_past(scene)
             np.testing.assert_array_equal(found, expected, err_msg=f"{key} times {factor}")

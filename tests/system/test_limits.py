@@ -44,7 +44,7 @@ PATH = {
     Case("point outside"): (64, 64, 0.003),
     Case("rectangle near"): (64, 32, 0.003),
 }
-#: Of all orders, by ``sweep``.
+#: All orders of scattering, solver ``sweep``.
 ORDERS = {
     Case("constant", max_depth=-1): (64, 128, 0.003),
     Case("point outside", max_depth=-1): (64, 128, 0.003),

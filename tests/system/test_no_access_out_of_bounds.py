@@ -46,7 +46,7 @@ def test_the_check_finds_one(reported):
 
 @pytest.mark.parametrize("shape", [(4, 5, 6), (1, 7, 1), (1, 1, 1)], ids=str)
 def test_lookups(reported, shape):
-    """Of one field and of two, in the grid, on its border, and beyond."""
+    """Lookups of one and of two fields inside, on the border and outside of the grid."""
     grid, rng = Grid(shape, np.eye(4)), np.random.default_rng(1)
     count = grid.voxel_count
     grey = GridField(grid, mi.Float(np.float32(rng.random(count))), 1)

@@ -17,7 +17,7 @@ SHEAR = np.eye(4) + 0.5 * np.eye(4)[:, [0]] @ np.eye(4)[[1]]
 
 
 def difference(scenes, shape: dict, solver: str = "sweep", **objects) -> float:
-    """Of the means of images by irrcache and volpath, single scattering, in units of the mean."""
+    """Difference of the mean radiance from volpath's, relative; single scattering."""
     ours = {"type": "irrcache", "solver": solver, "resolution": 20, "cache_spp": 256} | ONCE
     mine = scenes.image(scenes.load(ours, shape, 16, **objects), spp=64).mean()
     theirs = scenes.load({"type": "volpath"} | ONCE, shape, 16, **objects)

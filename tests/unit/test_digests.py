@@ -354,8 +354,8 @@ LIT_BY_A_LAMP = {
     ids=["flipped", "two-sided", "another BSDF", "another radiance"],
 )
 def test_cache_files_of_other_scenes_are_refused(scenes, tmp_path_factory, change):
-    """A lamp that shines the other way lights nothing: with the file of the first one its image
-    would be bright.
+    """A lamp that emits to the other side illuminates nothing: with the file of the first one its
+    image would be bright.
     """
     lamp = LIT_BY_A_LAMP | {"to_world": mi.ScalarTransform4f(LIT_BY_A_LAMP["to_world"])}
     file = tmp_path_factory.getbasetemp() / "lamp.cache"

@@ -74,8 +74,8 @@ def centred(level: DirectionalLevel, ways: np.ndarray) -> np.ndarray:
 
 
 def test_light_that_a_voxel_scatters_goes_on_forward():
-    """Of one voxel that light comes to along an oblique direction, and that scatters forwards with
-    g = 0.5, along all lines: what voxels receive is mirrored about it if the light comes from the
+    """One voxel, illuminated along an oblique direction, scatters forwards with g = 0.5 along all
+    lines: what voxels receive is mirrored about it if the light comes from the
     opposite side, and the voxels ahead receive 4 pi p of the angle, those behind likewise.
     """
     moments, of_matter = moments_of(0.5), lines(0.2)

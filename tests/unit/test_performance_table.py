@@ -59,7 +59,7 @@ def test_defaults_have_a_row_of_their_own_error(case):
 
 
 def test_errors_of_the_volume_alone(case):
-    """Of an image of mean 0.8, 0.2 is scattered: the errors are four times those of the image."""
+    """In an image of mean 0.8, 0.2 is scattered: errors are four times those of the image."""
     assert columns(case)["of the volume"] == ("5 %", "2 %", "0.5 %", "1 %")
     assert run.of_the_volume(0.01, {"mean": 0.8, "volume": 0.0}) == "—"
     assert run.of_the_volume(0.01, {"mean": 0.8}) == "—"  # of results without it

@@ -30,7 +30,7 @@ def rays(count: int, reach: float) -> mi.Ray3f:
 
 
 def box(place: np.ndarray) -> Boundary:
-    """That of the unit cube which is placed so."""
+    """The ``to_world`` of the unit cube of this placement."""
     unit = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
     return Boundary("box", place @ unit)
 
