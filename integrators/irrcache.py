@@ -64,7 +64,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
          0: chosen from an estimate of the error, 0.5 % of the mean radiance (``path``: 1 %): the
-         voxels of the data, up to four times as many along each axis where they are optically
+         voxels of the data, up to six times as many along each axis where they are optically
          thick, at least 32 along the longest side (``path``: 16), up to 64 or 128 where the
          contrast is high or the boundary cuts through matter; at most 2^25, for ``path`` 128 along
          a side, and 32 to 64 where there are surfaces or several media. An opaque homogeneous

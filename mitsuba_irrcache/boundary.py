@@ -163,8 +163,8 @@ def rays_through(shape: mi.Shape) -> mi.Ray3f:
 
 
 def orientation(scene: mi.Scene, shape: mi.Shape) -> tuple[float, float]:
-    """Two shares of the rays from outside that intersect ``shape``, ignoring other shapes: rays that
-    hit its back side first, and rays that do not leave it as often as they enter.
+    """Two shares of the rays from outside that intersect ``shape``, ignoring other shapes: rays
+    that hit its back side first, and rays that do not leave it as often as they enter.
     """
     first, depth = _crossings(scene, mi.ShapePtr(shape), rays_through(shape))
     dr.eval(first, depth)

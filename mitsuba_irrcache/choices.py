@@ -32,13 +32,13 @@ AMONG_SURFACES = (32, 64)
 #: Voxels of a cache that ``resolution`` 0 leads to, at most; where light is known by its direction.
 MOST_VOXELS, MOST_DIRECTIONAL = 1 << 25, 1 << 21
 #: RMSE of the image, in % of its mean, that ``resolution`` 0 aims at by the estimates below, which
-#: are fits to images of random and smooth media of 0.3 to 100 optical depths per data voxel.
+#: are fits to images of a CT head and of random and smooth media of 0.3 to 100 optical depths per
+#: data voxel. The error falls with the square of the voxels along an axis.
 TARGET_ERROR = 0.5
-#: Interpolation between cache voxels, r along an axis for each data voxel of the optical depth d,
-#: causes an error of about this many % times sqrt(d) / r^2.
-INTERPOLATION_ERROR = 1.3
-#: ... and r is at most this.
-MOST_PER_DATA_VOXEL = 4.0
+#: Optical depth of a data voxel up to which the data's own voxels have that error; one from which
+#: on the voxels that it takes grow less than in proportion to the depth, with this power; and the
+#: most voxels along an axis for each of the data.
+RESOLVED, OPAQUE, OPAQUE_POWER, MOST_PER_DATA_VOXEL = 0.7, 1.2, 0.45, 6.0
 #: A medium whose boundary cuts through matter, with an optical depth d of a cache voxel there, has
 #: an error of about this many % times d^1.2.
 BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
@@ -51,7 +51,7 @@ FEWEST, CONTRASTED, BORDERED = 32, 64, 128
 PATH_TARGET_ERROR, PATH_FEWEST, PATH_MOST = 1.0, 16, 32
 #: Voxels of a cache that is finer than its data, at most: all orders of scattering in so many take
 #: half a minute on two cores.
-MOST_REFINED = 10_000_000
+MOST_REFINED = 8_000_000
 #: Directions per voxel of the solver ``sweep``, unless told otherwise: for all orders of
 #: scattering, and among surfaces, whose light has the noise of the image's samples besides. Twice
 #: as many for single scattering of irradiance, where each is less work and blurs less.
@@ -249,7 +249,8 @@ def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid,
         ratio = np.ones(3)
         if not by_path:  # its noise in finer voxels exceeds the error of these
             depth = mean * data.voxel_size
-            ratio = np.sqrt(INTERPOLATION_ERROR * np.sqrt(depth) / target)
+            ratio = np.minimum(depth, OPAQUE) / RESOLVED
+            ratio *= np.maximum(depth / OPAQUE, 1) ** OPAQUE_POWER
         ratio = np.clip(ratio, 1, MOST_PER_DATA_VOXEL)
         dense = "finer than those of the medium, which is dense"
         wanted[dense if ratio.max() > 1 else "of the medium"] = data.resolution * ratio

@@ -51,14 +51,16 @@ def test_few_data_get_more_voxels(shape):
 
 
 def test_dense_data_get_finer_voxels_where_it_counts():
-    """Along each axis as far as its optical depth asks for, at most four times; ``path``, whose
+    """Along each axis as far as its optical depth asks for, at most six times; ``path``, whose
     noise is larger than that error, does not.
     """
     thin, dense, opaque = (chosen(in_air(40, 40 * depth)) for depth in (0.1, 1.0, 1000.0))
     assert thin == (40, 40, 40)
-    assert dense == (64, 64, 64)  # sqrt(1.3 / 0.5) for each of the data
-    assert opaque == (160, 160, 160)
-    assert chosen(in_air(40, 40.0), (1.0, 1.0, 2.0)) == (76, 64, 64)
+    assert dense == (64, 64, 64)  # 1 / 0.7 for each of the data would be 57
+    assert chosen(in_air(40, 48.0)) == (68, 68, 68)
+    assert chosen(in_air(40, 40.0 * 1.2 * 4)) == (127, 127, 127)  # 4^0.45 times as many
+    assert opaque == (200, 200, 200)
+    assert chosen(in_air(20, 20000.0)) == (120, 120, 120)
     assert chosen(in_air(40, 40000.0), solver="path") == (40, 40, 40)
     assert chosen(np.full((4, 4, 4), 500.0), solver="path") == (32, 32, 32)
     assert chosen(np.full((1, 1, 1), 1.0), solver="path") == (16, 16, 16)
