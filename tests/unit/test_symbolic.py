@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 import drjit as dr
 import mitsuba as mi
+import pytest
 
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.symbolic import symbolic
 
 
@@ -27,3 +31,16 @@ def test_a_function_is_transformed_once_when_it_is_called(rgb, monkeypatch):
     assert list(later(mi.UInt32([0, 1, 2, 3, 10]))) == [0, 1, 3, 6, 55]
     assert list(later(mi.UInt32([4, 5]), step=2)) == [6, 12]
     assert transformed == ["triangular"]
+
+
+def test_a_file_that_was_changed_after_its_import_is_refused(rgb, tmp_path):
+    """``dr.syntax`` would compile whatever is at the function's line numbers now."""
+    file = tmp_path / "edited.py"
+    source = "def half(x):\n    return x / 2\n"
+    file.write_text(source)
+    found: dict = {}
+    exec(compile(source, str(file), "exec"), found)
+    function = symbolic(found["half"])
+    os.utime(file, ns=(1, 1))
+    with pytest.raises(IrrcacheError, match="was changed after it was imported"):
+        function(mi.Float(1))
