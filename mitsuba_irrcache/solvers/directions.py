@@ -8,6 +8,7 @@ even as one of so many directions: independent turns would leave three times the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import combinations
 
@@ -16,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.polynomial.legendre import legval
 
+from mitsuba_irrcache.beams import Beam
 from mitsuba_irrcache.directional import spots_of
 from mitsuba_irrcache.medium import MediumGrid
 from mitsuba_irrcache.tracking import medium_transmittance
@@ -273,9 +275,16 @@ class Sky:
             total += np.array(self._environment.pdf_direction(at, record), dtype=np.float64)
         return total
 
-    def near_light(self, medium: MediumGrid, position: mi.Point3f) -> list[mi.Spectrum]:
-        """Irradiance at ``position`` from each point-like light nearby."""
-        return [_from_point(emitter, medium, position) for emitter in self.near]
+    def near_light(
+        self, medium: MediumGrid, position: mi.Point3f, beams: Sequence[Beam] = ()
+    ) -> list[mi.Spectrum]:
+        """Irradiance at ``position`` from each point-like light nearby; from spot lights of
+        ``beams``, which are not marched again, its means over the voxels.
+        """
+        means = {id(beam.emitter): beam.irradiance for beam in beams}
+        return [
+            means[id(e)] if id(e) in means else _from_point(e, medium, position) for e in self.near
+        ]
 
 
 def _even(count: int) -> np.ndarray:

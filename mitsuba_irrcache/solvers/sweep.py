@@ -117,8 +117,8 @@ class Sweep:
         self._emitted: list[list[mi.Spectrum]] = []
         self._around: Around | None = None
         if medium.alone:
-            near = self._sky.near_light(medium, self._places)
-            self._direct = self._with_beams([[e] for e in near])
+            near = self._sky.near_light(medium, self._places, cache.beams)
+            self._direct = [[e] for e in near]
             return
         small, large = split(scene, grid, *box)
         self._around = Around(scene, medium, large, rr_depth, cache.directional)
