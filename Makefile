@@ -46,5 +46,5 @@ $(BIN)/pip:
 $(READY): pyproject.toml | $(BIN)/pip
 	@echo "Installing the package and what it needs into .venv; this takes a minute or two"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[test]"
-	$(BIN)/python -m mitsuba_irrcache.install_llvm
+	$(BIN)/python -m mitsuba_irrcache.machine.install_llvm
 	@touch $@

@@ -12,7 +12,7 @@ import numpy as np
 from experiments.methods import specify
 from mitsuba_irrcache.compare import metrics
 from mitsuba_irrcache.compare.reference import Reference
-from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.io.scene_files import load_scene
 
 
 def measure(

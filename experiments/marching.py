@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.projection import Projection
+from mitsuba_irrcache.render.raymarch import Projection
 
 
 def unjittered(projection: Projection, ray: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mitsuba_irrcache.loading import describe_integrator, parse_integrator
+from mitsuba_irrcache.io.scene_files import describe_integrator, parse_integrator
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.machine.llvm import require_llvm
 
 
 @dataclass(frozen=True)

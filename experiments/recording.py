@@ -20,7 +20,7 @@ from mitsuba_irrcache.compare.processes import WorkerError, run_job
 from mitsuba_irrcache.compare.reference import Reference, reference
 from mitsuba_irrcache.compare.results import Measurement, Snapshot
 from mitsuba_irrcache.compare.scene_files import scene_digest
-from mitsuba_irrcache.images import write_image
+from mitsuba_irrcache.io.images import write_image
 
 #: Single scattering, and half the presets' extinction: bone lets light through, and a voxel of a
 #: coarse volume is not opaque on its own.

@@ -11,7 +11,7 @@ import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from mitsuba_irrcache.cli import main as irrcache
+from mitsuba_irrcache.cli.main import main as irrcache
 
 DATA = Path(os.environ.get("IRRCACHE_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
 

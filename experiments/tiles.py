@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from mitsuba_irrcache.compare import style
 from mitsuba_irrcache.compare.perceptual import display
-from mitsuba_irrcache.images import read_image
+from mitsuba_irrcache.io.images import read_image
 
 
 def tiles(

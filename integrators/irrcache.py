@@ -11,22 +11,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache import given
-from mitsuba_irrcache.agreement import check_sensor
-from mitsuba_irrcache.build import CacheBuilder, CacheSettings
-from mitsuba_irrcache.cache import IrradianceCache
-from mitsuba_irrcache.choices import choose_stock
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.core import properties
+from mitsuba_irrcache.core.cancellation import Stopped, Stopping
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.filtering import FILTERS, filter_illumination
-from mitsuba_irrcache.layers import AOVS, Layers, parse_aovs
-from mitsuba_irrcache.progressive import Frame, Targets, frames
-from mitsuba_irrcache.projection import QUADRATURES
-from mitsuba_irrcache.rendering import check_film, exclusive, fill_film, planes, render_film
-from mitsuba_irrcache.runtime import require_llvm
-from mitsuba_irrcache.sight import Sight, SimpleSight, sight_of
-from mitsuba_irrcache.stopping import Stopped, Stopping
-from mitsuba_irrcache.variants import require_same_variant, require_variant
-from mitsuba_irrcache.versions import check_versions
+from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
+from mitsuba_irrcache.machine.versions import check_versions
+from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
+from mitsuba_irrcache.pipeline.defaults import choose_stock
+from mitsuba_irrcache.pipeline.progressive import Frame, Targets, frames
+from mitsuba_irrcache.render.aovs import AOVS, Layers, parse_aovs
+from mitsuba_irrcache.render.camera import Sight, SimpleSight, sight_of
+from mitsuba_irrcache.render.denoise import FILTERS, filter_illumination
+from mitsuba_irrcache.render.film import check_film, exclusive, fill_film, planes, render_film
+from mitsuba_irrcache.render.raymarch import QUADRATURES
+from mitsuba_irrcache.scene.consistency import check_sensor
 
 SOLVERS = ("auto", "path", "sweep")
 _NO_GRADIENTS = 'irrcache computes no gradients; use the integrator "prbvolpath" for them.'
@@ -174,32 +174,36 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         require_llvm()
         check_versions()
         super().__init__(props)
-        props = self._properties = given.Record(props)
-        max_depth = given.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0")
-        self._hide_emitters = given.flag(props, "hide_emitters", False)
-        self._filter = given.choice(props, "filter", "none", FILTERS)
-        self._aovs = parse_aovs(given.text(props, "aovs"))
+        props = self._properties = properties.Record(props)
+        max_depth = properties.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0")
+        self._hide_emitters = properties.flag(props, "hide_emitters", False)
+        self._filter = properties.choice(props, "filter", "none", FILTERS)
+        self._aovs = parse_aovs(properties.text(props, "aovs"))
         self._settings = CacheSettings(
             max_depth=max_depth,
-            rr_depth=given.integer(props, "rr_depth", 5, 1, "at least 1"),
-            solver=given.choice(props, "solver", "auto", SOLVERS),
-            resolution=given.integer(props, "resolution", 0, 0, "0 (chosen) or a number of voxels"),
-            samples=given.integer(props, "cache_spp", 0, 0, "0 (chosen) or a number of samples"),
-            seed=given.integer(props, "cache_seed", 0, 0, "at least 0"),
-            file=given.file_name(props, "cache_file"),
+            rr_depth=properties.integer(props, "rr_depth", 5, 1, "at least 1"),
+            solver=properties.choice(props, "solver", "auto", SOLVERS),
+            resolution=properties.integer(
+                props, "resolution", 0, 0, "0 (chosen) or a number of voxels"
+            ),
+            samples=properties.integer(
+                props, "cache_spp", 0, 0, "0 (chosen) or a number of samples"
+            ),
+            seed=properties.integer(props, "cache_seed", 0, 0, "at least 0"),
+            file=properties.file_name(props, "cache_file"),
             with_error=self._with_error,
         )
-        self._quadrature = given.choice(props, "quadrature", "exponential", QUADRATURES)
-        self._step = given.number(
+        self._quadrature = properties.choice(props, "quadrature", "exponential", QUADRATURES)
+        self._step = properties.number(
             props, "step", 1.0, 1e-3, 1e3, "between 0.001 and 1000 voxel edges"
         )
         self._emission = props.get("emission", None)
         largest = float(np.finfo(np.float32).max)
-        scale = given.number(
+        scale = properties.number(
             props, "emission_scale", 1.0, 0.0, largest, "a finite number that is not negative"
         )
         self._builder = CacheBuilder(self._settings, self._emission, scale)
-        self._timeout = given.number(
+        self._timeout = properties.number(
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
         self._stopping = Stopping()
@@ -243,7 +247,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     @cache_spp.setter
     def cache_spp(self, samples: int) -> None:
-        self._builder.samples = given.checked_integer(
+        self._builder.samples = properties.checked_integer(
             "cache_spp", samples, 0, "0 (chosen) or a number"
         )
 
@@ -388,7 +392,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         **targets: object,
     ) -> Iterator[Frame]:
         """Images of ``scene`` while the cache is refined, until one of the ``targets`` is reached;
-        see `mitsuba_irrcache.progressive.Targets` for these.
+        see `mitsuba_irrcache.pipeline.progressive.Targets` for these.
         """
 
         def image() -> tuple[mi.TensorXf, float]:
@@ -496,7 +500,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """All properties, as they are: the record of how an image was made."""
         aovs = ", ".join(f"{name}:{kind}" for name, kind in self._aovs.items())
         values = self._properties.values | {"cache_spp": self.cache_spp, "aovs": aovs}
-        return f"IrradianceCachingIntegrator[\n{given.described(values)}\n]"
+        return f"IrradianceCachingIntegrator[\n{properties.described(values)}\n]"
 
 
 mi.register_integrator("irrcache", IrradianceCachingIntegrator)

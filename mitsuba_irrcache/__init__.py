@@ -6,14 +6,15 @@ type="irrcache"/>`` available in every variant set from then on.
 
 from __future__ import annotations
 
-from . import runtime
+from mitsuba_irrcache.machine import llvm
 
-runtime.prepare_llvm()  # before Dr.Jit is imported for the first time
+llvm.prepare_llvm()  # before Dr.Jit is imported for the first time
+
+from mitsuba_irrcache.cache.volume import IrradianceCache  # noqa: E402
+from mitsuba_irrcache.pipeline.progressive import render_progressive  # noqa: E402
 
 from . import _register  # noqa: E402,F401
-from .cache import IrradianceCache  # noqa: E402
 from .errors import CacheFileError, IrrcacheError, UnsupportedSceneError  # noqa: E402
-from .progressive import render_progressive  # noqa: E402
 
 __version__ = "0.1.0"
 

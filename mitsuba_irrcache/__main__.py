@@ -1,5 +1,5 @@
 """``python -m mitsuba_irrcache`` is the command ``irrcache``."""
 
-from .cli import command
+from mitsuba_irrcache.cli import command
 
 command()

@@ -60,16 +60,16 @@ def scenes() -> SimpleNamespace:
 @pytest.fixture
 def refine_calls(monkeypatch) -> list[int]:
     """Samples per voxel of each call of the solver, while the test runs."""
-    from mitsuba_irrcache.solvers import path
+    from mitsuba_irrcache.solvers.path import solver as path_solver
 
     calls: list[int] = []
-    refine = path.refine
+    refine = path_solver.refine
 
     def counted(scene, medium, cache, samples, *args, **kwargs):
         calls.append(samples)
         return refine(scene, medium, cache, samples, *args, **kwargs)
 
-    monkeypatch.setattr(path, "refine", counted)
+    monkeypatch.setattr(path_solver, "refine", counted)
     return calls
 
 

@@ -20,7 +20,7 @@ from experiments.cached import measure
 from experiments.scenes import SOURCES, scene_file
 from experiments.store import Store
 from mitsuba_irrcache.compare.reference import reference
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.machine.llvm import require_llvm
 
 SCENES = ["phantom", "cloud", "head"]
 REFERENCE = {2: "volpath{rr_depth=1000}", -1: "volpath{rr_depth=20}"}

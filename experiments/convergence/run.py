@@ -17,10 +17,10 @@ import numpy as np
 
 from experiments.analysis import rms
 from experiments.marching import unjittered
-from mitsuba_irrcache.build import CacheBuilder, CacheSettings
-from mitsuba_irrcache.cache import IrradianceCache
-from mitsuba_irrcache.projection import QUADRATURES, Projection
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
+from mitsuba_irrcache.render.raymarch import QUADRATURES, Projection
 
 
 def main() -> None:

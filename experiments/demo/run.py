@@ -15,12 +15,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cli import main as irrcache
+from mitsuba_irrcache.cli.main import main as irrcache
+from mitsuba_irrcache.cli.render import progress_bar
 from mitsuba_irrcache.compare import metrics
-from mitsuba_irrcache.images import write_image
-from mitsuba_irrcache.loading import load_scene
-from mitsuba_irrcache.render import progress_bar
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.io.images import write_image
+from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.machine.llvm import require_llvm
 
 INTEGRATOR = "irrcache{step=0.5}"
 SCENE = {"max_depth": "2", "hide_emitters": "true", "radiance": "2"}

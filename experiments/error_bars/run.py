@@ -21,7 +21,7 @@ from experiments.options import Options, parse
 from experiments.scenes import scene_file
 from experiments.store import Store
 from mitsuba_irrcache.compare.reference import Reference, reference
-from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.io.scene_files import load_scene
 
 SCENES = ("phantom", "cloud", "head")
 CACHES = ((32, 16), (64, 16), (64, 64), (128, 16))  # resolution, samples per voxel

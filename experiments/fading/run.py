@@ -24,7 +24,7 @@ from experiments.recording import Subject
 from experiments.store import Store
 from mitsuba_irrcache.compare import metrics
 from mitsuba_irrcache.compare.reference import Reference
-from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.io.scene_files import load_scene
 
 #: Samples per cache voxel: 1, 4, 16 and 64 passes.
 SAMPLES = (16, 64, 256, 1024)

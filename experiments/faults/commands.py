@@ -105,7 +105,7 @@ def run_case(path: Path) -> None:
 
 
 def _run(arguments: list[str]) -> None:
-    from mitsuba_irrcache.cli import main
+    from mitsuba_irrcache.cli.main import main
 
     there, said = files_here(), io.StringIO()
     with _without_long_work(), contextlib.redirect_stderr(said):

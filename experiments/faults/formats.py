@@ -13,7 +13,7 @@ import SimpleITK
 
 from experiments.faults import commands, properties
 from experiments.faults.fuzz import lying_cache, mutated, mutated_gzip
-from mitsuba_irrcache.volumes.mitsuba_vol import write_vol
+from mitsuba_irrcache.io.mitsuba_vol import write_vol
 from mitsuba_irrcache.volumes.readers import read_volume
 from mitsuba_irrcache.volumes.transfer import load_preset, load_transfer_function
 
@@ -34,7 +34,7 @@ def read_cache(path: Path) -> None:
 
     if mi.variant() != "llvm_ad_rgb":
         mi.set_variant("llvm_ad_rgb")
-    from mitsuba_irrcache.cache import IrradianceCache
+    from mitsuba_irrcache.cache.volume import IrradianceCache
 
     IrradianceCache.description_of(path)
     cache = IrradianceCache.load(path)
@@ -47,8 +47,8 @@ def _write_cache(path: Path) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from mitsuba_irrcache.cache import IrradianceCache
-    from mitsuba_irrcache.grid import Grid
+    from mitsuba_irrcache.cache.volume import IrradianceCache
+    from mitsuba_irrcache.grids.grid import Grid
 
     cache = IrradianceCache(Grid((3, 4, 5), np.eye(4)), dr.arange(mi.UInt32, 60), 3, -1, {"a": "b"})
     double = dr.float64_array_t(mi.Float)

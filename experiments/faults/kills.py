@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_irrcache.cache import BATCH, IrradianceCache
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError
 
 SCENE = """<scene version="3.0.0">

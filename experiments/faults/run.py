@@ -22,7 +22,7 @@ from experiments.faults.fuzz import Tally, try_files
 from experiments.faults.kills import kill_renders
 from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.tables import Table
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.machine.llvm import require_llvm
 
 
 def main() -> int:

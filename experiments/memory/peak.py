@@ -14,8 +14,8 @@ from pathlib import Path
 import mitsuba as mi
 
 from mitsuba_irrcache.compare.worker import peak_memory
-from mitsuba_irrcache.loading import load_scene
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.machine.llvm import require_llvm
 
 
 def measure_peak(scene: Path, pixels: int, integrator: str) -> int:

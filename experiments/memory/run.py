@@ -17,7 +17,7 @@ from experiments.memory.peak import measure_peak
 from experiments.options import FULL, Options, parse
 from experiments.scenes import scene_file
 from experiments.store import Store
-from mitsuba_irrcache.volumes.mitsuba_vol import read_vol
+from mitsuba_irrcache.io.mitsuba_vol import read_vol
 
 #: Voxels along the longest side and pixels per side: one grows while the other stays.
 QUICK_SIZES = ((48, 128), (96, 128), (144, 128), (48, 512), (48, 1024))

@@ -27,7 +27,7 @@ from experiments.scenes import DATA
 from experiments.store import Store
 from mitsuba_irrcache.compare import metrics
 from mitsuba_irrcache.errors import IrrcacheError, essence, origin
-from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.io.scene_files import load_scene
 
 SUITE = DATA / "scenes" / "mitsuba-data" / "tests" / "scenes" / "participating_media"
 LAJOLLA = DATA / "scenes" / "lajolla"

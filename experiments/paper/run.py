@@ -17,10 +17,10 @@ from experiments.options import Options, parse
 from experiments.recording import Session
 from experiments.scenes import SOURCES, available
 from experiments.store import read_json
-from mitsuba_irrcache import doctor
 from mitsuba_irrcache.compare.report import write_report
 from mitsuba_irrcache.compare.results import Measurement
-from mitsuba_irrcache.versions import installed_version
+from mitsuba_irrcache.machine import doctor
+from mitsuba_irrcache.machine.versions import installed_version
 
 #: In the order of the page. Estimated minutes at the quick size on two idle cores: figure 2 takes
 #: 10 (a reference, and five methods on the chest, which figures 1 and 3 and table 1 only read),

@@ -12,7 +12,7 @@ from experiments.performance.run import TARGETS, cost, defaults, table
 from experiments.store import read_json
 from mitsuba_irrcache.compare import style
 from mitsuba_irrcache.compare.report import Figure, Section
-from mitsuba_irrcache.loading import parse_integrator
+from mitsuba_irrcache.io.scene_files import parse_integrator
 
 KINDS = (("cold", "irrcache, cold cache"), ("moved", "irrcache, camera moved"))
 

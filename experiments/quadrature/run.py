@@ -24,10 +24,10 @@ from experiments.options import Options, parse
 from experiments.recording import APPEARANCE
 from experiments.scenes import scene_file
 from experiments.store import Store
-from mitsuba_irrcache.build import CacheBuilder, CacheSettings
-from mitsuba_irrcache.images import write_image
-from mitsuba_irrcache.loading import load_scene
-from mitsuba_irrcache.projection import QUADRATURES, Projection
+from mitsuba_irrcache.io.images import write_image
+from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
+from mitsuba_irrcache.render.raymarch import QUADRATURES, Projection
 
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 #: Against which errors are measured.

@@ -16,7 +16,7 @@ from experiments.methods import specify
 from experiments.options import FULL, Options, parse
 from experiments.recording import Subject
 from experiments.store import Store
-from mitsuba_irrcache.cache import BATCH
+from mitsuba_irrcache.cache.volume import BATCH
 
 QUICK_RESOLUTIONS = (16, 32, 64, 96)
 FULL_RESOLUTIONS = (16, 32, 64, 96, 128)

@@ -30,14 +30,14 @@ from experiments.methods import specify
 from experiments.options import FULL, Options, parse
 from experiments.scenes import scene_file
 from experiments.store import Store
-from mitsuba_irrcache.build import CacheBuilder, CacheSettings
 from mitsuba_irrcache.compare.processes import KERNEL_CACHE
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.compare.worker import peak_memory
-from mitsuba_irrcache.loading import load_scene
-from mitsuba_irrcache.runtime import require_llvm
-from mitsuba_irrcache.solvers.sweep import BATCH, LARGEST_BATCH
-from mitsuba_irrcache.symbolic import symbolic
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
+from mitsuba_irrcache.solvers.sn.solver import BATCH, LARGEST_BATCH
 
 VARIANT = "llvm_ad_mono"
 #: Source and voxels along its longest side; 0: as the source has it.

@@ -23,8 +23,8 @@ from experiments.stability.hazards import cases
 from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import essence
-from mitsuba_irrcache.projection import QUADRATURES
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.render.raymarch import QUADRATURES
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono")
 

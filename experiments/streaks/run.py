@@ -21,7 +21,7 @@ from experiments.methods import specify
 from experiments.options import Options, parse
 from experiments.scenes import scene_file
 from experiments.store import Store
-from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.io.scene_files import load_scene
 
 SCENES = ("procedural", "cloud", "head")
 PIXELS, SPP, DIRECTIONS = 128, 32, 32

@@ -20,10 +20,10 @@ from experiments import methods
 from experiments.analysis import curve, errors, speed_up, time_to_converged
 from experiments.options import Options, parse
 from experiments.recording import Session
-from mitsuba_irrcache.build import CacheBuilder, CacheSettings
 from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.summary import Reached, time_to
-from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 
 #: The paper's threshold.
 LEVEL = 1e-2

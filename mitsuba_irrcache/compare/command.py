@@ -18,12 +18,12 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mitsuba_irrcache import doctor
-from mitsuba_irrcache.argument_types import finite, seconds, whole
+from mitsuba_irrcache.core.argument_types import finite, seconds, whole
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.extras import require
-from mitsuba_irrcache.loading import check_scene_file, parse_integrator, parse_parameters
-from mitsuba_irrcache.versions import installed_version
+from mitsuba_irrcache.io.scene_files import check_scene_file, parse_integrator, parse_parameters
+from mitsuba_irrcache.machine import doctor
+from mitsuba_irrcache.machine.extras import require
+from mitsuba_irrcache.machine.versions import installed_version
 
 from .processes import WorkerError, run_job
 from .reference import Reference, default_folder

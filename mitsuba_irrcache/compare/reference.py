@@ -13,8 +13,8 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from mitsuba_irrcache.files import atomic_write
-from mitsuba_irrcache.loading import load_scene
+from mitsuba_irrcache.io.files import atomic_write
+from mitsuba_irrcache.io.scene_files import load_scene
 
 from .scene_files import scene_digest
 

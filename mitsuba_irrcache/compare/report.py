@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.io.files import atomic_write
 
 from .results import Measurement
 from .summary import Curve, Reached, equal_time, time_to, uncertainty

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_irrcache.files import atomic_write
-from mitsuba_irrcache.images import read_image
+from mitsuba_irrcache.io.files import atomic_write
+from mitsuba_irrcache.io.images import read_image
 
 
 @dataclass

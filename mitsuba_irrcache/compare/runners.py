@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.loading import (
+from mitsuba_irrcache.io.scene_files import (
     describe_integrator,
     has_cache,
     load_scene,
@@ -93,7 +93,7 @@ class Subject:
         """
         if not self.is_filtered_here:
             return average.mean, {}
-        from mitsuba_irrcache.filtering import denoise
+        from mitsuba_irrcache.render.denoise import denoise
 
         started = time.perf_counter()
         image = denoise(colours(average.mean), average.standard_error)

@@ -11,7 +11,7 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot
 
-from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.io.files import atomic_write
 
 #: Okabe and Ito's colours, which colour-blind people can tell apart, and a marker for print.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")

@@ -19,8 +19,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.errors import IrrcacheError, essence
-from mitsuba_irrcache.images import write_image
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.io.images import write_image
+from mitsuba_irrcache.machine.llvm import require_llvm
 
 from . import runners
 from .metrics import colours

@@ -1,1 +1,1 @@
-"""Solvers fill an ``IrradianceCache``; each may be run again to refine it."""
+"""Solvers that compute the cache."""

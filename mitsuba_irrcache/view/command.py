@@ -11,13 +11,13 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from mitsuba_irrcache.argument_types import whole
+from mitsuba_irrcache.cli.render import REPLACED, add_scene_options
+from mitsuba_irrcache.core.argument_types import whole
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.extras import require
-from mitsuba_irrcache.loading import integrator_of, parse_parameters
-from mitsuba_irrcache.memory import free_at_once
-from mitsuba_irrcache.render import REPLACED, add_scene_options
-from mitsuba_irrcache.runtime import require_llvm
+from mitsuba_irrcache.io.scene_files import integrator_of, parse_parameters
+from mitsuba_irrcache.machine.extras import require
+from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.machine.memory import free_at_once
 from mitsuba_irrcache.volumes import importer
 from mitsuba_irrcache.volumes.scene import SceneSettings
 

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.lit import CacheSettings
-from mitsuba_irrcache.loading import filled, scene_of_text, scene_text
+from mitsuba_irrcache.io.mitsuba_vol import write_vol
+from mitsuba_irrcache.io.scene_files import filled, scene_of_text, scene_text
+from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seeing
-from mitsuba_irrcache.volumes.mitsuba_vol import write_vol
 
 #: What the viewer calls things that have no name.
 SUN_ID, MEDIUM_ID = "sun", "medium"
@@ -66,7 +66,7 @@ class Document:
     def load(
         cls, path: Path, parameters: dict[str, str] | None = None, integrator: str | None = None
     ) -> Document:
-        """Of a scene file; as `loading.load_scene`."""
+        """Of a scene file; as `scene_files.load_scene`."""
         return cls(scene_text(path, parameters, integrator), path.parent)
 
     @classmethod

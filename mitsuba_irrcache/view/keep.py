@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mitsuba_irrcache import __version__
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.images import write_image, write_pixels
+from mitsuba_irrcache.io.images import write_image, write_pixels
 from mitsuba_irrcache.view.picture import Samples
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import SAMPLES, View

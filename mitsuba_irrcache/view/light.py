@@ -10,12 +10,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.build import CacheBuilder, CacheSettings
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.lit import LitMedium
-from mitsuba_irrcache.progressive import FIRST, OPENING
-from mitsuba_irrcache.sight import Sight, SimpleSight, sight_of
-from mitsuba_irrcache.surroundings import medium_at
+from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
+from mitsuba_irrcache.pipeline.cached_medium import LitMedium
+from mitsuba_irrcache.pipeline.progressive import FIRST, OPENING
+from mitsuba_irrcache.render.camera import Sight, SimpleSight, sight_of
+from mitsuba_irrcache.scene.context import medium_at
 
 #: Caches with more voxels than this are preceded by one of `COARSE` voxels along its longest side,
 #: so that new light is there at once.

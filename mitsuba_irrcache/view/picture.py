@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.filtering import filter_illumination
-from mitsuba_irrcache.layers import AOVS, Layers, luminance
-from mitsuba_irrcache.reconstruction import pixel_of
-from mitsuba_irrcache.rendering import PixelPositions
+from mitsuba_irrcache.render.aovs import AOVS, Layers, luminance
+from mitsuba_irrcache.render.denoise import filter_illumination
+from mitsuba_irrcache.render.film import PixelPositions
+from mitsuba_irrcache.render.pixel_filter import pixel_of
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seen
 

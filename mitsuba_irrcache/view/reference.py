@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.reconstruction import pixel_of
-from mitsuba_irrcache.surroundings import medium_at
+from mitsuba_irrcache.render.pixel_filter import pixel_of
+from mitsuba_irrcache.scene.context import medium_at
 from mitsuba_irrcache.view.bands import Bands
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Light

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_irrcache.argument_types import argument, finite, finite_number, whole
+from mitsuba_irrcache.core.argument_types import argument, finite, finite_number, whole
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes import processing
 from mitsuba_irrcache.volumes.data import VolumeData

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.memory import require_memory
+from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 

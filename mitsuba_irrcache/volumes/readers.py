@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.mitsuba_vol import read_vol
 from mitsuba_irrcache.volumes.data import VolumeData
-from mitsuba_irrcache.volumes.mitsuba_vol import read_vol
 from mitsuba_irrcache.volumes.raw import RawLayout, read_raw, read_raw_slices
 
 PathLike = str | os.PathLike

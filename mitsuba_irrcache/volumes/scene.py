@@ -10,8 +10,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.mitsuba_vol import write_vol
 from mitsuba_irrcache.volumes.data import VolumeData
-from mitsuba_irrcache.volumes.mitsuba_vol import write_vol
 from mitsuba_irrcache.volumes.staging import staged_files, staged_folder
 from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 

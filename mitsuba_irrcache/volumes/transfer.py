@@ -31,7 +31,7 @@ import numpy as np
 from tqdm import tqdm
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.io.files import atomic_write
 
 FORMAT = "irrcache transfer function"
 VERSION = 1

@@ -11,13 +11,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache import IrradianceCache
-from mitsuba_irrcache.directional import Directional, sources_of
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.projection import Projection
-from mitsuba_irrcache.scene import bake_media, bake_scene
-from mitsuba_irrcache.solvers import path, sweep
-from mitsuba_irrcache.solvers.directional_sweep import DirectionalSweep, least_batch
+from mitsuba_irrcache.cache.angular import Directional, sources_of
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.scene.compile import bake_media, bake_scene
+from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.solvers.sn import solver as sn_solver
+from mitsuba_irrcache.solvers.sn.anisotropic import DirectionalSweep, least_batch
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -129,7 +130,7 @@ def column(scene, depths: tuple[float, float], voxels: int, samples: int, max_de
     place[:3, 3] = -0.5, -0.5, -depths[1]
     grid = Grid((voxels, 1, 1), place)
     cache = IrradianceCache(grid, dr.arange(mi.UInt32, voxels), 3, max_depth)
-    path.refine(scene, medium, cache, samples, seed=1, rr_depth=1000)
+    path_solver.refine(scene, medium, cache, samples, seed=1, rr_depth=1000)
     return medium, cache
 
 
@@ -192,11 +193,11 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     place[:3, 3] = -width / 2, -width / 2, -depth
     grid = Grid((layers, columns, columns), place)
     index, moments = dr.arange(mi.UInt32, grid.voxel_count), None
-    solver, least = sweep.Sweep, sweep.BATCH
+    solver, least = sn_solver.Sweep, sn_solver.BATCH
     if medium.phase is not None:
         moments = Directional(medium.phase, sources_of(scene))
         solver, least = DirectionalSweep, least_batch(moments.order)
-    batch = sweep.batch_of(samples, least)
+    batch = sn_solver.batch_of(samples, least)
     count = moments.count if moments else 0
     cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True, moments=count)
     cache.directional = moments

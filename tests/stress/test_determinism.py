@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from experiments.stability.worlds import WHITE_SKY, Camera, Matter, World, blob, scene
-from mitsuba_irrcache.solvers import path
-from mitsuba_irrcache.solvers.lattice import SMALL
+from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.solvers.sn.tracks import SMALL
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -135,7 +135,7 @@ def test_in_other_passes(monkeypatch):
     double precision.
     """
     expected = once("path")
-    monkeypatch.setattr(path, "LANES", 1 << 12)
+    monkeypatch.setattr(path_solver, "LANES", 1 << 12)
     assert_same(look("path"), expected)
 
 

@@ -20,9 +20,9 @@ import pytest
 
 from experiments.faults import commands, formats, properties, run
 from experiments.stability.worlds import Camera, Matter, scene
-from mitsuba_irrcache.cache import IrradianceCache
+from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
-from mitsuba_irrcache.files import ABANDONED, atomic_write
+from mitsuba_irrcache.io.files import ABANDONED, atomic_write
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -15,8 +15,8 @@ import numpy as np
 import OpenImageIO
 import pytest
 
-from mitsuba_irrcache.cache import IrradianceCache
-from mitsuba_irrcache.cli import main
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.cli.main import main
 
 SCENE = """<scene version="3.0.0">
     <default name="density" value="density.vol"/>
@@ -288,7 +288,7 @@ def test_damaged_cache_file(folder, capsys):
 
 def test_interrupted(folder, capsys, monkeypatch):
     """Ctrl-C while the cache is built: status 130, no picture, no cache file, no traceback."""
-    from mitsuba_irrcache.solvers import path
+    from mitsuba_irrcache.solvers.path import solver as path
 
     monkeypatch.setattr(path, "refine", interrupt)
     before = set(os.listdir(folder))
@@ -344,7 +344,7 @@ def test_a_stopped_progressive_render(folder, capsys, monkeypatch, request, how)
     """Ctrl-C or SIGTERM in the pass after the opening: status 130, the last finished image, and a
     cache file of the samples that it shows; what was reached is printed.
     """
-    from mitsuba_irrcache.solvers import path
+    from mitsuba_irrcache.solvers.path import solver as path
 
     refine, calls = path.refine, []
 
@@ -369,7 +369,7 @@ def test_a_stopped_progressive_render(folder, capsys, monkeypatch, request, how)
 
 
 def test_stopped_before_the_first_image(folder, capsys, monkeypatch):
-    from mitsuba_irrcache.solvers import path
+    from mitsuba_irrcache.solvers.path import solver as path
 
     monkeypatch.setattr(path.Opening, "grow", interrupt)
     before = set(os.listdir(folder))

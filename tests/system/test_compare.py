@@ -17,7 +17,7 @@ import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
 import pytest
 
 import mitsuba_irrcache.compare
-from mitsuba_irrcache.cli import main
+from mitsuba_irrcache.cli.main import main
 
 SCENE = """<scene version="3.0.0">
     <default name="density" value="1"/>

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from mitsuba_irrcache import filtering
-from mitsuba_irrcache.layers import AOVS, LEAST_COLOUR
+from mitsuba_irrcache.render import denoise
+from mitsuba_irrcache.render.aovs import AOVS, LEAST_COLOUR
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -332,11 +332,11 @@ def test_a_bone_keeps_its_edge(scenes, monkeypatch):
     """
     exact = bone(scenes, {"cache_spp": 256}).mean(axis=0)
     place, width = edge(exact)
-    assert edge(gaussian_filter1d(exact, filtering.SPREAD))[1] > width + 2
+    assert edge(gaussian_filter1d(exact, denoise.SPREAD))[1] > width + 2
     plain = bone(scenes, {"cache_spp": 16})
     for strength in (None, 1.0, 2.0):
         if strength is not None:
-            monkeypatch.setattr(filtering, "_least_risk", lambda *args, s=strength: (1, s))
+            monkeypatch.setattr(denoise, "_least_risk", lambda *args, s=strength: (1, s))
         image = bone(scenes, {"cache_spp": 16, "filter": "bilateral"})
         assert strength is None or rms(image - plain) > 0.01 * plain.mean(), "it does nothing"
         found = edge(image.mean(axis=0))
@@ -422,12 +422,12 @@ def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
     """No errors, no layers, no developed film."""
     from mitsuba_irrcache.integrators import irrcache
 
-    from mitsuba_irrcache import sight
+    from mitsuba_irrcache.render import camera
 
     def forbidden(*args, **kwargs):
         raise AssertionError("not asked for")
 
-    monkeypatch.setattr(sight, "uncertainty_of", forbidden)
+    monkeypatch.setattr(camera, "uncertainty_of", forbidden)
     for name in ("planes", "fill_film", "filter_illumination", "Layers"):
         monkeypatch.setattr(irrcache, name, forbidden)
     scene = noisy(scenes, {"cache_spp": 8}, size=6)
@@ -437,9 +437,9 @@ def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
 
 def test_layers_without_errors_project_none(scenes, monkeypatch):
     """Colour alone needs no error of the cache, and no second batch."""
-    from mitsuba_irrcache import sight
+    from mitsuba_irrcache.render import camera
 
-    monkeypatch.setattr(sight, "uncertainty_of", None)
+    monkeypatch.setattr(camera, "uncertainty_of", None)
     scene = noisy(scenes, {"cache_spp": 8, "aovs": "colour,depth", "filter": "fixed"}, size=6)
     scenes.image(scene, spp=1)
     assert scene.integrator().cache.samples == 8

@@ -191,7 +191,7 @@ def test_cancelled_while_the_cache_is_built(scenes):
 
 def test_cancelled_while_the_image_is_rendered(scenes, monkeypatch):
     """After the pass that is in progress, as in volpath; a later rendering is not."""
-    from mitsuba_irrcache import rendering
+    from mitsuba_irrcache.render import film as rendering
 
     monkeypatch.setattr(rendering, "LANES", SIZE**2 * 4)
     scene, passes = scenes.load(ours(), cloud(scenes), SIZE), []

@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.edges import Edges
-from mitsuba_irrcache.grid import Grid, GridField, RootField
-from mitsuba_irrcache.packets import Lookups
+from mitsuba_irrcache.grids.grid import Grid, GridField, RootField
+from mitsuba_irrcache.grids.packed_fields import Lookups
+from mitsuba_irrcache.scene.cut_cells import Edges
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

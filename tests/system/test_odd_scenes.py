@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.choices import choose_solver, choose_stock
+from mitsuba_irrcache.pipeline.defaults import choose_solver, choose_stock
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

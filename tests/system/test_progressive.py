@@ -11,10 +11,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache import build, progressive
-from mitsuba_irrcache.cache import IrradianceCache
+from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.progressive import render_progressive
+from mitsuba_irrcache.pipeline import builder, progressive
+from mitsuba_irrcache.pipeline.progressive import render_progressive
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -118,21 +118,21 @@ class Clock:
     def __init__(self, monkeypatch, sample: float, image: float) -> None:
         self.now = 0.0
         monkeypatch.setattr(progressive, "perf_counter", lambda: self.now)
-        monkeypatch.setattr(build, "perf_counter", lambda: self.now)
-        refine = build.path.refine
+        monkeypatch.setattr(builder, "perf_counter", lambda: self.now)
+        refine = builder.path.refine
 
         def slow_refine(scene, medium, cache, samples, *args, **kwargs):
             refine(scene, medium, cache, samples, *args, **kwargs)
             self.now += sample * samples
 
-        grow = build.path.Opening.grow
+        grow = builder.path.Opening.grow
 
         def slow_grow(opening, size, *args):
             self.now += sample * 2 * (size - opening.size)
             grow(opening, size, *args)
 
-        monkeypatch.setattr(build.path, "refine", slow_refine)
-        monkeypatch.setattr(build.path.Opening, "grow", slow_grow)
+        monkeypatch.setattr(builder.path, "refine", slow_refine)
+        monkeypatch.setattr(builder.path.Opening, "grow", slow_grow)
         self.image = image
 
     def slow_images(self, scene: mi.Scene) -> None:
@@ -210,7 +210,7 @@ def test_stopped_within_a_pass(cloud, tmp_path, monkeypatch, error):
     """The launches that were complete are in cache and file, the one that was not is in neither;
     the rest makes it the cache of one go.
     """
-    monkeypatch.setattr(build.path, "LANES", 1 << 12)
+    monkeypatch.setattr(builder.path, "LANES", 1 << 12)
     file = tmp_path / "light.npz"
     scene, whole = cloud(cache_file=str(file)), cloud()
     integrator, frames = scene.integrator(), []

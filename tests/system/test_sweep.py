@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from experiments.kinds.run import box, smoke
-from mitsuba_irrcache.choices import choose_solver
-from mitsuba_irrcache.scene import bake_media
-from mitsuba_irrcache.solvers import lattice, scattering, sweep
+from mitsuba_irrcache.pipeline.defaults import choose_solver
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.solvers.sn import multigrid, tracks
+from mitsuba_irrcache.solvers.sn import solver as sn_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -27,7 +28,7 @@ VARIED[2, 5] = 12.0
 @pytest.fixture(autouse=True)
 def small_batches(monkeypatch):
     """Enough batches for a standard error, of few directions."""
-    monkeypatch.setattr(sweep, "LARGEST_BATCH", 64)
+    monkeypatch.setattr(sn_solver, "LARGEST_BATCH", 64)
 
 
 def sun(*direction: float, irradiance=4.0) -> dict:
@@ -65,7 +66,7 @@ def soft_cloud(scenes, n: int = 12, albedo=0.9, channels: int = 1) -> dict:
 
 def batches(count: int, max_depth: int = -1) -> dict:
     """Settings: so many batches of the solver, and their ``max_depth``."""
-    return {"max_depth": max_depth, "cache_spp": count * sweep.BATCH}
+    return {"max_depth": max_depth, "cache_spp": count * sn_solver.BATCH}
 
 
 def assert_like(measured, expected, layer: str, tolerance: float) -> None:
@@ -92,9 +93,9 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
     is iterated until it stands still (measured: 6e-5); and on average to what the solver promises.
     """
     if tolerance:
-        monkeypatch.setattr(scattering, "TOLERANCE", tolerance)
-        monkeypatch.setattr(scattering, "FEW_TOLERANCE", tolerance / 10)
-        monkeypatch.setattr(scattering, "CORRECTIONS", 40)
+        monkeypatch.setattr(multigrid, "TOLERANCE", tolerance)
+        monkeypatch.setattr(multigrid, "FEW_TOLERANCE", tolerance / 10)
+        monkeypatch.setattr(multigrid, "CORRECTIONS", 40)
     if kind == "homogeneous":
         shape = scenes.boundary(scenes.medium(25.0, 1.0))
     else:
@@ -256,7 +257,7 @@ def test_caches_coarser_and_finer_than_the_data(scenes, resolution, tolerance):
     density = np.where(x**2 + y**2 + z**2 < 5.5**2, 8.0, 0.0).astype(np.float32)
     shape = scenes.boundary(scenes.medium(density, 0.8, to_world), to_world)
     settings = {"resolution": resolution, "max_depth": 2}
-    ours = values(filled(scenes, shape, **settings, cache_spp=8 * sweep.BATCH).irradiance)
+    ours = values(filled(scenes, shape, **settings, cache_spp=8 * sn_solver.BATCH).irradiance)
     theirs = values(filled(scenes, shape, "path", **settings, cache_spp=128).irradiance)
     voxel = ((np.arange(resolution) + 0.5) / resolution * 16).astype(int)
     weights = density[np.ix_(voxel, voxel, voxel)][..., None]
@@ -369,7 +370,7 @@ def test_seeds_and_batches_differ(scenes):
 @pytest.mark.parametrize("small", [0, 40**3])
 def test_more_batches_compile_nothing(scenes, kernels, monkeypatch, max_depth, small):
     """More batches, another seed, other densities of one shape: the kernels of another one."""
-    monkeypatch.setattr(lattice, "SMALL", small)
+    monkeypatch.setattr(tracks, "SMALL", small)
     to_world = scenes.placement()
 
     def fill(seed, count):
@@ -388,7 +389,7 @@ def test_launches_of_a_batch(scenes, kernels, monkeypatch):
     """Single scattering of a large grid: for each batch a launch for each of 16 pairs, and three
     per axis: what they read, a volume for what they leave, and its sharpening.
     """
-    monkeypatch.setattr(lattice, "SMALL", 0)
+    monkeypatch.setattr(tracks, "SMALL", 0)
     counts = []
     for count in (2, 6):
         history = kernels(
@@ -405,7 +406,7 @@ def test_a_sun_in_the_sky_has_no_noise(scenes, monkeypatch):
     same whatever the seed, to 0.1 % (it was 3 %, as many directions as met it); and no voxel at the
     edge of matter explodes where the lines of the sun alone find some of it (one did, of these).
     """
-    monkeypatch.setattr(sweep, "LARGEST_BATCH", 256)
+    monkeypatch.setattr(sn_solver, "LARGEST_BATCH", 256)
     texels = np.full((16, 32, 3), 0.5, np.float32)
     texels[4, 26] = 300.0
     sky, means = envmap(texels), []

@@ -6,10 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.choices import choose_solver
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.scene import bake_media
-from mitsuba_irrcache.solvers import sweep
+from mitsuba_irrcache.pipeline.defaults import choose_solver
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.solvers.sn import solver as sweep
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

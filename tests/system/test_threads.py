@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache import render_progressive
-from mitsuba_irrcache.cache import IrradianceCache
-from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.io.files import atomic_write
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsuba_irrcache.cli import main
-from mitsuba_irrcache.images import read_image
+from mitsuba_irrcache.cli.main import main
+from mitsuba_irrcache.io.images import read_image
 
 pytest.importorskip("playwright")
 from experiments.viewer.browser import Browser, Window, chromium, viewer

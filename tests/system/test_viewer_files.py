@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cli import main
-from mitsuba_irrcache.images import read_image
+from mitsuba_irrcache.cli.main import main
+from mitsuba_irrcache.io.images import read_image
 from mitsuba_irrcache.volumes.transfer import load_preset
 
 pytest.importorskip("playwright")

@@ -76,9 +76,9 @@ def test_a_second_scene_compiles_nothing(scenes, kernels):
 
 def test_passes_compile_nothing(scenes, kernels, monkeypatch):
     """A cache filled in many launches runs the same kernels in each (the last may be shorter)."""
-    from mitsuba_irrcache.solvers import path
+    from mitsuba_irrcache.solvers.path import solver as path_solver
 
-    monkeypatch.setattr(path, "LANES", 1 << 11)
+    monkeypatch.setattr(path_solver, "LANES", 1 << 11)
     scene = cloud_scene(scenes, cache_spp=64)
     history = kernels(lambda: scene.integrator().prepare(scene))
     launches = Counter(k["hash"] for k in history if k["size"] == 1 << 11)
@@ -195,9 +195,9 @@ def test_an_interrupted_build_goes_on(scenes, tmp_path, monkeypatch):
     """Ctrl-C from the progress callback: the next render completes the cache, and no file is left
     before that.
     """
-    from mitsuba_irrcache.solvers import path
+    from mitsuba_irrcache.solvers.path import solver as path_solver
 
-    monkeypatch.setattr(path, "LANES", 1 << 13)
+    monkeypatch.setattr(path_solver, "LANES", 1 << 13)
     file = tmp_path / "light.npz"
     scene = cloud_scene(scenes, cache_spp=64, cache_file=str(file))
     integrator = scene.integrator()

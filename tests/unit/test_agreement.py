@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.agreement import check_media_agree
 from mitsuba_irrcache.errors import UnsupportedSceneError
+from mitsuba_irrcache.scene.consistency import check_media_agree
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsuba_irrcache.arithmetic import Divisor, clipped, decay, greatest, least, unravelled
+from mitsuba_irrcache.core.fast_math import Divisor, clipped, decay, greatest, least, unravelled
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

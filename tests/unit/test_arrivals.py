@@ -7,12 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.scene import bake_media
-from mitsuba_irrcache.solvers import arrivals
-from mitsuba_irrcache.solvers.arrivals import Around, Arrivals
-from mitsuba_irrcache.solvers.lattice import Lattice
-from mitsuba_irrcache.solvers.table import Entering
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.solvers.sn import boundary_condition
+from mitsuba_irrcache.solvers.sn.boundary_condition import Around, Arrivals
+from mitsuba_irrcache.solvers.sn.track_table import Entering
+from mitsuba_irrcache.solvers.sn.tracks import Lattice
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -40,7 +40,9 @@ def swept(lattice: Lattice, found: Arrivals, values: mi.Float, i: int, offset) -
 @pytest.fixture
 def alone(monkeypatch):
     """Arrivals without anything to be followed."""
-    monkeypatch.setattr(arrivals, "_follow", lambda *args: (None, None, None, mi.UInt32(0), None))
+    monkeypatch.setattr(
+        boundary_condition, "_follow", lambda *args: (None, None, None, mi.UInt32(0), None)
+    )
 
 
 @pytest.mark.parametrize("way", [0, 1])
@@ -51,7 +53,7 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
     of the box as it is there: in a turned, stretched grid, on a coarser one, and if some lines
     share a cell, within its size.
     """
-    monkeypatch.setattr(arrivals, "CELLS", cells)
+    monkeypatch.setattr(boundary_condition, "CELLS", cells)
     place = scenes.placement((1.0, 3.0, 2.0), turn=35, mirror=True)
     grid = Grid((12, 10, 8), place)
     lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])

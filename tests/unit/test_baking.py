@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.scene import bake_scene
-from mitsuba_irrcache.solvers.baking import albedo_of_collisions
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.solvers.sn.resampling import albedo_of_collisions
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

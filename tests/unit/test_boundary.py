@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.boundary import Boundary, boundary_of
 from mitsuba_irrcache.errors import UnsupportedSceneError
+from mitsuba_irrcache.grids.boundary import Boundary, boundary_of
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

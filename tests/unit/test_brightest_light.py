@@ -6,9 +6,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache import BATCH, IrradianceCache
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.lamps import Falloff
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.falloff import Falloff
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -13,14 +13,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.boundary import Boundary
-from mitsuba_irrcache.cache import BATCH, IrradianceCache, active_voxels
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache, active_voxels
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
-from mitsuba_irrcache.grid import ConstantField, Grid, GridField
-from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.scene import bake_scene
-from mitsuba_irrcache.solvers import path
-from mitsuba_irrcache.volumes.mitsuba_vol import read_vol
+from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.io.mitsuba_vol import read_vol
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.solvers.path import solver as path_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -41,7 +41,7 @@ def make(scenes):
         active = active_voxels(medium, grid)
         cache = IrradianceCache(grid, active, 3, max_depth, {"medium": "a", "emitters": "b"})
         for seed, samples in calls:
-            path.refine(scene, medium, cache, samples, seed, rr_depth=100)
+            path_solver.refine(scene, medium, cache, samples, seed, rr_depth=100)
         return cache
 
     return run

@@ -9,14 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache import (
+from mitsuba_irrcache.cache.volume import (
     BATCH,
     IrradianceCache,
     _digest_of_arrays,
     _digest_of_description,
 )
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
-from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.grids.grid import Grid
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -6,12 +6,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache import choices
-from mitsuba_irrcache.boundary import Boundary
-from mitsuba_irrcache.choices import choose_grid
-from mitsuba_irrcache.grid import ConstantField, Grid, GridField
-from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.solvers import sweep
+from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.pipeline import defaults
+from mitsuba_irrcache.pipeline.defaults import choose_grid
+from mitsuba_irrcache.solvers.sn import solver as sn_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -92,9 +92,9 @@ def test_a_little_bone_in_much_air():
 
 
 def test_finer_voxels_have_a_limit(monkeypatch):
-    monkeypatch.setattr(choices, "MOST_REFINED", 70000)
+    monkeypatch.setattr(defaults, "MOST_REFINED", 70000)
     assert chosen(in_air(40, 40000.0)) == (41, 41, 41)
-    monkeypatch.setattr(choices, "MOST_VOXELS", 30000)
+    monkeypatch.setattr(defaults, "MOST_VOXELS", 30000)
     assert chosen(in_air(40, 40000.0)) == (31, 31, 31)
 
 
@@ -104,7 +104,7 @@ def test_finer_voxels_have_a_limit(monkeypatch):
 )
 def test_size_of_batches(samples, batch):
     """All that is wanted, or equal parts of up to 256 directions."""
-    assert sweep.batch_of(samples, sweep.BATCH) == batch
+    assert sn_solver.batch_of(samples, sn_solver.BATCH) == batch
 
 
 def test_directions_by_default(scenes):

@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.solvers.lattice import Lattice
-from mitsuba_irrcache.solvers.scattering import Level
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.solvers.sn.multigrid import Level
+from mitsuba_irrcache.solvers.sn.tracks import Lattice
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -13,22 +13,22 @@ from importlib import import_module
 
 import pytest
 
-from mitsuba_irrcache import doctor, versions
-from mitsuba_irrcache.argument_types import finite, seconds, whole
-from mitsuba_irrcache.cli import COMMANDS, main
-from mitsuba_irrcache.extras import missing_package
+from mitsuba_irrcache.cli.main import COMMANDS, main
+from mitsuba_irrcache.core.argument_types import finite, seconds, whole
+from mitsuba_irrcache.machine import doctor, versions
+from mitsuba_irrcache.machine.extras import missing_package
 
 NAMES = [name for name, *_ in COMMANDS]
 #: Runs a command as if no package of an extra were installed.
 WITHOUT = """
 import sys
-from mitsuba_irrcache import versions
+from mitsuba_irrcache.machine import versions
 core = {r.name for r in versions.requirements()}
 for extra in versions.extras():
     for requirement in versions.requirements(extra):
         if requirement.name not in core:
             sys.modules[requirement.name.replace("-", "_")] = None
-from mitsuba_irrcache.cli import main
+from mitsuba_irrcache.cli.main import main
 for arguments in sys.argv[1:]:
     try:
         status = main(arguments.split())

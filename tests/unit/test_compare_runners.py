@@ -95,7 +95,7 @@ def denoise(monkeypatch):
 
     module = ModuleType("filtering")
     module.denoise = halve
-    monkeypatch.setitem(sys.modules, "mitsuba_irrcache.filtering", module)
+    monkeypatch.setitem(sys.modules, "mitsuba_irrcache.render.denoise", module)
     monkeypatch.setattr(runners.time, "perf_counter", lambda: now[0])
     return calls
 

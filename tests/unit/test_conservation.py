@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.conservation import conserving
-from mitsuba_irrcache.grid import Grid, RootField
+from mitsuba_irrcache.cache.conservative import conserving
+from mitsuba_irrcache.grids.grid import Grid, RootField
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

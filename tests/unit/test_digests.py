@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import CacheFileError
-from mitsuba_irrcache.fingerprint import (
+from mitsuba_irrcache.scene.fingerprint import (
     RESPONSES,
     differing,
     digest_of_emitters,

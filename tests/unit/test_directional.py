@@ -7,10 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.directional import Directional, sources_of
+from mitsuba_irrcache.cache.angular import Directional, sources_of
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from mitsuba_irrcache.scene import bake_media
-from mitsuba_irrcache.solvers.volume_path import contributions
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.solvers.path.estimator import contributions
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

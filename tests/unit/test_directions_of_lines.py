@@ -7,13 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.directional import Directional
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.phase import Phase
-from mitsuba_irrcache.solvers.arrivals import Arrivals
-from mitsuba_irrcache.solvers.lattice import Lattice
-from mitsuba_irrcache.solvers.lines import ONE
-from mitsuba_irrcache.solvers.moments import DirectionalLevel, Moments
+from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.phase import Phase
+from mitsuba_irrcache.solvers.sn.boundary_condition import Arrivals
+from mitsuba_irrcache.solvers.sn.kernel import ONE
+from mitsuba_irrcache.solvers.sn.moments import DirectionalLevel, Moments
+from mitsuba_irrcache.solvers.sn.tracks import Lattice
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -115,7 +115,7 @@ def test_paths_begin_on_their_lines(scenes, monkeypatch):
     places of the lattice: a whole number of voxels from the first line.
     """
     monkeypatch.setattr(
-        "mitsuba_irrcache.solvers.arrivals._follow",
+        "mitsuba_irrcache.solvers.sn.boundary_condition._follow",
         lambda *args: (None, None, None, mi.UInt32(0), None),
     )
     grid = Grid((12, 10, 8), scenes.placement((1.0, 3.0, 2.0), turn=35))

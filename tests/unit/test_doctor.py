@@ -8,16 +8,16 @@ import os
 
 import pytest
 
-from mitsuba_irrcache import doctor, runtime
+from mitsuba_irrcache.machine import doctor, llvm
 
-OLD = [library.path for library in runtime.find_llvm() if library.problem]
-needs_llvm = pytest.mark.skipif(runtime.usable_llvm() is None, reason="needs a usable LLVM")
+OLD = [library.path for library in llvm.find_llvm() if library.problem]
+needs_llvm = pytest.mark.skipif(llvm.usable_llvm() is None, reason="needs a usable LLVM")
 
 
 @pytest.fixture
 def good_llvm(monkeypatch):
     """An LLVM for the trials, also where Dr.Jit itself has found none."""
-    monkeypatch.setenv(runtime.LLVM_VARIABLE, str(runtime.usable_llvm().path))
+    monkeypatch.setenv(llvm.LLVM_VARIABLE, str(llvm.usable_llvm().path))
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_a_working_variant_is_reported_and_succeeds(good_llvm, capsys):
 
 @pytest.mark.parametrize("path", ["/missing/libLLVM.so", __file__], ids=["missing", "text"])
 def test_an_llvm_that_cannot_be_loaded_is_a_failed_trial(monkeypatch, path):
-    monkeypatch.setenv(runtime.LLVM_VARIABLE, path)
+    monkeypatch.setenv(llvm.LLVM_VARIABLE, path)
     trial = doctor.try_variant("llvm_ad_rgb")
     assert not trial["works"]
     assert trial["problem"]
@@ -57,7 +57,7 @@ def test_an_llvm_that_cannot_be_loaded_is_a_failed_trial(monkeypatch, path):
 @pytest.mark.skipif(not OLD, reason="needs a libLLVM that is too old")
 @pytest.mark.parametrize("path", OLD, ids=lambda path: path.name)
 def test_an_llvm_that_aborts_is_a_failed_trial(monkeypatch, path):
-    monkeypatch.setenv(runtime.LLVM_VARIABLE, str(path))
+    monkeypatch.setenv(llvm.LLVM_VARIABLE, str(path))
     trial = doctor.try_variant("llvm_ad_rgb")
     assert not trial["works"]
     assert "LLVM" in trial["problem"]
@@ -65,7 +65,7 @@ def test_an_llvm_that_aborts_is_a_failed_trial(monkeypatch, path):
 
 @pytest.mark.skipif(not OLD, reason="needs a libLLVM that is too old")
 def test_report_on_a_bad_llvm_ends_in_the_remedy(monkeypatch, capsys):
-    monkeypatch.setenv(runtime.LLVM_VARIABLE, str(OLD[0]))
+    monkeypatch.setenv(llvm.LLVM_VARIABLE, str(OLD[0]))
     assert doctor.run(parse("-m", "llvm_ad_rgb")) == 1
     text = capsys.readouterr().out
     assert "does not work" in text

@@ -7,10 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.edges import Edges
-from mitsuba_irrcache.grid import Grid, RootField
-from mitsuba_irrcache.scene import bake_media
-from mitsuba_irrcache.survey import neighbourhood
+from mitsuba_irrcache.grids.grid import Grid, RootField
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.cut_cells import Edges
+from mitsuba_irrcache.scene.voxel_classes import neighbourhood
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.solvers import empty, lattice
-from mitsuba_irrcache.solvers.empty import CELL, Emptiness
-from mitsuba_irrcache.solvers.lattice import Lattice
-from mitsuba_irrcache.solvers.scattering import Level
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.solvers.sn import empty_space, tracks
+from mitsuba_irrcache.solvers.sn.empty_space import CELL, Emptiness
+from mitsuba_irrcache.solvers.sn.multigrid import Level
+from mitsuba_irrcache.solvers.sn.tracks import Lattice
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -55,7 +55,7 @@ def test_lines_skip_what_is_empty_and_no_more():
         assert (n == 0) == inside.any()
         if n > 1:  # reached from any voxel of the cell in fewer than n slices
             assert not blocked[tuple(np.s_[a - n + 1 : a + CELL + n - 1] for a in first)].any()
-        if n and n < (empty.REACH - 1) * CELL:
+        if n and n < (empty_space.REACH - 1) * CELL:
             wide = n + 2 * CELL
             assert blocked[tuple(np.s_[a - wide : a + CELL + wide] for a in first)].any()
         longest = max(longest, n)
@@ -73,9 +73,9 @@ def test_light_is_the_same(monkeypatch, box, detailed):
     """Whichever way lines go, and where they enter, with voxels of the medium and its detail: of
     light that enters, and what voxels scatter besides.
     """
-    monkeypatch.setattr(lattice, "SMALL", 0)
-    monkeypatch.setattr(lattice, "RECEIVED", 0.0)
-    monkeypatch.setattr(empty, "WORTHWHILE", 1.0)
+    monkeypatch.setattr(tracks, "SMALL", 0)
+    monkeypatch.setattr(tracks, "RECEIVED", 0.0)
+    monkeypatch.setattr(empty_space, "WORTHWHILE", 1.0)
     occupied = sparse()
     lower, upper = (np.array(end) for end in box)
     keep = np.zeros_like(occupied)

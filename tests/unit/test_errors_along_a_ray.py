@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mitsuba_irrcache.boundary import Boundary
-from mitsuba_irrcache.grid import ConstantField, Grid, GridField
-from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.projection import Projection
+from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.render.raymarch import Projection
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

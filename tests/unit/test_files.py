@@ -8,7 +8,7 @@ import stat
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.files import atomic_write
+from mitsuba_irrcache.io.files import atomic_write
 
 
 def test_replaces_the_old_file(tmp_path):

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
-from mitsuba_irrcache import filtering
-from mitsuba_irrcache.filtering import (
+from mitsuba_irrcache.render import denoise as filtering
+from mitsuba_irrcache.render.aovs import Layers
+from mitsuba_irrcache.render.denoise import (
     SPREAD,
     STRENGTHS,
     STRIDES,
@@ -21,7 +22,6 @@ from mitsuba_irrcache.filtering import (
     denoise,
     filter_illumination,
 )
-from mitsuba_irrcache.layers import Layers
 
 SIZE = 48
 LEVELS = (0.02, 0.08, 0.3)

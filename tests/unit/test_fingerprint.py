@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.fingerprint import Snapshot, digests
-from mitsuba_irrcache.scene import bake_scene
+from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.scene.fingerprint import Snapshot, digests
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.grid import ConstantField, Grid, GridField, RootField
-from mitsuba_irrcache.packets import Lookups
+from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField, RootField
+from mitsuba_irrcache.grids.packed_fields import Lookups
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

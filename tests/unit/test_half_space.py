@@ -8,7 +8,7 @@ import pytest
 
 import mitsuba_irrcache
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.half_space import TABLE, _higher_orders, chandrasekhar_h
+from mitsuba_irrcache.solvers.half_space import TABLE, _higher_orders, chandrasekhar_h
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.boundary import boundary_of
+from mitsuba_irrcache.grids.boundary import boundary_of
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

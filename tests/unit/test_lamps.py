@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.lamps import LARGEST, REACH, Falloff
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.falloff import LARGEST, REACH, Falloff
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

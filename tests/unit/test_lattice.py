@@ -7,10 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid, GridField
-from mitsuba_irrcache.solvers import lattice
-from mitsuba_irrcache.solvers.lattice import Lattice, sharpened
-from mitsuba_irrcache.solvers.lines import ONE
+from mitsuba_irrcache.grids.grid import Grid, GridField
+from mitsuba_irrcache.solvers.sn import tracks
+from mitsuba_irrcache.solvers.sn.kernel import ONE
+from mitsuba_irrcache.solvers.sn.tracks import Lattice, sharpened
 
 SHAPES = [(8, 8, 8), (7, 12, 5), (1, 6, 9), (5, 1, 1), (9, 4, 1)]
 #: Along axes, edges and diagonals, almost along them, and between.
@@ -34,9 +34,9 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 @pytest.fixture(params=["together", "apart"], autouse=True)
 def mode(request, monkeypatch, rgb):
     """One launch for all directions, or one for each; voxels hold what lines leave in them."""
-    monkeypatch.setattr(lattice, "RECEIVED", 0.0)
+    monkeypatch.setattr(tracks, "RECEIVED", 0.0)
     if request.param == "apart":
-        monkeypatch.setattr(lattice, "SMALL", 0)
+        monkeypatch.setattr(tracks, "SMALL", 0)
     return request.param
 
 
@@ -225,7 +225,7 @@ def test_both_modes_agree(monkeypatch):
     light, weights = rng.random((10, 2)), rng.random(10)
     results = []
     for small in (0, 40**3):
-        monkeypatch.setattr(lattice, "SMALL", small)
+        monkeypatch.setattr(tracks, "SMALL", small)
         medium = lines(grid, sigma_t, box)
         assert medium.together == (small > 0)
         volume = np.zeros((grid.voxel_count, 4), np.float32)

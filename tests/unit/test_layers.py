@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.layers import AOVS, LEAST_COLOUR, Layers, parse_aovs
+from mitsuba_irrcache.render.aovs import AOVS, LEAST_COLOUR, Layers, parse_aovs
 
 PIXELS = 7
 

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.solvers.directions import Sky
+from mitsuba_irrcache.solvers.sn.incident import Sky
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

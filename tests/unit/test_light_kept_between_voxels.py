@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.conservation import conserving
-from mitsuba_irrcache.grid import Grid
+from mitsuba_irrcache.cache.conservative import conserving
+from mitsuba_irrcache.grids.grid import Grid
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

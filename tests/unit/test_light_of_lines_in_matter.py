@@ -7,10 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.solvers import lattice
-from mitsuba_irrcache.solvers.lattice import Lattice
-from mitsuba_irrcache.solvers.lines import ONE
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.solvers.sn import tracks
+from mitsuba_irrcache.solvers.sn.kernel import ONE
+from mitsuba_irrcache.solvers.sn.tracks import Lattice
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -23,7 +23,7 @@ WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
 def mode(request, monkeypatch):
     """One launch for all directions, or one for each."""
     if request.param == "apart":
-        monkeypatch.setattr(lattice, "SMALL", 0)
+        monkeypatch.setattr(tracks, "SMALL", 0)
 
 
 def behind_the_entry(grid: Grid, way: np.ndarray, offset: np.ndarray) -> np.ndarray:

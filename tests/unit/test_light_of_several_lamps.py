@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene import bake_media
-from mitsuba_irrcache.solvers.lamps import Lamps, is_lamp
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.solvers.sn.direct_light import Lamps, is_lamp
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

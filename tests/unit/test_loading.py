@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.loading import integrator_of, load_scene, parse_integrator, unknown_properties
+from mitsuba_irrcache.io.scene_files import (
+    integrator_of,
+    load_scene,
+    parse_integrator,
+    unknown_properties,
+)
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsuba_irrcache.boundary import Boundary
-from mitsuba_irrcache.grid import Grid, GridField
-from mitsuba_irrcache.macrocells import Macrocells
+from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.grid import Grid, GridField
+from mitsuba_irrcache.grids.majorants import Macrocells
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

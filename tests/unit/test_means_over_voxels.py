@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.scene import bake_scene
-from mitsuba_irrcache.solvers.baking import baked, detail_of
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.solvers.sn.resampling import baked, detail_of
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
-from mitsuba_irrcache.scene import bake_scene
+from mitsuba_irrcache.scene.compile import bake_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

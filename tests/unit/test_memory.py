@@ -14,7 +14,7 @@ PROGRAM = """
 import re, threading
 from pathlib import Path
 import numpy as np
-from mitsuba_irrcache.memory import free_at_once
+from mitsuba_irrcache.machine.memory import free_at_once
 
 def resident():
     found = re.search(r"VmRSS:\\s+(\\d+)", Path("/proc/self/status").read_text())

@@ -7,14 +7,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.directional import Directional
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.phase import Phase
-from mitsuba_irrcache.solvers import lattice
-from mitsuba_irrcache.solvers.directions import spread
-from mitsuba_irrcache.solvers.lattice import Lattice
-from mitsuba_irrcache.solvers.moments import DirectionalLevel, Moments
-from mitsuba_irrcache.solvers.scattering import Level
+from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.phase import Phase
+from mitsuba_irrcache.solvers.sn import tracks
+from mitsuba_irrcache.solvers.sn.incident import spread
+from mitsuba_irrcache.solvers.sn.moments import DirectionalLevel, Moments
+from mitsuba_irrcache.solvers.sn.multigrid import Level
+from mitsuba_irrcache.solvers.sn.tracks import Lattice
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -25,8 +25,8 @@ SIDES = (6, 9, 7)
 def mode(request, monkeypatch):
     """All pairs of directions in one launch, or one in each."""
     if request.param == "apart":
-        monkeypatch.setattr(lattice, "SMALL", 0)
-        monkeypatch.setattr(lattice, "COPIES", 1)
+        monkeypatch.setattr(tracks, "SMALL", 0)
+        monkeypatch.setattr(tracks, "COPIES", 1)
 
 
 def moments_of(g: float, order: int) -> Moments:

@@ -7,10 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.boundary import Boundary
-from mitsuba_irrcache.grid import ConstantField, Grid, GridField
-from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.tracking import OPAQUE, optical_depth
+from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.transport.tracking import OPAQUE, optical_depth
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

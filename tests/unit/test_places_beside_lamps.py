@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.lamps import LEAST, Places
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.falloff import LEAST, Places
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

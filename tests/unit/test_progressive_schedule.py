@@ -8,8 +8,14 @@ import random
 
 import pytest
 
-from mitsuba_irrcache.cache import BATCH
-from mitsuba_irrcache.progressive import EARLY_FRAMES, FIRST, IMAGE_SHARE, OPENING, Schedule
+from mitsuba_irrcache.cache.volume import BATCH
+from mitsuba_irrcache.pipeline.progressive import (
+    EARLY_FRAMES,
+    FIRST,
+    IMAGE_SHARE,
+    OPENING,
+    Schedule,
+)
 
 
 def play(schedule, fixed=0.01, each=0.01, image=0.05, compile=0.0, noise=0.0, frames=40):

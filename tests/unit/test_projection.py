@@ -10,18 +10,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-import mitsuba_irrcache.projection as module
-from mitsuba_irrcache.boundary import Boundary
-from mitsuba_irrcache.grid import ConstantField, Grid, GridField
-from mitsuba_irrcache.macrocells import Macrocells
-from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.projection import (
-    EARLY_STOP,
-    QUADRATURES,
-    Clearance,
-    Projection,
-    segment,
-)
+import mitsuba_irrcache.render.raymarch as module
+from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.grids.majorants import Macrocells
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.render.raymarch import EARLY_STOP, QUADRATURES, Clearance, Projection, segment
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -24,7 +24,7 @@ def film_of(name: str, **properties) -> mi.Film:
 @pytest.mark.parametrize("per_pixel", [1, 3])
 def test_sums_are_those_of_mitsuba(name, crop, per_pixel):
     """All of Mitsuba's filters, within rounding: 1e-5 of the largest."""
-    from mitsuba_irrcache.reconstruction import reconstructed
+    from mitsuba_irrcache.render.pixel_filter import reconstructed
 
     film = film_of(name, **crop)
     border = film.rfilter().border_size() if film.sample_border() else 0

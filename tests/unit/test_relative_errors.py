@@ -8,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache import BATCH, IrradianceCache
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.lamps import Falloff
-from mitsuba_irrcache.uncertainty import PROBES, uncertainty_of
+from mitsuba_irrcache.cache.uncertainty import PROBES, uncertainty_of
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.falloff import Falloff
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -14,7 +14,7 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 
 def rendering():
     """The module; it can be imported only once a variant is set."""
-    from mitsuba_irrcache import rendering as module
+    from mitsuba_irrcache.render import film as module
 
     return module
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_irrcache import install_llvm, runtime
+from mitsuba_irrcache.machine import install_llvm, llvm
 
 ELF = b"\x7fELF" + bytes(60)
 
@@ -21,14 +21,14 @@ linux_only = pytest.mark.skipif(platform.system() != "Linux", reason="names of L
 
 @pytest.fixture
 def minimum_17(monkeypatch):
-    monkeypatch.setattr(runtime, "minimum_llvm", lambda: 17)
+    monkeypatch.setattr(llvm, "minimum_llvm", lambda: 17)
 
 
 @pytest.fixture
 def folder_of_libraries(tmp_path, monkeypatch, minimum_17):
     """A machine whose only LLVM libraries are those that a test puts into this folder."""
-    monkeypatch.setattr(runtime, "_llvm_patterns", lambda: [f"{tmp_path}/libLLVM*.so*"])
-    monkeypatch.setenv(runtime.LLVM_VARIABLE, "")
+    monkeypatch.setattr(llvm, "_llvm_patterns", lambda: [f"{tmp_path}/libLLVM*.so*"])
+    monkeypatch.setenv(llvm.LLVM_VARIABLE, "")
     return tmp_path
 
 
@@ -50,7 +50,7 @@ def put(folder: Path, *names: str) -> None:
 )
 def test_version_is_read_from_the_names_that_distributions_use(tmp_path, minimum_17, name, version):
     put(tmp_path, name)
-    library = runtime.inspect_llvm(tmp_path / name)
+    library = llvm.inspect_llvm(tmp_path / name)
     assert library.version == version
     assert bool(library.problem) == (version[0] < 17)
 
@@ -59,15 +59,15 @@ def test_version_is_read_from_the_names_that_distributions_use(tmp_path, minimum
 def test_version_is_read_from_a_link_and_from_neighbours(tmp_path, minimum_17):
     put(tmp_path, "libLLVM.so.19.1")
     (tmp_path / "libLLVM-unversioned.so").symlink_to("libLLVM.so.19.1")
-    assert runtime.inspect_llvm(tmp_path / "libLLVM-unversioned.so").version == (19, 1)
+    assert llvm.inspect_llvm(tmp_path / "libLLVM-unversioned.so").version == (19, 1)
 
     (tmp_path / "llvm/lib/clang/18").mkdir(parents=True)
     put(tmp_path / "llvm/lib", "libLLVM.so")
-    assert runtime.inspect_llvm(tmp_path / "llvm/lib/libLLVM.so").version == (18,)
+    assert llvm.inspect_llvm(tmp_path / "llvm/lib/libLLVM.so").version == (18,)
 
     (tmp_path / "Cellar/llvm/20.1.7_1/lib").mkdir(parents=True)
     put(tmp_path / "Cellar/llvm/20.1.7_1/lib", "libLLVM.so")
-    found = runtime.inspect_llvm(tmp_path / "Cellar/llvm/20.1.7_1/lib/libLLVM.so")
+    found = llvm.inspect_llvm(tmp_path / "Cellar/llvm/20.1.7_1/lib/libLLVM.so")
     assert found.version == (20, 1, 7)
 
 
@@ -77,77 +77,77 @@ def test_newest_usable_library_is_chosen(folder_of_libraries):
     put(folder_of_libraries, "libLLVM.so.19.1", "libLLVMSPIRVLib.so.99")
     (folder_of_libraries / "libLLVM.so.99.1").write_text("not a library")
 
-    found = [library.path.name for library in runtime.find_llvm()]
+    found = [library.path.name for library in llvm.find_llvm()]
     assert found == ["libLLVM.so.19.1", "libLLVM-17.so.1", "libLLVM-15.so.1", "libLLVM-9.so.1"]
 
-    runtime.prepare_llvm()
-    assert os.environ[runtime.LLVM_VARIABLE] == str(folder_of_libraries / "libLLVM.so.19.1")
+    llvm.prepare_llvm()
+    assert os.environ[llvm.LLVM_VARIABLE] == str(folder_of_libraries / "libLLVM.so.19.1")
 
 
 @linux_only
 def test_nothing_is_chosen_where_nothing_is_usable(folder_of_libraries):
     put(folder_of_libraries, "libLLVM-14.so.1", "libLLVM-15.so.1")
-    runtime.prepare_llvm()
-    assert os.environ[runtime.LLVM_VARIABLE] == ""
-    assert runtime.usable_llvm() is None
+    llvm.prepare_llvm()
+    assert os.environ[llvm.LLVM_VARIABLE] == ""
+    assert llvm.usable_llvm() is None
 
 
 def test_the_choice_of_the_user_stands(monkeypatch):
-    monkeypatch.setenv(runtime.LLVM_VARIABLE, "/my/own/libLLVM.so")
-    runtime.prepare_llvm()
-    assert os.environ[runtime.LLVM_VARIABLE] == "/my/own/libLLVM.so"
+    monkeypatch.setenv(llvm.LLVM_VARIABLE, "/my/own/libLLVM.so")
+    llvm.prepare_llvm()
+    assert os.environ[llvm.LLVM_VARIABLE] == "/my/own/libLLVM.so"
 
 
 def test_preparing_is_fast_and_starts_no_process(monkeypatch):
-    monkeypatch.setenv(runtime.LLVM_VARIABLE, "")
+    monkeypatch.setenv(llvm.LLVM_VARIABLE, "")
     monkeypatch.setattr(subprocess, "run", None)
-    runtime.find_llvm()  # the first look at a cold disk is not what is measured
+    llvm.find_llvm()  # the first look at a cold disk is not what is measured
     start = time.process_time()
-    runtime.prepare_llvm()
+    llvm.prepare_llvm()
     assert time.process_time() - start < 0.1
 
 
 def test_files_that_are_no_library_are_named_as_such(tmp_path):
     text = tmp_path / "libLLVM.so.19.1"
     text.write_text("LLVM")
-    assert "not a shared library" in runtime.inspect_llvm(text).problem
-    assert "no such file" in runtime.inspect_llvm(tmp_path / "missing.so").problem
-    assert "not a file" in runtime.inspect_llvm(tmp_path).problem
+    assert "not a shared library" in llvm.inspect_llvm(text).problem
+    assert "no such file" in llvm.inspect_llvm(tmp_path / "missing.so").problem
+    assert "not a file" in llvm.inspect_llvm(tmp_path).problem
 
 
 @linux_only
 def test_another_library_is_not_mistaken_for_llvm():
     name = ctypes.util.find_library("c")
-    library = runtime.inspect_llvm(name)
+    library = llvm.inspect_llvm(name)
     assert library.version == ()
     assert "not libLLVM" in library.problem
 
 
-@pytest.mark.skipif(not runtime.find_llvm(), reason="needs an LLVM library")
+@pytest.mark.skipif(not llvm.find_llvm(), reason="needs an LLVM library")
 def test_a_library_states_the_version_that_its_name_has():
-    for library in runtime.find_llvm():
-        assert runtime._version_by_loading(library.path)[:1] == library.version[:1]
+    for library in llvm.find_llvm():
+        assert llvm._version_by_loading(library.path)[:1] == library.version[:1]
 
 
 def run_with_llvm(path: str, code: str) -> subprocess.CompletedProcess:
-    environment = {**os.environ, runtime.LLVM_VARIABLE: path}
+    environment = {**os.environ, llvm.LLVM_VARIABLE: path}
     return subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120
     )
 
 
 REQUIRE = """
-from mitsuba_irrcache import runtime
+from mitsuba_irrcache.machine import llvm
 try:
-    runtime.require_llvm()
-except runtime.LLVMUnusableError as error:
+    llvm.require_llvm()
+except llvm.LLVMUnusableError as error:
     print(error)
     raise SystemExit(3)
 """
 
 
 def bad_libraries() -> list:
-    old = [library.path for library in runtime.find_llvm() if library.problem]
+    old = [library.path for library in llvm.find_llvm() if library.problem]
     if not old:
         reason = "needs a libLLVM that is too old, such as that of Debian's libllvm15"
         return [pytest.param("", marks=pytest.mark.skip(reason=reason), id="old")]
@@ -169,10 +169,10 @@ def test_bad_llvm_ends_in_an_error_that_names_it_and_the_remedy(path):
     assert "Remedy: " in done.stdout
 
 
-@pytest.mark.skipif(runtime.usable_llvm() is None, reason="needs a usable LLVM")
+@pytest.mark.skipif(llvm.usable_llvm() is None, reason="needs a usable LLVM")
 def test_usable_llvm_is_accepted_and_is_the_one_that_dr_jit_loads():
-    library = runtime.usable_llvm()
-    done = run_with_llvm(str(library.path), REQUIRE + "print(*runtime.loaded_llvm())")
+    library = llvm.usable_llvm()
+    done = run_with_llvm(str(library.path), REQUIRE + "print(*llvm.loaded_llvm())")
     assert done.returncode == 0, done.stderr
     loaded = tuple(map(int, done.stdout.split()))
     assert loaded[: len(library.version)] == library.version
@@ -181,10 +181,10 @@ def test_usable_llvm_is_accepted_and_is_the_one_that_dr_jit_loads():
 @linux_only
 def test_a_library_loaded_before_ours_was_chosen_is_explained(folder_of_libraries, monkeypatch):
     put(folder_of_libraries, "libLLVM.so.19.1")
-    runtime.prepare_llvm()
-    monkeypatch.setattr(runtime, "loaded_llvm", lambda: (15, 0, 6))
-    with pytest.raises(runtime.LLVMUnusableError, match=r"15\.0\.6(?s:.)*import mitsuba_irrcache"):
-        runtime.require_llvm()
+    llvm.prepare_llvm()
+    monkeypatch.setattr(llvm, "loaded_llvm", lambda: (15, 0, 6))
+    with pytest.raises(llvm.LLVMUnusableError, match=r"15\.0\.6(?s:.)*import mitsuba_irrcache"):
+        llvm.require_llvm()
 
 
 @pytest.mark.parametrize(
@@ -196,9 +196,9 @@ def test_a_library_loaded_before_ours_was_chosen_is_explained(folder_of_librarie
     ],
 )
 def test_remedy_fits_the_platform(monkeypatch, system, words):
-    monkeypatch.setattr(runtime, "usable_llvm", lambda: None)
+    monkeypatch.setattr(llvm, "usable_llvm", lambda: None)
     monkeypatch.setattr(platform, "system", lambda: system)
-    remedy = runtime.llvm_remedy()
+    remedy = llvm.llvm_remedy()
     assert [word for word in words if word not in remedy] == []
 
 

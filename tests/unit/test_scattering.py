@@ -6,13 +6,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.solvers import lattice, scattering
-from mitsuba_irrcache.solvers.directions import spread
-from mitsuba_irrcache.solvers.lattice import Lattice
-from mitsuba_irrcache.solvers.mixing import Mixing
-from mitsuba_irrcache.solvers.scattering import Level
-from mitsuba_irrcache.solvers.table import Entering
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.solvers.sn import multigrid, tracks
+from mitsuba_irrcache.solvers.sn.anderson import Mixing
+from mitsuba_irrcache.solvers.sn.incident import spread
+from mitsuba_irrcache.solvers.sn.multigrid import Level
+from mitsuba_irrcache.solvers.sn.track_table import Entering
+from mitsuba_irrcache.solvers.sn.tracks import Lattice
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -22,9 +22,9 @@ SHAPE, VOXELS, PAIRS = (9, 8, 10), 720, 6
 @pytest.fixture(params=["together", "apart"], autouse=True)
 def mode(request, monkeypatch):
     """One launch for all directions, or one for each; three levels."""
-    monkeypatch.setattr(scattering, "COARSEST", 4)
+    monkeypatch.setattr(multigrid, "COARSEST", 4)
     if request.param == "apart":
-        monkeypatch.setattr(lattice, "SMALL", 0)
+        monkeypatch.setattr(tracks, "SMALL", 0)
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_channels_are_solved_together_as_alone(random, evenly):
     together = stacked(of(0, 1, 2).solve(flat(b), of_rows))
     for c in range(3):
         alone = stacked(of(c).solve(flat(b[[c]]), of_rows))[0]
-        assert np.abs(together[c] - alone).sum() <= 2 * scattering.TOLERANCE * alone.sum()
+        assert np.abs(together[c] - alone).sum() <= 2 * multigrid.TOLERANCE * alone.sum()
         assert alone.sum() >= 1.2 * b[c].sum()
 
 
@@ -157,7 +157,7 @@ def test_voxels_without_matter_need_not_be_known(random, evenly):
         whole = whole[index]
         dense = sigma_t[index] > 0
         difference = np.abs(whole - part)[dense].sum(axis=0)
-        assert (difference < 2 * scattering.TOLERANCE * whole[dense].sum(axis=0)).all()
+        assert (difference < 2 * multigrid.TOLERANCE * whole[dense].sum(axis=0)).all()
     assert found[1][0].mean() > b.mean()
 
 

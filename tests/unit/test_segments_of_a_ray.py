@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from mitsuba_irrcache.boundary import Boundary
-from mitsuba_irrcache.cache import active_voxels
-from mitsuba_irrcache.emission import Emission
-from mitsuba_irrcache.grid import ConstantField, Grid, GridField
-from mitsuba_irrcache.macrocells import Macrocells
-from mitsuba_irrcache.medium import MediumGrid
-from mitsuba_irrcache.projection import Projection
+from mitsuba_irrcache.cache.volume import active_voxels
+from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.grids.majorants import Macrocells
+from mitsuba_irrcache.media.emission import Emission
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.render.raymarch import Projection
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

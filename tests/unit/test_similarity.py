@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from mitsuba_irrcache.phase import LARGEST_PEAK, PEAK, Phase
-from mitsuba_irrcache.scene import bake_media
+from mitsuba_irrcache.media.phase import LARGEST_PEAK, PEAK, Phase
+from mitsuba_irrcache.scene.compile import bake_media
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.solvers import lamps
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.solvers.sn import direct_light
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -25,7 +25,7 @@ def seen(lamp: dict, scale: float) -> tuple[float, list, list]:
     grid = Grid((4, 4, 4), frame)
     box = np.zeros(3, int), grid.resolution
     (emitter,) = scene.emitters()
-    return lamps._solid_angle(emitter, grid, *box), *lamps.split(scene, grid, *box)
+    return direct_light._solid_angle(emitter, grid, *box), *direct_light.split(scene, grid, *box)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
@@ -36,4 +36,4 @@ def test_solid_angle_of_a_disc(distance, scale):
     angle, small, large = seen({"type": "disk", "to_world": place}, scale)
     expected = 2 * np.pi * (1 - distance / np.hypot(distance, 1))
     assert angle == pytest.approx(expected, rel=0.05)
-    assert (len(small), len(large)) == ((1, 0) if expected < lamps.LARGE else (0, 1))
+    assert (len(small), len(large)) == ((1, 0) if expected < direct_light.LARGE else (0, 1))

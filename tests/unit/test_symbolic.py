@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
+from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.symbolic import symbolic
 
 
 @symbolic

@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene import bake_media
-from mitsuba_irrcache.solvers.volume_path import contributions
-from mitsuba_irrcache.transport import power_heuristic, visibility
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.solvers.path.estimator import contributions
+from mitsuba_irrcache.transport.path import power_heuristic, visibility
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -11,9 +11,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache import BATCH, IrradianceCache
-from mitsuba_irrcache.grid import Grid
-from mitsuba_irrcache.uncertainty import PROBES, UncertaintyField, uncertainty_of
+from mitsuba_irrcache.cache.uncertainty import PROBES, UncertaintyField, uncertainty_of
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
+from mitsuba_irrcache.grids.grid import Grid
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene import bake_media
+from mitsuba_irrcache.scene.compile import bake_media
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from packaging.requirements import Requirement
 
-from mitsuba_irrcache import versions
+from mitsuba_irrcache.machine import versions
 
 
 def test_everything_that_is_needed_is_installed():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.loading import scene_of_text, scene_text
+from mitsuba_irrcache.io.scene_files import scene_of_text, scene_text
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document, Lighting
 

@@ -13,9 +13,9 @@ import numpy as np
 import OpenImageIO
 import pytest
 
-from mitsuba_irrcache.cli import main
+from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.images import read_image
+from mitsuba_irrcache.io.images import read_image
 from mitsuba_irrcache.view import picture
 from mitsuba_irrcache.view import window as module
 from mitsuba_irrcache.view.camera import Camera

@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene import bake_media
-from mitsuba_irrcache.transport import visibility
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.transport.path import visibility
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import SimpleITK
 
-from mitsuba_irrcache.cli import main
+from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.readers import read_volume
 

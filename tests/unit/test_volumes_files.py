@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.mitsuba_vol import read_vol, write_vol
 from mitsuba_irrcache.volumes.data import VolumeData
-from mitsuba_irrcache.volumes.mitsuba_vol import read_vol, write_vol
 from mitsuba_irrcache.volumes.raw import RawLayout
 from mitsuba_irrcache.volumes.readers import read_volume
 

@@ -13,9 +13,9 @@ import pytest
 import SimpleITK
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.mitsuba_vol import read_vol, write_vol
 from mitsuba_irrcache.volumes import importer
 from mitsuba_irrcache.volumes.data import VolumeData
-from mitsuba_irrcache.volumes.mitsuba_vol import read_vol, write_vol
 from mitsuba_irrcache.volumes.scene import SceneSettings, camera, write_scene
 from mitsuba_irrcache.volumes.transfer import DensityMapping
 

@@ -1,0 +1,1 @@
+"""The irradiance cache: its values, statistics and files."""

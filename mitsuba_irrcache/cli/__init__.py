@@ -1,0 +1,5 @@
+"""The command ``irrcache``."""
+
+from mitsuba_irrcache.cli.main import command
+
+__all__ = ["command"]

@@ -1,0 +1,258 @@
+"""``irrcache render``: a scene file to an EXR and a PNG."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import time
+from contextlib import closing, contextmanager
+from importlib import metadata
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from mitsuba_irrcache import __version__
+from mitsuba_irrcache.core.argument_types import whole
+from mitsuba_irrcache.errors import IrrcacheError, origin
+from mitsuba_irrcache.io.images import check_output, write_image
+from mitsuba_irrcache.io.scene_files import (
+    check_scene_file,
+    has_cache,
+    integrator_of,
+    load_scene,
+    parse_parameters,
+)
+from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.machine.variants import SUPPORTED
+from mitsuba_irrcache.pipeline.progressive import Frame, render_progressive
+
+#: Stock integrators that ``irrcache`` stands in for when a scene names one of them.
+REPLACED = ("path", "volpath", "volpathmis", "prbvolpath")
+
+
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """What it takes to load a scene: the variant, and its parameters."""
+    parser.add_argument(
+        "-m",
+        "--mode",
+        default="llvm_ad_rgb",
+        choices=SUPPORTED,
+        help="variant (default: %(default)s)",
+    )
+    parser.add_argument(
+        "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
+        help="value of a $parameter of the scene; repeatable",
+    )  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``irrcache render``: those of the ``mitsuba`` command where it has them."""
+    parser.add_argument("scene", help="scene XML")
+    parser.add_argument("-o", "--output", help="EXR to write (default: beside the scene)")
+    add_scene_options(parser)
+    parser.add_argument(
+        "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
+        help="integrator and its properties (default: irrcache in place of a path tracer)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--spp", type=int, default=0, help="samples per pixel (default: the scene's)"
+    )
+    parser.add_argument(
+        "-s", "--sensor", type=int, default=0, help="index of the sensor (default: 0)"
+    )
+    parser.add_argument(
+        "--seed",
+        type=whole(0, 2**32 - 1),
+        default=0,
+        help="seed of the camera samples (default: 0)",
+    )
+    parser.add_argument(
+        "--budget", type=float, metavar="SECONDS",
+        help="refine the cache and render again and again, for so many seconds once the scene is "
+        "loaded; Ctrl-C ends it earlier",
+    )  # fmt: skip
+    parser.add_argument(
+        "--error", type=float, metavar="E",
+        help="refine until the standard error of the cache is this part of its mean, e.g. 0.02",
+    )  # fmt: skip
+    parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Renders, and prints where the time went."""
+    source = check_scene_file(args.scene)
+    output = check_output(args.output or source.with_suffix(".exr"))
+    if args.spp < 0:
+        raise IrrcacheError(
+            f"--spp is {args.spp}; it must be at least 1 (or 0 for the scene's own)."
+        )
+    _check_targets(args)
+    if args.mode.startswith("llvm"):
+        require_llvm()
+    mi.set_variant(args.mode)
+    mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
+    seconds: dict[str, float] = {}
+    with _stopwatch(seconds, "load"):
+        parameters = parse_parameters(args.define)
+        integrator = args.integrator
+        if integrator is None and integrator_of(source, parameters) in REPLACED:
+            integrator = "irrcache"
+        scene = load_scene(source, parameters, integrator)
+    if not 0 <= args.sensor < len(scene.sensors()):
+        raise IrrcacheError(
+            f"--sensor is {args.sensor}, but the scene has {len(scene.sensors())} sensor(s), "
+            "counted from 0."
+        )
+    if args.budget or args.error:
+        _require_progressive(scene, integrator or integrator_of(source, parameters))
+        _render_progressive(scene, args, seconds, output)
+    else:
+        image = _render(scene, args, seconds)
+        _write(output, image, scene, _describe(scene, args, seconds), seconds)
+    return 0
+
+
+def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]) -> np.ndarray:
+    integrator = scene.integrator()
+    try:
+        if has_cache(scene):
+            with _stopwatch(seconds, "cache"), progress_bar(integrator):
+                integrator.prepare(scene)
+        with _stopwatch(seconds, "projection" if "cache" in seconds else "render"):
+            image = mi.render(scene, sensor=args.sensor, seed=args.seed, spp=args.spp)
+            dr.sync_thread()
+    except (KeyboardInterrupt, RuntimeError) as error:
+        _say_what_is_left(error, "no image was written")
+        raise
+    return np.array(image)
+
+
+def _render_progressive(
+    scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], output: Path
+) -> None:
+    """Writes the last image there is, whether the run reaches its end or is stopped."""
+    frame = None
+    targets = {"seconds": args.budget or math.inf, "standard_error": args.error or 0.0}
+    try:
+        with (
+            progress_bar(scene.integrator()),
+            _terminated_like_interrupted(),
+            closing(
+                render_progressive(scene, args.sensor, args.spp, args.seed, **targets)
+            ) as frames,
+        ):
+            for frame in frames:
+                tqdm.write(f"{frame.elapsed:8.2f} s  {_reached(frame)}")
+    except (KeyboardInterrupt, RuntimeError) as error:
+        left = f"the image of {_reached(frame)} was written" if frame else "no image was written"
+        _say_what_is_left(error, left)
+        raise
+    finally:
+        if frame is not None:
+            seconds |= frame.seconds
+            about = _describe(scene, args, seconds, frame.samples)
+            _write(output, np.array(frame.image), scene, about, seconds)
+
+
+def _say_what_is_left(error: BaseException, left: str) -> None:
+    """Gives an interrupt a message; other errors have one."""
+    if isinstance(origin(error), KeyboardInterrupt):
+        raise KeyboardInterrupt(left) from None
+
+
+def _reached(frame: Frame) -> str:
+    if not frame.samples:
+        return "no cache"
+    error = "" if math.isnan(frame.standard_error) else f", error {frame.standard_error:.2%}"
+    return f"{frame.samples} samples per voxel{error}"
+
+
+def _write(
+    output: Path,
+    image: np.ndarray,
+    scene: mi.Scene,
+    about: dict[str, object],
+    seconds: dict[str, float],
+) -> None:
+    png = write_image(output, image, about, scene.integrator().aov_names())
+    print(f"wrote {output} and {png}")
+    print("  ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
+
+
+@contextmanager
+def _terminated_like_interrupted():
+    """A request to terminate ends the block as Ctrl-C does."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def progress_bar(integrator: mi.Integrator):
+    """Shows the growth of the cache on a terminal, once it takes longer than a second."""
+    with tqdm(unit="sample", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
+
+        def advance(stage: str, done: int, total: int) -> None:
+            bar.total = total
+            bar.set_description(stage, refresh=False)
+            bar.update(done - bar.n)
+
+        integrator.progress = advance
+        try:
+            yield
+        finally:
+            integrator.progress = None
+
+
+@contextmanager
+def _stopwatch(seconds: dict[str, float], name: str):
+    started = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - started
+
+
+def _check_targets(args: argparse.Namespace) -> None:
+    for name, value, wanted in (
+        ("budget", args.budget, "a number of seconds"),
+        ("error", args.error, "a part of the mean, for example 0.02,"),
+    ):
+        if value is not None and not 0 < value < math.inf:
+            raise IrrcacheError(f"--{name} is {value:g}; it must be {wanted} above 0.")
+
+
+def _require_progressive(scene: mi.Scene, integrator: str) -> None:
+    if not hasattr(scene.integrator(), "progressive"):
+        raise IrrcacheError(
+            f'--budget and --error need an integrator with a cache to refine, and "{integrator}" '
+            "has none; use irrcache, or --spp."
+        )
+
+
+def _describe(
+    scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], samples: int = 0
+) -> dict[str, object]:
+    """What made the image, for the header of the EXR; ``samples`` per voxel of the cache that it
+    shows, if it is not the cache as it is now.
+    """
+    described = {
+        "version": __version__,
+        "mitsuba": metadata.version("mitsuba"),
+        "drjit": metadata.version("drjit"),
+        "variant": args.mode,
+        "scene": Path(args.scene).name,
+        "integrator": " ".join(str(scene.integrator()).split()),
+        "sensor": args.sensor,
+        "seed": args.seed,
+        "spp": args.spp or scene.sensors()[args.sensor].sampler().sample_count(),
+    }
+    cache = getattr(scene.integrator(), "cache", None)
+    if cache is not None:
+        sides = "x".join(map(str, cache.grid.shape[::-1]))
+        described["cache"] = f"{sides} voxels, {samples or cache.samples} samples"
+    return described | {f"seconds_{name}": value for name, value in seconds.items()}

@@ -1,0 +1,1 @@
+"""Arithmetic, properties of plugins and other things that know nothing of rendering."""

@@ -1,0 +1,1 @@
+"""Voxel grids, fields on them, majorants and occupied voxels."""

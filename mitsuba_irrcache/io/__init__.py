@@ -1,0 +1,1 @@
+"""Files: images, scenes and volumes in Mitsuba's format."""

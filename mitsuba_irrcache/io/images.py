@@ -1,0 +1,81 @@
+"""Writing images: EXR with metadata and a PNG beside it, whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
+
+from mitsuba_irrcache.errors import IrrcacheError
+
+#: Names of the channels of an image, by their number.
+CHANNELS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+
+
+def check_output(path: str | Path) -> Path:
+    """The path of an EXR that can be written; raises IrrcacheError before any work is done for
+    it.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".exr":
+        raise IrrcacheError(f'the output "{path}" must end in .exr (a PNG is written beside it).')
+    if not path.parent.is_dir():
+        raise IrrcacheError(f'cannot write "{path}": the folder "{path.parent}" does not exist.')
+    if path.is_dir():
+        raise IrrcacheError(f'cannot write "{path}": it is a folder; name a file.')
+    if not os.access(path.parent, os.W_OK):
+        raise IrrcacheError(f'cannot write "{path}": no permission to write to "{path.parent}".')
+    return path
+
+
+def write_image(
+    path: str | Path,
+    image: np.ndarray,
+    metadata: dict[str, object],
+    further: Sequence[str] = (),
+) -> Path:
+    """Writes ``image`` (height, width, channel), linear radiance, to ``path`` (.exr) and as sRGB to
+    a PNG.
+
+    Channels are luminance or RGB, perhaps alpha, and then those that ``further`` names, which go
+    into the EXR only. ``metadata`` goes into its header under ``irrcache:``. Returns the PNG's
+    path.
+    """
+    path = check_output(path)
+    image = np.ascontiguousarray(image, dtype=np.float32)
+    buffer = oiio.ImageBuf(image)
+    shown = image.shape[2] - len(further)
+    if further:
+        buffer.specmod().channelnames = (*CHANNELS[shown], *further)
+    for key, value in metadata.items():
+        buffer.specmod().attribute(
+            f"irrcache:{key}", value if isinstance(value, float | int) else str(value)
+        )
+    _write(buffer, path, oiio.FLOAT)
+    png = path.with_suffix(".png")
+    buffer = oiio.ImageBuf(np.ascontiguousarray(image[..., :shown]))
+    _write(oiio.ImageBufAlgo.colorconvert(buffer, "linear", "sRGB"), png, oiio.UINT8)
+    return png
+
+
+def write_pixels(path: Path, pixels: np.ndarray) -> None:
+    """Writes ``pixels``, uint8 (height, width, channel), to a PNG as they are."""
+    _write(oiio.ImageBuf(np.ascontiguousarray(pixels)), path, oiio.UINT8)
+
+
+def read_image(path: str | Path) -> np.ndarray:
+    """The pixels of an image file (height, width, channel), float32, as they are stored."""
+    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
+
+
+def _write(buffer: oiio.ImageBuf, path: Path, kind: oiio.BASETYPE) -> None:
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        if buffer.has_error or not buffer.write(str(temporary), kind):
+            raise IrrcacheError(f'cannot write "{path}": {buffer.geterror()}')
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

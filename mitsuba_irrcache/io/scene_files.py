@@ -1,0 +1,239 @@
+"""Scene files, with parameters, and with another integrator where one is asked for."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+from contextlib import suppress
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mitsuba as mi
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.scene_xml import scene_element
+
+#: Properties that every volumetric path integrator shares, and that keep their meaning here.
+SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+
+
+#: What stands between commas, of which those in quotes do not count.
+_ITEM = r"""(?:[^,"']|"[^"]*"|'[^']*')+"""
+
+
+def load_scene(
+    path: str | Path,
+    parameters: dict[str, str] | None = None,
+    integrator: str | None = None,
+) -> mi.Scene:
+    """Loads a scene XML with ``$parameters`` and gives it the ``integrator``, for example
+    ``irrcache{step=0.5}``.
+
+    Depth, Russian roulette and visibility of emitters are taken over from the scene's own
+    integrator, unless the specification sets them or the plugin does not know them. With None the
+    scene's integrator stays as it is.
+    Raises IrrcacheError if the file is missing or has no integrator to replace.
+    """
+    path = Path(path)
+    config, state = _parse(path, parameters)
+    with _search_path(path.parent):
+        mi.parser.transform_all(config, state)
+        if integrator is not None:
+            _replace_integrator(state, integrator, path)
+        scene = mi.parser.instantiate(config, state)
+    return scene[0] if isinstance(scene, list) else scene
+
+
+def check_scene_file(path: str | Path) -> Path:
+    """The path of a scene file that can be read; raises IrrcacheError for anything else."""
+    path = Path(path)
+    try:
+        found, folder, readable = path.is_file(), path.is_dir(), os.access(path, os.R_OK)
+    except (OSError, ValueError) as error:  # a name too long, or with a NUL
+        raise IrrcacheError(f'"{str(path)[:80]!s}" is no name of a scene file: {error}.') from None
+    if folder:
+        inside = sorted(p.name for p in path.glob("*.xml"))[:5]
+        there = f", for example {path / inside[0]}" if inside else ""
+        raise IrrcacheError(f'the scene "{path}" is a folder; name an XML file{there}.')
+    if not found:
+        raise IrrcacheError(f'there is no scene file "{path}".')
+    if not readable:
+        raise IrrcacheError(f'no permission to read the scene file "{path}".')
+    if not path.stat().st_size:
+        raise IrrcacheError(f'the scene file "{path}" is empty.')
+    return path
+
+
+def scene_text(
+    path: str | Path, parameters: dict[str, str] | None = None, integrator: str | None = None
+) -> str:
+    """The XML of a scene with all its $parameters filled in and all included files in one; with
+    another ``integrator`` as in `load_scene`.
+    """
+    path = Path(path)
+    _, state = _parse(path, parameters)
+    if integrator is not None:
+        _replace_integrator(state, integrator, path)
+    return ElementTree.tostring(scene_element(state), encoding="unicode")
+
+
+def filled(text: str, integrator: str, parameters: dict[str, str] | None = None) -> str:
+    """An XML text as `scene_text` makes it of a file."""
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_string(config, text, **(parameters or {}))
+    _replace_integrator(state, integrator, Path("scene.xml"))
+    return ElementTree.tostring(scene_element(state), encoding="unicode")
+
+
+def scene_of_text(
+    text: str, folder: str | Path, grids: dict[str, mi.VolumeGrid] | None = None
+) -> mi.Scene:
+    """The scene of an XML text whose files are in ``folder``, but for those named in ``grids``:
+    volumes that need no file.
+    """
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_string(config, text)
+    with _search_path(Path(folder)):
+        for node in state.nodes:
+            name = node.props.get("filename", None)
+            if node.type == mi.ObjectType.Volume and name in (grids or {}):
+                del node.props["filename"]
+                node.props["grid"] = grids[name]
+        mi.parser.transform_all(config, state)
+        scene = mi.parser.instantiate(config, state)
+    return scene[0] if isinstance(scene, list) else scene
+
+
+def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) -> str:
+    """Name of the integrator plugin in a scene file; "path" where it names none, as in Mitsuba."""
+    _, state = _parse(Path(path), parameters)
+    node = _integrator_node(state)
+    return "path" if node is None else node.props.plugin_name()
+
+
+def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
+    """Splits ``name`` or ``name{key=value,...}`` into the plugin's name and its properties.
+
+    Values become booleans (true, false), integers, floats or strings, whichever they look like;
+    those with commas have to be quoted.
+    """
+    match = re.fullmatch(r"\s*([A-Za-z_]\w*)\s*(?:\{(.*)\})?\s*", specification, re.DOTALL)
+    if match is None:
+        raise IrrcacheError(
+            f'cannot read the integrator "{specification}"; write a name, or '
+            f"name{{key=value,key=value}}."
+        )
+    name, body = match.groups()
+    properties: dict[str, object] = {}
+    for item in filter(None, map(str.strip, re.findall(_ITEM, body or ""))):
+        key, equals, value = item.partition("=")
+        if not equals or not key.strip():
+            raise IrrcacheError(
+                f'cannot read "{item}" in the integrator "{specification}"; write key=value.'
+            )
+        properties[key.strip()] = _literal(value.strip())
+    return name, properties
+
+
+def unknown_properties(specification: str) -> list[str]:
+    """Those of the properties in ``name{key=value,...}`` that the plugin does not read; none where
+    that cannot be told, because the plugin refuses what it reads.
+    """
+    name, properties = parse_integrator(specification)
+    return _unread(name, properties)
+
+
+def _unread(name: str, properties: dict[str, object]) -> list[str]:
+    trial = mi.Properties(name)
+    for key, value in properties.items():
+        trial[key] = value
+    with suppress(Exception):  # loading the scene will tell it, with the place in the file
+        mi.PluginManager.instance().create_object(trial)
+        return trial.unqueried()
+    return []
+
+
+def parse_parameters(definitions: list[str]) -> dict[str, str]:
+    """The ``$parameters`` that options ``-D name=value`` give."""
+    result = {}
+    for item in definitions:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise IrrcacheError(f'cannot read -D "{item}"; write -D name=value.')
+        result[key] = value
+    return result
+
+
+def describe_integrator(name: str, properties: dict[str, object]) -> str:
+    """The inverse of `parse_integrator`."""
+    return f"{name}{{{','.join(f'{key}={_quoted(value)}' for key, value in properties.items())}}}"
+
+
+def _quoted(value: object) -> str:
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return f"'{text}'" if "," in text else text
+
+
+def _parse(
+    path: Path, parameters: dict[str, str] | None
+) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
+    check_scene_file(path)
+    config = mi.parser.ParserConfig(mi.variant())
+    return config, mi.parser.parse_file(config, str(path), **(parameters or {}))
+
+
+def _literal(text: str) -> object:
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text.strip("'\"")
+
+
+def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
+    """The scene's integrator: nodes are in the file's order, so one nested in a wrapper comes after
+    it.
+    """
+    return next((n for n in state.nodes if n.type == mi.ObjectType.Integrator), None)
+
+
+def _replace_integrator(state: mi.parser.ParserState, specification: str, path: Path) -> None:
+    name, properties = parse_integrator(specification)
+    node = _integrator_node(state)
+    if node is None:
+        raise IrrcacheError(f'"{path}" names no integrator; add <integrator type="{name}"/> to it.')
+    inherited = {k: node.props[k] for k in SHARED_PROPERTIES if k in node.props}
+    for key in list(node.props.keys()):
+        del node.props[key]
+    node.props.set_plugin_name(name)
+    unread = _unread(name, inherited | properties)
+    inherited = {k: v for k, v in inherited.items() if k not in unread}
+    for key, value in (inherited | properties).items():
+        node.props[key] = value
+
+
+class _search_path:  # noqa: N801 (a context manager)
+    """Mitsuba looks for files of a scene beside it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = str(folder.resolve())
+
+    def __enter__(self) -> None:
+        self.saved = mi.file_resolver()
+        resolver = mi.FileResolver(self.saved)
+        resolver.prepend(self.folder)
+        mi.set_file_resolver(resolver)
+
+    def __exit__(self, *_: object) -> None:
+        mi.set_file_resolver(self.saved)
+
+
+def has_cache(scene: mi.Scene) -> bool:
+    """Whether the integrator builds a cache before it renders."""
+    method = getattr(scene.integrator(), "prepare", None)
+    # Mitsuba's differentiable integrators have another method of this name.
+    return callable(method) and "scene" in inspect.signature(method).parameters

@@ -1,0 +1,1 @@
+"""The machine that runs: LLVM, versions, variants, memory, optional packages."""

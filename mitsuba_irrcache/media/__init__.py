@@ -1,0 +1,1 @@
+"""Participating media on grids: extinction, albedo, phase function, emission."""

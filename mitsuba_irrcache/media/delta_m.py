@@ -1,0 +1,74 @@
+"""Sharp forward scattering as less scattering (delta-M, Wiscombe 1977; TMS, Nakajima 1988).
+
+Of light that a sharp phase function scatters, a share f goes on almost straight: as if nothing had
+happened. The medium
+
+    sigma_t' = sigma_t (1 - f albedo),   albedo' = albedo (1 - f) / (1 - f albedo)
+
+with the moments (g_l - f) / (1 - f) has the same light but for a blur of a few degrees, and needs
+as few moments as a broad one. f is the first moment that is left out. What is scattered once from
+narrow lights takes the phase function as it is, divided by 1 - f.
+
+So transmittance counts what is scattered into the peak as not scattered. Of narrow lights that is
+known otherwise: where they are seen themselves, through the medium, it counts as scattered. To
+paths from surfaces, which see light from all sides at once, nothing is scattered into the peak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grids.grid import ConstantField, Field, Grid, GridField
+from mitsuba_irrcache.grids.majorants import Macrocells
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.render.aovs import interleaved
+
+
+def take_away_peak(medium: MediumGrid) -> None:
+    """Makes of ``medium``, whose phase function has a forward peak, the one that is like it but for
+    that.
+    """
+    medium.keep_peak()
+    phase = medium.phase.without_peak()
+    share, sigma_t, albedo = phase.forward, medium.sigma_t, medium.albedo
+    medium.sigma_t = _combined(lambda s, a: s * (1 - share * a), sigma_t, albedo)
+    medium.albedo = _combined(lambda a: a * (1 - share) / (1 - share * a), albedo)
+    remaining = _mean(medium.sigma_t)
+    medium.straight = _mean(sigma_t) / remaining if remaining else 1.0
+    medium.phase = phase
+    medium.macrocells = Macrocells.build(medium.sigma_t, medium.boundary)
+
+
+def _mean(field: Field) -> float:
+    if field.grid is None:
+        return 0.5 * (field.minimum + field.maximum)
+    return float(dr.mean(field.data)[0] * field.scale[0])
+
+
+def _combined(function: Callable, *fields: Field) -> Field:
+    """A ``function`` of the values of ``fields``, on the first grid that one of these has."""
+    channels = max(field.channels for field in fields)
+    grid = next((field.grid for field in fields if field.grid is not None), None)
+    index = dr.arange(mi.UInt32, 1 if grid is None else grid.voxel_count)
+    known = [_channels(field, grid, index, channels) for field in fields]
+    values = [function(*of_channel) for of_channel in zip(*known, strict=True)]
+    dr.eval(values)
+    if grid is None:
+        return ConstantField(np.array([v[0] for v in values], dtype=np.float64))
+    data = interleaved(values, grid.voxel_count)
+    dr.eval(data)
+    return GridField(grid, data, channels)
+
+
+def _channels(field: Field, grid: Grid | None, index: mi.UInt32, count: int) -> list[mi.Float]:
+    """Values of so many channels at the voxel centres of ``grid``."""
+    place = mi.Point3f(0)
+    if grid is not None:
+        place = grid.world.point(mi.Point3f(*grid.places(index)) + 0.5)
+    value = field.at_world(place)
+    channels = [value] if field.channels == 1 else list(value)
+    return [mi.Float(channels[min(c, field.channels - 1)]) for c in range(count)]

@@ -1,0 +1,1 @@
+"""From a scene and settings to complete caches."""

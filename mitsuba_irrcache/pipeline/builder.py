@@ -1,0 +1,241 @@
+"""From a scene to a filled cache, and when an old one still holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from threading import RLock
+from time import perf_counter
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.core.cancellation import Pause
+from mitsuba_irrcache.media.emission import Emission, bake_emission
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.pipeline.cached_medium import CacheSettings, LitMedium
+from mitsuba_irrcache.pipeline.defaults import choose_solver
+from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.fingerprint import Snapshot
+from mitsuba_irrcache.solvers.path import solver as path_solver
+
+__all__ = ["CacheBuilder", "CacheSettings", "Progress"]
+
+#: Between two checkpoints: at least so many seconds, and the time of writing over this share.
+CHECKPOINT_SECONDS = 30.0
+CHECKPOINT_SHARE = 0.1
+
+#: called with (stage, done, total)
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(eq=False)
+class Stage:
+    """How far a progressive run has the caches built: ``samples`` per voxel (0: it has not begun),
+    and whether the first two batches may be shown in pieces.
+    """
+
+    samples: int = 0
+    early: bool = False
+
+
+class CacheBuilder:
+    """Keeps the media and caches of one scene up to date, and does no work twice.
+
+    Threads may share it: whatever changes media or caches does so under its ``lock``. Who needs
+    several of its attributes to fit each other holds the lock while reading them.
+    """
+
+    def __init__(
+        self, settings: CacheSettings, emission: object = None, emission_scale: float = 1.0
+    ) -> None:
+        """``emission`` is what `emission.bake_emission` takes; None: media do not shine."""
+        self.settings = settings
+        self.lock = RLock()
+        self._emission, self._emission_scale = emission, emission_scale
+        #: samples per voxel to build up to (0: chosen); a higher number refines the caches
+        self.samples = settings.samples
+        #: goes up with every change of a medium or a cache
+        self.revision = 0
+        #: the media of the scene that can be seen, each with its cache
+        self.parts: list[LitMedium] = []
+        self._snapshot: Snapshot | None = None
+        self._stages: list[Stage] = []
+        self._checkpointed = 0  # runs that save the caches themselves
+        #: whether the first two batches may be shown in pieces; see `path.solver.Opening`
+        self.early = False
+        #: its action is called often while the solver ``sweep`` is at work, between launches: other
+        #: things may be computed meanwhile; what it raises drops the batch that is computed
+        self.pause = Pause()
+
+    @property
+    def medium(self) -> MediumGrid | None:
+        """The first medium of the scene, None where there is none."""
+        return self.parts[0].medium if self.parts else None
+
+    @property
+    def cache(self) -> IrradianceCache | None:
+        """The cache of the first medium, None where no light needs caching."""
+        return self.parts[0].cache if self.parts else None
+
+    @property
+    def solver(self) -> str:
+        """Of all caches: path or sweep."""
+        return self.parts[0].solver if self.parts else ""
+
+    def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
+        """Makes media and caches fit ``scene``."""
+        with self.lock:
+            self.fit(scene)
+            for number, part in enumerate(self.parts):
+                self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
+
+    def fit(self, scene: mi.Scene) -> None:
+        """Makes the media fit ``scene``, with empty caches where the old ones do not hold."""
+        with self.lock:
+            self._fit(scene)
+
+    def _fit(self, scene: mi.Scene) -> None:
+        volume = self._emission if isinstance(self._emission, mi.Volume) else None
+        snapshot = Snapshot(scene, volume, self._snapshot)
+        changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
+        if self._snapshot is None or changes:
+            edited = bool(changes) and snapshot.shares_objects_with(self._snapshot)
+            if edited:
+                names = ", ".join(changes[:4])
+                mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
+            self.parts, self._snapshot = [], None
+            self.revision += 1
+            media = bake_media(scene, self._baked_emission())
+            wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
+            settings = replace(self.settings, samples=self._wanted)
+            self.parts = [
+                LitMedium(
+                    scene,
+                    medium,
+                    settings,
+                    choose_solver(scene, medium, *wanted),
+                    medium.name if len(media) > 1 else "",
+                    edited,
+                    self.pause,
+                )
+                for medium in media
+            ]
+        self._snapshot = snapshot
+
+    def _baked_emission(self) -> Emission | None:
+        if self._emission is None:
+            return None
+        return bake_emission(self._emission, self._emission_scale)
+
+    def _refine(
+        self, scene: mi.Scene, part: LitMedium, progress: path_solver.Progress | None
+    ) -> None:
+        changed = True  # the solver may be stopped half-way
+        try:
+            early = self.early or any(stage.early for stage in self._stages)
+            changed = part.refine(scene, self._wanted, early, progress)
+        finally:
+            self.revision += changed
+        if changed:
+            dr.sync_thread()
+            if not self._checkpointed:
+                part.save()
+
+    def save(self) -> None:
+        """Writes the caches to their files, where they have ones that have fewer samples."""
+        with self.lock:
+            for part in self.parts:
+                part.save()
+
+    def close(self) -> None:
+        """Ends `early`; incomplete batches are dropped."""
+        with self.lock:
+            self.early = False
+            if any(stage.early for stage in self._stages):
+                return  # another thread shows them
+            for part in self.parts:
+                self.revision += part.close()
+
+    @contextmanager
+    def stage(self) -> Iterator[Stage]:
+        """What this gives says how far caches are built while it lasts, in place of ``samples``."""
+        stage = Stage()
+        with self.lock:
+            self._stages.append(stage)
+        try:
+            yield stage
+        finally:
+            with self.lock:
+                self._stages.remove(stage)
+                self.close()
+
+    @property
+    def _wanted(self) -> int:
+        """Samples per voxel that are wanted now; 0: chosen."""
+        return max((stage.samples for stage in self._stages), default=0) or self.samples
+
+    @property
+    def done(self) -> int:
+        """Samples per voxel that all caches have, those in incomplete batches included."""
+        shown = [p.shown.samples for p in self._lit or self.parts if p.shown is not None]
+        return min(shown, default=0)
+
+    @property
+    def saved_samples(self) -> int:
+        """Samples per voxel that all caches had in their files."""
+        return min((p.saved_samples for p in self._lit), default=0)
+
+    @property
+    def relative_error(self) -> float:
+        """The largest of the caches' relative errors; 0 where there is nothing to err."""
+        return max((p.shown.relative_error for p in self._lit), default=0.0)
+
+    @property
+    def target(self) -> int:
+        """Samples per voxel that `update` builds up to, the most of all caches."""
+        return max((p.target(self._wanted) for p in self.parts if p.cache is not None), default=0)
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether all caches are zero, or there are none: samples change nothing."""
+        return not self._lit
+
+    @property
+    def _lit(self) -> list[LitMedium]:
+        return [p for p in self.parts if not p.is_dark]
+
+    @contextmanager
+    def checkpoints(self) -> Iterator[Callable[[], None]]:
+        """For a cache that is filled in many passes: they do not save it while this lasts. The
+        function that it gives does, when it is time; and its end does, however it comes.
+        """
+        ended, took = perf_counter(), 0.0
+
+        def checkpoint() -> None:
+            nonlocal ended, took
+            started = perf_counter()
+            if started - ended >= max(CHECKPOINT_SECONDS, took / CHECKPOINT_SHARE):
+                self.save()
+                ended = perf_counter()
+                took = ended - started
+
+        with self.lock:
+            self._checkpointed += 1
+        try:
+            yield checkpoint
+        finally:
+            with self.lock:
+                self._checkpointed -= 1
+                self.save()
+
+
+def _of_the_caches(
+    progress: Progress | None, number: int, count: int
+) -> path_solver.Progress | None:
+    """``progress`` for a solver, which knows neither its stage nor that there are more caches."""
+    if progress is None:
+        return None
+    return lambda done, total: progress("cache", number * total + done, count * total)

@@ -1,0 +1,350 @@
+"""Progressive rendering: a first image soon, then better ones while the cache is refined.
+
+    for frame in render_progressive(scene, seconds=10):
+        mi.util.write_bitmap("image.png", frame.image)
+
+Passes refine the cache, images show it. How long a pass is and when an image is due follows from
+what they have taken so far, and from nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.volume import BATCH
+from mitsuba_irrcache.core.cancellation import Stopped
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.pipeline.builder import CacheBuilder, Progress, Stage
+
+#: Samples per voxel of the first pass: two for each of two batches, for a standard error.
+FIRST = 4
+#: As long as these are incomplete, passes may be smaller than a batch.
+OPENING = 2 * BATCH
+#: Frames that follow each other as fast as the samples double; those after them are spaced.
+EARLY_FRAMES = 3
+#: Between frames pass at least the time of an image over this share, ...
+IMAGE_SHARE = 0.2
+#: ... and this part of the time so far: later images differ less.
+GROWTH = 0.25
+#: What a prediction may be exceeded by within a time limit.
+SAFETY = 1.1
+#: A frame may come early by what a pass is too coarse for: from this part of its time on.
+REACHED = 0.97
+
+
+@dataclass(frozen=True)
+class Targets:
+    """When a progressive run ends: at the first that is reached of those that are given; if none
+    is, at the integrator's own ``cache_spp``.
+
+    Attributes:
+        cache_spp: samples per voxel, rounded up to batches; math.inf for a run without end.
+        standard_error: of the cache, relative, see `IrradianceCache.relative_error`.
+        seconds: for cache and images; the last image is there by then. The first one is rendered
+            whatever it takes.
+        times: seconds at which frames are wanted, in place of the usual spacing. Each is finished
+            as soon after its time as passes allow; the last one is the end.
+    """
+
+    cache_spp: float = 0
+    standard_error: float = 0.0
+    seconds: float = math.inf
+    times: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        spp = self.cache_spp
+        if not spp >= 0 or (spp != math.inf and spp != int(spp)):
+            raise IrrcacheError(
+                f"progressive: cache_spp is {spp!r}; it must be a number of samples, math.inf, or "
+                "0 (no target)."
+            )
+        if not 0 <= self.standard_error < math.inf:
+            raise IrrcacheError(
+                f"progressive: standard_error is {self.standard_error!r}; it must be a part of the "
+                "mean irradiance, for example 0.01, or 0 (no target)."
+            )
+        for name, values in (("seconds", [self.seconds]), ("times", self.times)):
+            for value in values:
+                if not value > 0:
+                    raise IrrcacheError(f"progressive: {name} is {value!r}; it must be above 0.")
+
+    @property
+    def given(self) -> bool:
+        """Whether there is any target."""
+        return bool(self.cache_spp or self.standard_error or self.times) or self.seconds < math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of a progressive run.
+
+    Attributes:
+        image: (height, width, channel), as ``mi.render`` gives it.
+        samples: per cache voxel so far; 0 where no light needs caching.
+        standard_error: of the cache, relative, see `IrradianceCache.relative_error`.
+        seconds: since the beginning by stage: "cache", "image" (of all frames), and "filter" where
+            the integrator reports one. What the caller does between frames does not count.
+    """
+
+    image: mi.TensorXf
+    samples: int
+    standard_error: float
+    seconds: dict[str, float]
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of all stages."""
+        return sum(self.seconds.values())
+
+
+def render_progressive(
+    scene: mi.Scene,
+    sensor: int | mi.Sensor = 0,
+    spp: int = 0,
+    seed: int = 0,
+    *,
+    cache_spp: float = 0,
+    standard_error: float = 0.0,
+    seconds: float = math.inf,
+    times: Sequence[float] = (),
+) -> Iterator[Frame]:
+    """Frames of a ``scene`` with the integrator ``irrcache``, better and better; see `Targets` for
+    when it ends.
+
+    Every frame is rendered afresh with ``spp`` samples per pixel and ``seed``; the last one shows
+    the final cache. A ``cache_file`` is written now and then, and at the end, however that comes;
+    the cache stays with the integrator, and another run goes on with it. ``cancel()`` of the
+    integrator ends it without another frame. Raises IrrcacheError for another integrator, and for
+    targets that make no sense.
+    """
+    integrator = scene.integrator()
+    if not hasattr(integrator, "progressive"):
+        raise IrrcacheError(
+            f"render_progressive: the scene's integrator is {integrator.class_name()}, which has "
+            "no cache to refine; use irrcache."
+        )
+    targets = {
+        "cache_spp": cache_spp,
+        "standard_error": standard_error,
+        "seconds": seconds,
+        "times": times,
+    }
+    return integrator.progressive(scene, sensor, seed, spp, **targets)
+
+
+def frames(
+    builder: CacheBuilder,
+    scene: mi.Scene,
+    image: Callable[[], tuple[mi.TensorXf, float]],
+    targets: Targets,
+    progress: Progress | None = None,
+) -> Iterator[Frame]:
+    """The frames of a run. ``image`` renders one with the cache as it is, and says how many of the
+    seconds it took were spent on a filter.
+    """
+    with builder.checkpoints() as checkpoint, builder.stage() as stage:
+        try:
+            run = _Run(builder, stage, scene, targets, progress)
+            run.begin()
+            while True:
+                while samples := run.next_pass():
+                    run.refine(samples, checkpoint)
+                yield run.frame(image)
+                if run.is_over:
+                    return
+        except Stopped:
+            return
+
+
+class _Run:
+    """What the stages of a run do, and how long they take."""
+
+    def __init__(
+        self,
+        builder: CacheBuilder,
+        stage: Stage,
+        scene: mi.Scene,
+        targets: Targets,
+        progress: Progress | None,
+    ) -> None:
+        self.builder, self.stage, self.scene, self.progress = builder, stage, scene, progress
+        self.targets = targets
+        self.schedule = Schedule(targets.seconds, targets.times)
+        self._opening = OPENING  # samples up to which passes may be smaller than a batch
+        self.error = math.nan
+        self._is_last = False  # whether the frame before shows what was asked for
+
+    def begin(self) -> None:
+        """Makes the cache, or finds it, with a first pass if it needs one."""
+        goal = self.targets.cache_spp if self.targets.given else self.builder.samples
+        self.stage.early = not 0 < goal < OPENING
+        self._update(FIRST if self.stage.early else goal, lambda: None)
+        if self.builder.cache is not None and self.builder.solver != "path":
+            self._opening = 0
+            self.schedule.batch = self.schedule.first = self.builder.cache.batch
+        self.goal = self.targets.cache_spp or math.inf
+        if not self.targets.given and self.builder.cache is not None:
+            with self.builder.lock:
+                first, self.stage.samples = self.stage.samples, 0
+                self.goal, self.stage.samples = self.builder.target, first
+
+    def refine(self, samples: int, checkpoint: Callable[[], None]) -> None:
+        """A pass of so many samples per voxel."""
+        done = self._samples
+        # A pass that is larger than what the opening lacks would be one of a size of its own.
+        self._update(
+            done + samples if done >= self._opening else min(done + samples, self._opening),
+            checkpoint,
+        )
+
+    def frame(self, image: Callable[[], tuple[mi.TensorXf, float]]) -> Frame:
+        """An image of the cache as it is."""
+        with self.builder.lock:
+            started = perf_counter()  # waiting for other threads does not count
+            tensor, filtering = image()
+            dr.sync_thread()
+            # Another thread may refine the cache as soon as it can.
+            samples, self._is_last = self._samples, self._has_arrived
+        self.schedule.note_image(perf_counter() - started, filtering)
+        return Frame(tensor, samples, self.error, dict(self.schedule.seconds))
+
+    def next_pass(self) -> int:
+        """Samples per voxel of the next pass; 0 when it is time for an image."""
+        if self._has_arrived:
+            return 0
+        needed = self.goal - self._samples
+        if self.targets.standard_error and math.isnan(self.error):
+            needed = min(needed, 1)
+        elif self.targets.standard_error:
+            ratio = self.error / self.targets.standard_error
+            needed = min(needed, self._samples * (ratio**2 - 1))
+        return self.schedule.next_pass(self._samples, needed)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the frame that was just made is the last one."""
+        return self._is_last or self.schedule.is_over
+
+    @property
+    def _samples(self) -> int:
+        return self.builder.done
+
+    @property
+    def _has_arrived(self) -> bool:
+        """Whether the cache is what was asked for."""
+        wanted = self.targets.standard_error
+        exact = wanted > 0 and self.error <= wanted
+        return exact or self._samples >= self.goal or self.builder.is_dark
+
+    def _update(self, samples: int, checkpoint: Callable[[], None]) -> None:
+        with self.builder.lock:
+            self.stage.samples = samples
+            started, old, before = perf_counter(), self.builder.cache, self._samples
+            self.builder.update(self.scene, self.progress)
+            cache = self.builder.cache
+            if cache is not old:
+                before = self.builder.saved_samples  # what a new one has, it has from its file
+            self.error = self.builder.relative_error
+        checkpoint()
+        self.schedule.note_pass(max(self._samples - before, 0), perf_counter() - started)
+
+
+class Schedule:
+    """When to refine and when to render; all times in seconds since the beginning."""
+
+    def __init__(self, limit: float = math.inf, times: Sequence[float] = ()) -> None:
+        self.limit, self.times = limit, sorted(times)
+        self.seconds = {"cache": 0.0, "image": 0.0}
+        self._passes: list[tuple[int, float]] = []
+        self._frames = 0
+        self._last_frame = 0.0  # when it was finished
+        self._image = 0.0  # what it took
+        self._fresh = False  # whether there has been a pass since
+        #: samples of the very first pass, and of a batch, of which later ones are made
+        self.first, self.batch = FIRST, BATCH
+        self._grain = FIRST  # samples of the smallest pass
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of all stages."""
+        return sum(self.seconds.values())
+
+    @property
+    def is_over(self) -> bool:
+        """Whether after a frame no better one can follow in time, or is wanted."""
+        wanted = not self.times or self._last_frame < REACHED * self.times[-1]
+        return not wanted or self._samples_within(self._left) < self._grain
+
+    def note_pass(self, samples: int, seconds: float) -> None:
+        """``samples`` per voxel took so long; 0 samples: the cache was found in a file."""
+        self.seconds["cache"] += seconds
+        if samples:
+            self._passes.append((samples, seconds))
+        self._fresh = True
+
+    def note_image(self, seconds: float, filtering: float = 0.0) -> None:
+        """An image took so long, of this the filter ``filtering``."""
+        self.seconds["image"] += seconds - filtering
+        if filtering:
+            self.seconds["filter"] = self.seconds.get("filter", 0.0) + filtering
+        self._frames += 1
+        self._image, self._last_frame, self._fresh = seconds, self.elapsed, False
+
+    def next_pass(self, done: int, needed: float) -> int:
+        """Samples per voxel of the next pass, whole batches after the opening, where ``done`` are
+        there and ``needed`` more are asked for; 0 when it is time for an image.
+        """
+        self._grain = grain = self.batch if done >= 2 * self.batch else self.first
+        possible = self._samples_within(self._left)
+        possible -= possible % grain if possible < math.inf else 0
+        due = self._due
+        soonest = due * (REACHED if self.times else 1)
+        if possible < grain or (self._fresh and self.elapsed + self._image >= soonest):
+            return 0
+        # Predictions carry no farther than to twice the samples.
+        samples = min(needed, possible, done)
+        if self._frames >= EARLY_FRAMES or self.times:
+            samples = min(samples, self._samples_within(due - self.elapsed - self._image))
+        return max(grain, -(-int(samples) // grain) * grain)
+
+    @property
+    def _left(self) -> float:
+        """Seconds that passes may take before the last image has to be rendered."""
+        return (self.limit - self.elapsed) / SAFETY - self._image
+
+    @property
+    def _due(self) -> float:
+        """When the next frame should be finished."""
+        if not self._frames:
+            return 0.0
+        if self.times:
+            waiting = (t for t in self.times if self._last_frame < REACHED * t)
+            return next(waiting, math.inf)
+        if self._frames < EARLY_FRAMES:
+            return self._last_frame
+        interval = max(self._image / IMAGE_SHARE, GROWTH * self._last_frame)
+        # What is left after the next frame should suffice for another one.
+        last = self._last_frame + 2 * interval > self.limit
+        return math.inf if last else self._last_frame + interval
+
+    def _samples_within(self, seconds: float) -> float:
+        """Samples per voxel that take at most so long, by what passes have taken: on the line
+        through the shortest and the longest, beyond that in proportion to the longest.
+        """
+        if seconds == math.inf:
+            return math.inf
+        if not self._passes:
+            return self.batch if seconds > 0 else 0
+        measured = self._passes[1:] or self._passes  # the first one may have compiled kernels
+        (least, short), (most, long) = min(measured), max(measured)
+        if seconds < long and short < long and least < most:
+            samples = most - (long - seconds) * (most - least) / (long - short)
+        else:
+            samples = most * seconds / max(long, 1e-9)
+        return samples // self.first * self.first

@@ -1,0 +1,1 @@
+"""From caches to an image: ray marching, film, filter."""

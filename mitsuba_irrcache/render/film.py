@@ -1,0 +1,243 @@
+"""From camera samples to the film, for integrators written in Python.
+
+Mitsuba's own loop for this knows only opaque or empty samples; a medium needs fractional alpha.
+And it knows only images that are final once the samples are in: here they may be developed first
+and put on the film afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from threading import Lock, RLock
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.core.fast_math import Divisor
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.machine.memory import require_memory
+from mitsuba_irrcache.render.aovs import interleaved
+from mitsuba_irrcache.render.pixel_filter import pixel_of, reconstructed
+
+#: Camera samples in one kernel launch: bounds the memory that they and the sampler's state take.
+LANES = 1 << 22
+#: Samples per pixel from which on their number does not fit in 32 bits, as the sampler has it.
+TOO_MANY = 1 << 32
+
+#: (sampler, ray, the sensor's weight of it, active) -> radiance, alpha, values of the further
+#: channels; the weight is in the radiance
+RadianceFunction = Callable[..., tuple]
+
+#: The films that threads render to or wait for: each with its lock, and with how many there are.
+_films: dict[mi.Film, tuple[RLock, int]] = {}
+_films_lock = Lock()
+
+
+@contextmanager
+def exclusive(film: mi.Film) -> Iterator[None]:
+    """While this lasts, other threads that ask for the same ``film`` wait: it has room for one
+    image.
+    """
+    with _films_lock:
+        lock, users = _films.get(film, (None, 0))
+        lock = lock or RLock()
+        _films[film] = lock, users + 1
+    try:
+        with lock:
+            yield
+    finally:
+        with _films_lock:
+            lock, users = _films.pop(film)
+            if users > 1:
+                _films[film] = lock, users - 1
+
+
+def render_film(
+    sensor: mi.Sensor,
+    radiance: RadianceFunction,
+    seed: int,
+    spp: int,
+    should_stop: Callable[[], bool] = lambda: False,
+    channels: Sequence[str] = (),
+) -> mi.Film:
+    """Renders ``radiance`` to the sensor's film, ``spp`` samples per pixel (0: the sampler's own
+    count); ``channels`` names those beside radiance and alpha. Raises IrrcacheError for a film
+    without pixels, and for one that memory does not hold.
+    """
+    film, sampler = sensor.film(), sensor.sampler().clone()
+    check_film(film, spp, len(channels))
+    if spp:
+        sampler.set_sample_count(spp)
+    spp = sampler.sample_count()
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    size = mi.ScalarVector2u(film.crop_size()) + 2 * border
+    pixels = int(size.x) * int(size.y)
+    film.prepare(list(channels))
+    per_pass = _divisor(spp, max(1, LANES // pixels))
+    sampler.set_samples_per_wavefront(per_pass)
+    sampler.seed(seed, pixels * per_pass)
+    spread, sums = PixelPositions(sampler, seed, spp), None
+    for done in range(0, spp, per_pass):
+        spread.first = dr.opaque(mi.UInt32, done)
+        samples = _sampled(sensor, sampler, spread, size, border, per_pass, spp, radiance)
+        found = reconstructed(film, border, per_pass, *samples)
+        sums = found if sums is None else [a + b for a, b in zip(sums, found, strict=True)]
+        if per_pass < spp:
+            sampler.advance()
+            sampler.schedule_state()
+            dr.eval(sums)
+            dr.sync_thread()  # else all passes are queued before anybody can stop them
+        if should_stop():
+            break
+    *values, weights = sums
+    colours = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+    _put(film, [*values[:colours], weights, *values[colours:]])
+    return film
+
+
+def planes(film: mi.Film, count: int) -> tuple[list[mi.Float], mi.Float | None, list[mi.Float]]:
+    """The developed film as arrays of a value for each pixel: colour (or luminance), alpha (None
+    without), and the last ``count`` channels.
+    """
+    image = film.develop()
+    height, width, depth = image.shape
+    index = dr.arange(mi.UInt32, height * width) * depth
+    values = [dr.gather(mi.Float, image.array, index + i) for i in range(depth)]
+    further = values[depth - count :]
+    values = values[: depth - count]
+    alpha = values.pop() if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else None
+    return values, alpha, further
+
+
+def fill_film(
+    film: mi.Film,
+    radiance: mi.Spectrum,
+    alpha: mi.Float | None,
+    channels: dict[str, mi.Float],
+) -> None:
+    """Puts a finished image on a film, in place of what was there."""
+    film.prepare(list(channels))
+    rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
+    alphas = [] if alpha is None else [alpha]
+    values = [*rgb, *alphas, mi.Float(1), *channels.values()]
+    _put(film, values)
+
+
+def _put(film: mi.Film, values: list[mi.Float]) -> None:
+    """Adds sums of samples, an array for each channel, to a film that is prepared for them."""
+    width, height = (int(n) for n in film.crop_size())
+    flat = interleaved(values, width * height)
+    tensor = mi.TensorXf(flat, (height, width, len(values)))
+    film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
+
+
+def check_film(film: mi.Film, spp: int, channels: int, at_once: bool = False) -> None:
+    """Raises IrrcacheError where a film of so many ``channels`` beside radiance and alpha has no
+    pixels, or cannot be rendered in the memory there is; ``at_once``: all ``spp`` in one launch.
+    """
+    width, height = (int(n) for n in film.crop_size())
+    if min(width, height) == 0:
+        raise IrrcacheError(
+            f"irrcache: the crop window of the film is {width} x {height} pixels; crop_width and "
+            "crop_height must be at least 1."
+        )
+    if not 0 <= spp < TOO_MANY:
+        raise IrrcacheError(
+            f"irrcache: spp is {spp}; it must be 0 (the sampler's) or a number of samples per "
+            f"pixel below {TOO_MANY}."
+        )
+    pixels, values = width * height, channels + 5  # colour, alpha, weight
+    lanes = pixels * max(spp, 1) if at_once else max(pixels, min(LANES, pixels * max(spp, 1)))
+    # The film's sums, those of a pass, and two copies while it is developed; of each sample its
+    # values, its place and the sampler's state.
+    needed = 4 * (4 * pixels * values + lanes * (values + 6))
+    what = f"irrcache: an image of {width} x {height} pixels"
+    what += f" with {channels} further channels" if channels else ""
+    remedy = f"lower width{', height or spp' if at_once else ' and height'} of the film"
+    remedy += ", ask for fewer aovs" if channels else ""
+    what += f" and {spp} samples each" if at_once else ""
+    remedy += ", or render it in crop windows"
+    require_memory(needed, what, remedy)
+    if lanes >= 2**32:
+        raise IrrcacheError(f"{what} needs {lanes} samples at once, 2^32 or more; {remedy}.")
+
+
+def _divisor(n: int, limit: int) -> int:
+    """The largest divisor of ``n`` that is at most ``limit``."""
+    return next(d for d in range(min(n, limit), 0, -1) if n % d == 0)
+
+
+class PixelPositions:
+    """Where in their pixels the camera samples lie.
+
+    Mitsuba's ``independent`` sampler knows nothing of the other samples of a pixel. With noise-free
+    light that is most of an image's noise, so they are spread evenly here: by the two-dimensional
+    golden ratio, shifted at random in every pixel, and in pairs that mirror each other at the
+    pixel's centre. Where the light changes evenly over a pixel, a pair is exact. Each sample of a
+    pair is still uniform. The last of an odd number lies in the centre: one sample per pixel shows
+    pixels as they are there, whatever the seed. Other samplers do it their way.
+    """
+
+    #: 2^32 over the root of x^3 = x + 1, and over its square
+    STEPS = (3242174889, 2447445414)
+
+    def __init__(self, sampler: mi.Sampler, seed: int, spp: int) -> None:
+        self.sampler = sampler
+        self.independent = sampler.class_name() == "IndependentSampler"
+        # Wrappers hand on a seed that is an array.
+        given = isinstance(seed, mi.UInt32)
+        self.seed = seed if given else dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+        self.first = dr.opaque(mi.UInt32, 0)
+        self.paired = dr.opaque(mi.UInt32, spp - spp % 2)
+
+    def next(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
+        """The position in [0, 1)^2 of a ``sample`` of this pass."""
+        if not self.independent:
+            return self.sampler.next_2d()
+        shifts = mi.sample_tea_32(pixel, self.seed, 8)
+        number = self.first + sample
+        pair = number // 2
+        bits = [s + pair * mi.UInt32(k) for s, k in zip(shifts, self.STEPS, strict=True)]
+        bits = [dr.select(number % 2 == 1, ~b, b) for b in bits]
+        bits = [dr.select(number < self.paired, b, 1 << 31) for b in bits]
+        return mi.Point2f([mi.Float(b >> 8) * 2.0**-24 for b in bits])
+
+
+def camera_ray(
+    sensor: mi.Sensor, sampler: mi.Sampler, position: mi.Point2f
+) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+    """A ray through each ``position`` on the film, in pixels, and the sensor's weight of it."""
+    film = sensor.film()
+    scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / int(n)) for n in film.crop_size()))
+    on_film = (position - mi.Vector2f(film.crop_offset())) * scale
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    return sensor.sample_ray_differential(time, 0, on_film, aperture)
+
+
+def _sampled(
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    spread: PixelPositions,
+    size: mi.ScalarVector2u,
+    border: int,
+    per_pass: int,
+    spp: int,
+    radiance: RadianceFunction,
+) -> tuple[mi.Point2f, list[mi.Float]]:
+    """The samples of a pass: their places on the film, and the values of their channels."""
+    film = sensor.film()
+    lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
+    index, sample = Divisor(per_pass).split(lane)
+    pixel = mi.Vector2f(pixel_of(index, int(size.x)) - border)
+    pixel += mi.Vector2f(film.crop_offset())
+    position = pixel + spread.next(index, sample)
+    ray, weight = camera_ray(sensor, sampler, position)
+    ray.scale_differential(dr.rsqrt(float(spp)))
+    value, alpha, further = radiance(sampler, ray, weight, mi.Bool(True))
+    rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
+    alphas = [alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+    return position, [*rgb, *alphas, *further]

@@ -1,0 +1,143 @@
+"""From camera samples to pixels, by the film's reconstruction filter.
+
+Mitsuba adds each sample to the pixels around it, atomically: sums that are other bits each time.
+Here each pixel gathers the samples around it, always in the same order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.core.fast_math import Divisor
+from mitsuba_irrcache.core.jit import symbolic
+
+
+class Samples:
+    """What camera samples have seen, ``per_pixel`` of each pixel, one after the other, row by row;
+    of the crop window, and of ``border`` pixels around it.
+
+    The place of a sample on the film and its values lie side by side, in packets of four: these are
+    read far faster than single numbers.
+    """
+
+    def __init__(
+        self,
+        film: mi.Film,
+        border: int,
+        per_pixel: int,
+        position: mi.Point2f,
+        values: Sequence[mi.Float],
+    ) -> None:
+        self.film, self.border, self.per_pixel = film, border, per_pixel
+        self.channels = len(values)
+        width, height = (int(n) + 2 * border for n in film.crop_size())
+        index = dr.arange(mi.UInt32, width * height * per_pixel)
+        numbers = [*position, *values]
+        numbers += [mi.Float(0)] * (-len(numbers) % 4)
+        self.packets = []
+        for start in range(0, len(numbers), 4):
+            packet = dr.zeros(mi.Float, 4 * dr.width(index))
+            dr.scatter(packet, mi.Vector4f(numbers[start : start + 4]), index)
+            self.packets.append(packet)
+        dr.eval(self.packets)
+
+    def read(self, index: mi.UInt32, active: mi.Bool) -> list[mi.Float]:
+        """The numbers of samples."""
+        packets = [dr.gather(mi.Vector4f, packet, index, active) for packet in self.packets]
+        numbers = [number for packet in packets for number in packet]
+        return numbers[: self.channels + 2]
+
+
+def reconstructed(
+    film: mi.Film,
+    border: int,
+    per_pixel: int,
+    position: mi.Point2f,
+    values: Sequence[mi.Float],
+) -> list[mi.Float]:
+    """Sums over the samples around each pixel of the crop window, row by row: of the filter's
+    weights times the values, an array for each channel, and of the weights. The samples are told
+    as in `Samples`.
+    """
+    if not film.rfilter().is_box_filter():
+        return _gathered(Samples(film, border, per_pixel, position, values))
+    # Samples count for their own pixel, whatever the rounding of their places.
+    pixels = int(film.crop_size().x) * int(film.crop_size().y)
+    everywhere = dr.zeros(mi.Float, pixels * per_pixel)
+    sums = [value + everywhere for value in values]
+    dr.eval(sums)
+    if per_pixel > 1:
+        sums = [dr.block_sum(value, per_pixel) for value in sums]
+    return [*sums, dr.opaque(mi.Float, per_pixel, pixels)]
+
+
+def pixel_of(index: mi.UInt32, width: int) -> mi.Vector2i:
+    """Column and row of the pixels with these numbers, where rows have ``width`` of them."""
+    row, column = Divisor(width).split(index)
+    return mi.Vector2i(mi.Int32(column), mi.Int32(row))
+
+
+def _gathered(samples: Samples) -> list[mi.Float]:
+    """The sums of `reconstructed`."""
+    film, reach = samples.film, int(samples.film.rfilter().border_size())
+    parts = _columns(samples, reach)
+    dr.eval(parts)
+    width, height = (int(n) for n in film.crop_size())
+    wide, high = (dr.opaque(mi.Int32, n) for n in (width, height + 2 * samples.border))
+    column, row = pixel_of(dr.arange(mi.UInt32, width * height), width)
+    sums = [mi.Float(0)] * (samples.channels + 1)
+    for part, down in zip(parts, range(-reach, reach + 1), strict=True):
+        of = row + (dr.opaque(mi.Int32, samples.border) - down)
+        inside = (of >= 0) & (of < high)
+        place = mi.UInt32(of * wide + column)
+        sums = [
+            s + dr.gather(mi.Float, values, place, inside)
+            for s, values in zip(sums, part, strict=True)
+        ]
+    dr.eval(sums)
+    return sums
+
+
+@symbolic
+def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
+    """What each row of samples adds to the columns of the rows of pixels from ``reach`` above it to
+    as many below it, in turn: sums as of `reconstructed`, an array over rows of samples and columns
+    of the crop window each.
+    """
+    film = samples.film
+    filter_, width = film.rfilter(), int(film.crop_size().x)
+    height = int(film.crop_size().y) + 2 * samples.border
+    wide, count, edge = (
+        dr.opaque(mi.Int32, n)
+        for n in (width + 2 * samples.border, samples.per_pixel, samples.border)
+    )
+    radius, first, last = filter_.radius(), dr.opaque(mi.Int32, -reach), dr.opaque(mi.Int32, reach)
+    left, top = (dr.opaque(mi.Float, int(n) + 0.5) for n in film.crop_offset())
+    column, row = pixel_of(dr.arange(mi.UInt32, width * height), width)
+    x, y = mi.Float(column) + left, mi.Float(row - edge) + top
+    rows = 2 * reach + 1
+    sums = [
+        [dr.zeros(mi.Float, width * height) for _ in range(samples.channels + 1)]
+        for _ in range(rows)
+    ]
+    dx, k = first + 0 * row, 0 * row
+    while dr.hint(dx <= last, label="samples of a pixel"):
+        at = column + edge + dx
+        inside = (at >= 0) & (at < wide)
+        values = samples.read(mi.UInt32((row * wide + at) * count + k), inside)
+        away, down = values[0] - x, values[1] - y
+        inside &= dr.abs(away) <= radius
+        along = dr.select(inside, filter_.eval(away), 0)
+        for j in range(rows):
+            below = down - (j - reach)
+            weight = dr.select(dr.abs(below) <= radius, along * filter_.eval(below), 0)
+            for i in range(samples.channels):
+                sums[j][i] = dr.fma(values[i + 2], weight, sums[j][i])
+            sums[j][samples.channels] += weight
+        k += 1
+        ended = k == count
+        k, dx = dr.select(ended, 0, k), dr.select(ended, dx + 1, dx)
+    return sums

@@ -1,0 +1,427 @@
+"""Whether the shapes of a scene agree about which medium is where.
+
+Mitsuba keeps no map of media. A ray carries a medium, and a shape that has an ``interior`` or an
+``exterior`` replaces it, whatever it was. So ``volpath`` renders every scene, but where boundaries
+overlap, leave a gap or have their normals reversed, the medium at a point depends on the way that
+led there. A cache knows points only, so such scenes are refused.
+
+Random walks from outside and from the sensors find places where a shape contradicts the medium that
+is carried. Rays are moved off a surface by a small distance, and so miss another one close by. So
+each suspected place is asked again: straight rays from there meet shapes that must all claim the
+same medium.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.errors import UnsupportedSceneError
+from mitsuba_irrcache.grids.boundary import orientation
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+
+#: Walks that start outside, at least, per shape, and altogether; walks from each sensor.
+WALKS, WALKS_PER_SHAPE, MOST_WALKS, SENSOR_WALKS = 2048, 256, 1 << 16, 1024
+#: Events of a walk, at most, and the share of straight flights that end half-way, as in a medium.
+EVENTS, TURNS = 24, 0.25
+#: Suspected places that are examined, and the rays from each.
+PLACES, RAYS = 64, 64
+#: Places are chosen up to exp(-NEAREST) of a flight close to its ends.
+NEAREST = 6.0
+#: A place is disputed if so many of its rays contradict the others; a scene is refused if so many
+#: places are disputed. Single rays err at edges.
+DISSENT, DISPUTED = 3, 2
+#: Share of walks that may go wrong with no place disputed: edges cost some. More of them do where
+#: surfaces are closer together than rays are moved.
+ASTRAY = 0.05
+#: Share of rays that do not leave a shape as they enter it, or meet its back first, from which on
+#: that shape alone is at fault.
+OPEN = 0.5
+#: The same of rays that meet the back of a shape first, from which on it is inside out; it is 0.5
+#: for a flat one.
+INWARDS = 0.6
+#: Mitsuba's rays leave a surface at (1 + largest coordinate) times this.
+RAY_OFFSET = 9e-5
+
+#: Codes of what a straight ray says of the medium at its start.
+_NOTHING, _CLAIM, _ESCAPE = 0, 1, 2
+
+
+def check_media_agree(scene: mi.Scene) -> None:
+    """Raises UnsupportedSceneError, naming shapes and media, unless the shapes of a scene agree
+    about which medium is where.
+    """
+    shapes = [s for s in scene.shapes() if _bounds(s)]
+    if not shapes:
+        return
+    # An exterior medium that is bounded by no shape may well be what is outside of everything.
+    outside = _nothing_is_outside(shapes)
+    origin, direction, pointer, known = _starts(scene, shapes, bool(outside[0]))
+    wrong, met, lost, place, *near = _walk(
+        scene, mi.Ray3f(origin, direction), pointer, known, outside, dr.opaque(mi.UInt32, EVENTS)
+    )
+    near = [dr.reinterpret_array(mi.UInt32, shape) for shape in near]
+    lost = dr.reinterpret_array(mi.UInt32, lost)
+    dr.eval(wrong, met, lost, place, near)
+    count, walks = int(dr.count(wrong)[0]), int(dr.count(met)[0])
+    names = _Names(shapes, scene.shapes())
+    (lane, *_) = np.nonzero(np.array(lost))
+    if len(lane) > ASTRAY * walks:
+        _refuse_infinite(names, int(np.array(lost)[lane[0]]))
+    if not count:
+        return
+    chosen = np.unique(np.linspace(0, count - 1, min(count, PLACES)).astype(np.uint32))
+    found = dr.gather(mi.UInt32, dr.compress(wrong), mi.UInt32(chosen))
+    votes = _examine(scene, dr.gather(mi.Point3f, place, found), outside)
+    disputes = [v for v in votes if _dissent(v) >= DISSENT]
+    if len(disputes) >= min(DISPUTED, len(chosen)):
+        _refuse_dispute(scene, names, max(disputes, key=_dissent))
+    if count > ASTRAY * walks:
+        pairs = np.array([dr.gather(mi.UInt32, shape, found) for shape in near]).T
+        (pair, _), *_ = Counter(map(tuple, pairs.tolist())).most_common(1)
+        _refuse_close(scene, names, *pair)
+
+
+def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
+    """Raises UnsupportedSceneError for a sensor that says it is in a medium, and is not.
+
+    ``volpath`` then carries this medium up to the first shape, without bounds, and shows no
+    environment behind it.
+    """
+    medium = sensor.get_medium()
+    if medium is None:
+        return
+    shapes = [s for s in scene.shapes() if _bounds(s)]
+    ray, _ = _camera_rays(sensor, RAYS)
+    code, found, shape = _claims(scene, mi.Ray3f(ray.o, ray.d))
+    outside = _nothing_is_outside(shapes)
+    known = (code == _CLAIM) | (code == _ESCAPE) & outside
+    wrong = known & (found != mi.MediumPtr(medium))
+    number = dr.reinterpret_array(mi.UInt32, shape)
+    dr.eval(known, wrong, number)
+    if int(dr.count(wrong)[0]) <= 0.5 * max(int(dr.count(known)[0]), 1):
+        return
+    named = Counter(np.array(number)[np.array(wrong)].tolist()).most_common(1)[0][0]
+    by = _Names(shapes, scene.shapes()).shape(named)
+    raise UnsupportedSceneError(
+        f'irrcache: sensor "{sensor.id()}" has the medium "{medium.id()}", but it is not in it, by '
+        f"{by}. Take the medium away from the sensor, name the one that it is in, or move it. "
+        'Otherwise render this scene with "volpath", where the medium then reaches up to the next '
+        "shape."
+    )
+
+
+def _nothing_is_outside(shapes: list[mi.Shape]) -> mi.Bool:
+    """Whether it is known that there is no medium outside of all shapes: an exterior medium that
+    fills no shape may well be there.
+    """
+    filled = [s.interior_medium() for s in shapes]
+    return dr.opaque(mi.Bool, all(s.exterior_medium() in (None, *filled) for s in shapes))
+
+
+def _camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """Rays all over the film of a sensor."""
+    rng = mi.PCG32(count)
+    film, aperture = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
+    # Some sensors have no `sample_ray`.
+    return sensor.sample_ray_differential(sensor.shutter_open(), 0.5, film, aperture)
+
+
+def described(shape: mi.Shape) -> str:
+    """A shape as messages call it."""
+    return f'shape "{shape.id()}" ({shape.class_name()})'
+
+
+def _bounds(shape: mi.Shape) -> bool:
+    return shape.interior_medium() is not None or shape.exterior_medium() is not None
+
+
+def _starts(
+    scene: mi.Scene, shapes: list[mi.Shape], outside: bool
+) -> tuple[mi.Point3f, mi.Vector3f, mi.MediumPtr, mi.Bool]:
+    """Rays from outside through the bounds of each shape, and from the sensors; the medium that
+    they carry, and whether it is known: ``outside``, that there is none. A sensor without one may
+    be in a medium without saying so: ``volpath`` renders that as if it was in none, and so does
+    irrcache.
+    """
+    boxes = np.array([[s.bbox().min, s.bbox().max] for s in shapes], dtype=np.float64).reshape(
+        -1, 6
+    )
+    every = np.array([scene.bbox().min, scene.bbox().max], dtype=np.float64).reshape(6)
+    boxes = np.where(np.isfinite(boxes), boxes, every)
+    per_shape = max(WALKS_PER_SHAPE, WALKS // len(shapes))
+    per_shape = max(1, min(per_shape, MOST_WALKS // len(shapes)))
+    count = per_shape * len(shapes)
+    rng = mi.PCG32(count)
+    first = dr.arange(mi.UInt32, count) // per_shape * 6
+    table = mi.Float(np.float32(boxes).ravel())
+    lower, upper = (
+        mi.Point3f(*(dr.gather(mi.Float, table, first + end + i) for i in range(3)))
+        for end in (0, 3)
+    )
+    u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+    direction = mi.warp.square_to_uniform_sphere(sample)
+    size = np.linalg.norm(boxes[:, 3:].max(axis=0) - boxes[:, :3].min(axis=0))
+    origin = lower + u * (upper - lower) - dr.opaque(mi.Float, 1.1 * float(size)) * direction
+    none = dr.zeros(mi.MediumPtr)
+    parts = [(count, origin, direction, none, outside)]
+    for sensor in scene.sensors():
+        start, _ = _camera_rays(sensor, SENSOR_WALKS)
+        medium = sensor.get_medium()
+        pointer = none if medium is None else mi.MediumPtr(medium)
+        parts.append((SENSOR_WALKS, start.o, start.d, pointer, medium is not None))
+
+    def joined(kind: type, values: list) -> mi.Float:
+        return dr.concat(
+            [kind(v) + dr.zeros(kind, part[0]) for v, part in zip(values, parts, strict=True)]
+        )
+
+    origin, direction = (
+        [joined(mi.Float, [part[k][i] for part in parts]) for i in range(3)] for k in (1, 2)
+    )
+    ids = joined(mi.UInt32, [dr.reinterpret_array(mi.UInt32, part[3]) for part in parts])
+    known = joined(mi.UInt32, [int(part[4]) for part in parts]) > 0
+    result = (
+        mi.Point3f(origin),
+        mi.Vector3f(direction),
+        dr.reinterpret_array(mi.MediumPtr, ids),
+        known,
+    )
+    dr.eval(result)
+    return result
+
+
+@symbolic
+def _walk(
+    scene: mi.Scene,
+    ray: mi.Ray3f,
+    pointer: mi.MediumPtr,
+    known: mi.Bool,
+    outside: mi.Bool,
+    events: mi.UInt32,
+):
+    """Random walks that carry a medium as ``volpath`` does. Whether a shape contradicts it, whether
+    any shape with media was met, a place on the flight that led to the contradiction, the shape
+    that contradicts, and the one before. If something may be ``outside`` of all shapes: the medium
+    that is carried to infinity.
+    """
+    ray, pointer, known = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(known)
+    rng = mi.PCG32(dr.width(ray))
+    wrong, met, place = mi.Bool(False), mi.Bool(False), mi.Point3f(0)
+    contradicts, before = dr.zeros(mi.ShapePtr), dr.zeros(mi.ShapePtr)
+    last, lost = mi.Point3f(ray.o), dr.zeros(mi.MediumPtr)
+    event, active = mi.UInt32(0), mi.Bool(True)
+    while dr.hint(active, label="walks"):
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid()
+        transition = hit & si.is_medium_transition()
+        claim = si.target_medium(-ray.d)
+        now = transition & known & (claim != pointer)
+        # Outside of everything there is no medium.
+        escapes = active & ~hit & known & (pointer != None)  # noqa: E711
+        now |= escapes & outside
+        lost = dr.select(escapes & ~outside, pointer, lost)
+        wrong |= now
+        met |= transition
+        # Close to one end of the flight or the other: what is small there fills much of the view.
+        end = dr.exp(-NEAREST * rng.next_float32(active)) / 2
+        end = dr.select(rng.next_float32(active) < 0.5, end, 1 - end)
+        length = dr.select(hit, si.t, dr.norm(ray.o - last))
+        place = dr.select(now, ray(end * length), place)
+        contradicts = dr.select(now & hit, si.shape, contradicts)
+        # Half-way in another direction, on through the surface, or back from it.
+        turns = rng.next_float32(active) < TURNS
+        at = ray(rng.next_float32(active) * si.t)
+        sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+        anywhere = mi.warp.square_to_uniform_sphere(sample)
+        flags = si.bsdf().flags()
+        null = is_null(flags)
+        through = null | _lets_through(flags) & (rng.next_float32(active) < 0.5)
+        side = dr.dot(si.n, ray.d)
+        back = dr.select(dr.dot(anywhere, si.n) * side > 0, -anywhere, anywhere)
+        direction = dr.select(through, ray.d, back)
+        onwards = si.spawn_ray(direction)
+        reaches = hit & ~turns
+        pointer = dr.select(
+            transition, dr.select(turns, claim, si.target_medium(direction)), pointer
+        )
+        known |= transition
+        before = dr.select(reaches & ~now, si.shape, before)
+        last = dr.select(hit, ray.o, last)
+        ray.o = dr.select(turns, at, onwards.o)
+        ray.d = dr.select(turns, anywhere, direction)
+        event += 1
+        active &= hit & ~now & (event < events)
+    return wrong, met, lost, place, contradicts, before
+
+
+def _lets_through(flags: mi.UInt32) -> mi.Bool:
+    """Whether a BSDF of these flags lets some light through."""
+    return (flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)) != 0
+
+
+def _examine(
+    scene: mi.Scene, place: mi.Point3f, outside: mi.Bool
+) -> list[dict[tuple[int, int], int]]:
+    """For each place, how many straight rays from there meet a shape that claims a medium: by the
+    registry's numbers of the medium and of the shape, which is 0 where the ray escapes.
+    """
+    count = dr.width(place)
+    index = dr.arange(mi.UInt32, count * RAYS)
+    rng = mi.PCG32(count * RAYS)
+    direction = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    origin = dr.gather(mi.Point3f, place, index // RAYS)
+    code, medium, shape = _claims(scene, mi.Ray3f(origin, direction))
+    numbers = [dr.reinterpret_array(mi.UInt32, pointer) for pointer in (medium, shape)]
+    shared = np.array([dr.select(code == _ESCAPE, 0, n) for n in numbers]).T.reshape(count, RAYS, 2)
+    said = np.array(code).reshape(count, RAYS)
+    said = (said == _CLAIM) | (said == _ESCAPE) & bool(outside[0])
+    return [
+        Counter(tuple(row) for row in rows[which].tolist())
+        for rows, which in zip(shared, said, strict=True)
+    ]
+
+
+@symbolic
+def _claims(scene: mi.Scene, ray: mi.Ray3f):
+    """The medium at the start of rays as the first shape along them claims that has media, whatever
+    lets light through between; the code says whether there is one, and the shape which.
+    """
+    ray, code = mi.Ray3f(ray), mi.UInt32(_NOTHING)
+    medium, shape = dr.zeros(mi.MediumPtr), dr.zeros(mi.ShapePtr)
+    event, active = mi.UInt32(0), mi.Bool(True)
+    while dr.hint(active, label="claims"):
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid()
+        code = dr.select(active & ~hit, _ESCAPE, code)
+        claims = hit & si.is_medium_transition()
+        code = dr.select(claims, _CLAIM, code)
+        medium = dr.select(claims, si.target_medium(-ray.d), medium)
+        shape = dr.select(claims, si.shape, shape)
+        active &= hit & ~claims & _lets_through(si.bsdf().flags())
+        ray = si.spawn_ray(ray.d)
+        event += 1
+        active &= event < MOST_CROSSINGS
+    return code, medium, shape
+
+
+def _dissent(votes: Counter) -> int:
+    """How many votes are for other media than the one that most are for."""
+    media = _by_medium(votes)
+    return sum(media.values()) - max(media.values(), default=0)
+
+
+def _by_medium(votes: Counter) -> Counter:
+    media = Counter()
+    for (medium, _), number in votes.items():
+        media[medium] += number
+    return media
+
+
+class _Names:
+    """Shapes and media by the numbers that Dr.Jit's registry has for them."""
+
+    def __init__(self, shapes: list[mi.Shape], every: list[mi.Shape]) -> None:
+        self.shapes = {_number(mi.ShapePtr(s)): s for s in every}
+        media = [m for s in shapes for m in (s.interior_medium(), s.exterior_medium())]
+        self._media = {_number(mi.MediumPtr(m)): m for m in media if m is not None}
+
+    def is_alone(self, number: int) -> bool:
+        """Whether no other shape has the interior medium of this one."""
+        interior = self.shapes[number].interior_medium()
+        others = (s for n, s in self.shapes.items() if n != number)
+        return all(interior not in (s.interior_medium(), s.exterior_medium()) for s in others)
+
+    def medium(self, number: int) -> str:
+        """A medium as messages call it."""
+        return f'medium "{self._media[number].id()}"' if number in self._media else "no medium"
+
+    def shape(self, number: int) -> str:
+        """A shape as messages call it, with the media on both sides."""
+        shape = self.shapes.get(number)
+        if shape is None:
+            return "the outside of all shapes"
+        sides = {"interior": shape.interior_medium(), "exterior": shape.exterior_medium()}
+        said = " and ".join(f'{k} medium "{m.id()}"' for k, m in sides.items() if m is not None)
+        return f"{described(shape)}" + (f" with {said}" if said else "")
+
+
+def _number(pointer: mi.ShapePtr | mi.MediumPtr) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, pointer)[0])
+
+
+def _refuse_dispute(scene: mi.Scene, names: _Names, votes: Counter) -> None:
+    """The error for a place where shapes claim different media."""
+    (one, _), (other, _) = _by_medium(votes).most_common(2)
+    sides = []
+    for medium in (one, other):
+        claims = Counter({shape: n for (m, shape), n in votes.items() if m == medium})
+        sides.append(claims.most_common(1)[0][0])
+    # The outside of all shapes claims nothing that can be changed.
+    known = [side for side in dict.fromkeys(sides) if side in names.shapes]
+    if len(known) == 1:
+        _refuse_single(scene, names, known[0], {one, other} - {0})
+    for side in known:
+        if names.is_alone(side) and max(orientation(scene, names.shapes[side])) > OPEN:
+            _refuse_single(scene, names, side, set())
+    first, second = (names.shape(side) for side in sides)
+    raise UnsupportedSceneError(
+        f"irrcache: {first} and {second} disagree about the medium between them: the one says "
+        f"{names.medium(one)}, the other {names.medium(other)}. They overlap, or share a face, or "
+        "one is within the other without saying so, or there is a gap between them. The medium "
+        "would depend on the way that light takes. Move them apart by a thousandth of their size; "
+        "where one is within the other, give it the medium around it as its exterior. Otherwise "
+        'render this scene with "volpath", which shows the medium that was entered last.'
+    )
+
+
+def _refuse_single(scene: mi.Scene, names: _Names, number: int, media: set[int]) -> None:
+    """The error for a shape that contradicts itself, or the outside, about these ``media``."""
+    exterior = names.shapes[number].exterior_medium()
+    if exterior is not None and media == {_number(mi.MediumPtr(exterior))}:
+        raise UnsupportedSceneError(
+            f"irrcache: {names.shape(number)} has the exterior medium on all sides, where it would "
+            "reach to infinity. Put the shape into another one, with a null BSDF, that has this "
+            "medium as its interior; or take the exterior away. Otherwise render this scene with "
+            '"volpath".'
+        )
+    inwards, _ = orientation(scene, names.shapes[number])
+    if inwards > INWARDS:
+        raise UnsupportedSceneError(
+            f"irrcache: the normals of {names.shape(number)} point inwards, so Mitsuba puts its "
+            "interior medium outside of it, which would be rendered wrongly. Mirror its to_world "
+            'once more, or toggle flip_normals. Otherwise render this scene with "volpath".'
+        )
+    raise UnsupportedSceneError(
+        f"irrcache: {names.shape(number)} is not closed, or overlaps itself: rays enter and leave "
+        "its medium other than in turn, and take it to infinity, or lose it within. (Mitsuba "
+        "merges meshes that bound the same medium into one shape.) Close it, or move its parts "
+        'apart by a thousandth of their size. Otherwise render this scene with "volpath".'
+    )
+
+
+def _refuse_infinite(names: _Names, medium: int) -> None:
+    """The error for a medium that rays take to infinity."""
+    raise UnsupportedSceneError(
+        f"irrcache: {names.medium(medium)} is the exterior of shapes and fills none, and rays take "
+        "it out of the scene: volpath then shows no light from there. Put a closed shape with a "
+        "null BSDF, such as a cube, around everything that has it as its interior. Otherwise "
+        'render this scene with "volpath".'
+    )
+
+
+def _refuse_close(scene: mi.Scene, names: _Names, first: int, second: int) -> None:
+    """The error for shapes that Mitsuba's rays cannot tell apart."""
+    corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
+    offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
+    raise UnsupportedSceneError(
+        f"irrcache: {names.shape(first)} is closer to {names.shape(second)} than Mitsuba's rays "
+        f"can tell: they leave a surface at a distance of up to {offset:.1g} here, and miss what "
+        "is nearer. Media would be missing, as with volpath. Move the shapes apart by a few times "
+        "as much, or scale the scene up."
+    )

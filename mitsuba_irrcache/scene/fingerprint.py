@@ -1,0 +1,313 @@
+"""What a cache depends on: quick identities within a process, digests of the contents for files."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grids.grid import Field
+from mitsuba_irrcache.media.medium import MediumGrid
+
+#: Arrays of up to so many bytes are compared by their contents, all of them up to the second number
+#: of bytes in a scene; of larger arrays, so many values are.
+SMALL, SMALL_IN_ALL, SAMPLED = 1 << 17, 1 << 19, 1 << 12
+
+
+#: An ingredient of `digests` that is compared with a tolerance; rays for each shape, and how far
+#: their means may be apart.
+RESPONSES, PROBES, TOLERANCE = "responses of surfaces", 512, 1e-4
+#: In a description, what is no property of the object: a mesh's name, the scene's bounds, address.
+_ELSEWHERE = re.compile(
+    r"\A\w+\[\s*name = [^\n]*|\bbsphere = \w+\[.*?\n *\],?|0x[0-9a-f]+", re.DOTALL
+)
+
+
+class Snapshot:
+    """The objects and parameters of a scene that its light depends on, as they are now. Comparing
+    two of them launches no kernel unless a parameter was edited in between.
+
+    It holds references of its own to Dr.Jit's variables, not to Mitsuba's members, which change
+    with the scene. As long as it does, no other variable can get the index of one of them, and
+    whatever writes to such an array (``dr.scatter``, ``params[key][i] = x``) writes to a copy,
+    which has another index.
+
+    Only memory that is written to through a NumPy view of an array keeps its index. So contents are
+    compared, too, up to a size for which this takes no time; of larger arrays a few thousand values
+    are. Who edits a larger array through a view has to call ``params.set_dirty``, as Mitsuba
+    itself demands.
+
+    A snapshot keeps the old arrays of an edited scene until the next rendering, which releases them
+    before it makes the new cache.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        emission: mi.Volume | None = None,
+        previous: Snapshot | None = None,
+    ) -> None:
+        """``emission`` belongs to the integrator, which may not be the scene's. What has not
+        changed since the ``previous`` snapshot is shared with it, which makes comparing them quick.
+        """
+        params = mi.traverse(scene)
+        camera_side = (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.ReconstructionFilter)
+        # The scene owns the integrator, which owns this: holding it, neither would be freed.
+        self._objects = {
+            node
+            for node in params.hierarchy
+            if not isinstance(node, (mi.Scene, *camera_side)) and node is not emission
+        }
+        entries = {k: e for k, e in params.properties.items() if not isinstance(e[2], camera_side)}
+        if emission is not None:
+            own = mi.traverse(emission).properties
+            entries |= {f"emission.{key}": entry for key, entry in own.items()}
+        values = {key: _value(entry) for key, entry in entries.items()}
+        shared = {} if previous is None else previous._values
+        budget = _Budget(SMALL_IN_ALL)
+        self._values = {k: _kept(v, shared.get(k), budget) for k, v in values.items()}
+
+    def changes(self, other: Snapshot) -> list[str]:
+        """Names of the parameters that differ, and the classes of objects that only one has."""
+        mine, theirs = self._values, other._values
+        names = [k for k in mine.keys() | theirs.keys() if mine.get(k) != theirs.get(k)]
+        return sorted({*names, *(node.class_name() for node in self._objects ^ other._objects)})
+
+    def shares_objects_with(self, other: Snapshot) -> bool:
+        """Whether both are of the same scene, or of scenes that have objects in common."""
+        return not self._objects.isdisjoint(other._objects)
+
+
+def _value(entry: tuple) -> Any:
+    """The value of a parameter, from what a traversal has found; None where the plugin has none."""
+    value, kind, node, _ = entry
+    return value if kind is None else mi.get_property(value, kind, node)
+
+
+def _is_transform(value: Any) -> bool:
+    """Points have an attribute ``matrix`` as well: whatever is asked of them is a swizzle."""
+    return not dr.is_array_v(value) and hasattr(value, "matrix")
+
+
+class _Budget:
+    """Bytes that may still be compared by their contents."""
+
+    __slots__ = ("left",)
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+
+
+class _Kept:
+    """A one-dimensional Dr.Jit array, held and compared."""
+
+    __slots__ = ("_array", "_bytes", "_kind", "_view", "_whole", "_width", "index")
+
+    def __init__(self, array: Any, budget: _Budget) -> None:
+        self._array = array = dr.detach(array)  # an object of our own, not the edited member
+        self.index, self._kind, self._width = array.index, type(array), dr.width(array)
+        self._view = self._bytes = None
+        self._whole = False
+        if array.state == dr.VarState.Literal or dr.backend_v(array) != dr.JitBackend.LLVM:
+            return  # no memory that could be written to; on a GPU reading it would take time
+        view = array.numpy()
+        self._whole = view.nbytes <= min(SMALL, budget.left)
+        self._view = view if self._whole else view[:: view.size // SAMPLED + 1]
+        self._bytes = self._view.tobytes()
+        budget.left -= view.nbytes if self._whole else 0
+
+    @property
+    def is_intact(self) -> bool:
+        """Whether the memory of the array holds what it held, as far as that is compared."""
+        return self._view is None or self._view.tobytes() == self._bytes
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _Kept) or self._kind is not other._kind:
+            return False
+        if self._width != other._width or self._bytes != other._bytes:
+            return False
+        return self.index == other.index or (self._whole and other._whole)
+
+    __hash__ = None
+
+
+def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
+    """A form of ``value`` that stays as it is and can be compared; ``previous`` if it still is."""
+    if dr.is_jit_v(value):
+        if dr.is_tensor_v(value):
+            parts, shape = (value.array,), value.shape
+        elif dr.depth_v(value) > 1:
+            parts, shape = tuple(value), ()
+        elif type(previous) is _Kept and previous.index == value.index and previous.is_intact:
+            return previous
+        else:
+            return _Kept(value, budget)
+        known = previous[1] if type(previous) is tuple else ()
+        if len(known) != len(parts):
+            known = (None,) * len(parts)
+        return shape, tuple(_kept(p, k, budget) for p, k in zip(parts, known, strict=True))
+    if isinstance(value, (bool, int, float, str, type(None))):
+        return repr(value)  # in this form NaN is equal to itself
+    if isinstance(value, mi.Object):
+        return value
+    if _is_transform(value):
+        return _kept(value.matrix, previous, budget)
+    array = np.array(value)
+    return repr(value) if array.dtype == object else (array.dtype.str, array.tobytes())
+
+
+def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
+    """SHA-256 of the contents of each ingredient of the light in ``medium``."""
+    boundary = medium.boundary
+    found = {
+        "medium": _medium_digest(medium),
+        "boundary": _digest(boundary.kind, boundary.to_world),
+        "emitters": digest_of_emitters(scene),
+        "variant": "grey" if mi.is_monochromatic else "rgb",
+    }
+    if medium.surroundings is not None:
+        media = medium.surroundings.media.grids
+        found["media"] = _digest(*sorted(_medium_digest(grid) for grid in media))
+        found["surfaces"] = digest_of_surfaces(scene)
+        found[RESPONSES] = responses(scene)
+    return found
+
+
+def digest_of_emitters(scene: mi.Scene) -> str:
+    """SHA-256 of all emitters, in any order."""
+    return _digest(*sorted(_object_digest(emitter) for emitter in scene.emitters()))
+
+
+def digest_of_surfaces(scene: mi.Scene) -> str:
+    """SHA-256 of all shapes, in any order."""
+    return _digest(*sorted(_shape_digest(shape) for shape in scene.shapes()))
+
+
+def differing(mine: dict[str, str], theirs: dict[str, str]) -> list[str]:
+    """Names of the ingredients that differ between two results of `digests`."""
+    names = sorted(mine.keys() | theirs.keys())
+    return [n for n in names if not _agree(n, mine.get(n), theirs.get(n))]
+
+
+def _agree(name: str, mine: str | None, theirs: str | None) -> bool:
+    if name != RESPONSES or mine is None or theirs is None:
+        return mine == theirs
+    try:
+        first, second = (np.array(text.split(), dtype=np.float64) for text in (mine, theirs))
+    except ValueError:
+        return False
+    return first.shape == second.shape and bool((np.abs(first - second) <= TOLERANCE).all())
+
+
+def responses(scene: mi.Scene) -> str:
+    """What rays find at the shapes of a scene: numbers in [0, 1] for each of them.
+
+    Some options of Mitsuba's plugins are neither parameters nor in their descriptions (the filter
+    of a bitmap, the normals of an sdfgrid, invalid normals of a bump map, ...). They show in how
+    surfaces respond. These numbers are results of floating point arithmetic, which other machines
+    round otherwise, so they are compared with a tolerance, not digested.
+    """
+    shapes = sorted(scene.shapes(), key=_shape_digest)
+    if not shapes:
+        return ""
+    lower, upper = (
+        np.array([getattr(shape.bbox(), end) for shape in shapes], dtype=np.float32).T
+        for end in ("min", "max")
+    )
+    count = len(shapes) * PROBES
+    shape = dr.arange(mi.UInt32, count) // PROBES
+    lower, upper = (
+        mi.Point3f([dr.gather(mi.Float, mi.Float(row), shape) for row in rows])
+        for rows in (lower, upper)
+    )
+    # The same random numbers for each shape: their order does not matter.
+    lane = dr.arange(mi.UInt32, count) % PROBES
+    draws = [mi.sample_tea_float32(lane, mi.UInt32(k), 6) for k in range(16)]
+    target = lower + mi.Point3f(draws[:3]) * (upper - lower)
+    direction = mi.warp.square_to_uniform_sphere(mi.Point2f(draws[3:5]))
+    ray = mi.Ray3f(target - 1.01 * dr.norm(upper - lower) * direction, direction)
+    si = scene.ray_intersect(ray)
+    valid, bsdf = si.is_valid(), si.bsdf()
+    outgoing = mi.warp.square_to_uniform_sphere(mi.Point2f(draws[5:7]))
+    context, random = mi.BSDFContext(), mi.Point2f(draws[8:10])
+    reflected = bsdf.eval(context, si, outgoing, valid)
+    sample, weight = bsdf.sample(context, si, draws[7], random, valid)
+    emitted = si.emitter(scene).eval(si, valid)
+    axis = mi.warp.square_to_uniform_sphere(mi.Point2f(draws[10:12]))
+    found = [
+        0.5 + 0.5 * dr.dot(axis, si.n),
+        0.5 + 0.5 * dr.dot(axis, si.sh_frame.n),
+        0.5 + 0.5 * dr.dot(axis, sample.wo),
+        *(_squashed(value) for value in (reflected, weight, emitted)),
+    ]
+    # Weights tell apart what is the same on average.
+    sums = [dr.block_sum(dr.select(valid, value, 0) * draws[12], PROBES) for value in found]
+    numbers = np.nan_to_num(np.array(sums, dtype=np.float64) / PROBES, nan=1.0)
+    return " ".join(f"{number:.6f}" for number in numbers.T.ravel())
+
+
+def _squashed(value: mi.Spectrum) -> mi.Float:
+    """A number in [0, 1] for a radiance or a BSDF that can have any value; colours differ."""
+    parts = [channel / (1 + dr.abs(channel)) for channel in mi.Spectrum(value)]
+    scale = 1 / len(parts)
+    total = sum((i + 1) * scale * dr.clip(part, 0, 1) for i, part in enumerate(parts))
+    return dr.select(dr.isfinite(total), total * scale, 1)
+
+
+def _medium_digest(medium: MediumGrid) -> str:
+    parts = [*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()]
+    if medium.phase is not None:
+        parts.append(np.float32(medium.phase.moments))
+    if medium.emission is not None:
+        parts += ["emission", *_field_parts(medium.emission.field)]
+    return _digest(*parts)
+
+
+def _shape_digest(shape: mi.Shape) -> str:
+    """A shape with its BSDF and emitter, and which media are on its sides."""
+    sides = [m.id() if m else "" for m in (shape.interior_medium(), shape.exterior_medium())]
+    flags = shape.has_flipped_normals(), shape.is_mesh() and shape.has_face_normals()
+    media = ("interior_medium", "exterior_medium")
+    return _digest(_object_digest(shape, media), str(flags), *sides)
+
+
+def _object_digest(node: mi.Object, without: tuple[str, ...] = ()) -> str:
+    """All that an object says of itself: the values of its parameters but those ``without`` these
+    prefixes, exactly, and its description, which names nested objects and options.
+    """
+    values = [
+        (key, np.array(_plain(value)))
+        for key, entry in sorted(mi.traverse(node).properties.items())
+        if not key.startswith(without or "\0") and (value := _value(entry)) is not None
+    ]
+    description = _ELSEWHERE.sub("", str(node))
+    return _digest(node.class_name(), description, *(part for pair in values for part in pair))
+
+
+def _field_parts(field: Field) -> tuple:
+    if field.grid is None:
+        return (np.array(field.value),)
+    return (
+        field.grid.shape,
+        np.float32(field.grid.to_world),
+        np.array(field.scale),
+        field.channels,
+        np.array(field.data),
+    )
+
+
+def _plain(value: Any) -> Any:
+    return value.matrix if _is_transform(value) else value
+
+
+def _digest(*parts: Any) -> str:
+    sha = hashlib.sha256()
+    for part in parts:
+        data = part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
+        sha.update(len(data).to_bytes(8, "little"))
+        sha.update(data)
+    return sha.hexdigest()[:32]

@@ -1,0 +1,145 @@
+"""Whether surfaces lie in a box of voxels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.fast_math import Divisor, unravelled
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+
+#: Rays that look for surfaces, per voxel and axis: through the corners and the middle of its face.
+OFFSETS = ((0.0, 0.0), (0.5, 0.5))
+#: Of a voxel: surfaces may lie on the faces of the box.
+SLACK = 1e-3
+
+_PICK = np.array(list(np.ndindex(2, 2, 2)), dtype=bool)  # corners of a box
+
+
+def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> str | None:
+    """A shape other than null boundaries that lies in the box of voxels between ``lower`` and
+    ``upper`` (x, y, z), by its name; None where there is none.
+
+    Shapes apart from the box, and vertices and small shapes in it, are told for certain; of others,
+    rays find what is about as large as a voxel.
+    """
+    near = [s for s in scene.shapes() if _is_solid(s) and _may_meet(s, grid, lower, upper)]
+    for shape in near:
+        if _begins_within(shape, grid, lower, upper):
+            return _name(shape)
+    if near:
+        for axis in range(3):
+            for offset in OFFSETS:
+                found = _met(scene, near, grid, lower, upper, axis, offset)
+                if found is not None:
+                    return _name(found)
+    return None
+
+
+def _name(shape: mi.Shape) -> str:
+    return f'shape "{shape.id()}" ({shape.class_name()})'
+
+
+def _is_solid(shape: mi.Shape) -> bool:
+    bsdf = shape.bsdf()
+    null = is_null(int(bsdf.flags()) if bsdf is not None else 0)
+    return not null or shape.is_emitter() or shape.is_sensor()
+
+
+def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
+    """Whether the bounds of a shape meet the box."""
+    box = shape.bbox()
+    ends = np.array([box.min, box.max], dtype=np.float64)
+    if not np.isfinite(ends).all():
+        return True  # meshes that Mitsuba has merged do not know theirs
+    return boxes_meet(grid, lower, upper, np.where(_PICK, ends[1], ends[0]))
+
+
+def boxes_meet(grid: Grid, lower: np.ndarray, upper: np.ndarray, corners: np.ndarray) -> bool:
+    """Whether a box with these ``corners`` (8, 3; world) may meet that of the voxels between
+    ``lower`` and ``upper``: whether their bounds do, along the axes of the world and of the grid.
+    """
+    own = np.where(_PICK, upper, lower)
+    slack = SLACK * grid.voxel_size.min()
+    for to_axes, small in ((np.eye(4), slack), (grid.coordinates.matrix, SLACK)):
+        back = to_axes @ grid.world.matrix
+        mine, other = _mapped(back, own), _mapped(to_axes, corners)
+        if (other.max(axis=0) < mine.min(axis=0) + small).any():
+            return False
+        if (other.min(axis=0) > mine.max(axis=0) - small).any():
+            return False
+    return True
+
+
+def corners_of(frame: np.ndarray) -> np.ndarray:
+    """Of the unit cube's image (8, 3)."""
+    return _mapped(frame, _PICK)
+
+
+def _mapped(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Images of points (n, 3) under an affine map."""
+    return (matrix[:3, :3] * points[:, None, :]).sum(axis=-1) + matrix[:3, 3]
+
+
+def _begins_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
+    """Whether a vertex of a mesh, or all of another shape, is in the box."""
+    vertices = mi.traverse(shape).get("vertex_positions")
+    if vertices is not None:
+        u = grid.coordinates.point(dr.unravel(mi.Point3f, mi.Float(vertices)))
+        low, high = (mi.Point3f(*(float(v) for v in end)) for end in (lower, upper))
+        return bool(dr.any(dr.all((u > low + SLACK) & (u < high - SLACK))))
+    box = shape.bbox()
+    ends = np.where(_PICK, np.array(box.max), np.array(box.min))
+    u = _mapped(grid.coordinates.matrix, ends)
+    return bool((u > lower).all() and (u < upper).all())
+
+
+def _met(scene, near, grid, lower, upper, axis, offset) -> mi.Shape | None:
+    """The first of the shapes that rays along an axis of the grid meet in the box."""
+    across = [k for k in range(3) if k != axis]
+    corner, sides = lower + SLACK, upper - lower - 2 * SLACK
+    steps = grid.world.matrix[:3, :3]  # a voxel along each axis
+    start = steps @ corner + grid.world.matrix[:3, 3]
+    count = [int(upper[k] - lower[k]) + 1 for k in across]
+    places = unravelled(dr.arange(mi.UInt32, count[0] * count[1]), [Divisor(count[0])])
+    p = _opaque(start)
+    for k, place, shift in zip(across, places, offset, strict=True):
+        place = dr.minimum(mi.Float(place) + _opaque([shift]).x, _opaque([sides[k]]).x)
+        p = p + _opaque(steps[:, k]) * place
+    met = _shapes_between(
+        scene, mi.Point3f(p), mi.Point3f(p + _opaque(steps[:, axis] * sides[axis]))
+    )
+    dr.eval(met)
+    if not dr.any(met != None):  # noqa: E711
+        return None
+    return next((s for s in near if dr.any(met == mi.ShapePtr(s))), near[0])
+
+
+def _opaque(values: Sequence[float]) -> mi.Vector3f:
+    return mi.Vector3f([dr.opaque(mi.Float, float(v)) for v in (*values, 0, 0)[:3]])
+
+
+@symbolic
+def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
+    """The first shapes between two points that are not null boundaries."""
+    length = dr.norm(stop - start)
+    direction = (stop - start) / length
+    ray, found = mi.Ray3f(start, direction), dr.zeros(mi.ShapePtr, dr.width(start))
+    ray.maxt = mi.Float(length)
+    crossings, active = mi.UInt32(0), mi.Bool(True)
+    while dr.hint(active, label="obstacles"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        solid = active & (~is_null(si.bsdf().flags()) | (si.shape.emitter() != None))  # noqa: E711
+        shape = dr.select(si.instance != None, si.instance, si.shape)  # noqa: E711
+        found = dr.select(solid, shape, found)
+        ray = si.spawn_ray(direction)
+        ray.maxt = dr.maximum(length - dr.norm(si.p - start), 0)
+        crossings += 1
+        active &= ~solid & (crossings < MOST_CROSSINGS)
+    return found

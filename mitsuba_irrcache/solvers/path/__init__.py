@@ -1,0 +1,1 @@
+"""Monte Carlo: paths from every voxel of the cache."""

@@ -1,0 +1,355 @@
+"""The solver ``path``: unbiased Monte Carlo path tracing from the voxel centres to the lights.
+
+With isotropic scattering the irradiance at x is a sum over scattering orders (paper, section 3):
+
+    Phi(x) = sum_k E[beta_k D(x_k)],   x_0 = x,  beta_0 = 1,  beta_k = beta_(k-1) albedo(x_k)
+
+where x_k follows from x_(k-1) by a uniform direction and a free flight, and D(x) = int_S2 L_e T dw
+is the light that reaches x straight from the emitters. Order 0 is the *uncollided* layer of the
+cache, the others the *scattered* one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from time import perf_counter
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.volume import BATCH, LAYERS, IrradianceCache
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.lights.falloff import Places
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers.path import estimator as volume_path
+from mitsuba_irrcache.transport.tracking import free_flight, transmittance
+
+#: Paths in one kernel launch: enough to fill any machine, few enough to bound memory (about 100
+#: bytes each).
+LANES = 1 << 21
+
+#: called with (samples done, samples in all), both in voxels times samples
+Progress = Callable[[int, int], None]
+
+
+def refine(
+    scene: mi.Scene,
+    medium: MediumGrid,
+    cache: IrradianceCache,
+    samples: int,
+    seed: int,
+    rr_depth: int,
+    progress: Progress | None = None,
+) -> None:
+    """Adds ``samples`` per voxel (a multiple of ``BATCH``) of the random stream ``seed``.
+
+    The stream goes on where an earlier call with the same seed stopped. If ``progress`` raises,
+    passes that are complete stay in the cache.
+    """
+    dark = not scene.emitters() and medium.emission is None
+    if not cache.active_count or _orders(cache) < 1 or dark:
+        cache.note_samples(seed, samples)
+        return
+    estimator = _Estimator(scene, medium, cache, seed, rr_depth)
+    total, done = cache.active_count * samples, 0
+    if total > 16 * LANES:
+        seconds = estimator.seconds(total)
+        mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
+    lanes = _lanes(cache)
+    block = min(cache.active_count, lanes // BATCH)
+    batches_at_once = max(1, lanes // (BATCH * block))
+    remaining = samples // BATCH
+    while remaining:
+        count = min(batches_at_once, remaining)
+        first = cache.streams.get(seed, 0) // BATCH
+        layers = []
+        for voxels in _blocks(cache.active_count, block):
+            if layers and progress is not None:
+                progress(done, total)
+            layers.append(estimator.batches(voxels, first, count))
+            done += dr.width(voxels) * BATCH * count
+        cache.add(seed, BATCH * count, layers)
+        if progress is not None:
+            progress(done, total)
+        remaining -= count
+
+
+def _orders(cache: IrradianceCache) -> int:
+    """Scattering orders that the cache holds: 0 .. max_depth - 2, or all of them."""
+    return cache.max_depth - 1 if cache.max_depth >= 0 else 0xFFFFFFFF
+
+
+def _blocks(count: int, width: int) -> Iterator[mi.UInt32]:
+    """The numbers below ``count`` in arrays of ``width``, the last of which may be shorter."""
+    for start in range(0, count, width):
+        yield dr.arange(mi.UInt32, min(width, count - start)) + dr.opaque(mi.UInt32, start)
+
+
+def _lanes(cache: IrradianceCache) -> int:
+    """Paths in one kernel launch: each moment of the radiance takes as much again."""
+    return LANES // 8 if cache.moments else LANES
+
+
+def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
+    """From sums over batches of ``size`` samples, ``count`` batches of a voxel in a row: per voxel,
+    the sums of batch means for each layer and channel; and for each channel the squared deviations
+    of both layers' sum from its mean; then sums of batch means of the moments, if there are any.
+    """
+    means = [total / size for total in totals]
+    n = dr.opaque(type(means[0]), count)
+    both = [means[c] + means[channels + c] for c in range(channels)]
+    squares = [dr.square(b) for b in both]
+    dr.eval(means, both, squares)  # by one kernel, also where a sum over one batch is part of it
+    spreads = [
+        dr.maximum(dr.block_sum(s, count) - dr.square(dr.block_sum(b, count)) / n, 0)
+        for s, b in zip(squares, both, strict=True)
+    ]
+    sums = [dr.block_sum(mean, count) for mean in means]
+    layers, moments = tuple(sums[: 2 * channels]), tuple(sums[2 * channels :])
+    return (layers, tuple(spreads), *([moments] if moments else []))
+
+
+class Opening:
+    """The first two batches of a stream, a few samples of both at a time, for early images: two are
+    enough for a standard error. Complete, they are what `refine` begins with.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int, rr_depth: int
+    ) -> None:
+        self.cache, self.seed = cache, seed
+        self.size = 0  #: samples of each batch so far
+        self._estimator = _Estimator(scene, medium, cache, seed, rr_depth)
+        # In blocks of voxels, for each layer and channel: the sums of both batches.
+        self._totals: list[list] = []
+
+    def grow(self, size: int, progress: Progress | None = None) -> None:
+        """Adds samples until there are ``size`` in each batch, at most `BATCH`."""
+        more, active = size - self.size, self.cache.active_count
+        totals, done = [], 0
+        for i, voxels in enumerate(_blocks(active, min(active, _lanes(self.cache) // (2 * BATCH)))):
+            sums = self._estimator.sums(voxels, 0, 2, self.size, more)
+            if self._totals:
+                sums = [old + new for old, new in zip(self._totals[i], sums, strict=True)]
+            dr.eval(sums)
+            dr.sync_thread()
+            totals.append(sums)
+            done += dr.width(voxels) * 2 * more
+            if progress is not None:
+                progress(done, active * 2 * more)
+        self._totals, self.size = totals, size
+
+    def fill(self, cache: IrradianceCache) -> None:
+        """Puts both batches into an empty ``cache`` for batches of this size."""
+        blocks = [_statistics(sums, self.size, 2, cache.channels) for sums in self._totals]
+        cache.add(self.seed, 2 * self.size, blocks)
+
+
+class _Estimator:
+    """One kernel for all passes: whatever differs between them is opaque to it."""
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        cache: IrradianceCache,
+        seed: int,
+        rr_depth: int,
+    ) -> None:
+        orders = _orders(cache)
+        self.scene, self.medium, self.cache = scene, medium, cache
+        self.places = Places(scene, cache.grid)
+        # Light of the medium itself is found on the way to the next collision.
+        self.multiple = orders > 1 or medium.emission is not None
+        self.orders, self.seed, self.rr_depth = (
+            dr.opaque(mi.UInt32, n) for n in (orders, seed, rr_depth)
+        )
+
+    def batches(self, voxels: mi.UInt32, first: int, count: int) -> tuple:
+        """Estimates ``count`` batches from the batch ``first`` on.
+
+        ``voxels`` are places in the list of active voxels. Returns, for every layer and channel,
+        the sum of the batch means, and for every channel their spread, per voxel (float64); then
+        the sums for every moment and channel (float32).
+        """
+        result = _statistics(
+            self.sums(voxels, first, count, 0, BATCH), BATCH, count, self.cache.channels
+        )
+        dr.eval(result)
+        dr.sync_thread()
+        return result
+
+    def sums(self, voxels: mi.UInt32, first: int, count: int, start: int, size: int) -> list:
+        """Sums of the samples ``start`` to ``start + size`` of the batches ``first`` to ``first +
+        count``, for every layer and channel; all batches of a voxel in a row.
+
+        In float64 sums of float32 values are exact (unless these span a factor of 2^25): it does
+        not matter in which passes the samples come.
+        """
+        cache = self.cache
+        per_batch, per_voxel = (dr.opaque(mi.UInt32, n) for n in (size, size * count))
+        lane = dr.arange(mi.UInt32, dr.width(voxels) * count * size)
+        row = lane // per_batch
+        batch = row % dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+        within = lane - row * per_batch + dr.opaque(mi.UInt32, start)
+        place = dr.gather(mi.UInt32, voxels, lane // per_voxel)
+        voxel = dr.gather(mi.UInt32, cache.active, place)
+        layers = self._layers(self.places.of(voxel), batch, within, voxel)
+        double = dr.float64_array_t(mi.Float)
+        # A layer that is zero throughout comes as a literal without a width.
+        none = dr.zeros(mi.Float, dr.width(lane))
+        kinds = [double] * len(LAYERS) + [mi.Float] * cache.moments
+        values = [
+            kind(v[c] + none)
+            for kind, v in zip(kinds, layers, strict=True)
+            for c in range(cache.channels)
+        ]
+        dr.eval(values)
+        return [dr.block_sum(value, size) for value in values]
+
+    def _layers(
+        self, position: mi.Point3f, batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32
+    ) -> Sequence[mi.Spectrum]:
+        """One sample of both layers per lane, and of the moments."""
+        around = self.medium.surroundings
+        if around is None:
+            return _estimate(
+                self.scene,
+                self.medium,
+                position,
+                batch,
+                within,
+                voxel,
+                self.seed,
+                self.orders,
+                self.rr_depth,
+                self.multiple,
+            )
+        rng, spread = _random_numbers(batch, within, voxel, self.seed)
+        pointer = around.pointer(dr.gather(mi.UInt32, self.cache.survey.place, voxel))
+        max_depth = dr.select(self.orders < 0xFFFFFFFF, self.orders + 1, self.orders)
+        return volume_path.estimate(
+            self.cache.directional,
+            self.scene,
+            around.media,
+            position,
+            pointer,
+            spread,
+            rng,
+            max_depth,
+            self.rr_depth,
+        )
+
+    def seconds(self, samples: int) -> float:
+        """Predicts the time for ``samples`` from one batch at voxels all over the medium."""
+        count = self.cache.active_count
+        voxels = dr.arange(mi.UInt32, min(count, _lanes(self.cache) // 256))
+        voxels = voxels * dr.opaque(mi.UInt32, max(1, count // dr.width(voxels)))
+        dr.eval(voxels)
+        self.batches(voxels, 0, 1)  # compiles the kernel
+        started = perf_counter()
+        self.batches(voxels, 0, 1)
+        return (perf_counter() - started) * samples / (dr.width(voxels) * BATCH)
+
+
+@symbolic
+def _estimate(
+    scene: mi.Scene,
+    medium: MediumGrid,
+    position: mi.Point3f,
+    batch: mi.UInt32,
+    within: mi.UInt32,
+    voxel: mi.UInt32,
+    seed: mi.UInt32,
+    orders: mi.UInt32,
+    rr_depth: mi.UInt32,
+    multiple: bool,
+):
+    """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over
+    directions.
+    """
+    rng, spread = _random_numbers(batch, within, voxel, seed)
+    always = mi.Bool(True)
+    uncollided, rng = direct_light(
+        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always
+    )
+    scattered, glowing = mi.Spectrum(0), medium.emission is not None
+    further = 1 if glowing else 0  # flights beyond the last collision
+    if dr.hint(multiple, mode="scalar"):
+        weight = mi.Spectrum(1)
+        direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
+        order = mi.UInt32(1)
+        active = order - further < orders
+        while dr.hint(active, label="scattering orders"):
+            ray = mi.Ray3f(position, direction)
+            hit, near, far = medium.intersect(ray)
+            near = dr.maximum(near, 0)
+            collided, t, weight, rng, light = free_flight(
+                medium, ray, near, far, weight, rng, active & hit
+            )
+            if dr.hint(glowing, mode="scalar"):
+                uncollided += dr.select(order == 1, 4 * dr.pi * light, 0)
+                scattered += dr.select(order == 1, 0, 4 * dr.pi * light)
+                active &= order < orders
+            active &= collided
+            position = dr.select(active, ray(t), position)
+            weight *= medium.albedo.at_world(position, active)
+            active &= dr.max(weight) > 0
+            # Russian roulette, as volpath does it.
+            survival = dr.select(order > rr_depth, dr.minimum(dr.max(weight), 0.95), 1)
+            active &= rng.next_float32(active) < survival
+            weight /= survival
+            sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+            light, rng = direct_light(scene, medium, position, sample, rng, active)
+            scattered += dr.select(active, weight * light, 0)
+            sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+            direction = mi.warp.square_to_uniform_sphere(sample)
+            order += 1
+            active &= order - further < orders
+    return uncollided, scattered
+
+
+def _random_numbers(
+    batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32, seed: mi.UInt32
+) -> tuple[mi.PCG32, list[mi.Float]]:
+    """The random stream of a sample, and four numbers that the samples of a batch spread evenly."""
+    shift_a, shift_b = mi.sample_tea_32(voxel, mi.sample_tea_32(seed, batch)[0])
+    rng = mi.PCG32(
+        initstate=mi.UInt64(shift_a) << 32 | mi.UInt64(shift_b), initseq=mi.UInt64(within) + 1
+    )
+    # A batch shares one random shift of a low-discrepancy set; each point alone is uniform.
+    shifts = mi.PCG32(initstate=mi.UInt64(shift_b) << 32 | mi.UInt64(shift_a), initseq=mi.UInt64(0))
+    return rng, [_fraction(shifts.next_float32() + _kronecker(within, axis)) for axis in range(4)]
+
+
+def direct_light(
+    scene: mi.Scene,
+    medium: MediumGrid,
+    position: mi.Point3f,
+    sample: mi.Point2f,
+    rng: mi.PCG32,
+    active: mi.Bool,
+) -> tuple[mi.Spectrum, mi.PCG32]:
+    """One sample of D(x) = int_S2 L_e T dw by emitter sampling and ratio tracking."""
+    interaction = dr.zeros(mi.Interaction3f)
+    interaction.p = position
+    record, radiance = scene.sample_emitter_direction(interaction, sample, False, active)
+    lit = active & (record.pdf > 0) & (dr.max(radiance) > 0)
+    ray = mi.Ray3f(position, record.d)
+    hit, near, far = medium.intersect(ray)
+    near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
+    through, rng = transmittance(medium, ray, near, far, rng, lit & hit)
+    through = dr.select(hit & (near < far), through, 1)
+    return dr.select(lit, radiance * through, 0), rng
+
+
+def _kronecker(index: mi.UInt32, axis: int) -> mi.Float:
+    """Point ``index`` of the four-dimensional Kronecker sequence of the generalised golden
+    ratio.
+    """
+    golden = 1.1673039782614187  # root of x^5 = x + 1
+    return mi.Float(index) * (golden ** -(axis + 1) % 1.0)
+
+
+def _fraction(x: mi.Float) -> mi.Float:
+    return x - dr.floor(x)

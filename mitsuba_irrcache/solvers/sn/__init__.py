@@ -1,0 +1,1 @@
+"""Discrete ordinates (S_N) along long characteristics, with source iteration."""

@@ -1,0 +1,52 @@
+"""Light that reaches voxels straight from a medium that shines."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.angular import Directional, added, nothing
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.transport.tracking import free_flight
+
+#: 2^32 over the root of x^3 = x + 1, and over its square: points that are spread evenly.
+STEPS = (3242174889, 2447445414)
+
+
+@symbolic
+def emitted_light(
+    medium: MediumGrid,
+    position: mi.Point3f,
+    count: int,
+    seed: tuple[int, int],
+    directional: Directional | None = None,
+) -> list[mi.Spectrum]:
+    """Irradiance at ``position`` from the emission of ``medium``, and its moments if it is told by
+    its direction: unbiased estimates by ``count`` directions, spread evenly and shifted at random
+    at each position. ``seed`` ends with the number of the batch.
+    """
+    place = dr.arange(mi.UInt32, dr.width(position))
+    stream = mi.sample_tea_32(*(dr.opaque(mi.UInt32, s) for s in seed))[0]
+    state = mi.sample_tea_32(place, stream)
+    rng = mi.PCG32(initstate=mi.UInt64(state[0]) << 32 | mi.UInt64(state[1]), initseq=1)
+    shift = [rng.next_uint32(), rng.next_uint32()]
+    total, weight = nothing(directional), dr.opaque(mi.Float, 4 * dr.pi / count)
+    k, count = mi.UInt32(0), dr.opaque(mi.UInt32, count)
+    while dr.hint(k < count, label="emission"):
+        ray = mi.Ray3f(position, _direction(shift, k))
+        hit, near, far = medium.intersect(ray)
+        *_, rng, light = free_flight(
+            medium, ray, dr.maximum(near, 0), far, mi.Spectrum(1), rng, hit
+        )
+        # None of it is of narrow lights.
+        total = added(total, position, ray.d, mi.Spectrum(0), light * weight, directional)
+        k += 1
+    dr.eval(total)
+    return total
+
+
+def _direction(shift: list[mi.UInt32], k: mi.UInt32) -> mi.Vector3f:
+    """Direction ``k`` of the set with this random shift."""
+    u = [mi.Float((s + k * n) >> 8) * 2.0**-24 for s, n in zip(shift, STEPS, strict=True)]
+    return mi.warp.square_to_uniform_sphere(mi.Point2f(u))

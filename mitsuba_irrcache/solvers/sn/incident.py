@@ -1,0 +1,312 @@
+"""Where light comes from: sets of directions, and the emitters that are far away.
+
+A set is of pairs of opposite directions, spread evenly and turned at random, so that every
+direction alone is uniform. Its weights integrate spherical harmonics up to degree 3 exactly: inside
+dense matter radiance has no others, whatever the turn. The sets of several passes together are as
+even as one of so many directions: independent turns would leave three times the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import combinations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.polynomial.legendre import legval
+
+from mitsuba_irrcache.cache.angular import spots_of
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.transport.spot_beams import Beam
+from mitsuba_irrcache.transport.tracking import medium_transmittance
+
+_GOLDEN = (1 + 5**0.5) / 2
+#: One over the root of x^3 = x + 1: steps of it are spread evenly.
+_STEP = 0.7548776662466927
+#: What a set, of several that share their directions, is to integrate, and how much it matters:
+#: spherical harmonics by their degree.
+DEGREES = {2: 4.0, 4: 2.0, 6: 0.5, 8: 0.2}
+#: Rounds of exchange between sets, at most; few are needed.
+ROUNDS = 8
+
+
+def spread(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """``count`` directions (n, 3) of one hemisphere, and the solid angle (n) that each of them
+    stands for; so does its opposite.
+    """
+    return spread_together(1, count, rng)[0]
+
+
+def spread_together(
+    sets: int, count: int, rng: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """As many ``sets`` of `spread` directions, which are spread evenly together, too."""
+    points, members = _shared_out(sets, count)
+    points = points @ _rotation(rng).T
+    return [(points[own], _weights(points[own])) for own in members]
+
+
+@lru_cache(maxsize=32)
+def _shared_out(sets: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of one hemisphere on a Fibonacci spiral, and which of them each set has."""
+    number = np.arange(sets * count)
+    z, turn = 1 - (number + 0.5) / len(number), number / _GOLDEN % 1
+    radius, angle = np.sqrt(1 - z * z), 2 * np.pi * turn
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    members = _strata(sets, turn, 1 / _GOLDEN)
+    # The squared error of a set's integrals is the sum of this over all pairs of its points, by the
+    # addition theorem. Two sets exchange those two points that lower it most.
+    factors = np.zeros(max(DEGREES) + 1)
+    for degree, weight in DEGREES.items():
+        factors[degree] = weight * (2 * degree + 1)
+    error = legval(points @ points.T, factors)
+    for _ in range(ROUNDS):
+        exchanged = False
+        for a, b in combinations(range(sets), 2):
+            first, second = members[a], members[b]
+            within, beyond = error[np.ix_(first, first)], error[np.ix_(second, second)]
+            between = error[np.ix_(first, second)]
+            out = between.sum(axis=1) - within.sum(axis=1) + np.diag(within)
+            into = between.sum(axis=0) - beyond.sum(axis=1) + np.diag(beyond)
+            change = out[:, None] + into - 2 * between
+            i, j = np.unravel_index(change.argmin(), change.shape)
+            if change[i, j] < -1e-9:
+                first[i], second[j], exchanged = second[j], first[i], True
+        if not exchanged:
+            break
+    return points, members
+
+
+def _strata(sets: int, place: np.ndarray, step: float) -> np.ndarray:
+    """Numbers (sets, n) of points for each of so many ``sets``: one of each as many in a row, by
+    the order of their ``place`` in [0, 1), which goes round by ``step`` from row to row.
+    """
+    rows = place.reshape(-1, sets) - step * np.arange(len(place) // sets)[:, None]
+    order = np.argsort(rows % 1, axis=1)
+    return np.ascontiguousarray((order + sets * np.arange(len(order))[:, None]).T)
+
+
+def _weights(points: np.ndarray) -> np.ndarray:
+    """The weights nearest to equal ones that integrate all products of two coordinates."""
+    count = len(points)
+    x, y, z = points.T
+    moments = np.stack([np.ones(count), x * x, y * y, x * y, y * z, z * x])
+    wanted = 2 * np.pi * np.array([1, 1 / 3, 1 / 3, 0, 0, 0])
+    equal = np.full(count, 2 * np.pi / count)
+    correction, *_ = np.linalg.lstsq(moments, wanted - moments @ equal, rcond=None)
+    weights = equal + correction
+    return weights if weights.min() > 0.25 * equal[0] else equal
+
+
+def _rotation(rng: np.random.Generator) -> np.ndarray:
+    """A uniformly random rotation matrix."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+def environment_radiance(environment: mi.Emitter, directions: np.ndarray) -> np.ndarray:
+    """Radiance (n, channels) that the environment sends along ``directions`` (n, 3)."""
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    interaction.wi = mi.Vector3f(directions.T.astype(np.float32))
+    return _values(environment.eval(interaction), len(directions))
+
+
+def _values(spectrum: mi.Spectrum, count: int) -> np.ndarray:
+    """A spectrum as an array (count, channels), float64."""
+    channels = [np.broadcast_to(np.array(v, dtype=np.float64), count) for v in spectrum]
+    return np.stack(channels, axis=1)
+
+
+#: Pairs of directions of a pass for each line of light from a sun, and for each direction of an
+#: environment's bright parts.
+SUN_SHARE, BRIGHT_SHARE = 8, 2
+
+
+class Sky:
+    """The emitters of a scene, seen from the medium: an environment, suns that are infinitely far
+    and narrow, and point-like lights nearby.
+    """
+
+    def __init__(self, scene: mi.Scene, glows: bool = False) -> None:
+        """``glows``: there is light besides, whose colour is its own."""
+        self._glows = glows
+        self._environment = scene.environment()
+        self._spots: tuple | None = None
+        self._suns, self.near = [], []
+        for emitter in scene.emitters():
+            if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
+                self._suns.append(_sun(emitter))
+            elif mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+                self.near.append(emitter)
+
+    def tables(
+        self, passes: int, pairs: int, channels: int, rng: np.random.Generator, first: int = 0
+    ) -> tuple[list[tuple], np.ndarray]:
+        """Directions for a number of passes, and the light from far away along them; before these,
+        if wanted, for a ``first`` pass of so many pairs.
+
+        Returns arguments of `Lattice.table`, those of each pass, and the factors (channels) of what
+        these give: where channels differ by a factor only, light has a single one.
+        """
+        tables = self.rows(1, first, rng) if first else []
+        tables += self.rows(passes, pairs, rng)
+        light = np.concatenate([table[1] for table in tables])
+        brightest = light.max(axis=(0, 1))
+        colour = brightest / brightest.max() if brightest.max() > 0 else np.ones(channels)
+        apart = np.abs(light - light.max(axis=-1, keepdims=True) * colour)
+        if not self.near and not self._glows and apart.max() <= 1e-6 * light.max():
+            return [
+                (d, light.max(axis=-1, keepdims=True), w, o) for d, light, w, o in tables
+            ], colour
+        return tables, np.ones(channels)
+
+    def rows(self, passes: int, pairs: int, rng: np.random.Generator) -> list[tuple]:
+        """Directions of passes, irradiance along both ways (n, 2, channels), weights, offsets: an
+        even set, which light from voxels takes too, and those that only emitters need.
+        """
+        even = spread_together(passes, pairs, rng)
+        varies = (
+            self._environment is not None
+            and self._environment.class_name() != "ConstantBackgroundEmitter"
+        )
+        if varies:
+            found = self._with_bright(even, max(1, pairs // BRIGHT_SHARE), rng)
+        else:
+            found = [(*own, self._steady(*own)) for own in even]
+        return [self._pass(pairs, *own, rng) for own in found]
+
+    def _steady(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Light of an even environment, or none, as of `rows`."""
+        if self._environment is None:
+            return np.zeros((len(directions), 2, dr.size_v(mi.Spectrum)))
+        return self._both_ways(directions) * weights[:, None, None]
+
+    def _pass(
+        self,
+        pairs: int,
+        directions: np.ndarray,
+        weights: np.ndarray,
+        light: np.ndarray,
+        rng: np.random.Generator,
+    ) -> tuple:
+        """A pass of `rows`, with those of suns."""
+        colours, rows = dr.size_v(mi.Spectrum), [(directions, light, weights)]
+        lines = max(1, pairs // SUN_SHARE)
+        for direction, irradiance in self._suns:
+            ways = np.stack([irradiance / lines, np.zeros(colours)])
+            rows.append((np.tile(direction, (lines, 1)), np.tile(ways, (lines, 1, 1)), lines * [0]))
+        joined = [np.concatenate(part) for part in zip(*rows, strict=True)]
+        offsets = rng.random((len(joined[0]), 2))
+        for k in range(len(self._suns)):
+            # The last rows: lines of one direction lie evenly in the voxels.
+            end = len(offsets) - k * lines
+            offsets[end - lines : end] = (offsets[end - 1] + _even(lines)) % 1
+        return *joined, offsets
+
+    def _with_bright(
+        self, even: list[tuple], count: int, rng: np.random.Generator
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """To the ``even`` directions of each pass and their weights some by the luminance of an
+        environment that varies, and the light along all. One may come from either, and as the
+        opposite of one: what it stands for is one over the density of all ways to get it.
+        """
+        rows = []
+        chosen = self._bright(len(even), count, rng)
+        for (plain, weights), bright in zip(even, chosen, strict=True):
+            directions = np.concatenate([plain, bright])
+            uniform = len(plain) / (2 * np.pi)
+            angle = 1 / (uniform + count * self._density(directions))
+            angle[: len(plain)] *= weights * uniform
+            light = self._both_ways(directions) * angle[:, None, None]
+            rows.append((directions, np.concatenate([weights, np.zeros(count)]), light))
+        self._make_whole(rows)
+        return rows
+
+    def _make_whole(self, rows: list[tuple]) -> None:
+        """Lets as much light come from each bright spot, and from beside all, as there is: how many
+        directions meet one is chance.
+        """
+        if self._spots is None:
+            self._spots = spots_of(self._environment)
+        spots, irradiance = self._spots
+        numbers = []
+        for directions, *_ in rows:
+            towards = np.stack([-directions, directions], axis=1)
+            number = np.zeros(towards.shape[:2], int)
+            for k, spot in enumerate(spots, 1):
+                number[(number == 0) & spot.covers(towards)] = k
+            numbers.append(number)
+        for k, exact in enumerate(irradiance):
+            own = [light[n == k] for (*_, light), n in zip(rows, numbers, strict=True)]
+            found = np.concatenate(own).sum(axis=0) / len(rows)
+            known = (found > 0) & np.isfinite(exact)
+            factor = np.where(known, exact / np.where(known, found, 1), 1)
+            for (*_, light), number in zip(rows, numbers, strict=True):
+                light[number == k] *= factor
+
+    def _both_ways(self, directions: np.ndarray) -> np.ndarray:
+        """Radiance (n, 2, channels) along directions and their opposites."""
+        both = [environment_radiance(self._environment, s * directions) for s in (1, -1)]
+        return np.stack(both, axis=1)
+
+    def _bright(self, sets: int, count: int, rng: np.random.Generator) -> list[np.ndarray]:
+        """Sets of directions (n, 3) of light from the environment, by its own density, all of them
+        together evenly.
+        """
+        points = _even(sets * count)
+        members = _strata(sets, points[:, 1], _STEP)
+        samples = ((points.T + rng.random((2, 1))) % 1).astype(np.float32)
+        record, _ = self._environment.sample_direction(
+            dr.zeros(mi.Interaction3f, sets * count), mi.Point2f(samples)
+        )
+        directions = -np.array(record.d, dtype=np.float64).T
+        return [directions[own] for own in members]
+
+    def _density(self, directions: np.ndarray) -> np.ndarray:
+        """Density (n) with which the environment draws directions or their opposites [1/sr]."""
+        total = np.zeros(len(directions))
+        for sign in (1, -1):
+            record = dr.zeros(mi.DirectionSample3f, len(directions))
+            record.d = mi.Vector3f((-sign * directions).T.astype(np.float32))
+            at = dr.zeros(mi.Interaction3f, len(directions))
+            total += np.array(self._environment.pdf_direction(at, record), dtype=np.float64)
+        return total
+
+    def near_light(
+        self, medium: MediumGrid, position: mi.Point3f, beams: Sequence[Beam] = ()
+    ) -> list[mi.Spectrum]:
+        """Irradiance at ``position`` from each point-like light nearby; from spot lights of
+        ``beams``, which are not marched again, its means over the voxels.
+        """
+        means = {id(beam.emitter): beam.irradiance for beam in beams}
+        return [
+            means[id(e)] if id(e) in means else _from_point(e, medium, position) for e in self.near
+        ]
+
+
+def _even(count: int) -> np.ndarray:
+    """Points (n, 2) that lie evenly in the unit square."""
+    i = np.arange(count)
+    return np.stack([(i + 0.5) / count, i * _STEP % 1], axis=1)
+
+
+def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -> mi.Spectrum:
+    """Irradiance from a point-like emitter, its light followed through the medium."""
+    at = dr.zeros(mi.Interaction3f, dr.width(position))
+    at.p = position
+    record, light = emitter.sample_direction(at, mi.Point2f(0.5))
+    lit = dr.max(light) > 0
+    light = light * medium_transmittance(medium, mi.Ray3f(position, record.d), record.dist, lit)
+    light = dr.select(lit, light, 0)
+    dr.eval(light)
+    return light
+
+
+def _sun(emitter: mi.Emitter) -> tuple[np.ndarray, np.ndarray]:
+    """Direction (3) and irradiance (channels) of a light that is infinitely far and narrow."""
+    record, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1), mi.Point2f(0.5))
+    direction = -np.array(record.d, dtype=np.float64).ravel()
+    return direction / np.linalg.norm(direction), _values(weight, 1)[0]

@@ -1,0 +1,1 @@
+"""Free flights, transmittance and paths through media and between surfaces."""
