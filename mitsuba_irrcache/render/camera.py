@@ -1,10 +1,10 @@
 """What a camera ray sees: light scattered in media, from their caches, and what is behind them.
 
 In a simple scene (see `compile`) its way is known in closed form. In all others the ray goes
-straight on through null surfaces, from one medium into the next, and is marched through each with that
-medium's cache. Where it meets a surface, or nothing any more, its straight way ends: what a surface
-sends back is path traced, by one path per camera sample, which ends where it meets a medium with a
-cache.
+straight on through null surfaces, from one medium into the next, and is marched through each with
+that medium's cache. Where it meets a surface, or nothing any more, its straight way ends: what a
+surface sends back is path traced, by one path per camera sample, which ends where it meets a medium
+with a cache.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 See `tracks` for the lines, `incident` for where they point, `multigrid` for light that is
 scattered more than once, `direct_emission` for light of the medium itself, which is followed voxel
-by voxel. A batch is a chain of its own, with random numbers of its own: batches are independent of each other,
-so their scatter is the error of their mean, whatever the voxels and orders of scattering in a batch
-share.
+by voxel. A batch is a chain of its own, with random numbers of its own: batches are independent of
+each other, so their scatter is the error of their mean, whatever the voxels and orders of
+scattering in a batch share.
 """
 
 from __future__ import annotations
