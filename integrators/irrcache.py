@@ -25,7 +25,7 @@ from mitsuba_irrcache.render.aovs import AOVS, Layers, parse_aovs
 from mitsuba_irrcache.render.camera import Sight, SimpleSight, sight_of
 from mitsuba_irrcache.render.denoise import FILTERS, filter_illumination
 from mitsuba_irrcache.render.film import check_film, exclusive, fill_film, planes, render_film
-from mitsuba_irrcache.render.raymarch import QUADRATURES
+from mitsuba_irrcache.render.quadrature import QUADRATURES
 from mitsuba_irrcache.scene.consistency import check_sensor
 
 SOLVERS = ("auto", "path", "sweep")

@@ -20,7 +20,8 @@ from experiments.marching import unjittered
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
-from mitsuba_irrcache.render.raymarch import QUADRATURES, Projection
+from mitsuba_irrcache.render.quadrature import QUADRATURES
+from mitsuba_irrcache.render.raymarch import Projection
 
 
 def main() -> None:

@@ -141,7 +141,7 @@ MUTANTS = (
     ),
     Mutant(
         "the curvature of a segment with the wrong sign",
-        "render/raymarch.py",
+        "render/quadrature.py",
         "greatest(1 - sag, 0)",
         "greatest(1 + sag, 0)",
         (PROJECTION,),
@@ -225,7 +225,7 @@ MUTANTS = (
     ),
     Mutant(
         "roots of noisy values not made up for",
-        "cache/volume.py",
+        "cache/statistics.py",
         "return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)",
         "return 1 + 0 * variance",
         (CACHE,),
@@ -337,7 +337,7 @@ MUTANTS = (
     ),
     Mutant(
         "directions of passes not even together",
-        "solvers/sn/incident.py",
+        "solvers/sn/angular_quadrature.py",
         "points = points @ _rotation(rng).T",
         "points = points",
         ("tests/unit/test_directions.py",),

@@ -161,7 +161,7 @@ SLIPS = (
     ),
     Mutant(
         "rays skip one macrocell too many",
-        "render/raymarch.py",
+        "render/empty_space.py",
         "wall = c + clearance",
         "wall = c + clearance + 1",
         (PROJECTION,),
@@ -182,7 +182,7 @@ SLIPS = (
     ),
     Mutant(
         "emission of a segment bent to the wrong side",
-        "render/raymarch.py",
+        "render/quadrature.py",
         "bend = 0.5 * (sigma_a - sigma_b) * length",
         "bend = 0.5 * (sigma_b - sigma_a) * length",
         ("tests/unit/test_emission_of_a_segment.py",),
@@ -280,14 +280,14 @@ SLIPS = (
     ),
     Mutant(
         "light extrapolated without a limit (grid)",
-        "grids/grid.py",
+        "grids/root_field.py",
         "dr.clip(outermost / dr.select(known, other, 1), 1 / STEEPEST, STEEPEST)",
         "outermost / dr.select(known, other, 1)",
         (GRID,),
     ),
     Mutant(
         "voxels half a voxel below matter are not active (cache)",
-        "cache/volume.py",
+        "grids/occupancy.py",
         "dr.floor(c - extent - 0.5 - 1e-3)",
         "dr.floor(c - extent + 1e-3)",
         (CACHE,),

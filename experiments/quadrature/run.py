@@ -27,7 +27,8 @@ from experiments.store import Store
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
-from mitsuba_irrcache.render.raymarch import QUADRATURES, Projection
+from mitsuba_irrcache.render.quadrature import QUADRATURES
+from mitsuba_irrcache.render.raymarch import Projection
 
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 #: Against which errors are measured.

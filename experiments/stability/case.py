@@ -17,7 +17,7 @@ from experiments.stability.worlds import (
     scene,
     texture,
 )
-from mitsuba_irrcache.render.raymarch import QUADRATURES
+from mitsuba_irrcache.render.quadrature import QUADRATURES
 
 SOLVERS = ("sweep", "path")
 #: What a cache is asked for; roulette is put off, since its weights grow without end in furnaces.

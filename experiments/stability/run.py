@@ -24,7 +24,7 @@ from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import essence
 from mitsuba_irrcache.machine.llvm import require_llvm
-from mitsuba_irrcache.render.raymarch import QUADRATURES
+from mitsuba_irrcache.render.quadrature import QUADRATURES
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono")
 

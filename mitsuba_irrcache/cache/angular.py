@@ -22,9 +22,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
-from mitsuba_irrcache.render.aovs import interleaved
 
 #: Sine of half the angle that a lamp may take up to be told apart: one has to be beside it.
 WIDEST = 0.95

@@ -20,8 +20,10 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
-from mitsuba_irrcache.grids.grid import Extension, Grid, GridField, extrapolated
-from mitsuba_irrcache.render.aovs import interleaved
+from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.grids.fields import GridField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.root_field import Extension, extrapolated
 
 #: Random errors that are projected; their signs are kept in the last bits of a float.
 PROBES = 4

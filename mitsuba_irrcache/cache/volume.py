@@ -4,9 +4,7 @@ loaded.
 
 from __future__ import annotations
 
-import hashlib
 import json
-import zipfile
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -19,11 +17,23 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import Directional, DirectionalField
 from mitsuba_irrcache.cache.conservative import conserving
-from mitsuba_irrcache.core.fast_math import Divisor, unravelled
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
+from mitsuba_irrcache.cache.storage import (
+    ARRAYS,
+    FORMAT,
+    LARGEST_BATCH,
+    WITH_MOMENTS,
+    check_digest,
+    digest_of_arrays,
+    digest_of_description,
+    read_arrays,
+    samples_by_seed,
+    unreadable,
+)
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
-from mitsuba_irrcache.grids.grid import Affine, Grid, RootField
-from mitsuba_irrcache.grids.majorants import Macrocells
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import marked
+from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.lights.falloff import Falloff
 from mitsuba_irrcache.scene.fingerprint import differing
@@ -34,16 +44,8 @@ from mitsuba_irrcache.transport.spot_beams import Beam
 #: independent of each other, the batches are: means and errors are statistics of batch means.
 BATCH = 8
 
-#: Share of active voxels below which they are told apart more closely, by cells of so many voxels
-#: of the medium along an edge.
-SPARSE, FINE = 0.3, 2
 
 LAYERS = ("uncollided", "scattered")
-FORMAT = "mitsuba_irrcache 4"
-WITH_MOMENTS = "mitsuba_irrcache 5"  # of light by its direction
-ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description
-#: What a file may say at most: samples of a stream, and of a batch.
-MOST_SAMPLES, LARGEST_BATCH = 1 << 31, 1 << 16
 
 
 def _consistent(method: Callable) -> Callable:
@@ -206,7 +208,7 @@ class IrradianceCache:
         roots, variance = [dr.sqrt(m) for m in means], None
         if not self.correlated:  # neighbours that err alike do no harm to interpolation
             noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
-            roots = [r * _root_correction(v) for r, v in zip(roots, noise, strict=True)]
+            roots = [r * root_correction(v) for r, v in zip(roots, noise, strict=True)]
         if all(dr.all(r == roots[0])[0] for r in roots[1:]):
             roots = roots[:1]
         channels = len(roots)
@@ -283,11 +285,11 @@ class IrradianceCache:
         in all blocks. Then the sums of batch means for each moment and channel, if there are any.
         """
         totals, spreads, *moments = (
-            [_joined(part) for part in zip(*parts, strict=True)]
+            [concatenated(part) for part in zip(*parts, strict=True)]
             for parts in zip(*blocks, strict=True)
         )
         merged = self._merged(totals, spreads, samples // self.batch)
-        moments = _sums(self._moments, *moments) if moments else self._moments
+        moments = totals_of_pairs(self._moments, *moments) if moments else self._moments
         dr.eval(merged, moments)
         # An interrupt comes before or after this line, never between the two.
         self._totals, self._spreads, self._moments, self.streams = (
@@ -301,13 +303,13 @@ class IrradianceCache:
         known = self.samples // self.batch
         result = []
         for c, spread in enumerate(spreads):
-            old, new = (_sum(t[c :: self.channels]) for t in (self._totals, totals))
+            old, new = (total(t[c :: self.channels]) for t in (self._totals, totals))
             if known and (old is not None or new is not None):
                 n, more = (dr.opaque(self.real, k) for k in (known, count))
                 apart = (0 if old is None else old / n) - (0 if new is None else new / more)
-                spread = _sum([spread, dr.square(apart) * (n * more / (n + more))])
-            result.append(_sum([self._spreads[c], spread]))
-        return _sums(self._totals, totals), result
+                spread = total([spread, dr.square(apart) * (n * more / (n + more))])
+            result.append(total([self._spreads[c], spread]))
+        return totals_of_pairs(self._totals, totals), result
 
     @_consistent
     def note_samples(self, seed: int, samples: int) -> None:
@@ -348,7 +350,7 @@ class IrradianceCache:
         with self._lock:
             count = sum(streams.values()) // other.batch
             self._totals, self._spreads = self._merged(totals, spreads, count)
-            self._moments = _sums(self._moments, moments)
+            self._moments = totals_of_pairs(self._moments, moments)
             self.streams = self.streams | streams
 
     # ------------------------------------------------------------------ files
@@ -374,8 +376,8 @@ class IrradianceCache:
             "spreads": self._plain(self._spreads),
             **({"moments": self._plain(self._moments, np.float32)} if self.moments else {}),
         }
-        description["values"] = _digest_of_arrays(arrays)
-        description["digest"] = _digest_of_description(description)
+        description["values"] = digest_of_arrays(arrays)
+        description["digest"] = digest_of_description(description)
         encoded = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
         with atomic_write(path) as file:
             np.savez(file, description=encoded, **arrays)
@@ -390,7 +392,7 @@ class IrradianceCache:
         """
         path = Path(path)
         try:
-            arrays = _read_arrays(path)
+            arrays = read_arrays(path)
             description = json.loads(arrays["description"].tobytes())
             if description["format"] not in (FORMAT, WITH_MOMENTS):
                 raise CacheFileError(
@@ -401,17 +403,17 @@ class IrradianceCache:
         except CacheFileError:
             raise
         except Exception as error:  # whatever a damaged file makes of itself
-            raise _unreadable(path, error) from error
+            raise unreadable(path, error) from error
 
     @staticmethod
     def description_of(path: str | Path) -> tuple[dict[str, str], int]:
         """Fingerprint of a file and its samples per voxel, without its arrays; raises as `load`."""
         try:
-            description = json.loads(_read_arrays(Path(path), ())["description"].tobytes())
-            _check_digest(description)
-            return dict(description["fingerprint"]), sum(_streams(description).values())
+            description = json.loads(read_arrays(Path(path), ())["description"].tobytes())
+            check_digest(description)
+            return dict(description["fingerprint"]), sum(samples_by_seed(description).values())
         except Exception as error:  # as in `load`
-            raise _unreadable(path, error) from error
+            raise unreadable(path, error) from error
 
     @classmethod
     def _restore(cls, description: dict, arrays: dict[str, np.ndarray]) -> IrradianceCache:
@@ -441,15 +443,15 @@ class IrradianceCache:
             raise ValueError("it holds values that are not finite")
         if min(values.min(initial=0) for values in (totals, spreads)) < 0:
             raise ValueError("it holds light that is negative")
-        streams, batch = _streams(description), int(description["batch"])
+        streams, batch = samples_by_seed(description), int(description["batch"])
         smallest, largest = (1, LARGEST_BATCH) if correlated else (BATCH, BATCH)
         if not smallest <= batch <= largest or any(n % batch for n in streams.values()):
             raise ValueError(f"samples {streams} in batches of {batch}")
         batches = sum(streams.values()) // batch
         if (batches < 1 and totals.any()) or (batches < 2 and spreads.any()):
             raise ValueError(f"more light than {batches} batches of samples can have")
-        _check_digest(description)
-        if _digest_of_arrays(arrays) != description["values"]:
+        check_digest(description)
+        if digest_of_arrays(arrays) != description["values"]:
             raise ValueError("its values are not those that were saved")
         cache = cls(
             grid,
@@ -482,157 +484,3 @@ class IrradianceCache:
         write_vol(
             path, np.array(self.irradiance), (corners[:3].min(axis=1), corners[:3].max(axis=1))
         )
-
-
-def _joined(pieces: tuple):
-    """The values of all blocks, or None."""
-    if pieces[0] is None:
-        return None
-    return dr.concat(list(pieces)) if len(pieces) > 1 else pieces[0]
-
-
-def _sum(terms):
-    """Of arrays, or None for 0."""
-    known = [t for t in terms if t is not None]
-    return sum(known[1:], known[0]) if known else None
-
-
-def _sums(first: list, second: list) -> list:
-    """Term by term."""
-    return [_sum(pair) for pair in zip(first, second, strict=True)]
-
-
-def marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
-    """Of all voxels of ``grid``, whether they are among ``voxels``."""
-    marks = dr.zeros(mi.Bool, grid.voxel_count)
-    if dr.width(voxels):
-        dr.scatter(marks, mi.Bool(True), voxels)
-    return marks
-
-
-def _root_correction(variance: mi.Float) -> mi.Float:
-    """Makes interpolated roots of noisy values right on average.
-
-    With relative ``variance`` v of the voxels, E[(sum w_i sqrt(x_i))^2] = mu (1 - (1 - sum w_i^2) v
-    / 4) to first order, and sum w_i^2 is (2/3)^3 on average over a cell. Without it 16 samples read
-    some 1 % too little light.
-    """
-    return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)
-
-
-def _unreadable(path: str | Path, error: Exception) -> CacheFileError:
-    return CacheFileError(
-        f'"{path}" is not a readable irradiance cache ({error}); delete it or name another '
-        "cache_file."
-    )
-
-
-def _streams(description: dict) -> dict[int, int]:
-    """Samples by seed."""
-    streams = {int(seed): int(n) for seed, n in description["streams"].items()}
-    if any(seed < 0 or not 0 <= n <= MOST_SAMPLES for seed, n in streams.items()):
-        raise ValueError(f"samples {streams}; a stream has 0 to {MOST_SAMPLES}")
-    return streams
-
-
-def _digest_of_arrays(arrays: dict[str, np.ndarray]) -> str:
-    """SHA-256 of the arrays of a file beside its description."""
-    sha = hashlib.sha256()
-    for name in sorted(arrays.keys() - {"description"}):
-        values = np.ascontiguousarray(arrays[name])
-        sha.update(f"{name} {values.dtype.str} {values.shape};".encode())
-        sha.update(values.data)
-    return sha.hexdigest()
-
-
-def _digest_of_description(description: dict) -> str:
-    """SHA-256 of all that a file says of itself."""
-    said = {key: value for key, value in description.items() if key != "digest"}
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
-
-
-def _check_digest(description: dict) -> None:
-    if _digest_of_description(description) != description["digest"]:
-        raise ValueError("its description is not the one that was saved")
-
-
-def _read_arrays(path: Path, names: tuple[str, ...] = ARRAYS) -> dict[str, np.ndarray]:
-    """The description and some arrays of an uncompressed npz: a file cannot claim more memory than
-    it has bytes.
-    """
-    with zipfile.ZipFile(path) as archive:
-        if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
-            raise ValueError("it is compressed")
-    with np.load(path, allow_pickle=False) as archive:
-        if names:
-            names = (*names, *({"moments"} & set(archive.files)))
-        return {name: archive[name] for name in ("description", *names)}
-
-
-def active_voxels(medium, grid: Grid) -> mi.UInt32:
-    """Flat indices, ascending, of the voxels of ``grid`` that a lookup where ``sigma_t > 0`` can
-    read.
-
-    Every macrocell that is not empty marks the voxels whose trilinear support its box may overlap;
-    where these are few, smaller cells mark still fewer.
-    """
-    cells = medium.macrocells
-    occupied = dr.compress(cells.majorant > 0)
-    if dr.width(occupied) == 0:
-        return mi.UInt32()
-    if cells.count == 1:
-        return dr.arange(mi.UInt32, grid.voxel_count)
-    marked = _mark(cells, occupied, grid)
-    if dr.width(marked) < SPARSE * grid.voxel_count:
-        cells = Macrocells.build(medium.sigma_t, medium.boundary, FINE)
-        marked = _mark(cells, dr.compress(cells.majorant > 0), grid)
-    return marked
-
-
-def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], list[mi.Int32]]:
-    """First and last voxel along x, y, z whose trilinear support the box of each macrocell
-    meets.
-    """
-    nz, ny, nx = cells.shape
-    index = unravelled(occupied, [Divisor(nx), Divisor(ny)])
-    to_voxels = grid.coordinates.matrix @ np.linalg.inv(cells.coordinates.matrix)
-    # Border cells reach beyond their own grid, whose values are clamped: here as far as the cache.
-    corners = np.array(list(np.ndindex(2, 2, 2))) * grid.resolution
-    to_cells = np.linalg.inv(to_voxels)
-    reach = corners @ to_cells[:3, :3].T + to_cells[:3, 3]
-    start, end = np.minimum(0.0, reach.min(axis=0)), np.maximum((nx, ny, nz), reach.max(axis=0))
-    middle, half = [], []
-    for i, n, least, most in zip(index, (nx, ny, nz), start, end, strict=True):
-        low = dr.select(i == 0, dr.opaque(mi.Float, float(least)), mi.Float(i))
-        high = dr.select(i == n - 1, dr.opaque(mi.Float, float(most)), mi.Float(i) + 1)
-        middle.append(0.5 * (low + high))
-        half.append(0.5 * (high - low))
-    center = Affine(to_voxels).point(mi.Point3f(middle))
-    first, last = [], []
-    for side, c, row in zip(grid.sides, center, np.abs(to_voxels[:3, :3]), strict=True):
-        extent = sum(dr.opaque(mi.Float, float(m)) * h for m, h in zip(row, half, strict=True))
-        limit = mi.Float(side - 1)
-        # Voxel i is read from u in (i - 1/2, i + 3/2); border voxels also from beyond the grid.
-        first.append(mi.Int32(dr.clip(dr.floor(c - extent - 0.5 - 1e-3), 0, limit)))
-        last.append(mi.Int32(dr.clip(dr.floor(c + extent + 0.5 + 1e-3), 0, limit)))
-    return first, last
-
-
-@symbolic
-def _mark(cells: Macrocells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
-    """The voxels that a lookup in the ``occupied`` cells can read."""
-    (x0, y0, z0), (x1, y1, z1) = _supports(cells, occupied, grid)
-    marks = dr.zeros(mi.UInt32, grid.voxel_count)
-    x, y, z = mi.Int32(x0), mi.Int32(y0), mi.Int32(z0)
-    active = mi.Bool(True)
-    while dr.hint(active, label="active voxels"):
-        dr.scatter(marks, mi.UInt32(1), grid.index(x, y, z), active)
-        x += 1
-        wrap_x = x > x1
-        x = dr.select(wrap_x, x0, x)
-        y = dr.select(wrap_x, y + 1, y)
-        wrap_y = y > y1
-        y = dr.select(wrap_y, y0, y)
-        z = dr.select(wrap_y, z + 1, z)
-        active &= z <= z1
-    return dr.compress(marks > 0)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import Divisor, unravelled
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 
 
 def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.UInt32:

@@ -10,9 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.fast_math import Divisor
+from mitsuba_irrcache.core.jit import Divisor
 from mitsuba_irrcache.grids.boundary import Boundary, safe_rcp
-from mitsuba_irrcache.grids.grid import Affine, ConstantField, Field, GridField
+from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
+from mitsuba_irrcache.grids.grid import Affine
 
 
 class Macrocells:

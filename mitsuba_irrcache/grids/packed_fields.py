@@ -15,7 +15,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.fast_math import clipped
-from mitsuba_irrcache.grids.grid import Extension, Field, Grid, GridField, RootField
+from mitsuba_irrcache.grids.fields import Field, GridField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.root_field import Extension, RootField
 
 #: Most values of a voxel, two in each word; so many have those of their neighbours with them.
 MOST, PAIRED = 8, (1, 2, 4)

@@ -64,3 +64,21 @@ def _check_shape(emitter: mi.Emitter) -> None:
             "evaluates and samples it differently then. Give it the same scale along x and y, or "
             'use a mesh. Otherwise render this scene with "volpath".'
         )
+
+
+def point_lights(scene: mi.Scene) -> list[mi.Emitter]:
+    """The emitters of a scene that have a place and no size."""
+    flag = mi.EmitterFlags.DeltaPosition
+    return [e for e in scene.emitters() if mi.has_flag(e.flags(), flag)]
+
+
+def position_of(emitter: mi.Emitter) -> np.ndarray:
+    """Where a point-like emitter is (3), world space."""
+    params = mi.traverse(emitter)
+    position = params["position"] if "position" in params else params["to_world"].translation()
+    return np.array(position, dtype=np.float64).ravel()
+
+
+def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
+    """The emitters of a scene whose intensity depends on the direction and that have no size."""
+    return [e for e in point_lights(scene) if e.class_name() != "PointLight"]

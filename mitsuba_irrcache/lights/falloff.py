@@ -10,6 +10,7 @@ import numpy as np
 
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import point_lights, position_of
 
 #: A lamp is not nearer to what the cache knows than this part of a voxel's shortest edge: less than
 #: the half edge that lies between voxel centres and a lamp beside a box.
@@ -29,19 +30,6 @@ SHORT = 0.05
 #: Points along each axis of a voxel over which its light is averaged, if a lamp is at most so many
 #: edges from its middle; elsewhere two.
 FINEST, CLOSE = 24, 1.5
-
-
-def point_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """The emitters of a scene that have a place and no size."""
-    flag = mi.EmitterFlags.DeltaPosition
-    return [e for e in scene.emitters() if mi.has_flag(e.flags(), flag)]
-
-
-def position_of(emitter: mi.Emitter) -> np.ndarray:
-    """Where a point-like emitter is (3), world space."""
-    params = mi.traverse(emitter)
-    position = params["position"] if "position" in params else params["to_world"].translation()
-    return np.array(position, dtype=np.float64).ravel()
 
 
 class Places:

@@ -22,10 +22,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.grids.grid import ConstantField, Field, Grid, GridField
+from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.render.aovs import interleaved
 
 
 def take_away_peak(medium: MediumGrid) -> None:

@@ -14,12 +14,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.volume import active_voxels, marked
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.boundary import safe_rcp
-from mitsuba_irrcache.grids.grid import ConstantField, Field, Grid
+from mitsuba_irrcache.grids.fields import ConstantField, Field
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
-from mitsuba_irrcache.media.medium import MediumGrid, baked_field, volume_error
+from mitsuba_irrcache.grids.occupancy import active_voxels, marked
+from mitsuba_irrcache.media.bake import baked_field, volume_error
+from mitsuba_irrcache.media.medium import MediumGrid
 
 #: How far baked values may be from Mitsuba's own, relative to their maximum.
 TOLERANCE = 0.02

@@ -13,9 +13,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import Directional, sources_of
-from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache, active_voxels, marked
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import active_voxels, marked
 from mitsuba_irrcache.lights.falloff import Falloff
 from mitsuba_irrcache.machine.memory import give_back, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid

@@ -8,11 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.volume import IrradianceCache, active_voxels
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import active_voxels
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.render.aovs import luminance
 from mitsuba_irrcache.scene.compile import media_of
 from mitsuba_irrcache.scene.consistency import described
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, obstacle

@@ -15,11 +15,11 @@ import mitsuba as mi
 from mitsuba_irrcache.cache.uncertainty import uncertainty_of
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import give_back
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CacheSettings, LitMedium
-from mitsuba_irrcache.render.aovs import luminance
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.context import Surroundings
 from mitsuba_irrcache.solvers.half_space import HalfSpace

@@ -16,9 +16,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.uncertainty import PROBES, ROUNDS
-from mitsuba_irrcache.core.fast_math import Divisor
-from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.render.aovs import Layers, interleaved, luminance
+from mitsuba_irrcache.core.jit import Divisor, symbolic
+from mitsuba_irrcache.core.spectrum import interleaved, luminance
+from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.pixel_filter import pixel_of
 
 #: ``bilateral`` fades; ``fixed`` has one strength, as in the paper.

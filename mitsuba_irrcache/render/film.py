@@ -14,10 +14,10 @@ from threading import Lock, RLock
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import Divisor
+from mitsuba_irrcache.core.jit import Divisor
+from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import require_memory
-from mitsuba_irrcache.render.aovs import interleaved
 from mitsuba_irrcache.render.pixel_filter import pixel_of, reconstructed
 
 #: Camera samples in one kernel launch: bounds the memory that they and the sampler's state take.

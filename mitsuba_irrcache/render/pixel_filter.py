@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import Divisor
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import Divisor, symbolic
 
 
 class Samples:

@@ -23,21 +23,18 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import DirectionalField
 from mitsuba_irrcache.cache.uncertainty import UncertaintyField
-from mitsuba_irrcache.core.fast_math import absorbed, clipped, decay, greatest, least
+from mitsuba_irrcache.core.fast_math import least
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.grids.boundary import safe_rcp
-from mitsuba_irrcache.grids.distance_transform import chebyshev
-from mitsuba_irrcache.grids.grid import ConstantField, Field, GridField
-from mitsuba_irrcache.grids.majorants import Macrocells
+from mitsuba_irrcache.core.spectrum import luminance
+from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 from mitsuba_irrcache.grids.packed_fields import AlongRay, Lookups
 from mitsuba_irrcache.lights.falloff import Falloff
-from mitsuba_irrcache.media.emission import Emission
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.render.aovs import Layers, luminance
+from mitsuba_irrcache.render.aovs import Layers
+from mitsuba_irrcache.render.empty_space import Clearance
+from mitsuba_irrcache.render.quadrature import curved, emission_weights, segment
 from mitsuba_irrcache.scene.cut_cells import Edges
 from mitsuba_irrcache.transport.spot_beams import BeamAlongRays
-
-QUADRATURES = ("riemann", "trapezoid", "exponential")
 
 #: A ray ends early once nothing ahead, not even the brightest cache voxel or the background seen
 #: through the transmittance left, can change its radiance by more than this fraction.
@@ -45,17 +42,9 @@ EARLY_STOP = 1e-4
 #: Where no more than these fractions of a ray's radiance can still be added, steps are twice and
 #: four times as long: what they miss, they miss of a small rest only.
 COARSER, COARSEST = 0.2, 0.03
-#: Points and weights of three-point quadrature over [0, 1].
-GAUSS_LEGENDRE = (
-    (0.5 - 0.3872983346, 5 / 18),
-    (0.5, 8 / 18),
-    (0.5 + 0.3872983346, 5 / 18),
-)
 #: Optical depth of a step that counts for greater ones, too: what 16 bits tell of thin matter is
 #: measured by the densest.
 OPAQUE = 4096.0
-#: Macrocells that rays look ahead for matter.
-REACH = 8
 
 
 class Projection:
@@ -331,61 +320,6 @@ class Projection:
         )
 
 
-class Clearance:
-    """For each macrocell the Chebyshev distance to the nearest one with extinction or light of its
-    own, in macrocells: 0 where it has some itself, at most `REACH`.
-    """
-
-    def __init__(self, cells: Macrocells, emission: Emission | None = None) -> None:
-        self.cells = cells
-        occupied = cells.majorant > 0
-        if emission is not None:
-            occupied |= emission.reaches(cells)
-        self.distance = chebyshev(occupied, cells.shape, REACH)
-
-    def along(self, ray: mi.Ray3f) -> ClearWay:
-        """What it is along a ray."""
-        return ClearWay(self, ray)
-
-
-class ClearWay:
-    """The cells along a ray, counted from where it comes from along each axis: it goes forward
-    along all.
-    """
-
-    def __init__(self, clearance: Clearance, ray: mi.Ray3f) -> None:
-        self.distance, cells = clearance.distance, clearance.cells
-        origin, direction = cells.coordinates.point(ray.o), cells.coordinates.vector(ray.d)
-        rcp = safe_rcp(direction)
-        forward = rcp > 0  # also tells 0 from -0, as the reciprocal does
-        self.sides = mi.Vector3f(*cells.sides)
-        self.origin = dr.select(forward, origin, self.sides - origin)
-        self.direction, self.rcp = dr.abs(direction), dr.abs(rcp)
-        # Flat indices, as floats: there are no more than 2^24 cells.
-        nx, ny, _ = self.sides
-        strides = mi.Vector3f(1, nx, nx * ny)
-        self.first = dr.sum(dr.select(forward, 0, (self.sides - 1) * strides))
-        self.strides = dr.select(forward, strides, -strides)
-
-    def exit(self, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Float]:
-        """Whether the place at ``t`` is empty, and the distance along the ray, at least ``t``, up
-        to which it remains so.
-        """
-        u = dr.fma(self.direction, t, self.origin)
-        # Clipped as floats: one beyond 2^31 has no integer.
-        cell = [clipped(dr.floor(c), 0.0, n - 1) for c, n in zip(u, self.sides, strict=True)]
-        index = self.first
-        for c, stride in zip(cell, self.strides, strict=True):
-            index = dr.fma(c, stride, index)
-        clearance = mi.Float(dr.gather(mi.UInt32, self.distance, mi.UInt32(index), active))
-        nearest = mi.Float(dr.inf)
-        for c, n, origin, rcp in zip(cell, self.sides, self.origin, self.rcp, strict=True):
-            wall = c + clearance
-            # Border cells reach to infinity.
-            nearest = least(dr.select(wall < n, (wall - origin) * rcp, dr.inf), nearest)
-        return clearance > 0, greatest(nearest, t)
-
-
 def _constant_if_it_is(field: Field) -> Field:
     """A grid that holds one value only, as that value."""
     if not isinstance(field, GridField) or _varies(field):
@@ -435,98 +369,3 @@ def _gather(
     errors = [near * a + far * b for a, b in zip(near_errors, far_errors, strict=True)]
     added = [colour, luminance(mi.Spectrum(transmittance * distance)), *errors]
     return [old + new for old, new in zip(gathered, added, strict=True)]
-
-
-def curved(before, a, b, ratio: mi.Float) -> tuple:
-    """Values at both ends of a segment, scaled so that their mean is that of the parabola which
-    also passes through the sample ``before``.
-
-    ``ratio`` is the segment's length over that of the one before. What straight lines miss of a
-    kink or a curve, they miss to the same side in every ray; here it cancels on average.
-    """
-    # The sag of the parabola, over a mean of 1.
-    bend = ratio * dr.fma(ratio, before - a, b - a)
-    sag = bend / (3 * (1 + ratio) * (a + b))
-    scale = dr.select(a + b > 0, greatest(1 - sag, 0), 1)
-    return a * scale, b * scale
-
-
-def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
-    """Weights of the sources albedo Phi / (4 pi) at both ends of a segment, and its transmittance.
-
-    ``sigma`` is the extinction at both ends. ``riemann`` (the paper's rule, order 1) takes all from
-    the start; ``trapezoid`` (order 2) takes extinction and sigma_s Phi / (4 pi) as linear in
-    distance, but no more than the segment absorbs: of opaque ones it would make as many times more
-    as they are thick; ``exponential`` takes extinction and source as linear in distance (``curved``
-    ends make it of order 3 where both are smooth) and the transmittance as exact, so that opaque
-    and long segments stay right.
-    """
-    sigma_a, sigma_b = sigma
-    if quadrature == "riemann":
-        absorbed = absorptance(sigma_a * length)
-        return (absorbed, dr.zeros(type(absorbed))), decay(sigma_a * length)
-    tau_a, tau_b = sigma_a * length, sigma_b * length
-    passed = decay(0.5 * (tau_a + tau_b))
-    if quadrature == "trapezoid":
-        near, far = 0.5 * tau_a, 0.5 * passed * tau_b
-        total, absorbed = near + far, absorptance(0.5 * (tau_a + tau_b))
-        share = dr.select(total > absorbed, absorbed / total, 1)
-        return (near * share, far * share), passed
-    return exponential_weights(tau_a, tau_b, passed), passed
-
-
-def exponential_weights(tau_a, tau_b, passed) -> tuple:
-    """Weights of the sources at both ends: int_0^1 (1 - u | u) sigma(u) e^-tau(u) du.
-
-    ``tau_a``, ``tau_b`` are the extinctions at the ends times the segment's length, ``passed`` is
-    its transmittance, sigma(u) is linear between them and tau(u) = tau_a u + (tau_b - tau_a) u^2 /
-    2. By parts near = int 1 - e^-tau(u) du, here with three Gauss-Legendre points: right to 2e-3 up
-    to optical depths of 5, and within [0, 1] for all. A source linear in *optical depth* would be
-    simpler, but weights the empty end of a segment that enters a surface far too much.
-    """
-    near = 0.0
-    for u, weight in GAUSS_LEGENDRE:
-        depth = dr.fma(tau_a, u * (1 - 0.5 * u), tau_b * (0.5 * u * u))
-        near = dr.fma(absorptance(depth), weight, near)
-    return near, greatest(absorbed(0.5 * (tau_a + tau_b), passed) - near, 0.0)
-
-
-def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
-    """Weights of the emission at both ends of a segment, int_0^1 (1 - u | u) e^-tau(u) du times its
-    ``length``; ``sigma`` is the extinction at both ends.
-
-    ``exponential`` takes both as linear. With s such that ds is in proportion to e^-m u du, m the
-    optical depth, what is left to integrate is e^-(tau(u) - m u), 1 where extinction is constant:
-    exact there, whatever the depth, and 4 % off at worst where it rises from 0 to 20. ``riemann``
-    and ``trapezoid`` are what they are for scattered light.
-    """
-    sigma_a, sigma_b = sigma
-    mean = 0.5 * (sigma_a + sigma_b) * length
-    zero = dr.zeros(type(mean))
-    if quadrature == "riemann":
-        return zero + length, zero
-    if quadrature == "trapezoid":
-        return zero + 0.5 * length, 0.5 * length * dr.exp(-mean)
-    absorbed, thin = absorptance(mean), mean < 1e-3
-    bend = 0.5 * (sigma_a - sigma_b) * length
-    near, far = zero, zero
-    for s, weight in GAUSS_LEGENDRE:
-        u = dr.select(thin, s, -dr.log(1 - s * absorbed) / dr.select(thin, 1, mean))
-        part = weight * dr.exp(-bend * u * (1 - u))
-        near, far = near + part * (1 - u), far + part * u
-    scale = length * dr.select(thin, 1 - 0.5 * mean, absorbed / dr.select(thin, 1, mean))
-    return scale * near, scale * far
-
-
-def absorptance(tau):
-    """1 - e^-tau without cancellation.
-
-    Of a 16th of ``tau`` by its series, then four times 1 - e^-2x = a (2 - a) with a = 1 - e^-x:
-    right to 1e-6, for half an exponential's price.
-    """
-    x = least(tau, 16.0) * (1 / 16)
-    series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 120, -1 / 24), 1 / 6), -1 / 2), 1)
-    a = x * series
-    for _ in range(4):
-        a = a * (2 - a)
-    return a

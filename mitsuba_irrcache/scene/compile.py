@@ -15,9 +15,10 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary, boundary_of, rays_through
 from mitsuba_irrcache.lights.emitters import check_placement
+from mitsuba_irrcache.media.bake import bake, children
 from mitsuba_irrcache.media.delta_m import take_away_peak
 from mitsuba_irrcache.media.emission import Emission, place_emission
-from mitsuba_irrcache.media.medium import MediumGrid, bake, children
+from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.media.phase import refuse_sharp
 from mitsuba_irrcache.scene.consistency import (
     RAY_OFFSET,

@@ -12,9 +12,9 @@ import itertools
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import Divisor, unravelled
-from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.grids.grid import Extension, Grid, RootField
+from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.root_field import Extension, RootField
 from mitsuba_irrcache.transport.path import is_null
 
 CORNERS = list(itertools.product((0, 1), repeat=3))

@@ -8,8 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.fast_math import Divisor, unravelled
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from mitsuba_irrcache.core.fast_math import clipped
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.lights.falloff import point_lights, position_of
+from mitsuba_irrcache.lights.emitters import point_lights, position_of
 from mitsuba_irrcache.media.medium import MediumGrid
 
 #: Error of the image [%] times the radius of a sphere, or the shortest edge of a box, in mean free

@@ -12,8 +12,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.grids.grid import Grid, RootField
-from mitsuba_irrcache.lights.falloff import Places, point_lights, position_of
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.root_field import RootField
+from mitsuba_irrcache.lights.emitters import position_of, spot_lights
+from mitsuba_irrcache.lights.falloff import Places
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
@@ -22,11 +24,6 @@ from mitsuba_irrcache.transport.tracking import medium_transmittance
 POINTS = 8
 #: Points of a segment of a camera ray at which a beam is looked at.
 SEGMENT_POINTS = 4
-
-
-def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """The emitters of a scene whose intensity depends on the direction and that have no size."""
-    return [e for e in point_lights(scene) if e.class_name() != "PointLight"]
 
 
 class Beam:

@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.render.aovs import AOVS, Layers, luminance
+from mitsuba_irrcache.core.spectrum import luminance
+from mitsuba_irrcache.render.aovs import AOVS, Layers
 from mitsuba_irrcache.render.denoise import filter_illumination
 from mitsuba_irrcache.render.film import PixelPositions
 from mitsuba_irrcache.render.pixel_filter import pixel_of

@@ -10,8 +10,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grids.grid import Grid, GridField, RootField
+from mitsuba_irrcache.grids.fields import GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.packed_fields import Lookups
+from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.scene.cut_cells import Edges
 
 pytestmark = pytest.mark.usefixtures("rgb")

@@ -119,20 +119,20 @@ class Clock:
         self.now = 0.0
         monkeypatch.setattr(progressive, "perf_counter", lambda: self.now)
         monkeypatch.setattr(builder, "perf_counter", lambda: self.now)
-        refine = builder.path.refine
+        refine = builder.path_solver.refine
 
         def slow_refine(scene, medium, cache, samples, *args, **kwargs):
             refine(scene, medium, cache, samples, *args, **kwargs)
             self.now += sample * samples
 
-        grow = builder.path.Opening.grow
+        grow = builder.path_solver.Opening.grow
 
         def slow_grow(opening, size, *args):
             self.now += sample * 2 * (size - opening.size)
             grow(opening, size, *args)
 
-        monkeypatch.setattr(builder.path, "refine", slow_refine)
-        monkeypatch.setattr(builder.path.Opening, "grow", slow_grow)
+        monkeypatch.setattr(builder.path_solver, "refine", slow_refine)
+        monkeypatch.setattr(builder.path_solver.Opening, "grow", slow_grow)
         self.image = image
 
     def slow_images(self, scene: mi.Scene) -> None:
@@ -210,7 +210,7 @@ def test_stopped_within_a_pass(cloud, tmp_path, monkeypatch, error):
     """The launches that were complete are in cache and file, the one that was not is in neither;
     the rest makes it the cache of one go.
     """
-    monkeypatch.setattr(builder.path, "LANES", 1 << 12)
+    monkeypatch.setattr(builder.path_solver, "LANES", 1 << 12)
     file = tmp_path / "light.npz"
     scene, whole = cloud(cache_file=str(file)), cloud()
     integrator, frames = scene.integrator(), []

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsuba_irrcache.core.fast_math import Divisor, clipped, decay, greatest, least, unravelled
+from mitsuba_irrcache.core.fast_math import clipped, decay, greatest, least
+from mitsuba_irrcache.core.jit import Divisor, unravelled
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -13,10 +13,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache, active_voxels
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.boundary import Boundary
-from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.grids.fields import ConstantField, GridField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import active_voxels
 from mitsuba_irrcache.io.mitsuba_vol import read_vol
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.compile import bake_scene

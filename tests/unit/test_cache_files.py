@@ -9,12 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.volume import (
-    BATCH,
-    IrradianceCache,
-    _digest_of_arrays,
-    _digest_of_description,
-)
+from mitsuba_irrcache.cache.storage import digest_of_arrays, digest_of_description
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 
@@ -55,8 +51,8 @@ def rewrite(file, seal: bool, change) -> None:
     description = json.loads(arrays.pop("description").tobytes())
     change(description, arrays)
     if seal:
-        description["values"] = _digest_of_arrays(arrays)
-        description["digest"] = _digest_of_description(description)
+        description["values"] = digest_of_arrays(arrays)
+        description["digest"] = digest_of_description(description)
     encoded = np.frombuffer(json.dumps(description).encode(), np.uint8)
     with file.open("wb") as stream:
         np.savez(stream, description=encoded, **arrays)

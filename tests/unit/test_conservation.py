@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.cache.conservative import conserving
-from mitsuba_irrcache.grids.grid import Grid, RootField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.root_field import RootField
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -6,7 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.solvers.sn.incident import Sky, spread, spread_together
+from mitsuba_irrcache.solvers.sn.angular_quadrature import spread, spread_together
+from mitsuba_irrcache.solvers.sn.incident import Sky
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

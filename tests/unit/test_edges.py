@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grids.grid import Grid, RootField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.scene.compile import bake_media
 from mitsuba_irrcache.scene.cut_cells import Edges
 from mitsuba_irrcache.scene.voxel_classes import neighbourhood

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mitsuba_irrcache.render.raymarch import emission_weights
+from mitsuba_irrcache.render.quadrature import emission_weights
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import quad
 
 from mitsuba_irrcache.grids.boundary import Boundary
-from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.grids.fields import ConstantField, GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.render.raymarch import Projection
 

@@ -9,7 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.render.aovs import Layers, interleaved
+from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.denoise import STRIDES, bilateral, filter_illumination
 
 pytestmark = pytest.mark.usefixtures("rgb")

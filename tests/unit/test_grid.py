@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField, RootField
+from mitsuba_irrcache.grids.fields import ConstantField, GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.packed_fields import Lookups
+from mitsuba_irrcache.grids.root_field import RootField
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

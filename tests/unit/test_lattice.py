@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.grids.grid import Grid, GridField
+from mitsuba_irrcache.grids.fields import GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.sn import tracks
 from mitsuba_irrcache.solvers.sn.kernel import ONE
 from mitsuba_irrcache.solvers.sn.tracks import Lattice, sharpened

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsuba_irrcache.grids.boundary import Boundary
-from mitsuba_irrcache.grids.grid import Grid, GridField
+from mitsuba_irrcache.grids.fields import GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
 
 pytestmark = pytest.mark.usefixtures("rgb")

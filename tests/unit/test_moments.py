@@ -11,7 +11,7 @@ from mitsuba_irrcache.cache.angular import Directional
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
 from mitsuba_irrcache.solvers.sn import tracks
-from mitsuba_irrcache.solvers.sn.incident import spread
+from mitsuba_irrcache.solvers.sn.angular_quadrature import spread
 from mitsuba_irrcache.solvers.sn.moments import DirectionalLevel, Moments
 from mitsuba_irrcache.solvers.sn.multigrid import Level
 from mitsuba_irrcache.solvers.sn.tracks import Lattice

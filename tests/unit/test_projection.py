@@ -12,10 +12,13 @@ from scipy.integrate import quad, solve_ivp
 
 import mitsuba_irrcache.render.raymarch as module
 from mitsuba_irrcache.grids.boundary import Boundary
-from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.grids.fields import ConstantField, GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.render.raymarch import EARLY_STOP, QUADRATURES, Clearance, Projection, segment
+from mitsuba_irrcache.render.empty_space import REACH, Clearance
+from mitsuba_irrcache.render.quadrature import QUADRATURES, segment
+from mitsuba_irrcache.render.raymarch import EARLY_STOP, Projection
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -217,7 +220,7 @@ def test_clearance_is_the_distance_to_matter():
     matter = place[np.array(cells.majorant) > 0]
     expected = np.abs(place[:, None] - matter[None]).max(axis=2).min(axis=1)
     found = np.array(Clearance(cells).distance)
-    np.testing.assert_array_equal(found, np.minimum(expected, module.REACH))
+    np.testing.assert_array_equal(found, np.minimum(expected, REACH))
 
 
 def test_early_stop_with_a_bright_light_behind():

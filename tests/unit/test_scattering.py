@@ -9,7 +9,7 @@ import pytest
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.sn import multigrid, tracks
 from mitsuba_irrcache.solvers.sn.anderson import Mixing
-from mitsuba_irrcache.solvers.sn.incident import spread
+from mitsuba_irrcache.solvers.sn.angular_quadrature import spread
 from mitsuba_irrcache.solvers.sn.multigrid import Level
 from mitsuba_irrcache.solvers.sn.track_table import Entering
 from mitsuba_irrcache.solvers.sn.tracks import Lattice

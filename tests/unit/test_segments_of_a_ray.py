@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from mitsuba_irrcache.cache.volume import active_voxels
 from mitsuba_irrcache.grids.boundary import Boundary
-from mitsuba_irrcache.grids.grid import ConstantField, Grid, GridField
+from mitsuba_irrcache.grids.fields import ConstantField, GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
+from mitsuba_irrcache.grids.occupancy import active_voxels
 from mitsuba_irrcache.media.emission import Emission
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.render.raymarch import Projection

@@ -20,8 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import Directional
-from mitsuba_irrcache.core.fast_math import Divisor
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.context import probe

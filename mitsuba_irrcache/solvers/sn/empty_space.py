@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.fast_math import Divisor, unravelled
+from mitsuba_irrcache.core.jit import Divisor, unravelled
 from mitsuba_irrcache.grids.distance_transform import chebyshev
 from mitsuba_irrcache.grids.grid import Grid
 

@@ -9,102 +9,16 @@ even as one of so many directions: independent turns would leave three times the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
-from itertools import combinations
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.polynomial.legendre import legval
 
 from mitsuba_irrcache.cache.angular import spots_of
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers.sn.angular_quadrature import STEP, spread_together, strata
 from mitsuba_irrcache.transport.spot_beams import Beam
 from mitsuba_irrcache.transport.tracking import medium_transmittance
-
-_GOLDEN = (1 + 5**0.5) / 2
-#: One over the root of x^3 = x + 1: steps of it are spread evenly.
-_STEP = 0.7548776662466927
-#: What a set, of several that share their directions, is to integrate, and how much it matters:
-#: spherical harmonics by their degree.
-DEGREES = {2: 4.0, 4: 2.0, 6: 0.5, 8: 0.2}
-#: Rounds of exchange between sets, at most; few are needed.
-ROUNDS = 8
-
-
-def spread(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` directions (n, 3) of one hemisphere, and the solid angle (n) that each of them
-    stands for; so does its opposite.
-    """
-    return spread_together(1, count, rng)[0]
-
-
-def spread_together(
-    sets: int, count: int, rng: np.random.Generator
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """As many ``sets`` of `spread` directions, which are spread evenly together, too."""
-    points, members = _shared_out(sets, count)
-    points = points @ _rotation(rng).T
-    return [(points[own], _weights(points[own])) for own in members]
-
-
-@lru_cache(maxsize=32)
-def _shared_out(sets: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of one hemisphere on a Fibonacci spiral, and which of them each set has."""
-    number = np.arange(sets * count)
-    z, turn = 1 - (number + 0.5) / len(number), number / _GOLDEN % 1
-    radius, angle = np.sqrt(1 - z * z), 2 * np.pi * turn
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-    members = _strata(sets, turn, 1 / _GOLDEN)
-    # The squared error of a set's integrals is the sum of this over all pairs of its points, by the
-    # addition theorem. Two sets exchange those two points that lower it most.
-    factors = np.zeros(max(DEGREES) + 1)
-    for degree, weight in DEGREES.items():
-        factors[degree] = weight * (2 * degree + 1)
-    error = legval(points @ points.T, factors)
-    for _ in range(ROUNDS):
-        exchanged = False
-        for a, b in combinations(range(sets), 2):
-            first, second = members[a], members[b]
-            within, beyond = error[np.ix_(first, first)], error[np.ix_(second, second)]
-            between = error[np.ix_(first, second)]
-            out = between.sum(axis=1) - within.sum(axis=1) + np.diag(within)
-            into = between.sum(axis=0) - beyond.sum(axis=1) + np.diag(beyond)
-            change = out[:, None] + into - 2 * between
-            i, j = np.unravel_index(change.argmin(), change.shape)
-            if change[i, j] < -1e-9:
-                first[i], second[j], exchanged = second[j], first[i], True
-        if not exchanged:
-            break
-    return points, members
-
-
-def _strata(sets: int, place: np.ndarray, step: float) -> np.ndarray:
-    """Numbers (sets, n) of points for each of so many ``sets``: one of each as many in a row, by
-    the order of their ``place`` in [0, 1), which goes round by ``step`` from row to row.
-    """
-    rows = place.reshape(-1, sets) - step * np.arange(len(place) // sets)[:, None]
-    order = np.argsort(rows % 1, axis=1)
-    return np.ascontiguousarray((order + sets * np.arange(len(order))[:, None]).T)
-
-
-def _weights(points: np.ndarray) -> np.ndarray:
-    """The weights nearest to equal ones that integrate all products of two coordinates."""
-    count = len(points)
-    x, y, z = points.T
-    moments = np.stack([np.ones(count), x * x, y * y, x * y, y * z, z * x])
-    wanted = 2 * np.pi * np.array([1, 1 / 3, 1 / 3, 0, 0, 0])
-    equal = np.full(count, 2 * np.pi / count)
-    correction, *_ = np.linalg.lstsq(moments, wanted - moments @ equal, rcond=None)
-    weights = equal + correction
-    return weights if weights.min() > 0.25 * equal[0] else equal
-
-
-def _rotation(rng: np.random.Generator) -> np.ndarray:
-    """A uniformly random rotation matrix."""
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q * np.linalg.det(q)
 
 
 def environment_radiance(environment: mi.Emitter, directions: np.ndarray) -> np.ndarray:
@@ -257,7 +171,7 @@ class Sky:
         together evenly.
         """
         points = _even(sets * count)
-        members = _strata(sets, points[:, 1], _STEP)
+        members = strata(sets, points[:, 1], STEP)
         samples = ((points.T + rng.random((2, 1))) % 1).astype(np.float32)
         record, _ = self._environment.sample_direction(
             dr.zeros(mi.Interaction3f, sets * count), mi.Point2f(samples)
@@ -290,7 +204,7 @@ class Sky:
 def _even(count: int) -> np.ndarray:
     """Points (n, 2) that lie evenly in the unit square."""
     i = np.arange(count)
-    return np.stack([(i + 0.5) / count, i * _STEP % 1], axis=1)
+    return np.stack([(i + 0.5) / count, i * STEP % 1], axis=1)
 
 
 def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -> mi.Spectrum:

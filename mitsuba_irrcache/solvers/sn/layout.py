@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.fast_math import Divisor, unravelled
-from mitsuba_irrcache.render.aovs import interleaved
+from mitsuba_irrcache.core.jit import Divisor, unravelled
+from mitsuba_irrcache.core.spectrum import interleaved
 
 #: Axes of an array from the fastest to the slowest, unless they are laid out by slices.
 STANDARD = (0, 1, 2)

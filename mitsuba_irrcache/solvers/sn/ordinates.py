@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.solvers.sn.angular_quadrature import spread, spread_together
 from mitsuba_irrcache.solvers.sn.boundary_condition import Around, Arrivals
-from mitsuba_irrcache.solvers.sn.incident import Sky, spread, spread_together
+from mitsuba_irrcache.solvers.sn.incident import Sky
 from mitsuba_irrcache.solvers.sn.multigrid import Level
 from mitsuba_irrcache.solvers.sn.track_table import Table
 from mitsuba_irrcache.solvers.sn.tracks import Lattice

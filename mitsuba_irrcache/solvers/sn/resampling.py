@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.fast_math import Divisor, unravelled
-from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.grids.grid import Field, Grid, GridField
+from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
+from mitsuba_irrcache.grids.fields import Field, GridField
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 
 #: Most points along each axis of a voxel over which the medium is averaged.

@@ -1,0 +1,75 @@
+"""The file format of caches: an uncompressed npz with a description and digests."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from mitsuba_irrcache.errors import CacheFileError
+
+FORMAT = "mitsuba_irrcache 4"
+
+
+WITH_MOMENTS = "mitsuba_irrcache 5"  # of light by its direction
+
+
+ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description
+
+
+#: What a file may say at most: samples of a stream, and of a batch.
+MOST_SAMPLES, LARGEST_BATCH = 1 << 31, 1 << 16
+
+
+def unreadable(path: str | Path, error: Exception) -> CacheFileError:
+    """The error for a file that is not a cache, or a damaged one."""
+    return CacheFileError(
+        f'"{path}" is not a readable irradiance cache ({error}); delete it or name another '
+        "cache_file."
+    )
+
+
+def samples_by_seed(description: dict) -> dict[int, int]:
+    """Samples by seed."""
+    streams = {int(seed): int(n) for seed, n in description["streams"].items()}
+    if any(seed < 0 or not 0 <= n <= MOST_SAMPLES for seed, n in streams.items()):
+        raise ValueError(f"samples {streams}; a stream has 0 to {MOST_SAMPLES}")
+    return streams
+
+
+def digest_of_arrays(arrays: dict[str, np.ndarray]) -> str:
+    """SHA-256 of the arrays of a file beside its description."""
+    sha = hashlib.sha256()
+    for name in sorted(arrays.keys() - {"description"}):
+        values = np.ascontiguousarray(arrays[name])
+        sha.update(f"{name} {values.dtype.str} {values.shape};".encode())
+        sha.update(values.data)
+    return sha.hexdigest()
+
+
+def digest_of_description(description: dict) -> str:
+    """SHA-256 of all that a file says of itself."""
+    said = {key: value for key, value in description.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def check_digest(description: dict) -> None:
+    """Raises ValueError unless a description is the one that was saved."""
+    if digest_of_description(description) != description["digest"]:
+        raise ValueError("its description is not the one that was saved")
+
+
+def read_arrays(path: Path, names: tuple[str, ...] = ARRAYS) -> dict[str, np.ndarray]:
+    """The description and some arrays of an uncompressed npz: a file cannot claim more memory than
+    it has bytes.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):
+            raise ValueError("it is compressed")
+    with np.load(path, allow_pickle=False) as archive:
+        if names:
+            names = (*names, *({"moments"} & set(archive.files)))
+        return {name: archive[name] for name in ("description", *names)}

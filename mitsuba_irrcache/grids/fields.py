@@ -1,0 +1,83 @@
+"""Constant and trilinear fields."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.grids.grid import Grid, stencil
+
+
+class ConstantField:
+    """A value that is the same everywhere: a Float (grey) or a Color3f."""
+
+    grid = None
+
+    def __init__(self, values: np.ndarray, scale: float = 1.0) -> None:
+        self.channels = len(values)
+        opaque = [dr.opaque(mi.Float, float(v) * scale) for v in values]
+        self.value = opaque[0] if self.channels == 1 else mi.Color3f(opaque)
+        self.minimum = float(np.min(values)) * scale
+        self.maximum = float(np.max(values)) * scale
+
+    def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        return type(self.value)(self.value)  # a copy: loops write to what they carry
+
+
+class GridField:
+    """Values at the voxel centres of a grid, trilinear between them, clamped at the border.
+
+    ``data`` is flat with ``channels`` (1 or 3) interleaved values per voxel and is not copied;
+    ``scale`` multiplies every lookup, so that a scaled medium needs no array of its own.
+    """
+
+    def __init__(self, grid: Grid, data: mi.Float, channels: int, scale: float = 1.0) -> None:
+        if dr.width(data) != grid.voxel_count * channels:
+            raise IrrcacheError(
+                f"GridField: {dr.width(data)} values do not fill {grid.shape} x {channels} channels"
+            )
+        self.grid, self.data, self.channels = grid, data, channels
+        self.scale = dr.opaque(mi.Float, scale)
+        self.maximum = float(dr.max(data)[0]) * scale
+
+    def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """Trilinear value at the voxel coordinates ``u``: a Float for one channel, else a
+        Color3f.
+        """
+        values = [v * self.scale for v in self._interpolate(u, active)]
+        return values[0] if self.channels == 1 else mi.Color3f(values)
+
+    def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """Trilinear value at the world position ``p``."""
+        return self.at(self.grid.coordinates.point(p), active)
+
+    def _interpolate(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
+        nx, ny, _ = self.grid.sides
+        corners, weights, steps = zip(
+            *(stencil(c, n) for c, n in zip(u, self.grid.sides, strict=True)), strict=True
+        )
+        # One product per lookup; the other corners are a stride away, or 0 at the border.
+        base = ((corners[2] * ny + corners[1]) * nx + corners[0]) * self.channels
+        dx = dr.select(steps[0], self.channels, 0)
+        dy = dr.select(steps[1], nx * self.channels, 0)
+        dz = dr.select(steps[2], nx * ny * self.channels, 0)
+        wx, wy, wz = weights
+        result = []
+        for channel in range(self.channels):
+            faces = []
+            for z in (base, base + dz):
+                edges = []
+                for y in (z, z + dy):
+                    low, high = (
+                        dr.gather(mi.Float, self.data, mi.UInt32(i + channel), active)
+                        for i in (y, y + dx)
+                    )
+                    edges.append(dr.lerp(low, high, wx))
+                faces.append(dr.lerp(*edges, wy))
+            result.append(dr.lerp(*faces, wz))
+        return result
+
+
+Field = ConstantField | GridField

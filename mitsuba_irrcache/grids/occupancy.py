@@ -1,0 +1,92 @@
+"""Voxels of a grid that lookups in a medium can read."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
+from mitsuba_irrcache.grids.grid import Affine, Grid
+from mitsuba_irrcache.grids.majorants import Macrocells
+
+#: Share of active voxels below which they are told apart more closely, by cells of so many voxels
+#: of the medium along an edge.
+SPARSE, FINE = 0.3, 2
+
+
+def marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
+    """Of all voxels of ``grid``, whether they are among ``voxels``."""
+    marks = dr.zeros(mi.Bool, grid.voxel_count)
+    if dr.width(voxels):
+        dr.scatter(marks, mi.Bool(True), voxels)
+    return marks
+
+
+def active_voxels(medium, grid: Grid) -> mi.UInt32:
+    """Flat indices, ascending, of the voxels of ``grid`` that a lookup where ``sigma_t > 0`` can
+    read.
+
+    Every macrocell that is not empty marks the voxels whose trilinear support its box may overlap;
+    where these are few, smaller cells mark still fewer.
+    """
+    cells = medium.macrocells
+    occupied = dr.compress(cells.majorant > 0)
+    if dr.width(occupied) == 0:
+        return mi.UInt32()
+    if cells.count == 1:
+        return dr.arange(mi.UInt32, grid.voxel_count)
+    marked = _mark(cells, occupied, grid)
+    if dr.width(marked) < SPARSE * grid.voxel_count:
+        cells = Macrocells.build(medium.sigma_t, medium.boundary, FINE)
+        marked = _mark(cells, dr.compress(cells.majorant > 0), grid)
+    return marked
+
+
+def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], list[mi.Int32]]:
+    """First and last voxel along x, y, z whose trilinear support the box of each macrocell
+    meets.
+    """
+    nz, ny, nx = cells.shape
+    index = unravelled(occupied, [Divisor(nx), Divisor(ny)])
+    to_voxels = grid.coordinates.matrix @ np.linalg.inv(cells.coordinates.matrix)
+    # Border cells reach beyond their own grid, whose values are clamped: here as far as the cache.
+    corners = np.array(list(np.ndindex(2, 2, 2))) * grid.resolution
+    to_cells = np.linalg.inv(to_voxels)
+    reach = corners @ to_cells[:3, :3].T + to_cells[:3, 3]
+    start, end = np.minimum(0.0, reach.min(axis=0)), np.maximum((nx, ny, nz), reach.max(axis=0))
+    middle, half = [], []
+    for i, n, least, most in zip(index, (nx, ny, nz), start, end, strict=True):
+        low = dr.select(i == 0, dr.opaque(mi.Float, float(least)), mi.Float(i))
+        high = dr.select(i == n - 1, dr.opaque(mi.Float, float(most)), mi.Float(i) + 1)
+        middle.append(0.5 * (low + high))
+        half.append(0.5 * (high - low))
+    center = Affine(to_voxels).point(mi.Point3f(middle))
+    first, last = [], []
+    for side, c, row in zip(grid.sides, center, np.abs(to_voxels[:3, :3]), strict=True):
+        extent = sum(dr.opaque(mi.Float, float(m)) * h for m, h in zip(row, half, strict=True))
+        limit = mi.Float(side - 1)
+        # Voxel i is read from u in (i - 1/2, i + 3/2); border voxels also from beyond the grid.
+        first.append(mi.Int32(dr.clip(dr.floor(c - extent - 0.5 - 1e-3), 0, limit)))
+        last.append(mi.Int32(dr.clip(dr.floor(c + extent + 0.5 + 1e-3), 0, limit)))
+    return first, last
+
+
+@symbolic
+def _mark(cells: Macrocells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
+    """The voxels that a lookup in the ``occupied`` cells can read."""
+    (x0, y0, z0), (x1, y1, z1) = _supports(cells, occupied, grid)
+    marks = dr.zeros(mi.UInt32, grid.voxel_count)
+    x, y, z = mi.Int32(x0), mi.Int32(y0), mi.Int32(z0)
+    active = mi.Bool(True)
+    while dr.hint(active, label="active voxels"):
+        dr.scatter(marks, mi.UInt32(1), grid.index(x, y, z), active)
+        x += 1
+        wrap_x = x > x1
+        x = dr.select(wrap_x, x0, x)
+        y = dr.select(wrap_x, y + 1, y)
+        wrap_y = y > y1
+        y = dr.select(wrap_y, y0, y)
+        z = dr.select(wrap_y, z + 1, z)
+        active &= z <= z1
+    return dr.compress(marks > 0)

@@ -1,0 +1,70 @@
+"""Distances to matter, which let rays skip empty space."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.core.fast_math import clipped, greatest, least
+from mitsuba_irrcache.grids.boundary import safe_rcp
+from mitsuba_irrcache.grids.distance_transform import chebyshev
+from mitsuba_irrcache.grids.majorants import Macrocells
+from mitsuba_irrcache.media.emission import Emission
+
+#: Macrocells that rays look ahead for matter.
+REACH = 8
+
+
+class Clearance:
+    """For each macrocell the Chebyshev distance to the nearest one with extinction or light of its
+    own, in macrocells: 0 where it has some itself, at most `REACH`.
+    """
+
+    def __init__(self, cells: Macrocells, emission: Emission | None = None) -> None:
+        self.cells = cells
+        occupied = cells.majorant > 0
+        if emission is not None:
+            occupied |= emission.reaches(cells)
+        self.distance = chebyshev(occupied, cells.shape, REACH)
+
+    def along(self, ray: mi.Ray3f) -> ClearWay:
+        """What it is along a ray."""
+        return ClearWay(self, ray)
+
+
+class ClearWay:
+    """The cells along a ray, counted from where it comes from along each axis: it goes forward
+    along all.
+    """
+
+    def __init__(self, clearance: Clearance, ray: mi.Ray3f) -> None:
+        self.distance, cells = clearance.distance, clearance.cells
+        origin, direction = cells.coordinates.point(ray.o), cells.coordinates.vector(ray.d)
+        rcp = safe_rcp(direction)
+        forward = rcp > 0  # also tells 0 from -0, as the reciprocal does
+        self.sides = mi.Vector3f(*cells.sides)
+        self.origin = dr.select(forward, origin, self.sides - origin)
+        self.direction, self.rcp = dr.abs(direction), dr.abs(rcp)
+        # Flat indices, as floats: there are no more than 2^24 cells.
+        nx, ny, _ = self.sides
+        strides = mi.Vector3f(1, nx, nx * ny)
+        self.first = dr.sum(dr.select(forward, 0, (self.sides - 1) * strides))
+        self.strides = dr.select(forward, strides, -strides)
+
+    def exit(self, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Float]:
+        """Whether the place at ``t`` is empty, and the distance along the ray, at least ``t``, up
+        to which it remains so.
+        """
+        u = dr.fma(self.direction, t, self.origin)
+        # Clipped as floats: one beyond 2^31 has no integer.
+        cell = [clipped(dr.floor(c), 0.0, n - 1) for c, n in zip(u, self.sides, strict=True)]
+        index = self.first
+        for c, stride in zip(cell, self.strides, strict=True):
+            index = dr.fma(c, stride, index)
+        clearance = mi.Float(dr.gather(mi.UInt32, self.distance, mi.UInt32(index), active))
+        nearest = mi.Float(dr.inf)
+        for c, n, origin, rcp in zip(cell, self.sides, self.origin, self.rcp, strict=True):
+            wall = c + clearance
+            # Border cells reach to infinity.
+            nearest = least(dr.select(wall < n, (wall - origin) * rcp, dr.inf), nearest)
+        return clearance > 0, greatest(nearest, t)
