@@ -24,7 +24,7 @@ test: setup ## run the tests, two at a time: much of each is Python's
 
 stress: setup ## run the slow tests, try every hazard and fault, 20 minutes; ends with tables of what held
 	@status=0; $(BIN)/python -m pytest -m slow || status=1; \
-	for part in stability faults; do $(BIN)/python -m experiments.$$part.run || status=1; done; \
+	for part in stability faults; do $(BIN)/python -m experiments.robustness.$$part.run || status=1; done; \
 	exit $$status
 
 lint: setup ## check style and format

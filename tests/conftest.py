@@ -7,17 +7,21 @@ from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import pytest
 
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
-
-ISOTROPIC_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [0.6, 0.8, 1.0]}}
-SUN = {
-    "type": "directional",
-    "direction": [0.4, -1.0, 0.55],
-    "irradiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]},
-}
+from tests.support.scenes import (
+    ISOTROPIC_SKY,
+    SUN,
+    boundary,
+    description,
+    image,
+    load,
+    medium,
+    placement,
+    texture,
+    volume,
+)
 
 
 @pytest.fixture
@@ -94,94 +98,3 @@ def kernels():
                 gc.enable()
 
     return record
-
-
-def placement(
-    edges=(2.0, 2.0, 2.0), turn: float = 0.0, mirror: bool = False, center=(0.0, 0.0, 0.0)
-) -> np.ndarray:
-    """``to_world`` of the unit cube: a box with these edges about ``center``, turned by ``turn``
-    degrees about an oblique axis, and mirrored in its own x axis if asked.
-    """
-    axis = np.array([0.48, 0.64, 0.6])
-    cross = np.cross(np.eye(3), axis)
-    angle = np.deg2rad(turn)
-    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation @ np.diag(np.array(edges) * (-1.0 if mirror else 1.0, 1.0, 1.0))
-    matrix[:3, 3] = np.array(center) - 0.5 * matrix[:3, :3].sum(axis=1)
-    return matrix
-
-
-def texture(shape: tuple[int, ...], low: float, high: float, seed: int) -> np.ndarray:
-    """Random voxels in [low, high], float32, (z, y, x[, channel])."""
-    return np.random.default_rng(seed).uniform(low, high, shape).astype(np.float32)
-
-
-def volume(values, to_world: np.ndarray | None = None, **properties) -> dict:
-    """A gridvolume of an array (z, y, x[, channel]), or a constvolume of a number or a colour."""
-    if isinstance(values, np.ndarray) and values.ndim >= 3:
-        grid = mi.VolumeGrid(values.astype(np.float32).reshape(*values.shape[:3], -1))
-        place = mi.ScalarTransform4f(np.eye(4) if to_world is None else to_world)
-        return {"type": "gridvolume", "grid": grid, "raw": True, "to_world": place} | properties
-    if np.ndim(values) == 0:
-        return {"type": "constvolume", "value": float(values)}
-    colour = {"type": "rgb", "value": [float(v) for v in values]}
-    return {"type": "constvolume", "value": colour}
-
-
-def medium(sigma_t, albedo, to_world: np.ndarray | None = None, **properties) -> dict:
-    """A heterogeneous medium where ``sigma_t`` is an array, else a homogeneous one."""
-    varies = isinstance(sigma_t, np.ndarray) and sigma_t.ndim >= 3
-    return {
-        "type": "heterogeneous" if varies else "homogeneous",
-        "sigma_t": volume(sigma_t, to_world),
-        "albedo": volume(albedo, to_world),
-    } | properties
-
-
-def boundary(interior: dict, to_world: np.ndarray | None = None, kind: str = "cube") -> dict:
-    """A shape around the unit cube's image under ``to_world`` that bounds a medium; its normals
-    point outwards.
-    """
-    to_world = placement() if to_world is None else to_world
-    outwards = np.sign(np.linalg.det(to_world[:3, :3]))
-    local = np.diag([0.5 * outwards, 0.5, 0.5, 1])
-    local[:3, 3] = 0.5
-    place = to_world @ local
-    return {
-        "type": kind,
-        "to_world": mi.ScalarTransform4f(place),
-        "bsdf": {"type": "null"},
-        "interior": interior,
-    }
-
-
-def description(integrator: dict, shape: dict | None, size: int = 24, **objects) -> dict:
-    """A scene seen from (1, 1.5, -5), under a coloured sky and a sun unless ``objects`` names other
-    emitters.
-    """
-    look = mi.ScalarTransform4f().look_at([1.0, 1.5, -5.0], [0, 0, 0], [0, 1, 0])
-    film = {
-        "type": "hdrfilm",
-        "width": size,
-        "height": size,
-        "component_format": "float32",
-        "rfilter": {"type": "box"},
-    }
-    sensor = {"type": "perspective", "fov": 34.0, "to_world": look, "film": film}
-    emitters = {} if "emitter" in objects else {"emitter": ISOTROPIC_SKY, "sun": SUN}
-    shapes = {} if shape is None else {"shape": shape}
-    if integrator.get("type") == "irrcache":
-        integrator = {"solver": "path"} | integrator  # what most tests here are about
-    scene = {"type": "scene", "integrator": integrator, "sensor": sensor}
-    return scene | shapes | emitters | {k: v for k, v in objects.items() if v is not None}
-
-
-def load(integrator: dict, shape: dict | None, size: int = 24, **objects) -> mi.Scene:
-    """The scene of ``description``."""
-    return mi.load_dict(description(integrator, shape, size, **objects))
-
-
-def image(scene: mi.Scene, **options) -> np.ndarray:
-    """The rendered image, float64."""
-    return np.array(mi.render(scene, **options), dtype=np.float64)

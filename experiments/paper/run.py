@@ -10,13 +10,13 @@ from __future__ import annotations
 import time
 from importlib import import_module
 
-from experiments import methods
-from experiments.analysis import NOISE
-from experiments.figure4.run import VOLUMES
-from experiments.options import Options, parse
-from experiments.recording import Session
-from experiments.scenes import SOURCES, available
-from experiments.store import read_json
+from experiments.paper.figure4.run import VOLUMES
+from experiments.support import methods
+from experiments.support.analysis import NOISE
+from experiments.support.options import Options, parse
+from experiments.support.recording import Session
+from experiments.support.scenes import SOURCES, available
+from experiments.support.store import read_json
 from mitsuba_irrcache.compare.report import write_report
 from mitsuba_irrcache.compare.results import Measurement
 from mitsuba_irrcache.machine import doctor
@@ -40,9 +40,11 @@ def run(options: Options) -> None:
     for name in sorted(EXPERIMENTS, key=lambda name: name != RECORDED_BY):
         started = time.perf_counter()
         print(f"== {name}", flush=True)
-        import_module(f"experiments.{name}.run").run(options)
+        import_module(f"experiments.paper.{name}.run").run(options)
         spent[name] = time.perf_counter() - started
-    sections = [import_module(f"experiments.{name}.plot").plot(options) for name in EXPERIMENTS]
+    sections = [
+        import_module(f"experiments.paper.{name}.plot").plot(options) for name in EXPERIMENTS
+    ]
     page = folder / "paper.html"
     title = "Irradiance caching for volumetric data: the paper's experiments"
     write_report(page, title, findings(options), sections, failures(options), facts(options, spent))

@@ -18,7 +18,8 @@ class RootField(GridField):
 
     Irradiance falls off like an exponential inside dense matter, where it is convex and plain
     interpolation reads too much light: +1.3 % of the mean radiance on a CT head, against +0.4 % for
-    roots (experiments/accuracy). Roots are still exact for constants and of second order.
+    roots (experiments/validation/accuracy). Roots are still exact for constants and of second
+    order.
 
     Beyond the outermost centres values go on as they change from there inwards: dense matter that
     the border cuts is brightest in just that half of a voxel. Clamped, a cube of 0.6 mean free

@@ -349,8 +349,8 @@ def _check_memory(
     together: bool = False,
 ) -> None:
     """Refuses a cache that cannot be held, with what it takes to make it and to look it up; for the
-    field of its errors as much again (experiments/memory). ``together``: all channels are swept at
-    once.
+    field of its errors as much again (experiments/paper/memory). ``together``: all channels are
+    swept at once.
     """
     channels = 1 if mi.is_monochromatic else 3
     if solver == "sweep":

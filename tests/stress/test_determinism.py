@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.stability.worlds import WHITE_SKY, Camera, Matter, World, blob, scene
+from experiments.robustness.stability.worlds import WHITE_SKY, Camera, Matter, World, blob, scene
 from mitsuba_irrcache.solvers.path import solver as path_solver
 from mitsuba_irrcache.solvers.sn.tracks import SMALL
 

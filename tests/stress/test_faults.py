@@ -18,8 +18,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.faults import commands, formats, properties, run
-from experiments.stability.worlds import Camera, Matter, scene
+from experiments.robustness.faults import commands, formats, properties, run
+from experiments.robustness.stability.worlds import Camera, Matter, scene
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.io.files import ABANDONED, atomic_write
@@ -84,7 +84,7 @@ CROWDED = """
 import os, resource, sys
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from experiments.stability.worlds import Camera, Matter, scene
+from experiments.robustness.stability.worlds import Camera, Matter, scene
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 settings = {"solver": "path", "resolution": 4, "cache_spp": 8, "max_depth": 2}
 built = scene(settings | {"cache_file": sys.argv[1] + "/light.cache"}, Matter())
@@ -119,7 +119,7 @@ def test_a_full_disk_and_a_folder_that_is_read_only():
 RENDERED = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from experiments.stability.worlds import Matter, scene
+from experiments.robustness.stability.worlds import Matter, scene
 settings = {"solver": "path", "resolution": 4, "cache_spp": 8, "max_depth": 2}
 print(sum(mi.render(scene(settings, Matter()), spp=1).array))
 """

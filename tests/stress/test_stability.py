@@ -1,4 +1,5 @@
-"""Hazards from `experiments.stability`, a quick choice of them; all of them: ``make stress``."""
+"""Hazards from `experiments.robustness.stability`, a quick choice of them; all of them: ``make
+stress``."""
 
 from __future__ import annotations
 
@@ -7,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.stability import properties as p
-from experiments.stability.case import SETTINGS, Case
-from experiments.stability.hazards import cases
-from experiments.stability.run import described, run_case
-from experiments.stability.worlds import Camera, Matter, World, scene
+from experiments.robustness.stability import properties as p
+from experiments.robustness.stability.case import SETTINGS, Case
+from experiments.robustness.stability.hazards import cases
+from experiments.robustness.stability.run import described, run_case
+from experiments.robustness.stability.worlds import Camera, Matter, World, scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -45,7 +46,8 @@ def test_the_choice_names_cases_that_there_are(rgb):
 
 @pytest.mark.parametrize("hazard", CHOSEN)
 def test_hazards(hazard):
-    """The properties of `experiments.stability.properties`, both solvers, each with its bound."""
+    """The properties of `experiments.robustness.stability.properties`, both solvers, each with its
+    bound."""
     rows = []
     for case in (c for c in chosen() if c.hazard == hazard):
         rows += run_case(case, "llvm_ad_rgb", quadratures=("exponential",))

@@ -1,6 +1,6 @@
 """Images converge to the exact ones: coarse grids of high contrast, each kind of emitter and phase
-function, both solvers. The references are those of experiments/limits: quadrature of single
-scattering, and paths of all orders, without any code of irrcache.
+function, both solvers. The references are those of experiments/validation/limits: quadrature of
+single scattering, and paths of all orders, without any code of irrcache.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.limits.cases import Case
-from experiments.limits.reference import orders, single
+from experiments.validation.limits.cases import Case
+from experiments.validation.limits.reference import orders, single
 
 pytestmark = pytest.mark.usefixtures("mono")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import CacheFileError
-from tests.system.test_surfaces import check, diffuse, fog, ground, images, lamp
+from tests.support.surfaces import check, diffuse, fog, ground, images, lamp
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.kinds.run import box, smoke
+from experiments.performance.kinds.run import box, smoke
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import bake_media
 from mitsuba_irrcache.solvers.sn import multigrid, tracks

@@ -4,29 +4,22 @@ headless. Skipped where there is no Chromium.
 
 from __future__ import annotations
 
-import io
 import re
-import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.io.images import read_image
+from tests.support.viewer_windows import CLEAR, SIZE, after, difference, screen, settled
 
 pytest.importorskip("playwright")
-from experiments.viewer.browser import Browser, Window, chromium, viewer
+from experiments.performance.viewer.browser import Browser, chromium, viewer
 
 pytestmark = [
     pytest.mark.usefixtures("rgb"),
     pytest.mark.skipif(chromium() is None, reason="there is no Chromium on this machine"),
 ]
-
-SIZE = (700, 260)
-#: The part of a window, in pixels from the left, that the panel never covers.
-CLEAR = 340
 
 
 @pytest.fixture(scope="module")
@@ -45,36 +38,6 @@ def started(tmp_path_factory):
         yield address, folder
     log = (folder / "log.txt").read_text()
     assert not re.search("Traceback|rror|leaked|Warning", log), log
-
-
-def settled(window: Window) -> np.ndarray:
-    """What is on the screen once nothing better will follow: float (height, width, 3), without
-    what the panel may cover.
-    """
-    count = -1
-    while count != len(window.shown()) or not window.note().startswith("final"):
-        window.wait_for("^final", 90)
-        count = len(window.shown())
-        time.sleep(0.5)
-    return screen(window)
-
-
-def after(window: Window, act: Callable[[], None]) -> np.ndarray:
-    """What is on the screen in the end, once ``act`` has changed it."""
-    count = len(window.shown())
-    act()
-    window.wait_for_picture(count, SIZE[0])
-    return settled(window)
-
-
-def screen(window: Window, width: int = CLEAR) -> np.ndarray:
-    """So many columns of what is on the screen."""
-    shot = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
-    return np.asarray(shot, dtype=float)[:, :width]
-
-
-def difference(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.abs(a - b).mean())
 
 
 def test_looking_around(browser, started):

@@ -19,9 +19,9 @@ from mitsuba_irrcache.io.images import read_image
 from mitsuba_irrcache.volumes.transfer import load_preset
 
 pytest.importorskip("playwright")
-from experiments.viewer.browser import Browser, chromium, viewer
-from experiments.viewer.usage import use
-from tests.system.test_viewer import SIZE, after, difference, screen, settled
+from experiments.performance.viewer.browser import Browser, chromium, viewer
+from experiments.performance.viewer.usage import use
+from tests.support.viewer_windows import SIZE, after, difference, screen, settled
 
 pytestmark = [
     pytest.mark.usefixtures("rgb"),

@@ -10,7 +10,7 @@ import time
 import pytest
 
 pytest.importorskip("playwright")
-from experiments.viewer.browser import Browser, chromium, viewer
+from experiments.performance.viewer.browser import Browser, chromium, viewer
 
 pytestmark = [
     pytest.mark.usefixtures("rgb"),

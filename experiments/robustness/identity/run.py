@@ -20,8 +20,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from experiments.kinds import run as kinds
-from experiments.options import begin
+from experiments.performance.kinds import run as kinds
+from experiments.support.options import begin
 from mitsuba_irrcache.errors import IrrcacheError
 
 SIZE, SPP = 32, 4

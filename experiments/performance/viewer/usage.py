@@ -1,0 +1,185 @@
+"""The viewer in use: ``python -m experiments.performance.viewer.usage --seconds 280 --seed 0
+SCENE``.
+
+A browser drags, zooms, edits, saves, reloads, compares, and opens and closes further windows, at
+random but by a seed. Leaves how much memory the viewer had, second by second, what was done, and
+what went wrong: tracebacks in its log, errors in the browsers' consoles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from experiments.performance.viewer.browser import Browser, Window, viewer
+from experiments.performance.viewer.load import viewer_memory
+from mitsuba_irrcache.view.picture import KINDS
+
+#: Windows at once, at most.
+MOST_WINDOWS = 3
+SIZE = (512, 384)
+#: Seconds to wait for what should have come by then, on a machine that others use too.
+PATIENCE = 240
+
+
+@dataclass
+class Usage:
+    """What happened: ``memory`` as (seconds, MB), ``done`` how often by name."""
+
+    memory: list[tuple[float, float]] = field(default_factory=list)
+    done: dict[str, int] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+    pictures: int = 0
+
+    @property
+    def growth(self) -> float:
+        """MB from the second quarter of the time to the last: in the first one there is much to be
+        done for the first time. Of each its tenth percentile: what lies above it comes and goes
+        with the light and the windows that there happen to be.
+        """
+        seconds, sizes = np.array(self.memory).T
+        part = seconds / seconds[-1]
+        early = np.percentile(sizes[(part > 0.25) & (part <= 0.5)], 10)
+        return float(np.percentile(sizes[part > 0.75], 10) - early)
+
+
+class User:
+    """Does things to an open viewer, at random."""
+
+    def __init__(self, browser: Browser, address: str, rng: np.random.Generator) -> None:
+        self._browser, self._address, self._rng = browser, address, rng
+        self.usage = Usage()
+        self.windows = [browser.open(address, SIZE)]
+        self.windows[0].wait_for("per pixel", PATIENCE)
+        self._actions = {
+            self.drag: 8, self.zoom: 4, self.opacity: 4, self.density: 2, self.sun: 2,
+            self.kind: 2, self.compare: 1, self.preset: 1, self.save: 1, self.reload: 1,
+            self.open: 1, self.close: 1,
+        }  # fmt: skip
+
+    def act(self) -> None:
+        """One thing, in one of the windows."""
+        actions, weights = list(self._actions), np.array(list(self._actions.values()), float)
+        action = actions[self._rng.choice(len(actions), p=weights / weights.sum())]
+        window = self.windows[self._rng.integers(len(self.windows))]
+        action(window)
+        self.usage.done[action.__name__] = self.usage.done.get(action.__name__, 0) + 1
+
+    def drag(self, window: Window) -> None:
+        """A drag, and time to rest after some."""
+        steps = int(self._rng.integers(3, 20))
+        window.orbit(steps, float(self._rng.uniform(-4, 4)), 0.02, SIZE[0] / 3)
+        if self._rng.random() < 0.3:
+            window.wait_for("at rest|final", PATIENCE)
+
+    def zoom(self, window: Window) -> None:
+        """In or out; as far in as into the medium."""
+        window.page.mouse.move(SIZE[0] / 3, SIZE[1] / 2)
+        window.zoom(int(self._rng.choice([-4, -2, 2, 4])))
+
+    def opacity(self, window: Window) -> None:
+        """Another transfer function."""
+        window.enter("opacity", round(self._rng.uniform(0.05, 0.95), 2))
+
+    def density(self, window: Window) -> None:
+        """Sometimes one that cannot be."""
+        window.enter("density", self._rng.choice(["0.5", "1", "2", "-3"]))
+
+    def sun(self, window: Window) -> None:
+        """On and off."""
+        window.enter("sun", self._rng.choice(["0", "2", "5"]))
+
+    def kind(self, window: Window) -> None:
+        """Something else is shown."""
+        window.choose("show", str(self._rng.choice(KINDS)))
+
+    def compare(self, window: Window) -> None:
+        """With volpath, or not any more."""
+        window.tick("compare with volpath")
+
+    def preset(self, window: Window) -> None:
+        """A ready transfer function."""
+        window.choose("preset", str(self._rng.choice(["ct-bone", "ct-chest"])))
+
+    def save(self, window: Window) -> None:
+        """All that can be kept."""
+        name = window.page.get_by_role("button", name=re.compile("^(save|download)$"))
+        if not name.is_visible():
+            window.page.get_by_text("Keep", exact=True).click()
+        name.click()
+        window.page.get_by_text(re.compile("^(saved|downloaded) ")).first.wait_for(
+            timeout=1000 * PATIENCE
+        )
+
+    def reload(self, window: Window) -> None:
+        """The page, anew."""
+        window.page.reload()
+        window.wait_for("per pixel", PATIENCE)
+
+    def open(self, _: Window) -> None:
+        """One window more."""
+        if len(self.windows) < MOST_WINDOWS:
+            self.windows.append(self._browser.open(self._address, SIZE))
+            self.windows[-1].wait_for("per pixel", PATIENCE)
+
+    def close(self, window: Window) -> None:
+        """One window less, but never none."""
+        if len(self.windows) > 1:
+            self.leave(window)
+            self.windows.remove(window)
+
+    def leave(self, window: Window) -> None:
+        """Notes what a window has seen, and closes it."""
+        self.usage.errors += window.errors
+        self.usage.pictures += len(window.shown())
+        window.page.close()
+
+
+def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path) -> Usage:
+    """Uses ``irrcache view`` with these arguments for so long; what it prints goes to ``log``."""
+    rng = np.random.default_rng(seed)
+    with viewer(view, log) as address:
+        user = User(browser, address, rng)
+        usage, began = user.usage, time.monotonic()
+        while (passed := time.monotonic() - began) < seconds:
+            usage.memory.append((passed, viewer_memory()))
+            user.act()
+        usage.memory.append((time.monotonic() - began, viewer_memory()))
+        for window in user.windows:
+            user.leave(window)
+    said = log.read_text()
+    usage.errors += [line for line in said.splitlines() if re.search("Traceback|[Ee]rror", line)]
+    return usage
+
+
+def main() -> None:
+    """Uses it, and tells; what is not known is for ``irrcache view``."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=600)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("-o", "--output", type=Path, default=Path("output/viewer"))
+    args, view = parser.parse_known_args()
+    args.output.mkdir(parents=True, exist_ok=True)
+    log = args.output / f"usage{args.seed}.log"
+    with Browser() as browser:
+        usage = use(browser, view, args.seconds, args.seed, log)
+    sizes = [size for _, size in usage.memory]
+    print(", ".join(f"{count} x {name}" for name, count in sorted(usage.done.items())))
+    print(f"{usage.pictures} pictures were shown in {usage.memory[-1][0]:.0f} s")
+    print(
+        f"memory {sizes[0]:.0f} MB at first, {max(sizes):.0f} MB at most, {sizes[-1]:.0f} MB last"
+    )
+    print(f"from the second quarter to the last it grew by {usage.growth:.0f} MB")
+    print("errors:", "\n".join(usage.errors) or "none")
+    found = vars(usage) | {"growth": usage.growth}
+    (args.output / f"usage{args.seed}.json").write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Valid files of all formats, small ones, and their readers; each reader is a plain function, since
+it is sent to another process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import SimpleITK
+
+from experiments.robustness.faults import commands, properties
+from experiments.robustness.faults.fuzz import lying_cache, mutated, mutated_gzip
+from mitsuba_irrcache.io.mitsuba_vol import write_vol
+from mitsuba_irrcache.volumes.readers import read_volume
+from mitsuba_irrcache.volumes.transfer import load_preset, load_transfer_function
+
+
+@dataclass(frozen=True)
+class Format:
+    """How to make a valid file, damage it, and read it."""
+
+    name: str
+    make: Callable[[Path], None]
+    read: Callable[[Path], object]
+    mutate: Callable = mutated
+
+
+def read_cache(path: Path) -> None:
+    """Loads a cache, and uses all that it holds."""
+    import mitsuba as mi
+
+    if mi.variant() != "llvm_ad_rgb":
+        mi.set_variant("llvm_ad_rgb")
+    from mitsuba_irrcache.cache.volume import IrradianceCache
+
+    IrradianceCache.description_of(path)
+    cache = IrradianceCache.load(path)
+    if cache.grid.voxel_count <= 1 << 20:  # else the scene's own grid is another one
+        field = cache.field()
+        assert np.isfinite(np.array(field.data)).all()
+
+
+def _write_cache(path: Path) -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    from mitsuba_irrcache.cache.volume import IrradianceCache
+    from mitsuba_irrcache.grids.grid import Grid
+
+    cache = IrradianceCache(Grid((3, 4, 5), np.eye(4)), dr.arange(mi.UInt32, 60), 3, -1, {"a": "b"})
+    double = dr.float64_array_t(mi.Float)
+    sums = tuple(double(np.linspace(1, 2, 60).tolist()) for _ in range(6))
+    cache.add(3, 16, [(sums, sums[:3])])
+    cache.save(path)
+
+
+def _write_image(path: Path) -> None:
+    values = (np.arange(3 * 4 * 5).reshape(3, 4, 5) - 20).astype("int16")
+    SimpleITK.WriteImage(SimpleITK.GetImageFromArray(values), str(path))
+
+
+def _write_vol(path: Path) -> None:
+    write_vol(path, np.linspace(0, 1, 60).reshape(3, 4, 5))
+
+
+def _write_dicom(path: Path) -> None:
+    """A slice; the other ones stay as they are."""
+    writer = SimpleITK.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for index in range(3):
+        image = SimpleITK.GetImageFromArray(np.full((6, 5), 20 * index, dtype=np.int16))
+        tags = {
+            "0008|0060": "CT",
+            "0008|0016": "1.2.840.10008.5.1.4.1.1.2",
+            "0008|0018": f"1.2.826.0.1.9.{index + 1}",
+            "0020|000e": "1.2.826.0.1.9",
+            "0020|0032": f"0\\0\\{index}",
+            "0020|0037": "1\\0\\0\\0\\1\\0",
+        }
+        for key, value in tags.items():
+            image.SetMetaData(key, value)
+        writer.SetFileName(str(path.parent / f"{index}.dcm") if index else str(path))
+        writer.Execute(image)
+
+
+def read_series(path: Path) -> object:
+    """The folder that a slice is in."""
+    return read_volume(path.parent)
+
+
+def _write_transfer_function(path: Path) -> None:
+    load_preset("ct-bone").save(path)
+
+
+FORMATS = (
+    Format("light.cache", _write_cache, read_cache, lying_cache),
+    Format("a.nrrd", _write_image, read_volume),
+    Format("a.nii", _write_image, read_volume),
+    Format("a.nii.gz", _write_image, read_volume, mutated_gzip),
+    Format("a.mha", _write_image, read_volume),
+    Format("a.vol", _write_vol, read_volume),
+    Format("slice.dcm", _write_dicom, read_series),
+    Format("transfer.json", _write_transfer_function, load_transfer_function),
+    Format(
+        "properties.json",
+        properties.write_valid,
+        properties.render_case,
+        properties.mutated_properties,
+    ),
+    Format("command.json", commands.write_valid, commands.run_case, commands.mutated_command),
+)

@@ -1,0 +1,345 @@
+"""Faults as they are made: each a line of the library that is wrong in one place, with the tests
+that should say so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+CLOSED_FORMS = "tests/correctness/test_closed_forms.py"
+SWEEP = "tests/system/test_sweep.py"
+UNBIASED = "tests/system/test_unbiased.py"
+PROJECTION = "tests/unit/render/test_raymarch.py"
+CACHE = "tests/unit/cache/test_volume.py"
+MOMENTS = "tests/unit/solvers/sn/test_moments.py"
+PHASE = "tests/system/test_phase.py"
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """``old``, which occurs once in ``file`` (of mitsuba_irrcache), is replaced by ``new``."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+MUTANTS = (
+    Mutant(
+        "a factor 4 pi dropped (projection)",
+        "render/raymarch.py",
+        "albedo * phi * dr.inv_four_pi, known",
+        "albedo * phi, known",
+        (CLOSED_FORMS,),
+    ),
+    Mutant(
+        "1 % of what is scattered lost (sweep)",
+        "solvers/sn/multigrid.py",
+        "phi * self.albedo * dr.inv_four_pi",
+        "phi * self.albedo * (0.99 * dr.inv_four_pi)",
+        (SWEEP,),
+    ),
+    Mutant(
+        "cache voxels shifted by half a voxel",
+        "grids/grid.py",
+        "*self.places(index)) + 0.5)",
+        "*self.places(index)))",
+        (CLOSED_FORMS,),
+    ),
+    Mutant(
+        "lookups shifted by half a voxel",
+        "grids/grid.py",
+        "s = clipped(u - 0.5, 0.0",
+        "s = clipped(u, 0.0",
+        ("tests/unit/grids/test_grid.py",),
+    ),
+    Mutant(
+        "what rays read of a volume always rounded down",
+        "grids/packed_fields.py",
+        " + (noise >> (32 - DROPPED))",
+        "",
+        ("tests/unit/grids/test_grid.py",),
+    ),
+    Mutant(
+        "a bias of e^-x that adds up over steps",
+        "core/fast_math.py",
+        "dr.fma(value, part, 1))",
+        "dr.fma(value, part, 0.9999998))",
+        ("tests/unit/core/test_fast_math.py",),
+    ),
+    Mutant(
+        "extinction of coarse caches shifted by half a voxel (sweep)",
+        "solvers/sn/tracks.py",
+        "self.lower[k] * ratio[k] - 0.5, last",
+        "self.lower[k] * ratio[k], last",
+        (SWEEP,),
+    ),
+    Mutant(
+        "the cosine of the slope forgotten: length of a line in a slice (sweep)",
+        "solvers/sn/tracks.py",
+        "[1 / abs(velocity[axis]), weights[i]",
+        "[1 / np.linalg.norm(velocity), weights[i]",
+        (SWEEP,),
+    ),
+    Mutant(
+        "the cosine of the slope forgotten: area of a line (sweep)",
+        "solvers/sn/kernel.py",
+        "mi.Vector4f(0, middle, lost * area, count * tau * area)",
+        "mi.Vector4f(0, middle, lost, count * tau)",
+        (SWEEP,),
+    ),
+    Mutant(
+        "the albedo of a voxel is its plain mean, not that of its collisions (sweep)",
+        "solvers/sn/resampling.py",
+        "sigma_t = mi.Spectrum(medium.sigma_t.at_world(p)) * weight",
+        "sigma_t = mi.Spectrum(weight)",
+        ("tests/unit/solvers/sn/test_resampling.py",),
+    ),
+    Mutant(
+        "lines that leave through a side go on with their light (sweep)",
+        "solvers/sn/kernel.py",
+        "return voxel, position, dr.select(outside, self.since(position), 1.0)",
+        "return voxel, position, dr.select(outside, mi.Float(1.0), 1.0)",
+        (SWEEP,),
+    ),
+    Mutant(
+        "every other pair of directions forgotten (sweep)",
+        "solvers/sn/kernel.py",
+        "place += step",
+        "place += 2 * step",
+        ("tests/unit/solvers/sn/test_tracks.py",),
+    ),
+    Mutant(
+        "samples on the wrong side of their pixel's row (film)",
+        "render/pixel_filter.py",
+        "(dr.opaque(mi.Int32, samples.border) - down)",
+        "(dr.opaque(mi.Int32, samples.border) + down)",
+        ("tests/unit/render/test_pixel_filter.py",),
+    ),
+    Mutant(
+        "sharpening with the wrong sign (sweep)",
+        "solvers/sn/tracks.py",
+        "2 * here - below - above, 0)",
+        "below + above - 2 * here, 0)",
+        (SWEEP,),
+    ),
+    Mutant(
+        "light of an environment from the other side (sweep)",
+        "solvers/sn/incident.py",
+        "interaction.wi = mi.Vector3f(directions.T",
+        "interaction.wi = mi.Vector3f(-directions.T",
+        (SWEEP,),
+    ),
+    Mutant(
+        "the last segment skipped",
+        "render/raymarch.py",
+        "active &= (t < far) & (~empty",
+        "active &= (t + step < far) & (~empty",
+        (PROJECTION,),
+    ),
+    Mutant(
+        "the curvature of a segment with the wrong sign",
+        "render/quadrature.py",
+        "greatest(1 - sag, 0)",
+        "greatest(1 + sag, 0)",
+        (PROJECTION,),
+    ),
+    Mutant(
+        "rays stopped at 5 % of their light",
+        "render/raymarch.py",
+        "EARLY_STOP = 1e-4",
+        "EARLY_STOP = 5e-2",
+        (PROJECTION,),
+    ),
+    Mutant(
+        "the background in front of the medium",
+        "render/camera.py",
+        "background = self._left_of(transmittance, ray.d) * background + emitted",
+        "background = background + emitted",
+        (CLOSED_FORMS,),
+    ),
+    Mutant(
+        "one order of scattering too many (path)",
+        "solvers/path/solver.py",
+        "order = mi.UInt32(1)",
+        "order = mi.UInt32(0)",
+        (UNBIASED,),
+    ),
+    Mutant(
+        "a bounce counted twice (path)",
+        "solvers/path/solver.py",
+        "scattered += dr.select(active, weight * light, 0)",
+        "scattered += dr.select(active, weight * light * dr.select(order == 2, 2, 1), 0)",
+        (UNBIASED,),
+    ),
+    Mutant(
+        "the albedo forgotten (path)",
+        "solvers/path/solver.py",
+        "weight *= medium.albedo.at_world(position, active)",
+        "weight *= 1",
+        (UNBIASED,),
+    ),
+    Mutant(
+        "roulette without its weight (path)",
+        "solvers/path/solver.py",
+        "            weight /= survival\n",
+        "",
+        (UNBIASED,),
+    ),
+    Mutant(
+        "1 % of all collisions missed (path)",
+        "transport/tracking.py",
+        "choice * majorant < sigma_t)",
+        "choice * majorant < 0.99 * sigma_t)",
+        ("tests/unit/transport/test_tracking.py", UNBIASED, CLOSED_FORMS),
+    ),
+    Mutant(
+        "roulette without its weight (transmittance)",
+        "transport/tracking.py",
+        "result * (ROULETTE_BELOW / largest), 0)",
+        "result, 0)",
+        ("tests/unit/transport/test_tracking.py", UNBIASED),
+    ),
+    Mutant(
+        "emitters counted twice: sampled and met (surfaces)",
+        "transport/path.py",
+        "share = dr.select(sampled, power_heuristic(pdf, density), 1)",
+        "share = mi.Float(1)",
+        ("tests/system/test_surfaces.py",),
+    ),
+    Mutant(
+        "light scattered backwards (phase functions)",
+        "media/phase.py",
+        "found.p, found.wi = p, -direction",
+        "found.p, found.wi = p, direction",
+        ("tests/system/test_phase.py",),
+    ),
+    Mutant(
+        "standard errors of samples, not of batches",
+        "cache/volume.py",
+        "spread / (n * (n - 1))",
+        "spread / (n * (n * self.batch - 1))",
+        (CACHE,),
+    ),
+    Mutant(
+        "roots of noisy values not made up for",
+        "cache/statistics.py",
+        "return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)",
+        "return 1 + 0 * variance",
+        (CACHE,),
+    ),
+    Mutant(
+        "means of two caches not weighted by their samples",
+        "cache/volume.py",
+        "(n * more / (n + more))",
+        "(n * more / (n + more + 1))",
+        (CACHE,),
+    ),
+    Mutant(
+        "the ends of a segment exchanged (falloff of lamps)",
+        "lights/falloff.py",
+        "angle = dr.atan2(q * length, dr.fma(x, y, q * q)) / q",
+        "x, y = -y, -x; angle = dr.atan2(q * length, dr.fma(x, y, q * q)) / q",
+        ("tests/unit/lights/test_falloff.py",),
+    ),
+    Mutant(
+        "light in the voxel of a lamp as in its middle (sweep)",
+        "solvers/sn/solver.py",
+        "(1 if id(irradiance) in means else self._spread)",
+        "1",
+        ("tests/system/test_lamps.py",),
+    ),
+    Mutant(
+        "light from the opposite side (moments)",
+        "solvers/sn/moments.py",
+        "even, odd = there + back, there - back",
+        "even, odd = there + back, back - there",
+        (MOMENTS,),
+    ),
+    Mutant(
+        "what lines lose not per depth (moments)",
+        "solvers/sn/moments.py",
+        "dr.select(v.w > 0, v.z / v.w, 0)",
+        "v.z",
+        (PHASE,),
+    ),
+    Mutant(
+        "light of narrow lights twice (moments)",
+        "cache/angular.py",
+        "light = light - own",
+        "light = light - 0 * own",
+        (PHASE,),
+    ),
+    Mutant(
+        "light that comes back to a medium seen from any side (moments)",
+        "solvers/sn/moments.py",
+        "for factor in basis[: self.moments.count - 1]:",
+        "for factor in ():",
+        (PHASE,),
+    ),
+    Mutant(
+        "wide lamps as narrow as points (directional)",
+        "cache/angular.py",
+        "left *= ratio",
+        "left *= 1",
+        ("tests/unit/cache/test_angular.py",),
+    ),
+    Mutant(
+        "forward peaks of other media taken away, too",
+        "transport/path.py",
+        "grid if grid is medium else grid.with_peak",
+        "grid",
+        ("tests/unit/media/test_delta_m.py",),
+    ),
+    Mutant(
+        "suns of skies as bright as directions met them",
+        "solvers/sn/incident.py",
+        "light[number == k] *= factor",
+        "light[number == k] *= 1",
+        ("tests/system/test_sweep.py",),
+    ),
+    Mutant(
+        "light passes a sliver of its medium on its way in (arrivals)",
+        "solvers/sn/boundary_condition.py",
+        "out_of(around.scene, around.others, ray",
+        "out_of(around.scene, around.media, ray",
+        ("tests/stress/test_stability.py",),
+    ),
+    Mutant(
+        "moments of lamps forgotten (directional sweep)",
+        "solvers/sn/anisotropic.py",
+        "moments.part(smooth, k) + sum(light[k] for light in others)",
+        "moments.part(smooth, k)",
+        (PHASE,),
+    ),
+    Mutant(
+        "a forward peak of what is absorbed, too",
+        "media/delta_m.py",
+        "s * (1 - share * a)",
+        "s * (1 - share)",
+        ("tests/unit/media/test_delta_m.py",),
+    ),
+    Mutant(
+        "interpolated roots do not keep the light",
+        "cache/volume.py",
+        "values = conserving(self.grid, values, marked(self.grid, self.active), channels)",
+        "values = values + 0",
+        ("tests/system/test_lamps.py",),
+    ),
+    Mutant(
+        "interpolated roots keep half of the light that bends",
+        "cache/conservative.py",
+        "dr.select(inside, bend / 6, 0)",
+        "dr.select(inside, bend / 12, 0)",
+        ("tests/unit/cache/test_conservative.py",),
+    ),
+    Mutant(
+        "directions of passes not even together",
+        "solvers/sn/angular_quadrature.py",
+        "points = points @ _rotation(rng).T",
+        "points = points",
+        ("tests/unit/solvers/sn/test_angular_quadrature.py",),
+    ),
+)

@@ -1,0 +1,105 @@
+"""Mutants that people made who had not seen the tests, and that no test of the time detected."""
+
+from __future__ import annotations
+
+from experiments.robustness.mutation.mutants import Mutant
+
+NEIGHBOURS = "tests/unit/cache/test_conservative_at_every_voxel.py"
+FILTER = "tests/unit/render/test_denoise_symmetry_and_rejection.py"
+ERRORS = "tests/unit/cache/test_uncertainty_of_lookups.py"
+SIMILARITY = "tests/unit/media/test_delta_m_narrow_lights.py"
+SEGMENTS = "tests/unit/render/test_raymarch_segments.py"
+
+OUTSIDE = (
+    Mutant(
+        "the last voxels but one keep plain roots (conservation)",
+        "cache/conservative.py",
+        "(place + 1 < mi.UInt32(side))",
+        "(place + 2 < mi.UInt32(side))",
+        (NEIGHBOURS,),
+    ),
+    Mutant(
+        "only the lower neighbour has to be known (conservation)",
+        "cache/conservative.py",
+        "for there in (voxel - stride, voxel + stride):",
+        "for there in (voxel - stride,):",
+        (NEIGHBOURS,),
+    ),
+    Mutant(
+        "the filter is applied although its risk is larger than without",
+        "render/denoise.py",
+        "if risks[least] >= np.array(dr.block_sum(unfiltered, count))[0]:",
+        "if False:",
+        (FILTER,),
+    ),
+    Mutant(
+        "rows of the filter's window without the stride",
+        "render/denoise.py",
+        "y + dy * stride",
+        "y + dy",
+        (FILTER,),
+    ),
+    Mutant(
+        "errors that all voxels share have random signs",
+        "cache/uncertainty.py",
+        "random = random & 0",
+        "random = random | 0",
+        (ERRORS,),
+    ),
+    Mutant(
+        "the inverse square of lamps missing in the error",
+        "cache/uncertainty.py",
+        "phi * smooth, error * smooth",
+        "phi * smooth, error",
+        (ERRORS,),
+    ),
+    Mutant(
+        "the inverse square of lamps missing in light and error",
+        "cache/uncertainty.py",
+        "smooth = 1 / cache.falloff.of_voxels(cache.active)",
+        "smooth = 1",
+        (ERRORS,),
+    ),
+    Mutant(
+        "spheres that surround what is up to 14 % outside",
+        "grids/boundary.py",
+        "return dr.squared_norm(local) <= 1\n",
+        "return dr.squared_norm(local) <= 1.3\n",
+        ("tests/unit/grids/test_boundary_containment.py",),
+    ),
+    Mutant(
+        "light in a forward peak is never scattered",
+        "media/delta_m.py",
+        "medium.straight = _mean(sigma_t) / remaining if remaining else 1.0",
+        "medium.straight = 1.0",
+        (SIMILARITY,),
+    ),
+    Mutant(
+        "emission begins before the ray does",
+        "media/emission.py",
+        "return dr.maximum(near, enters), dr",
+        "return enters, dr",
+        (SEGMENTS,),
+    ),
+    Mutant(
+        "steps of 64 where little light is left",
+        "render/raymarch.py",
+        "dr.select(left > COARSEST * sofar, stride, 4)",
+        "dr.select(left > COARSEST * sofar, stride, 64)",
+        (SEGMENTS,),
+    ),
+    Mutant(
+        "a segment that enters matter has the light of its dark end",
+        "render/raymarch.py",
+        "            source = dr.select(enters, next_source, source)\n",
+        "",
+        (SEGMENTS,),
+    ),
+    Mutant(
+        "a segment that leaves matter has the light of its dark end",
+        "render/raymarch.py",
+        "next_source = dr.select(leaves, source, next_source)",
+        "next_source = next_source + 0",
+        (SEGMENTS,),
+    ),
+)

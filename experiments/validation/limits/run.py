@@ -1,0 +1,157 @@
+"""Whether images converge to the exact ones as resolution and cache_spp grow and step falls.
+
+    python -m experiments.validation.limits.run [--only TEXT] [--solver sweep|path] [--budget 280]
+        [--force]
+
+Coarse grids of high contrast, every emitter and phase function, both solvers (see cases.py). For
+max_depth 2 the reference is a quadrature without noise; for others Monte Carlo with a standard
+error of about 0.05 % (see reference.py). Printed is the error of the mean of the image in % of it,
+and the RMSE of its pixels where the reference has no noise, for one setting after the other; of the
+last two resolutions what errors of order 2 would leave in the limit; and the standard error of all
+this by caches of other seeds. A case *converges* where the last error, or the limit, is within
+0.1 % or three standard errors.
+
+Rows are kept in output/limits/results.json; no case is begun after ``--budget`` seconds.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+
+import mitsuba as mi
+import numpy as np
+
+import mitsuba_irrcache  # noqa: F401 (registers the plugin)
+from experiments.support.options import begin, parser_of
+from experiments.support.store import Store
+from experiments.validation.limits.cases import Case, cases
+from experiments.validation.limits.reference import orders, single
+from mitsuba_irrcache.errors import IrrcacheError, origin
+
+#: Resolutions with samples per voxel; the last two with several seeds. With few samples images of
+#: ``path`` are too dark (16 at a resolution of 64: 0.5 to 1 %, some 4 % in a narrow beam), which
+#: vanishes with the noise of the samples; probably since roots of light are interpolated.
+SWEEP = ((16, 512), (32, 512), (64, 512), (128, 512))
+PATH = ((16, 64), (32, 64), (64, 64))
+#: Settings of slow sweeps: anisotropic phase functions, or many orders of scattering.
+LONG_SWEEP = SWEEP[:3]
+#: Steps at the second but last resolution, beside 1.
+STEPS = (0.5, 0.25)
+SEEDS, SPP, PATHS = 2, 256, 1 << 22
+BOUND, SIGMAS = 1e-3, 3.0
+
+
+def measure(case: Case, solver: str, store: Store) -> dict:
+    """A row: errors by setting, their noise, and the seconds in all."""
+    started = time.perf_counter()
+    known = store.row(f"reference: {case.name}", partial(reference, case))
+    pixels = None if known["pixels"] is None else np.array(known["pixels"])
+    settings = SWEEP if solver == "sweep" else PATH
+    if solver == "sweep" and (case.max_depth != 2 or case.phase != "isotropic"):
+        settings = LONG_SWEEP
+    found = []
+    for resolution, samples in settings:
+        seeds = SEEDS if (resolution, samples) in settings[-2:] else 1
+        row = {"resolution": resolution, "cache_spp": samples, "step": 1.0}
+        found.append(row | error(case, solver, row, seeds, known["mean"], pixels))
+    resolution, samples = settings[-2]
+    for step in STEPS:
+        row = {"resolution": resolution, "cache_spp": samples, "step": step}
+        found.append(row | error(case, solver, row, SEEDS, known["mean"], pixels))
+    return {"errors": found, "noise": known["noise"], "seconds": time.perf_counter() - started}
+
+
+def reference(case: Case) -> dict:
+    """The mean, its relative standard error, and the pixels if these have no noise."""
+    if case.max_depth == 2:
+        pixels = single(case, 3, 64)
+        return {"mean": pixels.mean(), "noise": 0.0, "pixels": pixels.tolist()}
+    mean, noise = orders(case, PATHS)
+    return {"mean": mean, "noise": noise / mean, "pixels": None}
+
+
+def error(case: Case, solver: str, settings: dict, seeds: int, mean: float, pixels) -> dict:
+    """Relative errors of the mean, by cache seeds, and of the pixels of the mean of the images. Of
+    a point light that is seen, pixels next to it are left out.
+    """
+    known = None if pixels is None else pixels < (np.inf if case.position is None else 4 * mean)
+    images = []
+    for seed in range(seeds):
+        scene = case.scene(solver=solver, cache_seed=seed, **settings)
+        images.append(np.array(mi.render(scene, spp=SPP, seed=seed), dtype=np.float64)[..., 0])
+    if known is None:
+        return {"means": [float(i.mean() / mean - 1) for i in images], "rmse": None}
+    scale = pixels[known].mean()
+    apart = np.mean(images, axis=0)[known] - pixels[known]
+    means = [float(i[known].mean() / scale - 1) for i in images]
+    return {"means": means, "rmse": float(np.sqrt((apart**2).mean()) / scale)}
+
+
+def summary(row: dict) -> dict:
+    """The error at the finest resolution, in the limit, the standard error of the former, and
+    whether it converges.
+    """
+    plain = [e for e in row["errors"] if e["step"] == 1]
+    coarse, fine = (float(np.mean(e["means"])) for e in plain[-2:])
+    ratio = (plain[-1]["resolution"] / plain[-2]["resolution"]) ** 2
+    limit = fine + (fine - coarse) / (ratio - 1)
+    spreads = [np.std(e["means"], ddof=1) for e in row["errors"] if len(e["means"]) > 1]
+    noise = float(np.hypot(np.sqrt(np.mean(np.square(spreads)) / SEEDS), row["noise"]))
+    least = min(abs(fine), abs(limit))
+    verdict = "converges" if least < BOUND else "undecided" if least < SIGMAS * noise else "NO"
+    return {"fine": fine, "limit": limit, "noise": noise, "verdict": verdict}
+
+
+def line(name: str, row: dict) -> str:
+    """A row of the table."""
+    if "refused" in row:
+        return f"{name:55} refused: {row['refused'][:90]}"
+    parts = []
+    for e in row["errors"]:
+        rmse = "" if e["rmse"] is None else f" ({100 * e['rmse']:.2f})"
+        step = "" if e["step"] == 1 else f"/{e['step']:g}"
+        parts.append(f"{e['resolution']}{step}: {100 * np.mean(e['means']):+.2f}{rmse}")
+    found = summary(row)
+    return (
+        f"{name:55} {found['verdict']:9} limit {100 * found['limit']:+.3f} +- "
+        f"{100 * found['noise']:.3f} | " + ", ".join(parts)
+    )
+
+
+def attempt(case: Case, solver: str, store: Store) -> dict:
+    """A row, or why the scene is refused."""
+    try:
+        return measure(case, solver, store)
+    except RuntimeError as problem:
+        if not isinstance(origin(problem), IrrcacheError):
+            raise
+        return {"refused": str(origin(problem))}
+
+
+def run() -> None:
+    """Computes the rows that are missing, and prints the table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--solver", choices=("sweep", "path"), help="one of the two")
+    parser.add_argument("--budget", type=float, default=280, help="no case is begun later")
+    args = parser.parse_args()
+    begin()
+    mi.set_variant("llvm_ad_mono")
+    mi.set_log_level(mi.LogLevel.Error)
+    folder = args.output / "limits"
+    folder.mkdir(parents=True, exist_ok=True)
+    store, started = Store(folder / "results.json", args.force), time.perf_counter()
+    for solver in (args.solver,) if args.solver else ("sweep", "path"):
+        for case in cases():
+            name = f"{solver}: {case.name}"
+            if args.only not in name:
+                continue
+            if name not in store.rows and time.perf_counter() - started > args.budget:
+                print(f"{name:55} not computed yet; run again", flush=True)
+                continue
+            print(line(name, store.row(name, partial(attempt, case, solver, store))), flush=True)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,74 @@
+"""A scene file for the viewer, cameras around it, and a screen that keeps its pictures."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import Picture
+
+SCENE = """<scene version="3.0.0">
+    <integrator type="irrcache"> <integer name="max_depth" value="2"/> </integrator>
+    <sensor type="perspective">
+        <float name="fov" value="40"/>
+        <transform name="to_world">
+            <lookat origin="0.5, -5, 1.5" target="0, 0, 0" up="0, 0, 1"/>
+        </transform>
+    </sensor>
+    <emitter type="constant"> <rgb name="radiance" value="0.3, 0.4, 0.5"/> </emitter>
+    <emitter type="directional">
+        <vector name="direction" x="1" y="0.5" z="-1"/>
+        <rgb name="irradiance" value="3, 2.5, 2"/>
+    </emitter>
+    <medium type="heterogeneous" id="cloud">
+        <volume name="sigma_t" type="gridvolume">
+            <string name="filename" value="density.vol"/>
+            <transform name="to_world">
+                <matrix value="2 0 0 -1 0 2 0 -1 0 0 2 -1 0 0 0 1"/>
+            </transform>
+        </volume>
+        <rgb name="albedo" value="0.9, 0.8, 0.6"/>
+    </medium>
+    <shape type="cube"> <bsdf type="null"/> <ref name="interior" id="cloud"/> </shape>
+</scene>
+"""
+
+
+SIZE = (48, 40)
+
+
+class Screen:
+    """Keeps the pictures that a window gets."""
+
+    def __init__(self) -> None:
+        self.pictures: list[Picture] = []
+        self._news = threading.Condition()
+
+    def show(self, picture: Picture) -> None:
+        with self._news:
+            self.pictures.append(picture)
+            self._news.notify_all()
+
+    def wait(self, condition, seconds: float = 20) -> Picture:
+        """The first picture from now on that fulfils ``condition``, or the last one if it does."""
+        with self._news:
+            found = self._news.wait_for(
+                lambda: self.pictures and condition(self.pictures[-1]) and self.pictures[-1],
+                seconds,
+            )
+        assert found, f"none of {len(self.pictures)} pictures"
+        return found
+
+
+def front(session: Session) -> Camera:
+    return next(iter(session.cameras.values()))
+
+
+def turned(camera: Camera, degrees: float) -> Camera:
+    a = np.radians(degrees)
+    turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    return replace(camera, position=tuple((turn @ np.array(camera.position)).tolist()))

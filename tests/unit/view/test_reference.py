@@ -1,0 +1,176 @@
+"""The reference beside a picture: it is what ``volpath`` renders of the scene that is saved."""
+
+from __future__ import annotations
+
+import gc
+import time
+import weakref
+from collections.abc import Iterator
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.document import Document
+from mitsuba_irrcache.view.light import Light
+from mitsuba_irrcache.view.reference import Reference
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import Picture, View
+from tests.support.viewer_session import SCENE, SIZE, Screen, front, turned
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+GROUND = """<shape type="rectangle">
+        <transform name="to_world"> <scale value="4"/> <translate z="-1.2"/> </transform>
+        <bsdf type="diffuse"> <rgb name="reflectance" value="0.6, 0.5, 0.4"/> </bsdf>
+    </shape>
+</scene>"""
+SCENES = {"cloud": SCENE, "cloud over the ground": SCENE.replace("</scene>", GROUND)}
+#: Samples per pixel; 16 squares of pixels are compared at 4 standard errors
+SAMPLES, SQUARES = 32, 4
+
+
+@pytest.fixture
+def document(request, tmp_path, scenes) -> Document:
+    density = np.zeros((16, 16, 16, 1), np.float32)
+    density[3:13, 3:13, 3:13] = scenes.texture((10, 10, 10, 1), 0.5, 6, 1)
+    mi.VolumeGrid(density).write(str(tmp_path / "density.vol"))
+    (tmp_path / "scene.xml").write_text(SCENES[getattr(request, "param", "cloud")])
+    return Document.load(tmp_path / "scene.xml")
+
+
+def reference_of(document: Document, camera: Camera, samples: int) -> Reference:
+    light = Light(document.scene(), document.settings, document.seeing)
+    found = Reference(light, camera, SIZE)
+    while found.samples < samples:
+        found.refine()
+    return found
+
+
+def squares(image: np.ndarray) -> np.ndarray:
+    height, width, _ = image.shape
+    return image.reshape(SQUARES, height // SQUARES, SQUARES, width // SQUARES, 3).mean((1, 3))
+
+
+@pytest.mark.parametrize(
+    ("document", "position"),
+    [
+        ("cloud", (0.5, -5.0, 1.5)),
+        ("cloud", (0.1, -0.4, 0.2)),
+        ("cloud over the ground", (0.5, -5.0, 1.5)),
+    ],
+    indirect=["document"],
+)
+def test_it_is_volpaths_image_of_the_saved_scene(document, tmp_path, position):
+    """From outside and inside of the medium."""
+    camera = Camera(position, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
+    inside = position[1] > -1
+    saved = tmp_path / "saved.xml"
+    document.save(saved, camera, SIZE, inside, {}, "")
+    scene = mi.load_file(str(saved))
+    stock = mi.load_dict({"type": "volpath", "max_depth": document.settings.max_depth})
+    several = [
+        squares(np.array(mi.render(scene, integrator=stock, spp=SAMPLES // 4, seed=k)))
+        for k in range(8)
+    ]
+    found = squares(reference_of(document, camera, SAMPLES).radiance())
+    # The mean of the several images has half the variance of ours; 7 degrees of freedom, 48 values.
+    error = np.sqrt(3 * np.var(several, axis=0, ddof=1) / 8)
+    assert np.all(np.abs(found - np.mean(several, axis=0)) < 7 * error + 1e-6)
+    assert np.abs(found.mean() / np.mean(several) - 1) < 0.02
+
+
+def test_errors_are_told_without_its_own_noise(document):
+    """Of an image that is off by a known amount, with few samples."""
+    camera = Camera((0.5, -5.0, 1.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
+    exact = reference_of(document, camera, 96).radiance()
+    few = Reference(Light(document.scene(), document.settings, document.seeing), camera, SIZE)
+    assert few.error_of(exact) is None
+    while few.samples < 2:
+        few.refine()
+    off = 0.1 * exact.mean() * (-1) ** np.indices(exact.shape[:2]).sum(axis=0)[..., None]
+    error, resolved = few.error_of(exact + off)
+    noise = np.sqrt(((few.radiance() - exact) ** 2).mean()) / exact.mean()
+    assert error == pytest.approx(0.1, abs=0.02)
+    assert resolved < 0.5 * noise
+
+
+def test_it_is_beside_the_picture_until_something_changes(document):
+    """The same image on both sides, with its error; anew for another camera or scene, and while a
+    camera moves there is none.
+    """
+    session = Session(document)
+    session.target_error = 0.02
+    session.start()
+    try:
+        screen, wide = Screen(), (2 * SIZE[0], SIZE[1])
+        window = session.open(screen.show)
+        view = View(front(session), wide, compared=True)
+        session.look(window, view)
+        picture = screen.wait(lambda p: "RMSE" in p.comparison and _samples(p) >= 16)
+        left, right = np.split(picture.pixels.astype(float), 2, axis=1)
+        assert left.std() > 20 and np.abs(left.mean() - right.mean()) < 3
+        assert np.corrcoef(left.ravel(), right.ravel())[0, 1] > 0.95
+        count = len(screen.pictures)
+        moving: list[Picture] = []
+        for degrees in range(1, 200):  # as a mouse would
+            session.look(window, replace(view, camera=turned(front(session), degrees)))
+            time.sleep(0.02)
+            moving = [p for p in screen.pictures[count:] if p.moving]
+            if moving:
+                break
+        screen.wait(lambda p: p.view.camera != view.camera and "RMSE" in p.comparison)
+        assert moving and not np.any(np.split(moving[0].pixels, 2, axis=1)[1])
+        other = [p for p in screen.pictures[count:] if p.view.camera != view.camera]
+        assert _samples(next(p for p in other if p.comparison)) < 8
+        count = len(screen.pictures)
+        session.edit(lambda document: document.set_density(0.5))
+        screen.wait(lambda p: len(screen.pictures) > count + 3 and "RMSE" in p.comparison)
+        assert min(_samples(p) for p in screen.pictures[count:] if p.comparison) < 8
+    finally:
+        session.stop()
+        dr.sync_thread()
+
+
+@pytest.mark.parametrize("document", list(SCENES), indirect=True)
+def test_light_that_is_not_seen_any_more_is_freed(document, uncollected):
+    """With its medium, once there is other light, in a window that has compared it before."""
+    session = Session(document)
+    session.target_error = 0.05
+    session.start()
+    try:
+        screen = Screen()
+        window = session.open(screen.show)
+        view = View(front(session), SIZE)
+        session.look(window, replace(view, compared=True))
+        screen.wait(lambda p: "RMSE" in p.comparison)
+        session.look(window, view)
+        screen.wait(lambda p: p.view == view)
+        light = session.call(lambda: weakref.ref(session.light))
+        medium = session.call(lambda: weakref.ref(session.light.parts[0].medium))
+        assert light() is not None and medium() is not None
+        count = len(screen.pictures)
+        session.edit(lambda document: document.set_density(0.5))
+        screen.wait(lambda p: len(screen.pictures) > count + 1 and p.final)
+        assert session.call(lambda: (light(), medium())) == (None, None)
+    finally:
+        session.stop()
+        dr.sync_thread()
+
+
+@pytest.fixture
+def uncollected() -> Iterator[None]:
+    """Python does not look for cycles of references of its own accord, as in a large program it
+    hardly does.
+    """
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def _samples(picture: Picture) -> int:
+    """Of the reference, as told."""
+    return int(picture.comparison.split()[1])

@@ -1,0 +1,264 @@
+"""The session: who is shown what, and when the solver may work. No browser is needed."""
+
+from __future__ import annotations
+
+import time
+import weakref
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import OpenImageIO
+import pytest
+
+from mitsuba_irrcache.cli.main import main
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.images import read_image
+from mitsuba_irrcache.view import picture
+from mitsuba_irrcache.view import window as module
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.document import Document
+from mitsuba_irrcache.view.keep import keep
+from mitsuba_irrcache.view.picture import KINDS, Look, Samples
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import Picture, View
+from tests.support.viewer_session import SCENE, SIZE, Screen, front, turned
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+@pytest.fixture
+def path(tmp_path, scenes):
+    density = np.zeros((16, 16, 16, 1), np.float32)
+    density[3:13, 3:13, 3:13] = scenes.texture((10, 10, 10, 1), 0.5, 6, 1)
+    mi.VolumeGrid(density).write(str(tmp_path / "density.vol"))
+    (tmp_path / "scene.xml").write_text(SCENE)
+    return tmp_path / "scene.xml"
+
+
+@pytest.fixture
+def session(path):
+    session = Session(Document.load(path))
+    session.target_error = 0.02
+    session.start()
+    yield session
+    session.stop()
+
+
+def final(picture: Picture) -> bool:
+    return picture.final
+
+
+def test_a_window_at_rest_gets_the_image_that_render_gives(session, path, tmp_path):
+    """And files that reproduce it: the PNG is what was shown, the scene renders to it."""
+    screen = Screen()
+    window = session.open(screen.show)
+    view = View(turned(front(session), 40), SIZE)
+    session.look(window, view)
+    shown = screen.wait(final).pixels
+    files = keep(session, view, tmp_path, "kept", with_cache=True)
+    assert {f.name for f in files} == {"kept.exr", "kept.png", "kept.xml", "kept.cache"}
+    np.testing.assert_array_equal(np.rint(255 * read_image(tmp_path / "kept.png")), shown)
+    assert main(["render", str(tmp_path / "kept.xml"), "-o", str(tmp_path / "again.exr")]) == 0
+    again = np.rint(255 * read_image(tmp_path / "again.png"))
+    difference = np.abs(again - shown.astype(float))
+    assert shown.std() > 20
+    assert difference.mean() < 0.6 and difference.max() < 12
+    names = OpenImageIO.ImageBuf(str(tmp_path / "kept.exr")).spec().channelnames
+    layers = dict(zip(names, np.moveaxis(read_image(tmp_path / "kept.exr"), -1, 0), strict=True))
+    parts = (layers[f"{kind}.G"] for kind in ("colour", "illumination", "background"))
+    colour, illumination, background = parts
+    np.testing.assert_allclose(colour * illumination + background, layers["G"], atol=2e-5)
+
+
+def test_no_solver_works_while_a_camera_moves(session):
+    """By the session's own history, and the light is better afterwards."""
+    session.call(lambda: setattr(session, "target_error", 1e-6))
+    screen = Screen()
+    window = session.open(screen.show)
+    camera = front(session)
+    session.look(window, View(camera, SIZE))
+    screen.wait(lambda p: not p.moving)
+    before = session.status.samples
+    began = time.monotonic()
+    for k in range(30):
+        session.look(window, View(turned(camera, k + 1), SIZE))
+        time.sleep(0.02)
+    ended = time.monotonic()
+    rest = screen.wait(lambda p: not p.moving and p.view.camera == turned(camera, 30))
+    assert rest.pixels.shape == (*SIZE[::-1], 3)
+    moving = [p for p in screen.pictures if p.moving]
+    assert len(moving) > 5
+    # A pass that was at work when the mouse moved goes on when it rests: it is interrupted.
+    history = list(session.history)
+    paused = [(a, b) for what, a, b in history if what == "interruption"]
+    worked = [(a, b) for what, a, b in history if what == "solver" and b > began + 0.1]
+    for a, b in worked:
+        inside = sum(min(d, ended) - max(c, a) for c, d in paused if d > a and c < b)
+        overlap = min(b, ended) - max(a, began + 0.1)
+        assert overlap <= max(inside, 0) + 0.05
+    time.sleep(0.5)
+    assert session.status.samples > before
+
+
+def test_a_picture_at_rest_gives_way_to_a_camera_that_moves(session, monkeypatch):
+    """It is begun in bands, and left when the mouse moves again; in the end it is there."""
+    monkeypatch.setattr(picture, "BAND", 64)
+    traced: list[Camera] = []
+    screen, original = Screen(), Samples._trace
+    window = session.open(screen.show)
+    still = View(front(session), SIZE)
+
+    def trace(samples: Samples, band: range, total: int) -> list:
+        if len(band) == 64 and samples.camera == still.camera:
+            traced.append(samples.camera)
+            session.look(window, View(turned(front(session), len(traced)), SIZE))
+        return original(samples, band, total)
+
+    monkeypatch.setattr(Samples, "_trace", trace)
+    session.look(window, still)
+    last = screen.wait(lambda p: not p.moving)
+    assert 1 <= len(traced) < SIZE[0] * SIZE[1] // 64
+    assert last.view.camera == turned(front(session), len(traced))
+    assert any(p.moving for p in screen.pictures)
+
+
+def test_moving_pictures_are_smaller_where_time_is_short(session, monkeypatch):
+    monkeypatch.setattr(module, "MOVING_SECONDS", 1e-6)
+    screen = Screen()
+    window = session.open(screen.show)
+    for k in range(12):
+        session.look(window, View(turned(front(session), k), SIZE))
+        time.sleep(0.03)
+    share = module.LEVELS[-1][0]
+    moving = [p for p in screen.pictures if p.moving]
+    assert moving[-1].pixels.shape[1] == round(share * SIZE[0])
+
+
+def test_no_kernel_is_compiled_for_another_camera_or_size(session, kernels):
+    screen = Screen()
+    window = session.open(screen.show)
+    session.look(window, View(front(session), SIZE))
+    screen.wait(final)
+
+    def pictures(size, degrees):
+        seen = session.light.seen(False, False)
+        samples = Samples(seen, turned(front(session), degrees), size)
+        samples.add(1)
+        samples.picture(Look(exposure=degrees), (0, 1))
+        dr.sync_thread()
+
+    session.call(lambda: pictures(SIZE, 1))
+    used = session.call(lambda: kernels(lambda: [pictures((31, 57), 20), pictures((9, 8), 30)]))
+    assert used and all(k["cache_hit"] for k in used)
+
+
+def test_an_edit_shows_new_light_and_never_black(session):
+    """As bright as the scene with that density; every picture in between is as bright as one of
+    both.
+    """
+    screen = Screen()
+    window = session.open(screen.show)
+    session.look(window, View(front(session), SIZE))
+    before = screen.wait(final).pixels.mean()
+    count = len(screen.pictures)
+    session.edit(lambda document: document.set_density(0.2))
+    screen.wait(lambda p: len(screen.pictures) > count + 1 and p.final)
+    means = [p.pixels.mean() for p in screen.pictures[count:]]
+    low, high = sorted((before, means[-1]))
+    assert high - low > 2
+    assert min(means) > low - 1 and max(means) < high + 1
+
+
+def test_light_that_is_put_out_is_out(path):
+    """There is nothing to improve then, but something to show."""
+    sky = '<emitter type="constant"> <rgb name="radiance" value="0.3, 0.4, 0.5"/> </emitter>'
+    assert sky in SCENE
+    path.write_text(SCENE.replace(sky, ""))
+    session = Session(Document.load(path))
+    session.target_error = 0.02
+    session.start()
+    try:
+        screen = Screen()
+        session.look(session.open(screen.show), View(front(session), SIZE))
+        assert screen.wait(final).pixels.mean() > 1
+        dark = replace(session.document.lighting, sun=0.0)
+        session.edit(lambda document: document.set_lighting(dark))
+        assert screen.wait(lambda p: p.final and not p.pixels.any()).pixels.max() == 0
+    finally:
+        session.stop()
+
+
+def test_a_refused_edit_changes_nothing(session):
+    text = session.document.state()[0]
+    with pytest.raises(IrrcacheError, match="density"):
+        session.edit(lambda document: document.set_density(-1))
+    with pytest.raises(IrrcacheError, match="negative"):
+        session.edit(
+            lambda document: document.set_volumes(
+                {"density.vol": np.full((4, 4, 4), -1, np.float32)}
+            )
+        )
+    assert session.document.state()[0] == text
+    screen = Screen()
+    session.look(session.open(screen.show), View(front(session), SIZE))
+    assert screen.wait(final).pixels.std() > 10
+
+
+def test_windows_have_cameras_of_their_own(session):
+    """On one cache; closing one leaves the other."""
+    screens = Screen(), Screen()
+    windows = [session.open(s.show) for s in screens]
+    for k, window in enumerate(windows):
+        session.look(window, View(turned(front(session), 90 * k), SIZE))
+    first, second = (s.wait(final).pixels.astype(float) for s in screens)
+    assert np.abs(first - second).mean() > 1
+    session.close(windows[0])
+    count = len(screens[0].pictures)
+    session.look(windows[1], View(front(session), SIZE))
+    again = screens[1].wait(lambda p: p.final and p.view.camera == front(session)).pixels
+    np.testing.assert_array_equal(again, first)
+    assert len(screens[0].pictures) == count
+
+
+def test_a_closed_window_holds_nothing(session):
+    """Though it is held itself: its controls are in cycles of references."""
+    screen = Screen()
+    window = session.open(screen.show)
+    session.look(window, View(front(session), SIZE))
+    screen.wait(final)
+    samples = session.call(lambda: weakref.ref(window.samples))
+    assert samples() is not None
+    session.close(window)
+    session.call(lambda: None)
+    assert samples() is None
+
+
+def test_all_that_can_be_shown(session):
+    """Every kind of picture has content, and differs from the others."""
+    screen = Screen()
+    window = session.open(screen.show)
+    found = []
+    for kind in KINDS:
+        look = Look(kind)
+        session.look(window, View(front(session), SIZE, look))
+        found.append(screen.wait(lambda p, look=look: p.view.look == look and p.final).pixels)
+        assert found[-1].std() > 1, kind
+    for i, a in enumerate(found):
+        assert all(np.abs(a.astype(float) - b).mean() > 1 for b in found[:i])
+
+
+@pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "", "a" * 100, "/etc/passwd", "a\n"])
+def test_names_that_lead_elsewhere_are_refused(session, tmp_path, name):
+    with pytest.raises(IrrcacheError, match="no name"):
+        keep(session, View(front(session), SIZE), tmp_path, name)
+
+
+def test_what_cannot_be_viewed_is_said(path, tmp_path):
+    text = path.read_text().replace('<ref name="interior" id="cloud"/>', "")
+    (tmp_path / "empty.xml").write_text(text)
+    session = Session(Document.load(tmp_path / "empty.xml"))
+    with pytest.raises(IrrcacheError, match="no medium"):
+        session.start()
+    session.stop()
