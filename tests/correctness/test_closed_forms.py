@@ -27,7 +27,9 @@ SKY = {"type": "constant", "radiance": 1.0}
 
 def prepared(scenes, integrator: dict, shape: dict, **objects):
     """The cache of a scene."""
-    scene = scenes.load({"type": "irrcache", **integrator}, shape, size=4, **objects)
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path", **integrator}, shape, size=4, **objects
+    )
     scene.integrator().prepare(scene)
     return scene.integrator().cache
 
@@ -108,7 +110,7 @@ def test_white_furnace(scenes, scale):
     sigma_t = scenes.texture((4, 6, 5), 0.0, 1.0, 11)
     shape = scenes.boundary(scenes.medium(sigma_t, 1.0, to_world, scale=scale), to_world)
     integrator = {"type": "irrcache", "resolution": 8, "cache_spp": 4096, "rr_depth": 100000}
-    scene = scenes.load(integrator, shape, size=16, emitter=SKY)
+    scene = scenes.load(integrator, shape, size=16, emitter=SKY, default_solver="path")
     image = scenes.image(scene, spp=64)
     cache = scene.integrator().cache
     phi = np.array(cache.irradiance) / (4 * np.pi)
@@ -157,7 +159,7 @@ def slab(
     to_world = scenes.placement((width, width, depth), center=(0, 0, -depth / 2))
     medium = scenes.medium(sigma_t, albedo) | ({"phase": phase} if phase else {})
     shape = scenes.boundary(medium, to_world)
-    return scenes.load({"type": "irrcache"}, shape, **objects)
+    return scenes.load({"type": "irrcache", "solver": "path"}, shape, **objects)
 
 
 # correctness.md table C: albedo, surface irradiance / 4 pi, radiance leaving at cosine 1 and at 0.5
@@ -391,7 +393,9 @@ def test_beer_lambert(scenes):
         "to_world": mi.ScalarTransform4f().look_at([0, 0, -3], [0, 0, 0], [0, 1, 0]).scale(0.8),
         "film": scenes.description({}, None, size=8)["sensor"]["film"],
     }
-    scene = scenes.load({"type": "irrcache", "max_depth": 1}, shape, emitter=SKY, sensor=sensor)
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path", "max_depth": 1}, shape, emitter=SKY, sensor=sensor
+    )
     expected = np.exp(-1.5 * np.array([0.3, 1.0, 4.0]))
     np.testing.assert_allclose(
         scenes.image(scene, spp=4), np.broadcast_to(expected, (8, 8, 3)), 3e-6

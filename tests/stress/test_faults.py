@@ -39,9 +39,10 @@ def filled(file: Path, samples: int, sigma_t: float = 1.0) -> mi.Scene:
 
 WRITER = """
 import sys
-sys.modules["package"] = package = type(sys)("package")  # without Mitsuba, which takes a second
+package = type(sys)("mitsuba_irrcache")  # without Mitsuba, which takes a second
 package.__path__ = ["mitsuba_irrcache"]
-from package.files import atomic_write
+sys.modules["mitsuba_irrcache"] = package
+from mitsuba_irrcache.io.files import atomic_write
 content = [bytes([n]) * (1 << 22) for n in range(8)]
 for n in range(10**6):
     with atomic_write(sys.argv[1]) as file:

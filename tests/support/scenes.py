@@ -77,9 +77,15 @@ def boundary(interior: dict, to_world: np.ndarray | None = None, kind: str = "cu
     }
 
 
-def description(integrator: dict, shape: dict | None, size: int = 24, **objects) -> dict:
+def description(
+    integrator: dict,
+    shape: dict | None,
+    size: int = 24,
+    default_solver: str | None = None,
+    **objects,
+) -> dict:
     """A scene seen from (1, 1.5, -5), under a coloured sky and a sun unless ``objects`` names other
-    emitters.
+    emitters. The integrator ``irrcache`` has to name its solver, unless ``default_solver`` does.
     """
     look = mi.ScalarTransform4f().look_at([1.0, 1.5, -5.0], [0, 0, 0], [0, 1, 0])
     film = {
@@ -93,14 +99,22 @@ def description(integrator: dict, shape: dict | None, size: int = 24, **objects)
     emitters = {} if "emitter" in objects else {"emitter": ISOTROPIC_SKY, "sun": SUN}
     shapes = {} if shape is None else {"shape": shape}
     if integrator.get("type") == "irrcache":
-        integrator = {"solver": "path"} | integrator  # what most tests here are about
+        if default_solver is None and "solver" not in integrator:
+            raise ValueError("a test names the solver that it is about, or auto")
+        integrator = {"solver": default_solver} | integrator
     scene = {"type": "scene", "integrator": integrator, "sensor": sensor}
     return scene | shapes | emitters | {k: v for k, v in objects.items() if v is not None}
 
 
-def load(integrator: dict, shape: dict | None, size: int = 24, **objects) -> mi.Scene:
+def load(
+    integrator: dict,
+    shape: dict | None,
+    size: int = 24,
+    default_solver: str | None = None,
+    **objects,
+) -> mi.Scene:
     """The scene of ``description``."""
-    return mi.load_dict(description(integrator, shape, size, **objects))
+    return mi.load_dict(description(integrator, shape, size, default_solver, **objects))
 
 
 def image(scene: mi.Scene, **options) -> np.ndarray:

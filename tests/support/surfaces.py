@@ -71,7 +71,7 @@ def images(scenes, objects: dict, settings: dict, depth: dict, spp: tuple) -> li
 def pair(scenes, objects: dict, integrator: dict, spp: int) -> list[np.ndarray]:
     """Images of two seeds."""
     objects = {"emitter": scenes.sky, "sun": scenes.sun} | objects
-    scene = scenes.load(integrator, None, SIZE, **objects)
+    scene = scenes.load(integrator, None, SIZE, **objects, default_solver="path")
     return [scenes.image(scene, spp=spp, seed=seed) for seed in (1, 2)]
 
 

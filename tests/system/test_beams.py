@@ -21,7 +21,9 @@ def fog(scenes, cutoff: float, resolution: int, solver: str = "sweep", **objects
     cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO))
     settings = {"max_depth": 2, "resolution": resolution, "solver": solver, "cache_spp": 32}
     lights = {"emitter": spot(cutoff), "sun": None}
-    return scenes.load({"type": "irrcache", **settings}, cube, SIZE, **(lights | objects))
+    return scenes.load(
+        {"type": "irrcache", "solver": "path", **settings}, cube, SIZE, **(lights | objects)
+    )
 
 
 def single(scene: mi.Scene) -> np.ndarray:
@@ -79,7 +81,9 @@ def _all_orders(scenes, solver: str) -> mi.Scene:
     cube = scenes.boundary(scenes.medium(2.0, ALBEDO))
     samples = 64 if solver == "sweep" else 256
     settings = {"resolution": 24, "solver": solver, "cache_spp": samples}
-    return scenes.load({"type": "irrcache", **settings}, cube, SIZE, emitter=spot(20.0), sun=None)
+    return scenes.load(
+        {"type": "irrcache", "solver": "path", **settings}, cube, SIZE, emitter=spot(20.0), sun=None
+    )
 
 
 def test_a_beam_past_an_object(scenes):
@@ -103,7 +107,9 @@ def test_the_cache_of_a_file_shows_the_beam(scenes, tmp_path):
     settings = {"resolution": 12, "solver": "sweep", "cache_spp": 32, "cache_file": file}
     images = []
     for _ in range(2):
-        scene = scenes.load({"type": "irrcache", **settings}, cube, 8, emitter=spot(7.0), sun=None)
+        scene = scenes.load(
+            {"type": "irrcache", "solver": "path", **settings}, cube, 8, emitter=spot(7.0), sun=None
+        )
         images.append(scenes.image(scene, spp=4))
     np.testing.assert_array_equal(*images)
 

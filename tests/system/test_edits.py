@@ -128,7 +128,7 @@ def loaded(scenes, world: str, solver: str) -> mi.Scene:
     objects = dict(worlds(scenes)[world])
     depth = 2 if solver == "sweep" and world in SWEPT_ONCE else -1
     shape, chosen = objects.pop("shape"), settings(solver, max_depth=depth)
-    return scenes.load(chosen, shape, size=10, **objects)
+    return scenes.load(chosen, shape, size=10, **objects, default_solver="path")
 
 
 def image(scene: mi.Scene, **options) -> np.ndarray:
@@ -335,7 +335,9 @@ def test_the_value_of_before_makes_no_cache(scenes):
 
 def test_emission_of_the_integrator_is_a_parameter_too(scenes):
     volume = scenes.volume(scenes.texture((2, 2, 2), 0.1, 1, 5), scenes.placement())
-    scene = scenes.load(settings("path", emission=volume), fog(scenes), size=6)
+    scene = scenes.load(
+        settings("path", emission=volume), fog(scenes), size=6, default_solver="path"
+    )
     params, old = mi.traverse(scene), image(scene)
     (key,) = [k for k in params.keys() if k.endswith("emission.data")]
     for factor in (0.9, 0.75):
@@ -344,7 +346,9 @@ def test_emission_of_the_integrator_is_a_parameter_too(scenes):
         found = image(scene)
         assert found.sum() < old.sum()
         old = found
-    fresh = scenes.load(settings("path", emission=volume), fog(scenes), size=6)
+    fresh = scenes.load(
+        settings("path", emission=volume), fog(scenes), size=6, default_solver="path"
+    )
     others = mi.traverse(fresh)
     others[key] = params[key]
     others.update()

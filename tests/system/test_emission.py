@@ -30,13 +30,15 @@ def rendered(scenes, shape, emission, spp: int = 4, size: int = 8, objects=None,
     """The image, in parallel rays unless ``objects`` has a sensor, and the scene."""
     integrator = {"type": "irrcache", "emission": emission, "resolution": 16} | settings
     objects = {"sensor": straight_ahead(scenes, size)} | DARK | (objects or {})
-    scene = scenes.load(integrator, shape, **objects)
+    scene = scenes.load(integrator, shape, **objects, default_solver="path")
     return scenes.image(scene, spp=spp), scene
 
 
 def prepare(scenes, shape, emission, **settings) -> None:
     """As far as the cache: what it raises is not wrapped by Mitsuba."""
-    scene = scenes.load({"type": "irrcache", "emission": emission} | settings, shape, **DARK)
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path", "emission": emission} | settings, shape, **DARK
+    )
     scene.integrator().prepare(scene)
 
 
@@ -204,7 +206,7 @@ def test_fire_in_a_room(scenes, max_depth, samples):
     for solver, spp in (("auto", 256), ("path", samples)):
         settings = {"solver": solver, "cache_spp": spp, "resolution": 16, "max_depth": max_depth}
         integrator = {"type": "irrcache", "emission": light, "emission_scale": 2.0} | settings
-        scene = scenes.load(integrator, shape, 4, **DARK, **objects)
+        scene = scenes.load(integrator, shape, 4, **DARK, **objects, default_solver="path")
         scene.integrator().prepare(scene)
         caches = scene.integrator().caches.values()
         assert all(c.correlated == (solver == "auto") for c in caches)

@@ -73,7 +73,7 @@ def test_single_scattering(scenes, lamp, rmse, mean, solver, g):
     cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO) | {"phase": phase})
     settings = {"max_depth": 2, "resolution": 32, "solver": solver, "cache_spp": 32}
     scene = scenes.load(
-        {"type": "irrcache", **settings}, cube, SIZE,
+        {"type": "irrcache", "solver": "path", **settings}, cube, SIZE,
         emitter=point(lamp), sun=None, sensor=camera(scenes),
     )  # fmt: skip
     image = scenes.image(scene, spp=256)[..., 0]
@@ -100,7 +100,7 @@ def test_all_orders_in_infinite_matter(scenes):
     lamp = np.array([0.05, 0.11, -0.07])
     settings = {"max_depth": -1, "resolution": 64, "solver": "sweep", "cache_spp": 128}
     scene = scenes.load(
-        {"type": "irrcache", "rr_depth": 50, **settings},
+        {"type": "irrcache", "solver": "path", "rr_depth": 50, **settings},
         scenes.boundary(scenes.medium(1.0, 0.8), to_world), 4, emitter=point(lamp), sun=None,
     )  # fmt: skip
     scene.integrator().prepare(scene)
@@ -130,7 +130,7 @@ def test_beside_a_spot_light(scenes):
     ):
         scene = scenes.load(
             {"max_depth": 2, **integrator}, cube, SIZE,
-            emitter=spot, sun=None, sensor=camera(scenes),
+            emitter=spot, sun=None, sensor=camera(scenes), default_solver="path",
         )  # fmt: skip
         means.append([scenes.image(scene, spp=1024, seed=seed).mean() for seed in range(3)])
     (ours, theirs), errors = np.mean(means, axis=1), np.std(means, axis=1, ddof=1) / 3**0.5

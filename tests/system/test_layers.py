@@ -62,7 +62,7 @@ def noisy(scenes, settings: dict, **objects) -> mi.Scene:
     integrator = {"type": "irrcache", "max_depth": 3, "resolution": 16} | settings
     emitter = {"type": "envmap", "bitmap": mi.Bitmap(WINDOW)}
     objects = {"emitter": emitter, "size": 24} | objects
-    return scenes.load(integrator, cloud(scenes), **objects)
+    return scenes.load(integrator, cloud(scenes), **objects, default_solver="path")
 
 
 # The image and its layers
@@ -80,7 +80,9 @@ def test_layers_do_not_change_the_image(scenes, pixel_format):
     images = []
     for aovs in ("", ALL):
         settings = {"type": "irrcache", "resolution": 8, "cache_spp": 16, "aovs": aovs}
-        scene = scenes.load(settings | {"hide_emitters": True}, cloud(scenes), sensor=sensor)
+        scene = scenes.load(
+            settings | {"hide_emitters": True}, cloud(scenes), sensor=sensor, default_solver="path"
+        )
         images.append(scenes.image(scene, spp=8, seed=3))
     channels = images[0].shape[2]
     assert images[1].shape[2] == channels + sum(map(len, AOVS.values()))
@@ -94,7 +96,7 @@ def sorted_slab(scenes, albedo, **film) -> mi.Scene:
     sigma_t = scenes.texture((8, 6, 6), 1.0, 3.0, 3)
     settings = {"max_depth": 2, "resolution": 16, "cache_spp": 16, "aovs": ALL}
     return scenes.load(
-        {"type": "irrcache"} | settings,
+        {"type": "irrcache", "solver": "path"} | settings,
         scenes.boundary(scenes.medium(sigma_t, albedo, to_world), to_world),
         sensor=facing(scenes, 12, 1.3, **film),
         emitter={"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.4]}},
@@ -130,7 +132,9 @@ def test_names_on_the_film(scenes):
     sensor = scenes.description({}, None, 6)["sensor"]
     sensor["film"] = film_of(scenes, 6, pixel_format="rgba")
     settings = {"resolution": 4, "cache_spp": 16, "aovs": "far:depth, light:illumination, noise"}
-    scene = scenes.load({"type": "irrcache"} | settings, cloud(scenes), sensor=sensor)
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path"} | settings, cloud(scenes), sensor=sensor
+    )
     mi.render(scene, spp=1)
     names = [field.name for field in scene.sensors()[0].film().bitmap().struct_()]
     further = ["far.T", "light.R", "light.G", "light.B", "noise.Y"]
@@ -154,7 +158,9 @@ def test_wrapped_like_a_stock_integrator(scenes):
     further = [f"inner.{name}" for name in ("far.T", "c.R", "c.G", "c.B")]
     after = names["volpath"].index("z.T")
     assert names["irrcache"] == names["volpath"][:after] + further + names["volpath"][after:]
-    outside = layered(scenes.load(ours | {"max_depth": 2}, cloud(scenes), 8), spp=1024)
+    outside = layered(
+        scenes.load(ours | {"max_depth": 2}, cloud(scenes), 8, default_solver="path"), spp=1024
+    )
     for wrapped, expected in ((0, outside["image"]), (after + 1, outside["c"])):
         inside = values["irrcache"][..., wrapped : wrapped + 3]
         assert np.abs(inside - expected).mean() < 0.02 * expected.mean()
@@ -172,7 +178,9 @@ def test_depth_of_a_thin_dense_slab(scenes):
     sigma_t[14] = 50.0
     settings = {"max_depth": 2, "resolution": 20, "cache_spp": 16, "aovs": ALL, "step": 0.25}
     shape = scenes.boundary(scenes.medium(sigma_t, 0.8, to_world), to_world)
-    scene = scenes.load({"type": "irrcache"} | settings, shape, sensor=facing(scenes, 8, 1.5))
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path"} | settings, shape, sensor=facing(scenes, 8, 1.5)
+    )
     depth = layered(scene, spp=16)["depth"][..., 0]
     assert np.abs(depth[2:-2, 2:-2] - 3.4).max() < 0.03
     assert not depth[0].any() and not depth[:, -1].any()
@@ -186,7 +194,9 @@ def test_transmittance_is_beer_lambert(scenes, kind):
     to_world = scenes.placement((2.0, 2.0, 1.5))
     settings = {"max_depth": 2, "resolution": 8, "cache_spp": 16, "aovs": ALL}
     shape = scenes.boundary(scenes.medium(values, albedo, to_world), to_world)
-    scene = scenes.load({"type": "irrcache"} | settings, shape, sensor=facing(scenes, 8, 1.5))
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path"} | settings, shape, sensor=facing(scenes, 8, 1.5)
+    )
     found = layered(scene, spp=4)
     inside, clear = np.s_[2:-2, 2:-2], np.exp(-1.5 * sigma_t)
     expected = np.broadcast_to(clear, (4, 4, 3))
@@ -219,7 +229,9 @@ def test_noise_is_the_scatter_of_caches(scenes, border):
     images, noise = [], []
     for seed in range(24):
         integrator = settings | {"cache_seed": seed, "aovs": "noise"}
-        found = layered(scenes.load(integrator, shape, 20, emitter=emitter), spp=4)
+        found = layered(
+            scenes.load(integrator, shape, 20, emitter=emitter, default_solver="path"), spp=4
+        )
         images.append(luminance(found["image"]))
         noise.append(found["noise"][..., 0])
     scatter = np.sqrt(np.var(images, axis=0, ddof=1).mean())
@@ -237,7 +249,10 @@ def soft_ball(scenes, resolution: int, samples: int) -> dict[str, np.ndarray]:
     settings["step"] = resolution / 36  # the same length
     sun = {"type": "directional", "direction": [0.2, -1.0, 0.1], "irradiance": 4.0}
     shape = scenes.boundary(medium, to_world)
-    return layered(scenes.load({"type": "irrcache"} | settings, shape, 16, emitter=sun), spp=16)
+    return layered(
+        scenes.load({"type": "irrcache", "solver": "path"} | settings, shape, 16, emitter=sun),
+        spp=16,
+    )
 
 
 def test_bias_is_what_a_finer_cache_changes(scenes):
@@ -292,7 +307,9 @@ def test_a_cache_without_noise_is_not_filtered(scenes):
     images = {}
     for kind in ("none", "bilateral", "fixed"):
         settings = {"max_depth": 2, "resolution": 12, "cache_spp": 16, "filter": kind}
-        scene = scenes.load({"type": "irrcache"} | settings, shape, 20, emitter=sun)
+        scene = scenes.load(
+            {"type": "irrcache", "solver": "path"} | settings, shape, 20, emitter=sun
+        )
         images[kind] = scenes.image(scene, spp=4)
     np.testing.assert_allclose(images["bilateral"], images["none"], rtol=2e-6, atol=1e-7)
     assert np.abs(images["fixed"] - images["none"]).max() > 0.01 * images["none"].max()
@@ -311,7 +328,11 @@ def bone(scenes, settings: dict) -> np.ndarray:
         "sensor": facing(scenes, 64, 0.7),
         "emitter": {"type": "envmap", "bitmap": mi.Bitmap(window)},
     }
-    return luminance(scenes.image(scenes.load(integrator | settings, shape, **objects), spp=16))
+    return luminance(
+        scenes.image(
+            scenes.load(integrator | settings, shape, **objects, default_solver="path"), spp=16
+        )
+    )
 
 
 def edge(profile: np.ndarray) -> tuple[float, float]:
@@ -381,9 +402,11 @@ def test_no_nan_where_there_is_little(scenes, kind, settings, shape, objects):
     sensor["film"] = film_of(scenes, 8, pixel_format="rgba")
     sensor["fov"] = 60.0
     objects = {"sensor": sensor} | objects
-    plain = scenes.load({"type": "irrcache"} | settings, shape(scenes), **objects)
+    plain = scenes.load({"type": "irrcache", "solver": "path"} | settings, shape(scenes), **objects)
     full = scenes.load(
-        {"type": "irrcache", "filter": kind, "aovs": ALL} | settings, shape(scenes), **objects
+        {"type": "irrcache", "solver": "path", "filter": kind, "aovs": ALL} | settings,
+        shape(scenes),
+        **objects,
     )
     found, expected = layered(full, spp=4), scenes.image(plain, spp=4)
     assert all(np.isfinite(values).all() for values in found.values())
@@ -472,7 +495,9 @@ def test_opacity_needs_no_light(scenes, settings):
     shape = scenes.boundary(scenes.medium(np.ones((8, 8, 8)), albedo, to_world), to_world)
     settings |= {"resolution": 8, "cache_spp": 16, "hide_emitters": True, "aovs": "transmittance"}
     sensor = facing(scenes, 8, pixel_format="rgba")
-    found = layered(scenes.load({"type": "irrcache"} | settings, shape, sensor=sensor), spp=4)
+    found = layered(
+        scenes.load({"type": "irrcache", "solver": "path"} | settings, shape, sensor=sensor), spp=4
+    )
     np.testing.assert_allclose(found["transmittance"], np.exp(-1.5), rtol=1e-3)
     np.testing.assert_allclose(found["image"][..., 3], 1 - np.exp(-1.5), rtol=1e-3)
 
@@ -482,7 +507,7 @@ def test_the_dimmest_light_is_not_nan(scenes):
     sun = {"type": "directional", "direction": [0.0, 0.0, -1.0], "irradiance": 3.0}
     shape = scenes.boundary(scenes.medium(60.0, 0.9), scenes.placement())
     settings = {"type": "irrcache", "max_depth": 2, "resolution": 32, "cache_spp": 16}
-    image = scenes.image(scenes.load(settings, shape, 8, emitter=sun), spp=4)
+    image = scenes.image(scenes.load(settings, shape, 8, emitter=sun, default_solver="path"), spp=4)
     assert np.isfinite(image).all()
 
 
@@ -491,7 +516,9 @@ def test_alpha_with_other_sample_counts_compiles_nothing(scenes, kernels):
     sensor = scenes.description({}, None, 8)["sensor"]
     sensor["film"] = film_of(scenes, 8, pixel_format="rgba")
     settings = {"type": "irrcache", "resolution": 8, "cache_spp": 8, "hide_emitters": True}
-    scene = scenes.load(settings | {"max_depth": 2}, cloud(scenes), sensor=sensor)
+    scene = scenes.load(
+        settings | {"max_depth": 2}, cloud(scenes), sensor=sensor, default_solver="path"
+    )
     scene.integrator().prepare(scene)
     first, again = (kernels(lambda n=n: scenes.image(scene, spp=n)) for n in (7, 11))
     assert {k["hash"] for k in again} <= {k["hash"] for k in first}
@@ -503,5 +530,7 @@ def test_depth_in_one_step(scenes):
     """
     shape = scenes.boundary(scenes.medium(10.0, 0.9), scenes.placement())
     settings = {"type": "irrcache", "max_depth": 1, "aovs": "depth"}
-    found = layered(scenes.load(settings, shape, sensor=facing(scenes, 4)), spp=1)
+    found = layered(
+        scenes.load(settings, shape, sensor=facing(scenes, 4), default_solver="path"), spp=1
+    )
     np.testing.assert_allclose(found["depth"], 2.1, atol=0.06)

@@ -39,7 +39,10 @@ def cloud(scenes) -> dict:
 def pair(scenes, wrap=lambda inner: inner, settings=None, **objects) -> list[mi.Scene]:
     """The same scene with both integrators."""
     mine = ours(**(settings or {}))
-    return [scenes.load(wrap(i), cloud(scenes), SIZE, **objects) for i in (mine, STOCK)]
+    return [
+        scenes.load(wrap(i), cloud(scenes), SIZE, **objects, default_solver="path")
+        for i in (mine, STOCK)
+    ]
 
 
 def agree(both: list[mi.Scene], spp=(32, 256), channels=None, **options) -> np.ndarray:
@@ -74,7 +77,10 @@ def test_pixel_formats(scenes, layers):
     formats = ("rgb", "rgba", "xyz", "xyza", "luminance", "luminance_alpha")
     films = {f: camera(scenes, pixel_format=f) for f in formats}
     films["sensor"] = films.pop("rgb")
-    pictures = [scenes.load(i, cloud(scenes), SIZE, **films) for i in (ours(**layers), STOCK)]
+    pictures = [
+        scenes.load(i, cloud(scenes), SIZE, **films, default_solver="path")
+        for i in (ours(**layers), STOCK)
+    ]
     for number in range(len(formats)):
         agree(pictures, sensor=number)
 
@@ -164,7 +170,11 @@ def test_in_aov_and_moment(scenes):
 
 def slow(scenes, **settings) -> mi.Scene:
     """Half a minute of work."""
-    return scenes.load(ours(solver="path", resolution=32, cache_spp=4096) | settings, cloud(scenes))
+    return scenes.load(
+        ours(solver="path", resolution=32, cache_spp=4096) | settings,
+        cloud(scenes),
+        default_solver="path",
+    )
 
 
 def test_cancelled_while_the_cache_is_built(scenes):
@@ -194,7 +204,7 @@ def test_cancelled_while_the_image_is_rendered(scenes, monkeypatch):
     from mitsuba_irrcache.render import film as rendering
 
     monkeypatch.setattr(rendering, "LANES", SIZE**2 * 4)
-    scene, passes = scenes.load(ours(), cloud(scenes), SIZE), []
+    scene, passes = scenes.load(ours(), cloud(scenes), SIZE, default_solver="path"), []
     integrator = scene.integrator()
     sampled = rendering._sampled
 
@@ -216,7 +226,7 @@ def test_timeout(scenes):
     scene = slow(scenes, timeout=0.01)
     assert scenes.image(scene, spp=4).mean() > 0.3
     assert 0 < scene.integrator().cache.samples < 4096
-    empty = scenes.load(ours(timeout=0.01), None, SIZE)
+    empty = scenes.load(ours(timeout=0.01), None, SIZE, default_solver="path")
     assert scenes.image(empty, spp=4).mean() > 0.3
 
 
@@ -237,7 +247,13 @@ def test_seeds_and_samples(scenes):
     sampler's; and the scene's own sampler is left alone.
     """
     sampler = {"type": "independent", "sample_count": 6}
-    scene = scenes.load(ours(), cloud(scenes), SIZE, sensor=camera(scenes) | {"sampler": sampler})
+    scene = scenes.load(
+        ours(),
+        cloud(scenes),
+        SIZE,
+        sensor=camera(scenes) | {"sampler": sampler},
+        default_solver="path",
+    )
     first = scenes.image(scene, spp=6, seed=3)
     for options in ({"spp": 6, "seed": mi.UInt32(3)}, {"seed": 3}, {"seed": 3, "sensor": 0}):
         np.testing.assert_array_equal(scenes.image(scene, **options), first)
@@ -248,7 +264,7 @@ def test_seeds_and_samples(scenes):
 
 
 def test_develop_and_evaluate(scenes):
-    scene = scenes.load(ours(), cloud(scenes), SIZE)
+    scene = scenes.load(ours(), cloud(scenes), SIZE, default_solver="path")
     integrator = scene.integrator()
     expected = scenes.image(scene, spp=4)
     assert np.array(integrator.render(scene, 0, spp=4, develop=False)).size == 0
@@ -270,14 +286,16 @@ def test_to_string(scenes):
     text = str(mi.load_dict(ours(aovs="far:depth,noise", step=0.5)))
     assert text.startswith("IrradianceCachingIntegrator[\n  max_depth = 3,") and text.endswith("]")
     assert "aovs = far:depth, noise:noise," in text and "step = 0.5," in text
-    assert "IrradianceCachingIntegrator[" in str(scenes.load(ours(), cloud(scenes)))
+    assert "IrradianceCachingIntegrator[" in str(
+        scenes.load(ours(), cloud(scenes), default_solver="path")
+    )
 
 
 # Parameters and gradients
 
 
 def test_parameters_without_gradients(scenes):
-    scene = scenes.load(ours(), cloud(scenes), SIZE)
+    scene = scenes.load(ours(), cloud(scenes), SIZE, default_solver="path")
     expected = scenes.image(scene, spp=4)
     params = mi.traverse(scene)
     np.testing.assert_array_equal(scenes.image(scene, params=params, spp=4), expected)
@@ -294,7 +312,7 @@ def test_gradients_are_refused(scenes, wrapped):
     integrator = ours(solver="path", resolution=8, cache_spp=16)
     if wrapped:
         integrator = {"type": "aov", "aovs": "z:depth", "inner": integrator}
-    scene = scenes.load(integrator, cloud(scenes), SIZE, ball=ball)
+    scene = scenes.load(integrator, cloud(scenes), SIZE, ball=ball, default_solver="path")
     expected = scenes.image(scene, spp=2)
     params = mi.traverse(scene)
     for key in (k for k in params.keys() if k.endswith(KEYS)):

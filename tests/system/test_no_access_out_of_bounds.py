@@ -99,5 +99,5 @@ def test_images(scenes, reported, settings, medium, objects):
     integrator = {"type": "irrcache", "solver": "auto", "resolution": 11, "cache_spp": 128}
     if settings.get("solver") == "path":
         integrator["cache_spp"] = 16
-    scene = scenes.load(integrator | settings, shape, 6, **objects)
+    scene = scenes.load(integrator | settings, shape, 6, **objects, default_solver="path")
     assert not reported(lambda: scenes.image(scene, spp=2))

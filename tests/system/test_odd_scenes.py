@@ -19,7 +19,9 @@ SHEAR = np.eye(4) + 0.5 * np.eye(4)[:, [0]] @ np.eye(4)[[1]]
 def difference(scenes, shape: dict, solver: str = "sweep", **objects) -> float:
     """Difference of the mean radiance from volpath's, relative; single scattering."""
     ours = {"type": "irrcache", "solver": solver, "resolution": 20, "cache_spp": 256} | ONCE
-    mine = scenes.image(scenes.load(ours, shape, 16, **objects), spp=64).mean()
+    mine = scenes.image(
+        scenes.load(ours, shape, 16, **objects, default_solver="path"), spp=64
+    ).mean()
     theirs = scenes.load({"type": "volpath"} | ONCE, shape, 16, **objects)
     return mine / scenes.image(theirs, spp=2048).mean() - 1
 
@@ -94,10 +96,10 @@ def test_cylinders_that_shine_are_round(scenes, place):
     lamp["emitter"] = {"type": "area", "radiance": 2.0}
     shape = scenes.boundary(scenes.medium(1.0, 0.8))
     settings = {"type": "irrcache", "solver": "auto", "resolution": 8, "cache_spp": 32}
-    mi.render(scenes.load(settings, shape, 4, lamp=lamp), spp=1)
+    mi.render(scenes.load(settings, shape, 4, lamp=lamp, default_solver="path"), spp=1)
     lamp["to_world"] = lamp["to_world"] @ mi.ScalarTransform4f(place)
     with pytest.raises(RuntimeError, match=r'shape "lamp".*not round.*same scale'):
-        mi.render(scenes.load(settings, shape, 4, lamp=lamp), spp=1)
+        mi.render(scenes.load(settings, shape, 4, lamp=lamp, default_solver="path"), spp=1)
 
 
 def box_without_a_face() -> mi.Mesh:
@@ -133,10 +135,10 @@ def test_a_null_shape_at_the_centre_is_no_face_of_the_boundary(scenes):
     ball = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "null"}}
     shape = scenes.boundary(scenes.medium(1.0, 0.8))
     settings = {"type": "irrcache", "solver": "auto", "resolution": 8, "cache_spp": 32}
-    scenes.image(scenes.load(settings, shape, 4, ball=ball), spp=1)
+    scenes.image(scenes.load(settings, shape, 4, ball=ball, default_solver="path"), spp=1)
     shape["to_world"] = mi.ScalarTransform4f(np.diag([-1.0, 1, 1, 1]))
     with pytest.raises(RuntimeError, match=r"normals.*inwards"):
-        mi.render(scenes.load(settings, shape, 4, ball=ball), spp=1)
+        mi.render(scenes.load(settings, shape, 4, ball=ball, default_solver="path"), spp=1)
 
 
 @pytest.mark.parametrize("depth", [2, -1])
@@ -152,7 +154,9 @@ def test_a_hole_in_a_medium_is_not_swept_as_if_it_was_full(scenes, depth):
         settings = {"type": name, "max_depth": depth, "rr_depth": 50}
         if name == "irrcache":
             settings |= {"solver": "auto", "resolution": 20, "cache_spp": 64}
-        described = scenes.description(settings, None, 16, box=box, hole=hole)
+        described = scenes.description(
+            settings, None, 16, box=box, hole=hole, default_solver="path"
+        )
         scene = mi.load_dict({"type": "scene", "fog": scenes.medium(1.5, 0.8)} | described)
         images.append(scenes.image(scene, spp=spp).mean())
         if name == "irrcache":
@@ -181,7 +185,7 @@ def test_errors_say_what_went_wrong(scenes, wrapper):
     if wrapper:
         more = {"aovs": "d:depth"} if wrapper == "aov" else {}
         integrator = {"type": wrapper, "inner": integrator} | more
-    scene = scenes.load(integrator, shape, 4)
+    scene = scenes.load(integrator, shape, 4, default_solver="path")
     with pytest.raises(RuntimeError) as caught:
         mi.render(scene, spp=1)
     assert re.search("normals of shape.*inwards.*flip_normals", str(caught.value), re.DOTALL)
@@ -209,7 +213,9 @@ def glass(extinction: list[float]) -> dict:
     [(1.0, "volpath"), (0.7, "volpath"), (0.4, "volpathmis"), (0.0, "volpathmis")],
 )
 def test_the_stock_integrator_by_extinction(scenes, red, expected):
-    scene = scenes.load({"type": "irrcache"}, None, 4, ball=glass([red, 0.9, 1.0]))
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path"}, None, 4, ball=glass([red, 0.9, 1.0])
+    )
     assert choose_stock(scene)[0] == expected
 
 
@@ -239,7 +245,7 @@ def test_sensors_that_are_not_in_their_medium_are_refused(scenes, build):
     told = r'sensor "sensor" has the medium "fog".*not in it.*Take'
 
     def load(where: dict) -> mi.Scene:
-        described = scenes.description(settings, None, 4, **more)
+        described = scenes.description(settings, None, 4, **more, default_solver="path")
         described = {"type": "scene", "fog": medium} | described | {"box": shape, "sensor": where}
         return mi.load_dict(described)
 
@@ -266,8 +272,8 @@ def test_the_cheaper_stock_integrator_stands_in(scenes, tmp_path, extinction, ex
     """Its own image, to the bit; and that no cache is used is logged once per scene."""
     ball = {} if extinction is None else {"ball": glass(extinction)}
     depth = {"max_depth": 4, "rr_depth": 5}
-    ours = scenes.load({"type": "irrcache"} | depth, None, 8, **ball)
-    stock = scenes.load({"type": expected} | depth, None, 8, **ball)
+    ours = scenes.load({"type": "irrcache", "solver": "path"} | depth, None, 8, **ball)
+    stock = scenes.load({"type": expected} | depth, None, 8, **ball, default_solver="path")
     assert choose_stock(ours)[0] == expected
     log = tmp_path / "log.txt"
     logger = mi.logger()

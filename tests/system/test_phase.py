@@ -105,7 +105,7 @@ def test_furnace_among_surfaces(scenes):
     objects = {"emitter": {"type": "constant", "radiance": 1.0}, "sun": None}
     objects["ground"] = ground(bsdf=diffuse(1.0, 1.0, 1.0))
     integrator = {"type": "irrcache", "solver": "auto", "resolution": 12, "rr_depth": 1000}
-    scene = scenes.load(integrator, scenes.boundary(medium), 16, **objects)
+    scene = scenes.load(integrator, scenes.boundary(medium), 16, **objects, default_solver="path")
     image = scenes.image(scene, spp=64)
     assert image.mean() == pytest.approx(1, abs=5e-3) and np.abs(image - 1).max() < 0.1
 
@@ -120,7 +120,7 @@ def test_thin_slab(scenes, g):
     look = mi.ScalarTransform4f().look_at([0, 0, -50], [0, 0, 0], [0, 1, 0])
     sensor = sensor | {"to_world": look, "fov": 0.5}
     scene = scenes.load(
-        {"type": "irrcache", "resolution": 8, "cache_spp": 16}, shape, 4,
+        {"type": "irrcache", "solver": "path", "resolution": 8, "cache_spp": 16}, shape, 4,
         emitter=sun, sun=None, sensor=sensor,
     )  # fmt: skip
     cosine = -(0.5**0.5)  # of the light's way and the way to the camera
@@ -134,7 +134,9 @@ def test_furnace(scenes):
     medium = scenes.medium(1.0, 1.0) | {"phase": hg(0.5)}
     sky = {"type": "constant", "radiance": 1.0}
     integrator = {"type": "irrcache", "resolution": 10, "cache_spp": 512, "rr_depth": 100000}
-    scene = scenes.load(integrator, scenes.boundary(medium), 16, emitter=sky, sun=None)
+    scene = scenes.load(
+        integrator, scenes.boundary(medium), 16, emitter=sky, sun=None, default_solver="path"
+    )
     image = scenes.image(scene, spp=16)
     assert image.mean() == pytest.approx(1, abs=3e-3) and np.abs(image - 1).max() < 0.05
 
@@ -142,7 +144,7 @@ def test_furnace(scenes):
 def loaded(scenes, phase: dict, **settings) -> mi.Scene:
     integrator = {"type": "irrcache", "max_depth": 3, "resolution": 6, "cache_spp": 16} | settings
     shape = scenes.boundary(scenes.medium(1.0, 0.9) | {"phase": phase})
-    return scenes.load(integrator, shape, 8)
+    return scenes.load(integrator, shape, 8, default_solver="path")
 
 
 def test_files(scenes, tmp_path):
@@ -169,7 +171,9 @@ def test_equilibrium(scenes, g):
     medium = scenes.medium(2.0, 0.6) | {"phase": hg(g)}
     integrator = {"type": "irrcache", "solver": "auto", "emission": 0.8, "resolution": 10}
     sky = {"type": "constant", "radiance": 1.0}
-    scene = scenes.load(integrator, scenes.boundary(medium), 16, emitter=sky, sun=None)
+    scene = scenes.load(
+        integrator, scenes.boundary(medium), 16, emitter=sky, sun=None, default_solver="path"
+    )
     image = scenes.image(scene, spp=16)
     assert scene.integrator()._builder.solver == "sweep"
     assert image.mean() == pytest.approx(1, abs=3e-3) and np.abs(image - 1).max() < 0.05

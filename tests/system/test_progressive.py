@@ -29,7 +29,9 @@ def cloud(scenes):
         integrator = {"type": type, "max_depth": 3} | properties
         if type == "irrcache":
             integrator = {"resolution": 8, "cache_spp": 64} | integrator
-        return scenes.load(integrator, scenes.boundary(medium, to_world) if shape else None)
+        return scenes.load(
+            integrator, scenes.boundary(medium, to_world) if shape else None, default_solver="path"
+        )
 
     return make
 
@@ -321,7 +323,7 @@ def test_one_frame_where_nothing_is_cached(scenes, cloud, why):
     if why in ("black", "no light"):
         shape = scenes.boundary(scenes.medium(1.0, 0.0 if why == "black" else 0.5))
         lights = {} if why == "black" else {"emitter": None}
-        scene = scenes.load({"type": "irrcache"}, shape, **lights)
+        scene = scenes.load({"type": "irrcache", "solver": "path"}, shape, **lights)
     else:
         lacking = {"no scattering": {"max_depth": 1}, "no paths": {"max_depth": 0}}
         scene = cloud(**lacking.get(why, {"shape": False}))

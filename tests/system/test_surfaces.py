@@ -228,7 +228,7 @@ def test_mono(mono, scenes):
 
 def loaded(scenes, objects: dict, **settings) -> mi.Scene:
     integrator = {"type": "irrcache", "max_depth": 3, "resolution": 8, "cache_spp": 16} | settings
-    return scenes.load(integrator, None, 8, **objects)
+    return scenes.load(integrator, None, 8, **objects, default_solver="path")
 
 
 def test_each_medium_has_a_cache(scenes, tmp_path):
@@ -281,7 +281,9 @@ def test_media_that_only_glass_shows_are_volpaths(scenes):
     pictures = []
     for name in ("irrcache", "volpath"):
         jar = {"jar": ball(radius=1.0, **glass)}
-        scene = scenes.load({"type": name, "max_depth": 4, "rr_depth": 5}, None, 8, **jar)
+        scene = scenes.load(
+            {"type": name, "max_depth": 4, "rr_depth": 5}, None, 8, **jar, default_solver="path"
+        )
         pictures.append(scenes.image(scene, spp=4, seed=5))
     np.testing.assert_array_equal(*pictures)
 

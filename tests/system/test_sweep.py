@@ -42,7 +42,7 @@ def envmap(image: np.ndarray) -> dict:
 def filled(scenes, shape: dict, solver: str = "sweep", light=SKY, **settings):
     """The cache that ``solver`` makes of a medium under one light."""
     integrator = {"type": "irrcache", "solver": solver, "rr_depth": 1000} | settings
-    scene = scenes.load(integrator, shape, size=4, emitter=light)
+    scene = scenes.load(integrator, shape, size=4, emitter=light, default_solver="path")
     scene.integrator().prepare(scene)
     return scene.integrator().cache
 
@@ -413,7 +413,7 @@ def test_a_sun_in_the_sky_has_no_noise(scenes, monkeypatch):
     for seed in range(8):
         integrator = {"type": "irrcache", "solver": "sweep", "cache_seed": seed}
         cloud = box(smoke(albedo=(0.99,) * 3))
-        scene = scenes.load(integrator, cloud, 4, emitter=sky, sun=None)
+        scene = scenes.load(integrator, cloud, 4, emitter=sky, sun=None, default_solver="path")
         scene.integrator().prepare(scene)
         light = values(scene.integrator().cache.irradiance)
         means.append(light.mean())

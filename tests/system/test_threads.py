@@ -57,7 +57,9 @@ def make(scenes):
             f"sensor{i}": scenes.description({}, None, size=6 + i)["sensor"]
             for i in range(1, THREADS)
         }
-        return scenes.load({"type": "irrcache"} | settings, shape, size=6, **others)
+        return scenes.load(
+            {"type": "irrcache", "solver": "path"} | settings, shape, size=6, **others
+        )
 
     return scene
 

@@ -166,7 +166,14 @@ def test_voxel_irradiance_is_unbiased(scenes, measured, coloured, max_depth):
         "irradiance": {"type": "rgb", "value": SUN_IRRADIANCE.tolist()},
     }
     sky = {"type": "envmap", "bitmap": mi.Bitmap(sky_image())}
-    scene = scenes.load(integrator, scenes.boundary(medium, to_world), size=4, emitter=sky, sun=sun)
+    scene = scenes.load(
+        integrator,
+        scenes.boundary(medium, to_world),
+        size=4,
+        emitter=sky,
+        sun=sun,
+        default_solver="path",
+    )
     scene.integrator().prepare(scene)
     cache = scene.integrator().cache
     positions = voxel_centers(cache)

@@ -54,8 +54,10 @@ def compare(scenes):
     ) -> Comparison:
         depth = {"max_depth": max_depth, "rr_depth": 1000, "hide_emitters": hide}
         settings = {"resolution": 16, "cache_spp": 64} | (irrcache or {})
-        mine = scenes.load({"type": "irrcache", **depth, **settings}, shape, **objects)
-        stock = scenes.load({"type": stock, **depth}, shape, **objects)
+        mine = scenes.load(
+            {"type": "irrcache", "solver": "path", **depth, **settings}, shape, **objects
+        )
+        stock = scenes.load({"type": stock, **depth}, shape, **objects, default_solver="path")
         images = [scenes.image(mine, spp=spp // 4, seed=seed) for seed in (1, 2)]
         images += [scenes.image(stock, spp=spp, seed=seed) for seed in (1, 2)]
         return Comparison(*images)
@@ -74,7 +76,7 @@ def test_heterogeneous_cube(scenes, compare, max_depth):
     to_world = scenes.placement()
     shape = scenes.boundary(cloud(scenes, to_world), to_world)
     if max_depth == 0:
-        scene = scenes.load({"type": "irrcache", "max_depth": 0}, shape)
+        scene = scenes.load({"type": "irrcache", "solver": "path", "max_depth": 0}, shape)
         assert not scenes.image(scene, spp=4).any()
     else:
         compare(shape, max_depth).check()
@@ -218,7 +220,9 @@ def test_camera_within_the_boundary_but_not_in_the_medium(scenes):
     sensor = scenes.description({}, None)["sensor"] | {"to_world": look, "fov": 60.0}
     images = []
     for name in ("irrcache", "volpath"):
-        scene = scenes.load({"type": name, "max_depth": 2}, shape, sensor=sensor)
+        scene = scenes.load(
+            {"type": name, "max_depth": 2}, shape, sensor=sensor, default_solver="path"
+        )
         images.append(scenes.image(scene, spp=4))
     np.testing.assert_allclose(*images, rtol=1e-5)
     np.testing.assert_allclose(images[0], np.broadcast_to([0.6, 0.8, 1.0], images[0].shape), 1e-5)
@@ -233,7 +237,9 @@ def test_hidden_emitters_leave_alpha(scenes):
     film = scenes.description({}, None)["sensor"]["film"] | {"pixel_format": "rgba"}
     sensor = scenes.description({}, None)["sensor"] | {"film": film}
     depth = {"max_depth": 2, "rr_depth": 1000, "hide_emitters": True}
-    mine = scenes.load({"type": "irrcache", **depth, "resolution": 16}, shape, sensor=sensor)
+    mine = scenes.load(
+        {"type": "irrcache", "solver": "path", **depth, "resolution": 16}, shape, sensor=sensor
+    )
     stock = scenes.load({"type": "volpath", **depth}, shape, sensor=sensor)
     x, y = (scenes.image(mine, spp=64, seed=s)[..., 3:] for s in (1, 2))
     a, b = (scenes.image(stock, spp=1024, seed=s)[..., 3:] for s in (1, 2))
@@ -250,7 +256,9 @@ def test_crop_window(scenes):
     whole["film"] = whole["film"] | {"rfilter": {"type": "gaussian"}}
     crop = {"crop_offset_x": 5, "crop_offset_y": 9, "crop_width": 12, "crop_height": 8}
     sensors = {"sensor": whole, "cropped": whole | {"film": whole["film"] | crop}}
-    scene = scenes.load({"type": "irrcache", "max_depth": 2, "resolution": 16}, shape, **sensors)
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path", "max_depth": 2, "resolution": 16}, shape, **sensors
+    )
     full = scenes.image(scene, spp=256)[9:17, 5:17]
     part = scenes.image(scene, spp=256, sensor=1, seed=3)
     assert part.shape == full.shape
@@ -267,7 +275,9 @@ def test_scene_without_a_medium_is_volpaths(scenes):
     ball = {"type": "sphere", "bsdf": {"type": "diffuse"}}
     images = []
     for name in ("irrcache", "volpath"):
-        scene = scenes.load({"type": name, "max_depth": 4, "rr_depth": 5}, ball)
+        scene = scenes.load(
+            {"type": name, "max_depth": 4, "rr_depth": 5}, ball, default_solver="path"
+        )
         images.append(scenes.image(scene, spp=4, seed=5))
     assert images[0].mean() > 0
     np.testing.assert_array_equal(*images)

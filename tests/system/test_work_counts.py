@@ -28,7 +28,7 @@ def cloud_scene(scenes, density=None, albedo=0.8, **settings) -> mi.Scene:
     second = scenes.description({}, None, size=12)["sensor"]
     second["to_world"] = mi.ScalarTransform4f().look_at([4.0, 1.0, 2.0], [0, 0, 0], [0, 1, 0])
     integrator = {"type": "irrcache", "max_depth": 3, "resolution": 12, "cache_spp": 32}
-    return scenes.load(integrator | settings, shape, second=second)
+    return scenes.load(integrator | settings, shape, second=second, default_solver="path")
 
 
 def edit(scene: mi.Scene, ending: str, change) -> None:
@@ -230,7 +230,7 @@ def test_wrappers_use_the_cache(scenes, refine_calls):
     )
     inner = {"type": "irrcache", "solver": "path", "max_depth": 3, "resolution": 12}
     inner |= {"cache_spp": 32}
-    plain = scenes.image(scenes.load(inner, shape), spp=64)
+    plain = scenes.image(scenes.load(inner, shape, default_solver="path"), spp=64)
     refine_calls.clear()
     wrapped = scenes.load({"type": "aov", "aovs": "depth:depth", "inner": inner}, shape)
     image = scenes.image(wrapped, spp=64, seed=3)
@@ -264,7 +264,9 @@ def plain_scene(scenes, sigma_t, albedo, **more) -> mi.Scene:
     to_world = scenes.placement()
     shape = scenes.boundary(scenes.medium(sigma_t, albedo, to_world), to_world)
     integrator = {"type": "irrcache", "max_depth": 2, "resolution": 8, "cache_spp": 8}
-    return scenes.load(integrator | more, shape, emitter={"type": "constant"}, sun=None)
+    return scenes.load(
+        integrator | more, shape, emitter={"type": "constant"}, sun=None, default_solver="path"
+    )
 
 
 def test_constants_are_not_looked_up(scenes, kernels):
@@ -292,7 +294,7 @@ def test_grey_light_is_swept_once(scenes, kernels):
         integrator = {"type": "irrcache", "solver": "sweep", "max_depth": 2}
         integrator |= {"resolution": 44, "cache_spp": 32}
         sky = {"type": "constant", "radiance": radiance}
-        scene = scenes.load(integrator, shape, size=4, emitter=sky, sun=None)
+        scene = scenes.load(integrator, shape, size=4, emitter=sky, sun=None, default_solver="path")
         history = kernels(lambda: scene.integrator().prepare(scene))
         return sum(k["size"] == 44 * 44 and k["operation_count"] > 100 for k in history)
 
@@ -350,7 +352,7 @@ def test_few_numbers_per_voxel_are_kept(scenes):
     density = scenes.texture((64, 64, 64), 0.2, 2.0, 1)
     shape = scenes.boundary(scenes.medium(density, 0.8, to_world), to_world)
     integrator = {"type": "irrcache", "solver": "sweep", "max_depth": 2, "cache_spp": 32}
-    scene = scenes.load(integrator, shape, emitter={"type": "constant"})
+    scene = scenes.load(integrator, shape, emitter={"type": "constant"}, default_solver="path")
     before = stored()
     scenes.image(scene, spp=1)
     assert scene.integrator().cache.grid.voxel_count == 64**3

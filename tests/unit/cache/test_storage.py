@@ -154,7 +154,7 @@ def test_what_needs_an_error_gets_two_batches(scenes, solver, samples):
     common = {"type": "irrcache", "solver": solver, "resolution": 2, "max_depth": 2}
     for aovs, least in (("", 1), ("noise", 2)):
         settings = common | {"cache_spp": samples, "aovs": aovs}
-        scene = scenes.load(settings, shape, emitter=scenes.sky)
+        scene = scenes.load(settings, shape, emitter=scenes.sky, default_solver="path")
         scene.integrator().prepare(scene)
         made = scene.integrator().cache
         assert made.samples >= max(least * made.batch, samples)

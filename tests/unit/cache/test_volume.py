@@ -35,7 +35,7 @@ def make(scenes):
     to_world = scenes.placement((2.0, 1.0, 1.5), turn=20)
     sigma_t = scenes.texture((4, 3, 5), 0.0, 2.0, 1)
     shape = scenes.boundary(scenes.medium(sigma_t, 0.8, to_world), to_world)
-    scene = scenes.load({"type": "irrcache"}, shape)
+    scene = scenes.load({"type": "irrcache", "solver": "path"}, shape)
     medium = bake_scene(scene)
 
     def run(*calls: tuple[int, int], max_depth: int = 3, resolution: int = 6) -> IrradianceCache:

@@ -228,7 +228,9 @@ def test_any_integrator_may_offer_frames(monkeypatch):
 )
 def test_who_has_a_cache(scenes, integrator, expected):
     """Mitsuba's differentiable integrators have a method "prepare" too, but it is another one."""
-    scene = scenes.load({"type": integrator}, scenes.boundary(scenes.medium(1.0, 0.5)))
+    scene = scenes.load(
+        {"type": integrator}, scenes.boundary(scenes.medium(1.0, 0.5)), default_solver="path"
+    )
     assert runners.has_cache(scene) is expected
 
 

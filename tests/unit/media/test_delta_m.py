@@ -41,7 +41,9 @@ def test_only_forward_peaks_are_taken_away():
 
 def scene_of(scenes, settings: dict, **objects) -> mi.Scene:
     medium = scenes.medium(1.0, 0.9) | {"phase": hg(0.8)}
-    return scenes.load({"type": "irrcache"} | settings, scenes.boundary(medium), 8, **objects)
+    return scenes.load(
+        {"type": "irrcache", "solver": "path"} | settings, scenes.boundary(medium), 8, **objects
+    )
 
 
 def grid(values) -> dict:
@@ -72,7 +74,9 @@ def test_what_is_absorbed_stays(scenes, sigma_t, albedo):
             colour = value if plain else {"type": "rgb", "value": list(value)}
             volume = {"type": "constvolume", "value": colour}
             medium[name] = volume if medium["type"] == "heterogeneous" else colour
-    found = bake_media(scenes.load({"type": "irrcache"}, scenes.boundary(medium), 8))[0]
+    found = bake_media(
+        scenes.load({"type": "irrcache", "solver": "path"}, scenes.boundary(medium), 8)
+    )[0]
     z, y, x = (np.ravel(i) for i in np.indices((4, 5, 6)))
     centres = np.float32([(x + 0.5) / 3 - 1, (y + 0.5) / 2.5 - 1, (z + 0.5) / 2 - 1])
 

@@ -54,7 +54,12 @@ def test_a_bright_spot_of_the_sky_through_a_medium(scenes):
     seen = []
     for extinction in (1e-6, 0.9):
         medium = scenes.medium(extinction, 0.9) | {"phase": PHASE}
-        scene = scenes.load({"type": "irrcache", **settings}, scenes.boundary(medium), 2, **objects)
+        scene = scenes.load(
+            {"type": "irrcache", "solver": "path", **settings},
+            scenes.boundary(medium),
+            2,
+            **objects,
+        )
         seen.append(scenes.image(scene, spp=4)[..., -3:].mean())
     assert seen[0] > 20
     assert seen[1] / seen[0] == pytest.approx(np.exp(-2 * 0.9), rel=2e-3)

@@ -36,7 +36,7 @@ def test_null_surfaces_within_a_medium_change_nothing(scenes, varies):
         "sun": None,
         "sensor": ahead(scenes),
     }
-    found = scenes.image(scenes.load(SETTINGS, shape, 2, **objects), spp=16)
+    found = scenes.image(scenes.load(SETTINGS, shape, 2, **objects, default_solver="path"), spp=16)
     np.testing.assert_allclose(found, 2 * np.exp(-1.2), rtol=1e-3)
 
 
@@ -50,7 +50,7 @@ def test_depth_of_a_medium_behind_another(scenes):
         slabs.append(scenes.boundary(scenes.medium(depth / 0.01, 0.5), place))
     objects = {"behind": slabs[1], "emitter": None, "sun": None, "sensor": ahead(scenes)}
     objects["emitter"] = {"type": "constant", "radiance": 2.0}
-    scene = scenes.load(SETTINGS | {"aovs": "depth"}, slabs[0], 2, **objects)
+    scene = scenes.load(SETTINGS | {"aovs": "depth"}, slabs[0], 2, **objects, default_solver="path")
     found = scenes.image(scene, spp=4)[..., -1]
     first, second = 1 - np.exp(-0.7), np.exp(-0.7) * (1 - np.exp(-1.1))
     expected = (4 * first + 6 * second) / (first + second)

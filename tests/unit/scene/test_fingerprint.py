@@ -15,7 +15,9 @@ pytestmark = pytest.mark.usefixtures("rgb")
 def cloud_scene(scenes, seed=1, albedo=0.8, scale=1.0, turn=0.0, integrator="volpath", **objects):
     to_world = scenes.placement(turn=turn)
     medium = scenes.medium(scenes.texture((4, 4, 4), 0, 2, seed), albedo, to_world, scale=scale)
-    return scenes.load({"type": integrator}, scenes.boundary(medium, to_world), **objects)
+    return scenes.load(
+        {"type": integrator}, scenes.boundary(medium, to_world), **objects, default_solver="path"
+    )
 
 
 def named(scene: mi.Scene, ending: str) -> tuple[mi.SceneParameters, str]:

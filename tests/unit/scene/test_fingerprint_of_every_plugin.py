@@ -362,12 +362,12 @@ def test_cache_files_of_other_scenes_are_refused(scenes, tmp_path_factory, chang
     settings = {"type": "irrcache", "resolution": 2, "cache_spp": 8, "cache_file": str(file)}
     shape = scenes.boundary(scenes.medium(1.0, 0.8))
     if not file.exists():
-        first = scenes.load(settings, shape, emitter=lamp)
+        first = scenes.load(settings, shape, emitter=lamp, default_solver="path")
         first.integrator().prepare(first)
-    same = scenes.load(settings | {"cache_spp": 16}, shape, emitter=lamp)
+    same = scenes.load(settings | {"cache_spp": 16}, shape, emitter=lamp, default_solver="path")
     same.integrator().prepare(same)  # goes on with the file
     assert same.integrator().cache.streams == {0: 16}
-    other = scenes.load(settings, shape, emitter=lamp | change)
+    other = scenes.load(settings, shape, emitter=lamp | change, default_solver="path")
     with pytest.raises(CacheFileError, match=r"surfaces|emitters"):
         other.integrator().prepare(other)
 
@@ -380,7 +380,9 @@ def test_cache_files_know_where_a_point_light_is(scenes, tmp_path, position):
     shape = scenes.boundary(scenes.medium(1.0, 0.8))
 
     def prepare(place):
-        scene = scenes.load(settings, shape, emitter={"type": "point", "position": place})
+        scene = scenes.load(
+            settings, shape, emitter={"type": "point", "position": place}, default_solver="path"
+        )
         scene.integrator().prepare(scene)
 
     prepare([0, 0, 3])

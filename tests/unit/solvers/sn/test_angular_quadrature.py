@@ -67,7 +67,7 @@ def test_sets_are_even_together(sets, count):
 
 def lights(scenes, batches: int, **emitters) -> list[list[tuple]]:
     """The rows of passes of 8 pairs, under these emitters."""
-    sky = Sky(scenes.load({"type": "irrcache"}, None, size=2, **emitters))
+    sky = Sky(scenes.load({"type": "irrcache", "solver": "path"}, None, size=2, **emitters))
     rows, colour = sky.tables(batches, 8, 3, np.random.default_rng(3))
     np.testing.assert_array_equal(colour, 1)
     return rows
@@ -98,7 +98,7 @@ def test_an_environment_is_sampled_without_bias(scenes, bright):
     image[3:8] = 0.7
     image[5, 9] += bright
     emitter = {"type": "envmap", "bitmap": mi.Bitmap(image)}
-    scene = scenes.load({"type": "irrcache"}, None, size=2, emitter=emitter)
+    scene = scenes.load({"type": "irrcache", "solver": "path"}, None, size=2, emitter=emitter)
     rng, sky = np.random.default_rng(4), Sky(scene)
     found = []
     for _ in range(64):

@@ -95,7 +95,7 @@ def test_what_returns_is_linear_in_phi(scenes):
     wall = {"type": "sphere", "radius": 4.0, "flip_normals": True}
     wall["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
     shape = scenes.boundary(scenes.medium(40.0, 1.0))
-    scene = scenes.load({"type": "irrcache"}, shape, 4, emitter=None, wall=wall)
+    scene = scenes.load({"type": "irrcache", "solver": "path"}, shape, 4, emitter=None, wall=wall)
     (medium,) = bake_media(scene)
     grid = Grid((8, 8, 8), medium.frame)
     lattice = Lattice(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)

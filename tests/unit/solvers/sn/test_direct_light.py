@@ -28,7 +28,9 @@ def test_lamps_add_up(scenes, count):
         cosine = np.sqrt(1 - radius**2 / (place @ place))
         expected += 2 * np.pi * (1 - cosine) * radiance
     shape = scenes.boundary(scenes.medium(0.0, 0.5))
-    scene = scenes.load({"type": "irrcache"}, shape, 2, emitter=None, sun=None, **objects)
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path"}, shape, 2, emitter=None, sun=None, **objects
+    )
     (medium,) = bake_media(scene)
     small = [e for e in scene.emitters() if is_lamp(e)]
     assert len(small) == count

@@ -17,7 +17,7 @@ def sky_of(scenes, pixels: np.ndarray) -> tuple[Sky, np.ndarray, np.ndarray]:
     """
     bitmap = mi.Bitmap(np.repeat(np.float32(pixels)[..., None], 3, axis=2))
     emitter = {"type": "envmap", "bitmap": bitmap}
-    scene = scenes.load({"type": "irrcache"}, None, 2, emitter=emitter, sun=None)
+    scene = scenes.load({"type": "irrcache", "solver": "path"}, None, 2, emitter=emitter, sun=None)
     count = 1 << 14
     y, turn = 2 * (np.arange(count) + 0.5) / count - 1, 2.399963 * np.arange(count)
     around = np.sqrt(1 - y * y)
