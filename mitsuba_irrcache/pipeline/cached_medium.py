@@ -31,7 +31,7 @@ from mitsuba_irrcache.scene.fingerprint import differing, digests
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.solvers.path import solver as path_solver
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
-from mitsuba_irrcache.solvers.sn.anisotropic import DirectionalSweep, least_batch
+from mitsuba_irrcache.solvers.sn.anisotropic import AnisotropicSweep, least_batch
 from mitsuba_irrcache.solvers.sn.solver import Sweep
 from mitsuba_irrcache.transport.spot_beams import beams_of
 
@@ -280,7 +280,7 @@ class LitMedium:
         if self.solver == "sweep":
             if self._sweep is None:
                 arguments = settings.seed, settings.rr_depth, self._pause
-                kind = Sweep if cache.directional is None else DirectionalSweep
+                kind = Sweep if cache.directional is None else AnisotropicSweep
                 self._sweep = kind(scene, self.medium, cache, *arguments)
             self._sweep.refine(missing, progress)
         else:

@@ -18,7 +18,7 @@ from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.compile import bake_media, bake_scene
 from mitsuba_irrcache.solvers.path import solver as path_solver
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
-from mitsuba_irrcache.solvers.sn.anisotropic import DirectionalSweep, least_batch
+from mitsuba_irrcache.solvers.sn.anisotropic import AnisotropicSweep, least_batch
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -198,7 +198,7 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     solver, least = sn_solver.Sweep, sn_solver.BATCH
     if medium.phase is not None:
         moments = Directional(medium.phase, sources_of(scene))
-        solver, least = DirectionalSweep, least_batch(moments.order)
+        solver, least = AnisotropicSweep, least_batch(moments.order)
     batch = sn_solver.batch_of(samples, least)
     count = moments.count if moments else 0
     cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True, moments=count)

@@ -16,7 +16,7 @@ TINY = 1e-300
 FARTHEST = 20.0
 
 
-class Mixing:
+class AndersonAcceleration:
     """Of an iteration of large arrays, of which two steps are kept: how the error that falls most
     slowly has fallen tells what is left of it.
     """

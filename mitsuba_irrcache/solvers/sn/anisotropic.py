@@ -10,9 +10,9 @@ import mitsuba as mi
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.sn.layout import joined
-from mitsuba_irrcache.solvers.sn.moments import DirectionalLevel, Moments
-from mitsuba_irrcache.solvers.sn.multigrid import Level
-from mitsuba_irrcache.solvers.sn.ordinates import Pass
+from mitsuba_irrcache.solvers.sn.moments import AnisotropicMultigridLevel, Moments
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.sn.ordinates import OrdinateSet
 from mitsuba_irrcache.solvers.sn.solver import Sweep
 
 #: Directions of a pass for moments up to order 4, and beyond. They have to integrate products of
@@ -30,7 +30,7 @@ def least_batch(order: int) -> int:
     return 2 * directions_of(order)
 
 
-class DirectionalSweep(Sweep):
+class AnisotropicSweep(Sweep):
     """Fills ``cache``, which has moments."""
 
     def __init__(
@@ -45,10 +45,10 @@ class DirectionalSweep(Sweep):
         points = [s for s in self._sources if s.sharp and not s.far]
         self._towards = [s.seen_from(self._places)[0] for s in points]
 
-    def _new_level(self, *arguments: object) -> Level:
-        return DirectionalLevel(*arguments, not self._medium.alone, moments=self._moments)
+    def _new_level(self, *arguments: object) -> MultigridLevel:
+        return AnisotropicMultigridLevel(*arguments, not self._medium.alone, moments=self._moments)
 
-    def _solved(self, passes: list[Pass], channels: tuple[int, ...]) -> list[tuple]:
+    def _solved(self, passes: list[OrdinateSet], channels: tuple[int, ...]) -> list[tuple]:
         """As of `Sweep`; narrow lights are not in the moments of the light straight from emitters,
         but beside them.
         """

@@ -25,9 +25,9 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.context import probe
 from mitsuba_irrcache.solvers.sn.layout import joined
-from mitsuba_irrcache.solvers.sn.multigrid import Level
-from mitsuba_irrcache.solvers.sn.track_table import Entering, Table
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.sn.track_table import Entering, TrackTable
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 from mitsuba_irrcache.transport.path import Start, out_of, trace
 
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
@@ -75,13 +75,13 @@ class Arrivals:
     def __init__(
         self,
         around: Around,
-        lattice: Lattice,
+        lattice: Tracks,
         rows: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         paths: bool,
         seed: tuple[int, int, int],
     ) -> None:
         """``rows`` are directions, light from far away (n, 2, channels), weights and offsets as
-        for `Lattice.table`: light from surfaces comes along those that have a weight. Without
+        for `Tracks.table`: light from surfaces comes along those that have a weight. Without
         ``paths``, light comes straight from emitters only.
         """
         directions, light, weights, offsets = rows
@@ -106,7 +106,7 @@ class Arrivals:
         return [*self.straight, self.emitted, self.returned]
 
     def directly(
-        self, channels: Sequence[int], table: Table, rows: np.ndarray, part: int = 0
+        self, channels: Sequence[int], table: TrackTable, rows: np.ndarray, part: int = 0
     ) -> Entering:
         """Light straight from emitters, that ``part`` of it, along the lines of a ``table`` of the
         same lattice for these ``rows``.
@@ -117,8 +117,8 @@ class Arrivals:
     def returning(
         self,
         channels: Sequence[int],
-        level: Level,
-        table: Table,
+        level: MultigridLevel,
+        table: TrackTable,
         rows: np.ndarray,
         emitted: bool,
     ) -> Returning:
@@ -218,7 +218,7 @@ class Arrivals:
         return row * 2 + dr.select(back, 1, 0), weight, hit, ray, rng
 
     def _placed(
-        self, lattice: Lattice, table: Table, rows: np.ndarray
+        self, lattice: Tracks, table: TrackTable, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The first arguments of `Entering`."""
         mine, lines = self.lattice, table.rows
@@ -268,7 +268,7 @@ class Returning(Entering):
 
     def __init__(
         self,
-        level: Level,
+        level: MultigridLevel,
         channels: int,
         places: np.ndarray,
         cells: np.ndarray,

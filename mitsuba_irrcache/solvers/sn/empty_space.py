@@ -17,7 +17,7 @@ CELL, REACH = 2, 12
 WORTHWHILE = 0.5
 
 
-class Emptiness:
+class EmptySpace:
     """How far lines may go between ``lower`` and ``upper`` (x, y, z) of a grid without meeting a
     voxel that is needed.
 
@@ -34,7 +34,7 @@ class Emptiness:
     @staticmethod
     def find(
         grid: Grid, needed: mi.UInt32, lower: np.ndarray, upper: np.ndarray
-    ) -> Emptiness | None:
+    ) -> EmptySpace | None:
         """``needed``: flat indices of voxels of ``grid``. None where skipping gains too little."""
         sides = np.array(upper) - np.array(lower)
         shape = tuple(int(n) for n in -(-sides // CELL))[::-1]
@@ -67,4 +67,4 @@ class Emptiness:
             there > 0, 0, dr.select(distance > 0, (distance - 1) * CELL + 1, mi.UInt32(1))
         )
         dr.eval(slices)
-        return Emptiness(slices, shape)
+        return EmptySpace(slices, shape)

@@ -62,7 +62,7 @@ class Sky:
         """Directions for a number of passes, and the light from far away along them; before these,
         if wanted, for a ``first`` pass of so many pairs.
 
-        Returns arguments of `Lattice.table`, those of each pass, and the factors (channels) of what
+        Returns arguments of `Tracks.table`, those of each pass, and the factors (channels) of what
         these give: where channels differ by a factor only, light has a single one.
         """
         tables = self.rows(1, first, rng) if first else []

@@ -82,7 +82,7 @@ def follow(
     copy_back: mi.UInt32 | None = None,
 ):
     """Follows pairs of directions. ``corners``: so many ``words`` together, of `Extinction`.
-    ``empty``: the slices that may be skipped, of `Emptiness`. ``source``: what `Lattice.scatter`
+    ``empty``: the slices that may be skipped, of `EmptySpace`. ``source``: what `Tracks.scatter`
     calls volume, None if voxels send no light; may be ``volume`` itself, where the light is added,
     from voxel ``copy`` on. Light of several ``channels`` goes the same way; a voxel has those of
     all of them next to each other.

@@ -17,10 +17,10 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import Directional
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.solvers.sn.layout import joined, layers_of
-from mitsuba_irrcache.solvers.sn.multigrid import Level
-from mitsuba_irrcache.solvers.sn.ordinates import ArrivingPass, Pass
-from mitsuba_irrcache.solvers.sn.track_table import Group, Table
-from mitsuba_irrcache.solvers.sn.tracks import Lattice, sharpened
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.sn.ordinates import BoundaryOrdinateSet, OrdinateSet
+from mitsuba_irrcache.solvers.sn.track_table import Group, TrackTable
+from mitsuba_irrcache.solvers.sn.tracks import Tracks, sharpened
 
 #: Highest degree of what is corrected on coarser grids.
 SMOOTH = 1
@@ -59,13 +59,13 @@ class Moments:
 
     def carry(
         self,
-        lattice: Lattice,
+        lattice: Tracks,
         directions: np.ndarray,
         light: np.ndarray,
         offsets: np.ndarray,
         entering: Callable | None = None,
     ) -> mi.Float:
-        """As `Lattice.carry`: moments of the light that enters."""
+        """As `Tracks.carry`: moments of the light that enters."""
         table = lattice.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
         table.entering = entering(table) if entering is not None else None
         wanted = lattice.wanted
@@ -81,7 +81,7 @@ class Moments:
         return [dr.opaque(mi.Float, 0, width) for _ in range(self.count)]
 
     def uncollided(
-        self, passes: list[Pass] | list[ArrivingPass], lattice: Lattice
+        self, passes: list[OrdinateSet] | list[BoundaryOrdinateSet], lattice: Tracks
     ) -> tuple[mi.Float, list[mi.Float | None]]:
         """Moments of the light straight from emitters along lines at the wanted voxels, the sum of
         all ``passes``, but for that of narrow lights; and those of each narrow light (none where it
@@ -95,18 +95,18 @@ class Moments:
         return (smooth if found[0] is None else found[0]), found[1:]
 
 
-class DirectionalLevel(Level):
-    """A `Level` whose light are the ``moments``, one after the other."""
+class AnisotropicMultigridLevel(MultigridLevel):
+    """A `MultigridLevel` whose light are the ``moments``, one after the other."""
 
     def __init__(self, *arguments: object, moments: Moments) -> None:
-        """``arguments`` are those of `Level`."""
+        """``arguments`` are those of `MultigridLevel`."""
         super().__init__(*arguments)
         self.moments = moments
 
-    def _coarse(self, *arguments: object) -> DirectionalLevel:
+    def _coarse(self, *arguments: object) -> AnisotropicMultigridLevel:
         # What is slow to converge is smooth, and so are its directions.
         smooth = Moments(self.moments.directional, min(self.moments.order, SMOOTH))
-        return DirectionalLevel(*arguments, self.evenly, moments=smooth)
+        return AnisotropicMultigridLevel(*arguments, self.evenly, moments=smooth)
 
     def restrict(self, values: mi.Float) -> mi.Float:
         coarser = self.coarser
@@ -119,15 +119,15 @@ class DirectionalLevel(Level):
         return result
 
     def prolong(self, values: mi.Float) -> mi.Float:
-        """As of `Level`; moments that the coarser one does not have are 0."""
+        """As of `MultigridLevel`; moments that the coarser one does not have are 0."""
         moments = self.coarser.moments
         moment, place = layers_of(self.lattice.count, self.moments.count)
         known = moment < dr.opaque(mi.UInt32, moments.count)
         begin = dr.select(known, moment, 0) * dr.opaque(mi.UInt32, self.coarser.lattice.count)
         return dr.select(known, self._interpolated(values, place, 1, begin), 0)
 
-    def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
-        """As of `Level`, all moments of it."""
+    def scatter(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
+        """As of `MultigridLevel`, all moments of it."""
         moments, wanted, voxels = self.moments, self.lattice.wanted, self.grid.voxel_count
         if phi is not None and table.entering is not None:
             table.entering.receive(phi)
@@ -157,7 +157,7 @@ class DirectionalLevel(Level):
         return joined(received), joined(collided)
 
     def seen(self, phi: mi.Float, place: mi.UInt32, heading: mi.Vector3f | None) -> mi.Float:
-        """As of `Level`."""
+        """As of `MultigridLevel`."""
         step, result = dr.opaque(mi.UInt32, self.lattice.count), dr.gather(mi.Float, phi, place)
         basis = self.moments.directional.basis(heading)
         for factor in basis[: self.moments.count - 1]:

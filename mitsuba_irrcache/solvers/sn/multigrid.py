@@ -18,10 +18,10 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid, stencil
-from mitsuba_irrcache.solvers.sn.anderson import TINY, Mixing, mixed
+from mitsuba_irrcache.solvers.sn.anderson import TINY, AndersonAcceleration, mixed
 from mitsuba_irrcache.solvers.sn.layout import voxels_of
-from mitsuba_irrcache.solvers.sn.track_table import Table
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.track_table import TrackTable
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 #: Voxels along the longest side of the coarsest grid, at most.
 COARSEST = 20
@@ -35,7 +35,7 @@ TOLERANCE = 2e-3
 FEW_TOLERANCE, COARSE_TOLERANCE = 2e-4, 3e-2
 
 
-class Level:
+class MultigridLevel:
     """A grid of the hierarchy: extinction, albedo, the lines, and the next coarser level.
 
     ``sigma_t`` and ``albedo``, as all light, have a value for each voxel that the ``lattice``
@@ -47,14 +47,14 @@ class Level:
     """
 
     def __init__(
-        self, sigma_t: mi.Float, albedo: mi.Float, lattice: Lattice, evenly: bool = False
+        self, sigma_t: mi.Float, albedo: mi.Float, lattice: Tracks, evenly: bool = False
     ) -> None:
         self.sigma_t, self.albedo, self.lattice = sigma_t, albedo, lattice
         self.grid, self.evenly = lattice.grid, evenly
         self.channels = dr.width(albedo) // lattice.count
         # to the next level: x, y, z
         self._ratio = np.array([2, 2, 2]) if evenly else _ratio(self.grid)
-        self._coarser: Level | None = None
+        self._coarser: MultigridLevel | None = None
         self._tolerance = FEW_TOLERANCE
         self._children: list[tuple[mi.UInt32, mi.Float]] = []
 
@@ -63,7 +63,7 @@ class Level:
         return max(self.grid.shape) <= COARSEST
 
     @property
-    def coarser(self) -> Level:
+    def coarser(self) -> MultigridLevel:
         """The level of fewer voxels, made when it is first asked for."""
         if self._coarser is None:
             grid, lines = _reduced(self.grid, self._ratio), self.lattice
@@ -80,7 +80,7 @@ class Level:
             shares = [(i, dr.select(total > 0, s / total, 0)) for i, s in children]
             dr.eval(sigma_t, shares)
             box = np.zeros(3, int), grid.resolution
-            lattice = Lattice(grid, sigma_t, *box, None, wanted, lines.sparse, lines.pause)
+            lattice = Tracks(grid, sigma_t, *box, None, wanted, lines.sparse, lines.pause)
             wanted = lattice.wanted
             sigma_t = dr.gather(mi.Float, sigma_t, wanted)
             self._children = [
@@ -91,8 +91,8 @@ class Level:
             self._coarser._tolerance = COARSE_TOLERANCE
         return self._coarser
 
-    def _coarse(self, *arguments: object) -> Level:
-        return Level(*arguments, self.evenly)
+    def _coarse(self, *arguments: object) -> MultigridLevel:
+        return MultigridLevel(*arguments, self.evenly)
 
     def _around(self, coarse: Grid) -> mi.UInt32:
         """The voxels of a ``coarse`` grid that wanted ones lie between."""
@@ -116,7 +116,7 @@ class Level:
         """Means over the voxels of the coarser level, weighted by extinction."""
         return self._restricted(values, self.coarser.lattice)
 
-    def _restricted(self, values: mi.Float, coarse: Lattice) -> mi.Float:
+    def _restricted(self, values: mi.Float, coarse: Tracks) -> mi.Float:
         place, channel = voxels_of(coarse.count, self.channels)
         result = mi.Float(0)
         for i, w in self._children:
@@ -146,7 +146,7 @@ class Level:
 
         return dr.lerp(*(dr.lerp(*(along_x(y, z) for y in ys), wy) for z in zs), wz)
 
-    def scatter(self, phi: mi.Float | None, table: Table) -> tuple[mi.Float, mi.Float]:
+    def scatter(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
         """A phi plus the light that enters along ``table``: irradiance, and the mean of it where it
         collides, which is what is scattered again.
 
@@ -197,8 +197,10 @@ class Level:
             return self.scatter(phi, table)[0]
         return self.prolong(coarse.scatter(self.restrict(phi), table)[0])
 
-    def tables(self, rows: Sequence[np.ndarray], returning: Callable | None = None) -> list[Table]:
-        """Those of this level and of all coarser ones for ``rows`` as in `Lattice.table`, along
+    def tables(
+        self, rows: Sequence[np.ndarray], returning: Callable | None = None
+    ) -> list[TrackTable]:
+        """Those of this level and of all coarser ones for ``rows`` as in `Tracks.table`, along
         which no light enters from outside. ``returning``, if given, makes of a level and such a
         table of it the light that enters because phi is what it is.
         """
@@ -224,7 +226,7 @@ class Level:
         tables = self.tables(rows, returning)
         phi = self._guess(b, tables)
         change, light = np.inf, self._sums(dr.abs(b)).max() > 0
-        mixing = Mixing(self._sums)
+        mixing = AndersonAcceleration(self._sums)
         for _ in range(CORRECTIONS if not self.coarsest and light else 0):
             corrected = self.correct(phi, b, tables)
             scale = self._sums(dr.abs(corrected))
@@ -260,11 +262,11 @@ class Level:
         dr.eval(sums)
         return np.array([float(total[0]) for total in sums])
 
-    def correct(self, phi: mi.Float, b: mi.Float, tables: list[Table]) -> mi.Float:
+    def correct(self, phi: mi.Float, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
         """A sweep, and the correction of its error."""
         return self.corrected(phi, self.scatter(phi, tables[0])[1] + b, tables[1:])
 
-    def corrected(self, phi: mi.Float, swept: mi.Float, coarse: list[Table]) -> mi.Float:
+    def corrected(self, phi: mi.Float, swept: mi.Float, coarse: list[TrackTable]) -> mi.Float:
         """What a sweep has made of ``phi``, the errors that are left of which are found on the
         coarser level, with tables of it and those below; there is none under the coarsest.
         """
@@ -275,18 +277,18 @@ class Level:
         dr.eval(result)
         return result
 
-    def _approximate(self, b: mi.Float, tables: list[Table]) -> mi.Float:
+    def _approximate(self, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
         """About the solution, by a single correction on each level."""
         return self._iterate(b, tables[0]) if self.coarsest else self.correct(b, b, tables)
 
-    def _guess(self, b: mi.Float, tables: list[Table]) -> mi.Float:
+    def _guess(self, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
         """The solution as the coarser level sees it; on the coarsest, the solution."""
         if self.coarsest:
             return self._iterate(b, tables[0])
         coarser = self.coarser  # made before anything is restricted to it
         return self.prolong(coarser._approximate(self.restrict(b), tables[1:]))
 
-    def _iterate(self, b: mi.Float, table: Table) -> mi.Float:
+    def _iterate(self, b: mi.Float, table: TrackTable) -> mi.Float:
         """Source iteration with Anderson's acceleration on few voxels."""
         known = np.array(b, dtype=np.float64).reshape(-1, self.channels).T
         phi, history = known.copy(), []

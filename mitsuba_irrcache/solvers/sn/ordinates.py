@@ -13,18 +13,18 @@ from mitsuba_irrcache.cache.angular import Directional
 from mitsuba_irrcache.solvers.sn.angular_quadrature import spread, spread_together
 from mitsuba_irrcache.solvers.sn.boundary_condition import Around, Arrivals
 from mitsuba_irrcache.solvers.sn.incident import Sky
-from mitsuba_irrcache.solvers.sn.multigrid import Level
-from mitsuba_irrcache.solvers.sn.track_table import Table
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.sn.track_table import TrackTable
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
-#: Directions and what belongs to them, as `Lattice.table` wants it.
+#: Directions and what belongs to them, as `Tracks.table` wants it.
 Rows = Sequence[np.ndarray]
 #: Directions of a pass along which light arrives where there are surfaces: it differs from one to
 #: the next by more than the light between voxels.
 ARRIVING = 64
 
 
-class Pass:
+class OrdinateSet:
     """Directions, light from far away along them in some ``channels`` or alike in all, weights and
     offsets: light that enters and light from voxels goes the same ways.
     """
@@ -35,8 +35,10 @@ class Pass:
         self.rows = directions, own, weights, offsets
 
     @staticmethod
-    def straight(passes: Sequence[Pass], directional: Directional | None = None) -> list[tuple]:
-        """The light of all ``passes`` that comes straight from emitters, as `Lattice.carry` takes
+    def straight(
+        passes: Sequence[OrdinateSet], directional: Directional | None = None
+    ) -> list[tuple]:
+        """The light of all ``passes`` that comes straight from emitters, as `Tracks.carry` takes
         it; where it is told by its direction, first without that of narrow lights, then that of
         each.
         """
@@ -48,18 +50,18 @@ class Pass:
             for part, rows in zip(parts, lit, strict=True)
         ]
 
-    def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
-        """As `Level.scatter`, with the light that enters."""
+    def scatter(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        """As `MultigridLevel.scatter`, with the light that enters."""
         return level.scatter(phi, level.lattice.table(*self.rows))
 
-    def solve(self, level: Level, b: mi.Float, passes: int) -> mi.Float:
+    def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
         """All orders of scattering, of which ``b`` is the first, for so many further ``passes``:
         what is left of its error these correct, and divide by their number.
         """
         return level.solve(b, self.between, tolerance=max(1.0, passes / 2))
 
-    def corrected(self, level: Level, phi: mi.Float, swept: mi.Float) -> mi.Float:
-        """As `Level.corrected`, of a sweep along the lines of this pass."""
+    def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
+        """As `MultigridLevel.corrected`, of a sweep along the lines of this pass."""
         coarse = [] if level.coarsest else level.coarser.tables(self.between)
         return level.corrected(phi, swept, coarse)
 
@@ -69,7 +71,7 @@ class Pass:
         return between(self.rows)
 
 
-class ArrivingPass:
+class BoundaryOrdinateSet:
     """Among surfaces: light that arrives comes along more directions than light between voxels,
     ``inner`` ones.
 
@@ -93,9 +95,9 @@ class ArrivingPass:
 
     @staticmethod
     def straight(
-        passes: Sequence[ArrivingPass], directional: Directional | None = None
+        passes: Sequence[BoundaryOrdinateSet], directional: Directional | None = None
     ) -> list[tuple]:
-        """As `Pass.straight`."""
+        """As `OrdinateSet.straight`."""
         directions, light, _, offsets = merged([p.rows for p in passes])
         arrivals, channels = passes[0].arrivals, passes[0].channels
         numbers = np.concatenate([p.numbers for p in passes])
@@ -106,8 +108,8 @@ class ArrivingPass:
             parts.append((directions[lit], light[lit], offsets[lit], entering))
         return parts
 
-    def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
-        """As `Level.scatter`, with the light that arrives."""
+    def scatter(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        """As `MultigridLevel.scatter`, with the light that arrives."""
         table = self._arriving(level)
         table.entering.receive(phi)
         found = level.scatter(None, table)
@@ -119,18 +121,18 @@ class ArrivingPass:
         dr.eval(both)
         return both
 
-    def _arriving(self, level: Level) -> Table:
+    def _arriving(self, level: MultigridLevel) -> TrackTable:
         """The rows, with the light that arrives along them."""
         table = level.lattice.table(*self.rows)
         of_table = self.channels, level, table, self.numbers
         table.entering = self.arrivals.returning(*of_table, emitted=True)
         return table
 
-    def corrected(self, level: Level, phi: mi.Float, swept: mi.Float) -> mi.Float:
+    def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
         """The sweep as it is: what differs between passes here is light that arrives."""
         return swept
 
-    def solve(self, level: Level, b: mi.Float, passes: int) -> mi.Float:
+    def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
         """All orders, of which ``b`` is the first; light may leave the medium between two."""
         numbers = np.arange(len(self.inner[0]))
         return level.solve(
@@ -142,12 +144,12 @@ class ArrivingPass:
         )
 
 
-class JointPass(ArrivingPass):
+class JointOrdinateSet(BoundaryOrdinateSet):
     """Of light by its direction: what arrives and what voxels send go the same ways. What even
     directions make of their sum, where it is alike from all sides, is what they make of nothing.
     """
 
-    def scatter(self, level: Level, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+    def scatter(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         table = self._arriving(level)
         if phi is None:
             table.entering.receive(phi)
@@ -157,12 +159,12 @@ class JointPass(ArrivingPass):
 def arriving(
     around: Around,
     sky: Sky,
-    lattice: Lattice,
+    lattice: Tracks,
     passes: int,
     pairs: int,
     rng: np.random.Generator,
     seed: tuple[int, int],
-) -> tuple[Callable[[Sequence[int]], list[ArrivingPass]], list[list[mi.Float]]]:
+) -> tuple[Callable[[Sequence[int]], list[BoundaryOrdinateSet]], list[list[mi.Float]]]:
     """Passes among surfaces, made of the channels that are wanted together, of which the first
     one's orders can be solved for if there are several; and what differs between channels.
     ``pairs`` are those between voxels.
@@ -177,9 +179,9 @@ def arriving(
     starts = np.cumsum([0] + [len(row[0]) for row in rows])
     kinds = [*arrivals.kinds, *(returns.kinds if several else ())]
 
-    def of(channels: Sequence[int]) -> list[ArrivingPass]:
+    def of(channels: Sequence[int]) -> list[BoundaryOrdinateSet]:
         parts = enumerate(zip(rows, inner, starts, strict=False))
-        kind = JointPass if joint else ArrivingPass
+        kind = JointOrdinateSet if joint else BoundaryOrdinateSet
         return [
             kind(dark(row), dark(own), arrivals, start, None if i else returns, channels)
             for i, (row, own, start) in parts

@@ -25,10 +25,10 @@ from mitsuba_irrcache.solvers.sn.direct_emission import emitted_light
 from mitsuba_irrcache.solvers.sn.direct_light import Lamps, is_lamp, split
 from mitsuba_irrcache.solvers.sn.incident import Sky
 from mitsuba_irrcache.solvers.sn.layout import side_by_side
-from mitsuba_irrcache.solvers.sn.multigrid import Level
-from mitsuba_irrcache.solvers.sn.ordinates import ArrivingPass, Pass, arriving, merged
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.sn.ordinates import BoundaryOrdinateSet, OrdinateSet, arriving, merged
 from mitsuba_irrcache.solvers.sn.resampling import albedo_of_collisions, baked, detail_of
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 #: Directions per voxel of a batch, pairs of opposite ones, at least and at most. Spread evenly
 #: together, 32 leave half the noise of two sets of 16, and 64 four fifths of that of two of 32.
@@ -97,9 +97,9 @@ class Sweep:
         data = medium.sigma_t.grid
         sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
         rest = *box, detail, cache.active, sparse, pause
-        self._lattices = [Lattice(grid, s, *rest) for s in extinction]
+        self._lattices = [Tracks(grid, s, *rest) for s in extinction]
         # For single scattering the albedo does not matter here.
-        self._levels: dict[tuple[int, ...], Level] = {}
+        self._levels: dict[tuple[int, ...], MultigridLevel] = {}
         self._sigma_t = self._albedo = [mi.Float(0)]
         if cache.max_depth != 2:
             sigma_t = extinction if detail is grid else baked(medium, medium.sigma_t, grid)
@@ -162,8 +162,8 @@ class Sweep:
             # Channels that differ by a factor only are one.
             grey = media == 1 and rows[0][1].shape[-1] == 1
 
-            def passes_of(channels: Sequence[int]) -> list[Pass]:
-                return [Pass(row, channels) for row in rows]
+            def passes_of(channels: Sequence[int]) -> list[OrdinateSet]:
+                return [OrdinateSet(row, channels) for row in rows]
         else:
             seed = self.seed, number
             lattice, colour = self._lattices[0], np.ones(cache.channels)
@@ -204,7 +204,7 @@ class Sweep:
             return [tuple(channels)]
         return [(c,) for c in channels]
 
-    def _level(self, channels: tuple[int, ...]) -> Level:
+    def _level(self, channels: tuple[int, ...]) -> MultigridLevel:
         """The finest level, made when it is first asked for."""
         if channels not in self._levels:
             sigma_t, albedo = self._sigma_t, self._albedo
@@ -215,18 +215,18 @@ class Sweep:
             )
         return self._levels[channels]
 
-    def _lattice(self, channels: tuple[int, ...]) -> Lattice:
+    def _lattice(self, channels: tuple[int, ...]) -> Tracks:
         """The lines of these channels of the medium."""
         return self._lattices[min(channels[0], len(self._lattices) - 1)]
 
-    def _new_level(self, *arguments: object) -> Level:
-        return Level(
+    def _new_level(self, *arguments: object) -> MultigridLevel:
+        return MultigridLevel(
             *arguments, evenly=not self._medium.alone
         )  # as `boundary_condition` takes for granted
 
     def _solved(
         self,
-        passes: list[Pass] | list[ArrivingPass],
+        passes: list[OrdinateSet] | list[BoundaryOrdinateSet],
         channels: tuple[int, ...],
     ) -> list[tuple]:
         """For each channel the irradiance at the active voxels: straight from the emitters, and
@@ -247,7 +247,10 @@ class Sweep:
         return list(zip(uncollided, scattered, strict=True))
 
     def _received(
-        self, level: Level, passes: list[Pass] | list[ArrivingPass], channels: tuple[int, ...]
+        self,
+        level: MultigridLevel,
+        passes: list[OrdinateSet] | list[BoundaryOrdinateSet],
+        channels: tuple[int, ...],
     ) -> mi.Float:
         """Light of all orders wanted along lines at the active voxels, on average over all passes
         but the first one, of all channels next to each other.
@@ -292,7 +295,10 @@ class Sweep:
         return [dr.gather(mi.Float, values, place + start) for start in starts]
 
     def _uncollided(
-        self, lattice: Lattice, passes: list[Pass] | list[ArrivingPass], channels: tuple[int, ...]
+        self,
+        lattice: Tracks,
+        passes: list[OrdinateSet] | list[BoundaryOrdinateSet],
+        channels: tuple[int, ...],
     ) -> tuple[list[mi.Float], list[mi.Float]]:
         """Irradiance straight from emitters along lines, on average over passes, in each channel;
         and that from all emitters.
@@ -306,7 +312,11 @@ class Sweep:
         ]
 
     def _collided(
-        self, level: Level, first: Pass | ArrivingPass, channels: tuple[int, ...], passes: int
+        self,
+        level: MultigridLevel,
+        first: OrdinateSet | BoundaryOrdinateSet,
+        channels: tuple[int, ...],
+        passes: int,
     ) -> mi.Float:
         """Mean irradiance of collisions, of all orders but the last, which so many further
         ``passes`` make use of.

@@ -9,7 +9,7 @@ import numpy as np
 from mitsuba_irrcache.solvers.sn.kernel import DIRECTION, NUMBERS, ONE, WEIGHT
 
 
-class Table:
+class TrackTable:
     """Parameters of pairs of directions as arrays: another direction compiles nothing.
 
     ``light`` (n, 2, channels) is what enters along the axis and against it; if it has one channel,
@@ -43,7 +43,7 @@ class Table:
 class Group:
     """Pairs of a ``table`` that follow each other there."""
 
-    def __init__(self, table: Table, pairs: list[int]) -> None:
+    def __init__(self, table: TrackTable, pairs: list[int]) -> None:
         self.table, self._pairs = table, pairs
         self._first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
         self.count = dr.opaque(mi.UInt32, len(pairs))

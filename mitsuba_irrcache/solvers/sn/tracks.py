@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn.empty_space import Emptiness
+from mitsuba_irrcache.solvers.sn.empty_space import EmptySpace
 from mitsuba_irrcache.solvers.sn.extinction import Extinction
 from mitsuba_irrcache.solvers.sn.kernel import DIRECTION, INTEGERS, NUMBERS, ONE, add_copies, follow
 from mitsuba_irrcache.solvers.sn.layout import (
@@ -38,7 +38,7 @@ from mitsuba_irrcache.solvers.sn.layout import (
     slicewise,
     strides_of,
 )
-from mitsuba_irrcache.solvers.sn.track_table import Group, Rows, Table
+from mitsuba_irrcache.solvers.sn.track_table import Group, Rows, TrackTable
 
 #: What lines leave in a voxel is a mean over its cross section: smoothing of variance 1/12 along
 #: both axes across, half of which is to be taken back (`sharpened`).
@@ -50,7 +50,7 @@ SMALL = 40**3
 COPIES = 1 << 22
 
 
-class Lattice:
+class Tracks:
     """The lines through the voxels of ``grid`` between ``lower`` and ``upper`` (x, y, z; voxels
     outside of this box are empty and get no light).
 
@@ -88,7 +88,7 @@ class Lattice:
         self._places: mi.UInt32 | None = None
         self.sparse, self._empty = sparse, None
         if sparse and not self.together:
-            self._empty = Emptiness.find(grid, self.wanted, lower, upper)
+            self._empty = EmptySpace.find(grid, self.wanted, lower, upper)
         #: where the corners of each axis begin among all that are kept
         self._first_corner = [0, 0, 0]
         if self.together:
@@ -117,7 +117,7 @@ class Lattice:
         weights: np.ndarray,
         offsets: np.ndarray,
         by_slice: bool = False,
-    ) -> Table:
+    ) -> TrackTable:
         """What kernels need to know of pairs of opposite directions.
 
         Args:
@@ -162,7 +162,7 @@ class Lattice:
             ]
         forward = velocities[np.arange(count), axes] > 0
         along = np.where(forward[:, None, None], light, light[:, ::-1])
-        return Table(integers, numbers, along, Rows(axes, forward, integers))
+        return TrackTable(integers, numbers, along, Rows(axes, forward, integers))
 
     def carry(
         self,
@@ -195,7 +195,7 @@ class Lattice:
             del volume, light  # before the next axis has its own
         return total
 
-    def scatter(self, volume: mi.Float, table: Table) -> None:
+    def scatter(self, volume: mi.Float, table: TrackTable) -> None:
         """Follows the light that comes from the voxels themselves, and that enters from outside.
 
         ``volume`` holds four values for each voxel: the radiance per optical depth that it sends
@@ -212,7 +212,7 @@ class Lattice:
             self._launch(volume, True, table, axis, pairs)
 
     def apart(
-        self, table: Table, sent: Callable[[Group], mi.Float] | None = None
+        self, table: TrackTable, sent: Callable[[Group], mi.Float] | None = None
     ) -> Iterator[tuple[int, Group, mi.Float]]:
         """Follows the pairs of ``table``, some at a time, and tells their axis and what their lines
         leave: volumes one after the other, two for each pair, of light along the axis and against
@@ -257,7 +257,7 @@ class Lattice:
         return corners, words
 
     def _launch(
-        self, volume: mi.Float, scatters: bool, table: Table, axis: int, pairs: list[int]
+        self, volume: mi.Float, scatters: bool, table: TrackTable, axis: int, pairs: list[int]
     ) -> None:
         """Follows the ``pairs`` of ``table``, all of which have the dominant ``axis``."""
         if self.together:
@@ -276,7 +276,7 @@ class Lattice:
             self.pause()
 
     def _launch_together(
-        self, volume: mi.Float, scatters: bool, table: Table, pairs: list[int]
+        self, volume: mi.Float, scatters: bool, table: TrackTable, pairs: list[int]
     ) -> None:
         """The same in one launch, or few; the ``pairs``, of any axes, follow each other in the
         table's order.

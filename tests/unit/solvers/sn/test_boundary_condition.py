@@ -12,7 +12,7 @@ from mitsuba_irrcache.scene.compile import bake_media
 from mitsuba_irrcache.solvers.sn import boundary_condition
 from mitsuba_irrcache.solvers.sn.boundary_condition import Around, Arrivals
 from mitsuba_irrcache.solvers.sn.track_table import Entering
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -26,7 +26,7 @@ class Nothing:
     shines, directional = False, None
 
 
-def swept(lattice: Lattice, found: Arrivals, values: mi.Float, i: int, offset) -> np.ndarray:
+def swept(lattice: Tracks, found: Arrivals, values: mi.Float, i: int, offset) -> np.ndarray:
     """What the lines of direction ``i`` bring to the voxels of ``lattice``, through nothing."""
     dark, rows = np.zeros((1, 2)), np.array([i])
 
@@ -57,7 +57,7 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
     place = scenes.placement((1.0, 3.0, 2.0), turn=35, mirror=True)
     grid = Grid((12, 10, 8), place)
     lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])
-    fine = Lattice(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
+    fine = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
     offsets = np.random.default_rng(3).random((len(DIRECTIONS), 2))
     rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
     found = Arrivals(Nothing, fine, rows, True, (0, 0, 0))
@@ -66,7 +66,7 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
     if coarse:
         half = Grid((6, 5, 4), place)
         low, high = lower // 2, upper // 2
-        lattice = Lattice(half, dr.zeros(mi.Float, half.voxel_count), low, high)
+        lattice = Tracks(half, dr.zeros(mi.Float, half.voxel_count), low, high)
     inside = np.s_[low[2] : high[2], low[1] : high[1], low[0] : high[0]]
     at = np.moveaxis(np.indices(lattice.grid.shape)[::-1], 0, -1) + 0.5
     world = lattice.grid.world.matrix
@@ -98,7 +98,7 @@ def test_what_returns_is_linear_in_phi(scenes):
     scene = scenes.load({"type": "irrcache", "solver": "path"}, shape, 4, emitter=None, wall=wall)
     (medium,) = bake_media(scene)
     grid = Grid((8, 8, 8), medium.frame)
-    lattice = Lattice(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)
+    lattice = Tracks(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)
     offsets = np.random.default_rng(1).random((len(DIRECTIONS), 2))
     rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
     found = Arrivals(Around(scene, medium, [], 1000), lattice, rows, True, (1, 2, 0))

@@ -12,8 +12,8 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
 from mitsuba_irrcache.solvers.sn.boundary_condition import Arrivals
 from mitsuba_irrcache.solvers.sn.kernel import ONE
-from mitsuba_irrcache.solvers.sn.moments import DirectionalLevel, Moments
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.moments import AnisotropicMultigridLevel, Moments
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -34,10 +34,10 @@ def moments_of(g: float, order: int = 2) -> Moments:
     return Moments(Directional(Phase(None, g ** np.arange(32), 1.0), []), order)
 
 
-def lines(extinction: float) -> Lattice:
+def lines(extinction: float) -> Tracks:
     grid = Grid(SHAPE, np.diag([1.0, 1.4, 1.0, 1]))
     sigma_t = dr.full(mi.Float, extinction, grid.voxel_count)
-    return Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
+    return Tracks(grid, sigma_t, np.zeros(3, int), grid.resolution)
 
 
 def harmonics(moments: Moments, towards: np.ndarray) -> np.ndarray:
@@ -59,7 +59,7 @@ def test_moments_of_light_through_nothing(way, back):
     np.testing.assert_allclose(found, np.broadcast_to(expected[:, None], found.shape), atol=1e-5)
 
 
-def centred(level: DirectionalLevel, ways: np.ndarray) -> np.ndarray:
+def centred(level: AnisotropicMultigridLevel, ways: np.ndarray) -> np.ndarray:
     """Offsets with which the lines of these directions go through the middle of the middle voxel:
     the set of all lines is symmetric about it.
     """
@@ -80,7 +80,7 @@ def test_light_that_a_voxel_scatters_goes_on_forward():
     """
     moments, of_matter = moments_of(0.5), lines(0.2)
     fields = dr.full(mi.Float, 0.2, of_matter.count), dr.full(mi.Float, 1.0, of_matter.count)
-    level = DirectionalLevel(*fields, of_matter, moments=moments)
+    level = AnisotropicMultigridLevel(*fields, of_matter, moments=moments)
     ways = WAYS[:15]
     table = ways, np.zeros((15, 2)), np.full(15, 2 * np.pi / 15), centred(level, ways)
     heading, received = np.array([0.6, 0.48, 0.64]), []
@@ -120,7 +120,7 @@ def test_paths_begin_on_their_lines(scenes, monkeypatch):
     )
     grid = Grid((12, 10, 8), scenes.placement((1.0, 3.0, 2.0), turn=35))
     lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])
-    lattice = Lattice(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
+    lattice = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
     offsets = np.random.default_rng(3).random((len(WAYS), 2))
     rows = WAYS, np.zeros((len(WAYS), 2, 3)), np.ones(len(WAYS)), offsets
     found = Arrivals(Nothing, lattice, rows, True, (0, 0, 0))

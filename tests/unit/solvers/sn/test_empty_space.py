@@ -11,9 +11,9 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.sn import empty_space, tracks
-from mitsuba_irrcache.solvers.sn.empty_space import CELL, Emptiness
-from mitsuba_irrcache.solvers.sn.multigrid import Level
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.empty_space import CELL, EmptySpace
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -30,7 +30,7 @@ def sparse(share: float = 1e-3) -> np.ndarray:
 
 def found(occupied: np.ndarray, lower, upper) -> np.ndarray | None:
     needed = mi.UInt32(np.flatnonzero(occupied).tolist())
-    emptiness = Emptiness.find(Grid(SHAPE, np.eye(4)), needed, np.array(lower), np.array(upper))
+    emptiness = EmptySpace.find(Grid(SHAPE, np.eye(4)), needed, np.array(lower), np.array(upper))
     if emptiness is None:
         return None
     shape = [-(-(b - a) // CELL) for a, b in zip(lower, upper, strict=True)][::-1]
@@ -99,7 +99,7 @@ def test_light_is_the_same(monkeypatch, box, detailed):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     light, offsets = rng.random((12, 2)), rng.random((12, 2))
     sigma_t = mi.Float(density.ravel().tolist())
-    lines = [Lattice(grid, sigma_t, lower, upper, medium, wanted, skip) for skip in (False, True)]
+    lines = [Tracks(grid, sigma_t, lower, upper, medium, wanted, skip) for skip in (False, True)]
     values = [np.array(each.carry(directions, light, offsets)) for each in lines]
     assert values[0].max() > 2 * values[0].min()
     np.testing.assert_allclose(*values, rtol=1e-6)
@@ -107,7 +107,7 @@ def test_light_is_the_same(monkeypatch, box, detailed):
     for channels in (1, 3):
         phi, found = mi.Float(rng.random(count * channels).tolist()), []
         for each in lines:
-            level = Level(dr.full(mi.Float, 1, count), phi * 0.8, each)
+            level = MultigridLevel(dr.full(mi.Float, 1, count), phi * 0.8, each)
             table = each.table(directions, light, np.full(12, 0.5), offsets)
             found.append([np.array(v) for v in level.scatter(phi, table)])
         for all_voxels, some in zip(*found, strict=True):

@@ -12,9 +12,9 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
 from mitsuba_irrcache.solvers.sn import tracks
 from mitsuba_irrcache.solvers.sn.angular_quadrature import spread
-from mitsuba_irrcache.solvers.sn.moments import DirectionalLevel, Moments
-from mitsuba_irrcache.solvers.sn.multigrid import Level
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.moments import AnisotropicMultigridLevel, Moments
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -45,17 +45,21 @@ def matter(seed: int = 0, empty: float = 0.0) -> np.ndarray:
     return np.float32(np.where(rng.random(SIDES) < empty, 0, sigma_t))
 
 
-def lines(sigma_t: np.ndarray) -> Lattice:
+def lines(sigma_t: np.ndarray) -> Tracks:
     grid = Grid(sigma_t.shape, np.diag([1.4, 1.8, 1.2, 1]))
-    return Lattice(grid, mi.Float(sigma_t.ravel().tolist()), np.zeros(3, int), grid.resolution)
+    return Tracks(grid, mi.Float(sigma_t.ravel().tolist()), np.zeros(3, int), grid.resolution)
 
 
-def level(sigma_t: np.ndarray, albedo: float, moments: Moments | None) -> Level:
+def level(sigma_t: np.ndarray, albedo: float, moments: Moments | None) -> MultigridLevel:
     of_matter = lines(sigma_t)
     number = of_matter.count
     fields = (mi.Float(v.ravel().tolist()) for v in (sigma_t, np.full(number, albedo)))
     arguments = *fields, of_matter
-    return Level(*arguments) if moments is None else DirectionalLevel(*arguments, moments=moments)
+    return (
+        MultigridLevel(*arguments)
+        if moments is None
+        else AnisotropicMultigridLevel(*arguments, moments=moments)
+    )
 
 
 def rows(pairs: int, light: float = 0.0, seed: int = 1) -> tuple[np.ndarray, ...]:
@@ -82,7 +86,7 @@ def test_light_of_one_direction():
 
 
 def test_isotropic_scattering_is_that_of_levels():
-    """Without further moments, light is scattered as `Level` has it."""
+    """Without further moments, light is scattered as `MultigridLevel` has it."""
     sigma_t, none = matter(empty=0.3), moments_of(0.0, 1)
     isotropic, directional = level(sigma_t, 0.8, None), level(sigma_t, 0.8, none)
     rng = np.random.default_rng(4)
@@ -133,10 +137,10 @@ def test_solution():
     rng = np.random.default_rng(7)
     grid = Grid((24, 24, 24), np.diag([1.0, 1, 1, 1]))
     sigma_t = mi.Float(rng.uniform(0, 40, grid.voxel_count).tolist())
-    box = Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
+    box = Tracks(grid, sigma_t, np.zeros(3, int), grid.resolution)
     moments = moments_of(0.5, 2)
     albedo = dr.full(mi.Float, 0.99, grid.voxel_count)
-    white = DirectionalLevel(sigma_t, albedo, box, moments=moments)
+    white = AnisotropicMultigridLevel(sigma_t, albedo, box, moments=moments)
     table = rows(16, 1.0)
     _, b = white.scatter(None, box.table(*table))
     directions, _, weights, offsets = table

@@ -8,11 +8,11 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.sn import multigrid, tracks
-from mitsuba_irrcache.solvers.sn.anderson import Mixing
+from mitsuba_irrcache.solvers.sn.anderson import AndersonAcceleration
 from mitsuba_irrcache.solvers.sn.angular_quadrature import spread
-from mitsuba_irrcache.solvers.sn.multigrid import Level
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.sn.track_table import Entering
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -37,10 +37,10 @@ def level(random, evenly: bool):
     sigma_t = mi.Float(random.uniform(0, 20, VOXELS).tolist())
     albedos = random.uniform(0.5, 1, (3, VOXELS))
     grid = Grid(SHAPE, np.eye(4))
-    lines = Lattice(grid, sigma_t, np.zeros(3, int), grid.resolution)
+    lines = Tracks(grid, sigma_t, np.zeros(3, int), grid.resolution)
 
-    def of(*channels: int) -> Level:
-        return Level(sigma_t, flat(albedos[list(channels)]), lines, evenly)
+    def of(*channels: int) -> MultigridLevel:
+        return MultigridLevel(sigma_t, flat(albedos[list(channels)]), lines, evenly)
 
     return of
 
@@ -144,12 +144,12 @@ def test_voxels_without_matter_need_not_be_known(random, evenly):
     found = []
     for wanted in (np.arange(VOXELS), index):
         all_matter = mi.Float(sigma_t.tolist())
-        lines = Lattice(
+        lines = Tracks(
             grid, all_matter, np.zeros(3, int), grid.resolution,
             wanted=mi.UInt32(wanted.tolist()), sparse=len(wanted) < VOXELS,
         )  # fmt: skip
         fields = (mi.Float(f[wanted].ravel().tolist()) for f in (sigma_t, albedo))
-        some = Level(*fields, lines, evenly)
+        some = MultigridLevel(*fields, lines, evenly)
         phi = some.solve(mi.Float(b[wanted].ravel().tolist()), of_rows)
         received = some.scatter(phi, lines.table(*of_rows))[0]
         found.append([np.array(v).reshape(-1, 2) for v in (phi, received)])
@@ -166,7 +166,7 @@ def test_mixing_goes_where_a_slow_error_leads():
     are solved by the third step.
     """
     solution, phi = mi.Float([3.0, 5.0] * 4), mi.Float([0.0, 1.0] * 4)
-    rates, mixing = mi.Float([0.9, 0.3] * 4), Mixing(by_channel)
+    rates, mixing = mi.Float([0.9, 0.3] * 4), AndersonAcceleration(by_channel)
     for _ in range(2):
         phi = mixing.next(phi, solution + rates * (phi - solution))
     np.testing.assert_allclose(phi, solution, rtol=1e-5)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn.multigrid import Level
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -23,15 +23,17 @@ GRIDS = {
 }
 
 
-def level_of(scenes, shape, edges, sigma_t: np.ndarray, evenly: bool) -> Level:
+def level_of(scenes, shape, edges, sigma_t: np.ndarray, evenly: bool) -> MultigridLevel:
     sides = np.array(shape)[::-1] * edges
     grid = Grid(shape, scenes.placement(tuple(sides), turn=20))
     values = mi.Float(np.float32(sigma_t).ravel())
-    lattice = Lattice(grid, values, np.zeros(3, int), grid.resolution)
-    return Level(values, mi.Float(np.full(values.shape[0], 0.8, np.float32)), lattice, evenly)
+    lattice = Tracks(grid, values, np.zeros(3, int), grid.resolution)
+    return MultigridLevel(
+        values, mi.Float(np.full(values.shape[0], 0.8, np.float32)), lattice, evenly
+    )
 
 
-def centres(level: Level) -> np.ndarray:
+def centres(level: MultigridLevel) -> np.ndarray:
     """World positions of the voxels (n, 3)."""
     return np.array(level.grid.centers(level.lattice.wanted), np.float64).T
 

@@ -11,7 +11,7 @@ from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.sn import tracks
 from mitsuba_irrcache.solvers.sn.kernel import ONE
-from mitsuba_irrcache.solvers.sn.tracks import Lattice, sharpened
+from mitsuba_irrcache.solvers.sn.tracks import Tracks, sharpened
 
 SHAPES = [(8, 8, 8), (7, 12, 5), (1, 6, 9), (5, 1, 1), (9, 4, 1)]
 #: Along axes, edges and diagonals, almost along them, and between.
@@ -45,14 +45,14 @@ def offsets(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((count, 2))
 
 
-def lines(grid: Grid, sigma_t, box=None) -> Lattice:
+def lines(grid: Grid, sigma_t, box=None) -> Tracks:
     """The lattice of a medium (z, y, x), in a box (lower, upper) of (x, y, z)."""
     values = np.broadcast_to(np.float32(sigma_t), grid.shape).ravel()
     lower, upper = ([0, 0, 0], grid.resolution) if box is None else box
-    return Lattice(grid, mi.Float(values), np.array(lower), np.array(upper))
+    return Tracks(grid, mi.Float(values), np.array(lower), np.array(upper))
 
 
-def carried(lines: Lattice, light, places: np.ndarray, directions=DIRECTIONS) -> np.ndarray:
+def carried(lines: Tracks, light, places: np.ndarray, directions=DIRECTIONS) -> np.ndarray:
     """Irradiance (z, y, x) of light (n, 2) along pairs of directions."""
     light = np.broadcast_to(light, (len(directions), 2))
     volume = lines.carry(directions, light, places)
@@ -284,7 +284,7 @@ def test_detail_of_the_medium_is_kept(detail, axis):
     grid, medium = Grid((5, 6, 6), np.eye(4)), Grid(detail, np.eye(4))
     sigma_t = np.random.default_rng(0).uniform(0, 8, detail)
     values = mi.Float(sigma_t.ravel())
-    both = Lattice(grid, values, np.zeros(3, int), grid.resolution, medium)
+    both = Tracks(grid, values, np.zeros(3, int), grid.resolution, medium)
     direction, places = np.eye(3)[axis], offsets(1, 3)
     at = passages(grid, direction, places[0]) / grid.resolution
     field = GridField(medium, values, 1)

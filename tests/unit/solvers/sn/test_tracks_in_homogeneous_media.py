@@ -10,7 +10,7 @@ import pytest
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.sn import tracks
 from mitsuba_irrcache.solvers.sn.kernel import ONE
-from mitsuba_irrcache.solvers.sn.tracks import Lattice
+from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -49,7 +49,7 @@ def test_light_that_enters_is_less_by_what_it_has_passed(way, back):
     """
     grid, sigma_t = Grid(SHAPE, np.diag([1.4, 1.8, 1.2, 1])), 4.0
     count = grid.voxel_count
-    lines = Lattice(grid, dr.full(mi.Float, sigma_t, count), np.zeros(3, int), grid.resolution)
+    lines = Tracks(grid, dr.full(mi.Float, sigma_t, count), np.zeros(3, int), grid.resolution)
     light, offset = np.zeros((1, 2)), np.array([[0.35, 0.8]])
     light[0, back] = 3.0
     volume = dr.opaque(mi.Float, 0, count * 4)
