@@ -35,7 +35,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.io.files import atomic_write
-from mitsuba_irrcache.lights.falloff import Falloff
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.scene.fingerprint import differing
 from mitsuba_irrcache.scene.voxel_classes import Survey
 from mitsuba_irrcache.transport.spot_beams import Beam
@@ -97,7 +97,7 @@ class IrradianceCache:
         #: what the moments are of
         self.directional: Directional | None = None
         #: how the light of lamps nearby falls off; None where there are none
-        self.falloff: Falloff | None = None
+        self.falloff: InverseSquareFactor | None = None
         #: spot lights, whose irradiance camera rays look up apart; the layers hold its means
         self.beams: list[Beam] = []
         #: where voxels lie among surfaces; None where there are none

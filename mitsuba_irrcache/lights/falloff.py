@@ -32,7 +32,7 @@ SHORT = 0.05
 FINEST, CLOSE = 24, 1.5
 
 
-class Places:
+class VoxelSamplePoints:
     """Where the light in the voxels of ``grid`` is computed: at their centres, but for those that a
     lamp is in.
 
@@ -57,7 +57,7 @@ class Places:
         return p
 
 
-class Falloff:
+class InverseSquareFactor:
     """How light falls off with the distance from lamps nearby, relative to what it is far away.
 
         W = 1 + sum_k w_k REACH^2 h^2 / r_k^2,    sum_k w_k = 1,
@@ -67,7 +67,9 @@ class Falloff:
     way from there.
     """
 
-    def __init__(self, places: Places, points: list[tuple[np.ndarray, float, float]]) -> None:
+    def __init__(
+        self, places: VoxelSamplePoints, points: list[tuple[np.ndarray, float, float]]
+    ) -> None:
         """``points`` are positions, strengths (irradiance times squared distance, in any unit) and
         squared radii.
         """
@@ -83,14 +85,16 @@ class Falloff:
         ]
 
     @classmethod
-    def of(cls, scene: mi.Scene, grid: Grid, others: Sequence[mi.Emitter] = ()) -> Falloff | None:
+    def of(
+        cls, scene: mi.Scene, grid: Grid, others: Sequence[mi.Emitter] = ()
+    ) -> InverseSquareFactor | None:
         """The falloff of lamps near the voxels of ``grid``, except ``others``; None without any."""
         lights = [e for e in point_lights(scene) if e not in others]
         points = [p for e in lights for p in _of_point(e, grid)]
         points += [p for s in scene.shapes() if s.is_emitter() for p in _of_area(s, grid)]
         points.sort(key=lambda point: -point[1])
         points = points[:MOST_POINTS]
-        return cls(Places(scene, grid), points) if points else None
+        return cls(VoxelSamplePoints(scene, grid), points) if points else None
 
     def at(self, p: mi.Point3f) -> mi.Float:
         """W at a world position."""

@@ -17,7 +17,7 @@ from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, marked
-from mitsuba_irrcache.lights.falloff import Falloff
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.machine.memory import give_back, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import (
@@ -190,7 +190,7 @@ class LitMedium:
         )
         cache.survey, cache.directional = survey, directional
         cache.beams = beams_of(scene, medium, grid, active) if swept else []
-        cache.falloff = Falloff.of(scene, grid, [beam.emitter for beam in cache.beams])
+        cache.falloff = InverseSquareFactor.of(scene, grid, [beam.emitter for beam in cache.beams])
         self.saved_samples = 0
         if not self.file:
             return cache

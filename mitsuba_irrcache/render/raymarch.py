@@ -28,7 +28,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 from mitsuba_irrcache.grids.packed_fields import AlongRay, Lookups
-from mitsuba_irrcache.lights.falloff import Falloff
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.empty_space import Clearance
@@ -64,7 +64,7 @@ class Projection:
         uncertainty: UncertaintyField | None = None,
         directional: DirectionalField | None = None,
         edges: Edges | None = None,
-        falloff: Falloff | None = None,
+        falloff: InverseSquareFactor | None = None,
         beams: Sequence[BeamAlongRays] = (),
     ) -> None:
         self.medium = medium

@@ -15,7 +15,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.lights.emitters import position_of, spot_lights
-from mitsuba_irrcache.lights.falloff import Places
+from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
@@ -39,7 +39,7 @@ class Beam:
     ) -> None:
         self.emitter, self._grid, self._voxels = emitter, grid, voxels
         position = mi.Point3f([dr.opaque(mi.Float, float(v)) for v in position_of(emitter)])
-        p = Places(scene, grid).of(voxels)
+        p = VoxelSamplePoints(scene, grid).of(voxels)
         way = position - p
         distance = dr.norm(way)
         ray = mi.Ray3f(p, way / dr.maximum(distance, 1e-30))

@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import BATCH, LAYERS, IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.lights.falloff import Places
+from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.path import estimator as volume_path
 from mitsuba_irrcache.transport.tracking import free_flight, transmittance
@@ -158,7 +158,7 @@ class _Estimator:
     ) -> None:
         orders = _orders(cache)
         self.scene, self.medium, self.cache = scene, medium, cache
-        self.places = Places(scene, cache.grid)
+        self.places = VoxelSamplePoints(scene, cache.grid)
         # Light of the medium itself is found on the way to the next collision.
         self.multiple = orders > 1 or medium.emission is not None
         self.orders, self.seed, self.rr_depth = (

@@ -41,7 +41,7 @@ class AnisotropicSweep(Sweep):
         super().__init__(scene, medium, cache, *rest)
         if not cache.active_count:
             return
-        # Point-like lights, in the order of `Sky.near`.
+        # Point-like lights, in the order of `DistantIllumination.near`.
         points = [s for s in self._sources if s.sharp and not s.far]
         self._towards = [s.seen_from(self._places)[0] for s in points]
 

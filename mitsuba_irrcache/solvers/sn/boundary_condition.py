@@ -26,7 +26,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.context import probe
 from mitsuba_irrcache.solvers.sn.layout import joined
 from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.track_table import Entering, TrackTable
+from mitsuba_irrcache.solvers.sn.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.sn.tracks import Tracks
 from mitsuba_irrcache.transport.path import Start, out_of, trace
 
@@ -39,7 +39,7 @@ WITHIN = 1e-3
 _NUMBERS = 12
 
 
-class Around:
+class SurfaceBoundary:
     """What is around a medium, as far as its light comes from there.
 
     ``lamps`` are area emitters that lines meet by chance: what the others send straight to a voxel
@@ -69,12 +69,12 @@ class Around:
         return bool(self.lamps) or self.others.shines
 
 
-class Arrivals:
+class IncomingRadiance:
     """The light that arrives along the lines of a table of ``lattice``."""
 
     def __init__(
         self,
-        around: Around,
+        around: SurfaceBoundary,
         lattice: Tracks,
         rows: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         paths: bool,
@@ -107,12 +107,12 @@ class Arrivals:
 
     def directly(
         self, channels: Sequence[int], table: TrackTable, rows: np.ndarray, part: int = 0
-    ) -> Entering:
+    ) -> BoundarySource:
         """Light straight from emitters, that ``part`` of it, along the lines of a ``table`` of the
         same lattice for these ``rows``.
         """
         light = joined([self.straight[part][c] for c in channels])
-        return Entering(*self._placed(self.lattice, table, rows), light, len(channels))
+        return BoundarySource(*self._placed(self.lattice, table, rows), light, len(channels))
 
     def returning(
         self,
@@ -121,7 +121,7 @@ class Arrivals:
         table: TrackTable,
         rows: np.ndarray,
         emitted: bool,
-    ) -> Returning:
+    ) -> ReflectedBoundarySource:
         """Light along the lines of a ``table`` for these ``rows``, which follow each other, of the
         same lattice or that of a coarser ``level``; without what is ``emitted`` unless that is
         wanted.
@@ -146,7 +146,9 @@ class Arrivals:
         if self._heading is not None:
             heading = mi.Vector3f(*(dr.gather(mi.Float, x, here) for x in self._heading))
         dr.eval(values, sources, heading)
-        return Returning(level, len(channels), places, cells, sources, heading, *values)
+        return ReflectedBoundarySource(
+            level, len(channels), places, cells, sources, heading, *values
+        )
 
     def _cells(self, most: np.ndarray) -> None:
         """Lays out cells: blocks of lines, so many along an edge that there are not too ``many``
@@ -220,7 +222,7 @@ class Arrivals:
     def _placed(
         self, lattice: Tracks, table: TrackTable, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The first arguments of `Entering`."""
+        """The first arguments of `BoundarySource`."""
         mine, lines = self.lattice, table.rows
         ratio = float(round((lattice.grid.voxel_size / mine.grid.voxel_size)[0]))
         lower, across, n = mine.lower, lines.across, np.arange(len(rows))
@@ -263,8 +265,10 @@ def _one_of(edge, cell_b, cell_c, least_b, least_c, slope_b, slope_c, nb, nc, na
     return b, c, near, far, rng
 
 
-class Returning(Entering):
-    """`Entering` light ``emitted + returned phi(source)``, this as it is seen along ``heading``."""
+class ReflectedBoundarySource(BoundarySource):
+    """`BoundarySource` light ``emitted + returned phi(source)``, this as it is seen along
+    ``heading``.
+    """
 
     def __init__(
         self,
@@ -299,14 +303,14 @@ def _coarser(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
 
 
 def _follow(
-    around: Around,
-    arrivals: Arrivals,
+    around: SurfaceBoundary,
+    arrivals: IncomingRadiance,
     numbers: tuple[mi.UInt32, mi.Float],
     colours: list[mi.Float],
     paths: bool,
     seed: tuple[int, int, int],
 ) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
-    """What arrives along the lines of all cells, both ways in turn; see `Arrivals`."""
+    """What arrives along the lines of all cells, both ways in turn; see `IncomingRadiance`."""
     grid = arrivals.lattice.grid
     way, weight, hit, ray, rng = arrivals.begin(numbers, seed)
     pointer = probe(around.scene, ray.o, ray.d)

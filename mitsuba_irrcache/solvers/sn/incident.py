@@ -39,7 +39,7 @@ def _values(spectrum: mi.Spectrum, count: int) -> np.ndarray:
 SUN_SHARE, BRIGHT_SHARE = 8, 2
 
 
-class Sky:
+class DistantIllumination:
     """The emitters of a scene, seen from the medium: an environment, suns that are infinitely far
     and narrow, and point-like lights nearby.
     """

@@ -11,8 +11,8 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import Directional
 from mitsuba_irrcache.solvers.sn.angular_quadrature import spread, spread_together
-from mitsuba_irrcache.solvers.sn.boundary_condition import Around, Arrivals
-from mitsuba_irrcache.solvers.sn.incident import Sky
+from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance, SurfaceBoundary
+from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
 from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.sn.track_table import TrackTable
 from mitsuba_irrcache.solvers.sn.tracks import Tracks
@@ -84,9 +84,9 @@ class BoundaryOrdinateSet:
         self,
         rows: Rows,
         inner: Rows,
-        arrivals: Arrivals,
+        arrivals: IncomingRadiance,
         start: int,
-        returns: Arrivals | None,
+        returns: IncomingRadiance | None,
         channels: Sequence[int],
     ) -> None:
         self.rows, self.inner, self.between = rows, inner, inner
@@ -157,8 +157,8 @@ class JointOrdinateSet(BoundaryOrdinateSet):
 
 
 def arriving(
-    around: Around,
-    sky: Sky,
+    around: SurfaceBoundary,
+    sky: DistantIllumination,
     lattice: Tracks,
     passes: int,
     pairs: int,
@@ -174,8 +174,8 @@ def arriving(
     # The first one is apart, the others are even together.
     rows = sky.rows(1, many, rng) + (sky.rows(passes - 1, many, rng) if several else [])
     inner = [between(row) for row in rows] if joint else _inner(passes, pairs, rng)
-    arrivals = Arrivals(around, lattice, merged(rows), several, (*seed, 0))
-    returns = Arrivals(around, lattice, inner[0], several, (*seed, 1)) if several else None
+    arrivals = IncomingRadiance(around, lattice, merged(rows), several, (*seed, 0))
+    returns = IncomingRadiance(around, lattice, inner[0], several, (*seed, 1)) if several else None
     starts = np.cumsum([0] + [len(row[0]) for row in rows])
     kinds = [*arrivals.kinds, *(returns.kinds if several else ())]
 

@@ -18,12 +18,12 @@ import numpy as np
 
 from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import Places
+from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.solvers.sn.boundary_condition import Around
+from mitsuba_irrcache.solvers.sn.boundary_condition import SurfaceBoundary
 from mitsuba_irrcache.solvers.sn.direct_emission import emitted_light
 from mitsuba_irrcache.solvers.sn.direct_light import Lamps, is_lamp, split
-from mitsuba_irrcache.solvers.sn.incident import Sky
+from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
 from mitsuba_irrcache.solvers.sn.layout import side_by_side
 from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.sn.ordinates import BoundaryOrdinateSet, OrdinateSet, arriving, merged
@@ -86,7 +86,7 @@ class Sweep:
     ) -> None:
         """``rr_depth`` is that of paths between surfaces."""
         self.cache, self.seed = cache, seed
-        self._sky = Sky(scene, medium.emission is not None)
+        self._sky = DistantIllumination(scene, medium.emission is not None)
         if not cache.active_count:
             return
         grid = cache.grid
@@ -105,7 +105,7 @@ class Sweep:
             sigma_t = extinction if detail is grid else baked(medium, medium.sigma_t, grid)
             self._sigma_t = self._at_active(sigma_t)
             self._albedo = albedo_of_collisions(medium, grid, cache.active)
-        self._medium, self._places = medium, Places(scene, grid).of(cache.active)
+        self._medium, self._places = medium, VoxelSamplePoints(scene, grid).of(cache.active)
         # What is scattered near a lamp is what a voxel gets on average, not in its middle.
         self._spread = mi.Float(1)
         if cache.falloff is not None and cache.max_depth != 2:
@@ -115,13 +115,13 @@ class Sweep:
         # are not known from the direction.
         self._direct: list[list[mi.Spectrum]] = []
         self._emitted: list[list[mi.Spectrum]] = []
-        self._around: Around | None = None
+        self._around: SurfaceBoundary | None = None
         if medium.alone:
             near = self._sky.near_light(medium, self._places, cache.beams)
             self._direct = [[e] for e in near]
             return
         small, large = split(scene, grid, *box)
-        self._around = Around(scene, medium, large, rr_depth, cache.directional)
+        self._around = SurfaceBoundary(scene, medium, large, rr_depth, cache.directional)
         lights = small, self._sky.near
         self._lamps = Lamps(scene, medium, *lights, self._places, cache.directional)
 

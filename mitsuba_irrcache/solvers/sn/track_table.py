@@ -21,7 +21,7 @@ class TrackTable:
     ) -> None:
         self.rows = rows
         #: the light that enters, where it is not the same along all lines of a pair
-        self.entering: Entering | None = None
+        self.entering: BoundarySource | None = None
         self.integers = mi.Int32(integers.astype(np.int32).ravel())
         self.numbers = mi.Float(numbers.astype(np.float32).ravel())
         self.light, self.channels = mi.Float(light.astype(np.float32).ravel()), light.shape[2]
@@ -78,7 +78,7 @@ class Rows:
         self.slopes, self.starts = integers[:, [11, 15]] / ONE, integers[:, [12, 16]] / ONE
 
 
-class Entering:
+class BoundarySource:
     """The light that enters a box along lines [irradiance: radiance times solid angle].
 
     The lines of a pair are told apart by where they pass the first slice, or would if they did not

@@ -173,8 +173,8 @@ class Tracks:
     ) -> mi.Float:
         """Irradiance at the centres of the wanted voxels: the light that enters along pairs of
         directions, told as in `track_table`; instead of that ``light``, line by line, if a
-        function of the table is given that makes `Entering`. Of several channels one follows the
-        other.
+        function of the table is given that makes `BoundarySource`. Of several channels one follows
+        the other.
         """
         table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
         table.entering = entering(table) if entering is not None else None

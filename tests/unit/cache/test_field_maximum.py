@@ -8,7 +8,7 @@ import pytest
 
 from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import Falloff
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -20,7 +20,7 @@ def test_maximum_is_reached_by_no_voxel(lamp, correlated):
     grid, voxels = Grid((8, 8, 8), np.eye(4)), mi.UInt32(np.arange(512, dtype=np.uint32))
     light = {"type": "point", "position": list(lamp), "intensity": 3.0}
     cache = IrradianceCache(grid, voxels, 1, -1, correlated=correlated)
-    cache.falloff = Falloff.of(mi.load_dict({"type": "scene", "lamp": light}), grid)
+    cache.falloff = InverseSquareFactor.of(mi.load_dict({"type": "scene", "lamp": light}), grid)
     places = cache.falloff.places.of(voxels)
     way = np.array(places, np.float64) - np.array(lamp)[:, None]
     phi = 3 / np.sum(way**2, axis=0)

@@ -11,7 +11,7 @@ import pytest
 from mitsuba_irrcache.cache.uncertainty import PROBES, uncertainty_of
 from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import Falloff
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -59,7 +59,7 @@ def test_errors_beside_a_lamp_are_relative_to_its_light(lamp, correlated):
     by more, and those at which all signs agree are by just that, near the lamp and far from it.
     """
     scene = {"type": "scene", "lamp": {"type": "point", "position": list(lamp), "intensity": 3.0}}
-    falloff = Falloff.of(mi.load_dict(scene), Grid((SIDE,) * 3, np.eye(4)))
+    falloff = InverseSquareFactor.of(mi.load_dict(scene), Grid((SIDE,) * 3, np.eye(4)))
     index = mi.UInt32(np.arange(SIDE**3, dtype=np.uint32))
     light = np.array(falloff.of_voxels(index), dtype=np.float64)
     assert light.max() > 20 * light.min()

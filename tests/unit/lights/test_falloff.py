@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import LARGEST, REACH, Falloff
+from mitsuba_irrcache.lights.falloff import LARGEST, REACH, InverseSquareFactor
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -20,12 +20,12 @@ def grid_of(n: int = 8, size: float = 1.0) -> Grid:
     return Grid((n, n, n), np.diag([size, size, size, 1.0]))
 
 
-def falloff(position=LAMP, n: int = 8, **more) -> Falloff:
+def falloff(position=LAMP, n: int = 8, **more) -> InverseSquareFactor:
     light = {"type": "point", "position": np.array(position).tolist(), "intensity": 3.0} | more
-    return Falloff.of(mi.load_dict({"type": "scene", "light": light}), grid_of(n))
+    return InverseSquareFactor.of(mi.load_dict({"type": "scene", "light": light}), grid_of(n))
 
 
-def value(found: Falloff, p: np.ndarray) -> np.ndarray:
+def value(found: InverseSquareFactor, p: np.ndarray) -> np.ndarray:
     return np.array(found.at(mi.Point3f(np.float32(p))))
 
 
@@ -80,10 +80,10 @@ def test_only_what_is_near_and_small_counts():
     for size, near in ((0.5, True), (2.0, False)):
         place = mi.ScalarTransform4f().translate([0.5, 0.5, 1.2]).scale(size * LARGEST / 8)
         lamp = {"type": "disk", "to_world": place, "emitter": {"type": "area"}}
-        found = Falloff.of(mi.load_dict({"type": "scene", "lamp": lamp}), grid_of())
+        found = InverseSquareFactor.of(mi.load_dict({"type": "scene", "lamp": lamp}), grid_of())
         assert (found is not None) == near
     scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}})
-    assert Falloff.of(scene, grid_of()) is None
+    assert InverseSquareFactor.of(scene, grid_of()) is None
 
 
 def test_a_small_lamp_is_a_point_from_afar():
@@ -91,7 +91,7 @@ def test_a_small_lamp_is_a_point_from_afar():
     squares of both differ by 8 %.
     """
     ball = {"type": "sphere", "center": LAMP.tolist(), "radius": 0.02, "emitter": {"type": "area"}}
-    found = Falloff.of(mi.load_dict({"type": "scene", "ball": ball}), grid_of())
+    found = InverseSquareFactor.of(mi.load_dict({"type": "scene", "ball": ball}), grid_of())
     p = np.random.default_rng(2).random((3, 200))
     far = np.linalg.norm(p - LAMP[:, None], axis=0) > 0.1
     np.testing.assert_allclose(value(found, p)[far], value(falloff(), p)[far], rtol=0.12)

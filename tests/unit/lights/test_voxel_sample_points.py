@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import LEAST, Places
+from mitsuba_irrcache.lights.falloff import LEAST, VoxelSamplePoints
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -22,7 +22,9 @@ def test_places_keep_away_from_lamps(scenes, aside):
     centres = np.array(grid.centers(index), np.float64).T
     lamp = centres[100] + aside * np.array([0.48, -0.6, 0.64])
     light = {"type": "point", "position": lamp.tolist(), "intensity": 1.0}
-    found = np.array(Places(mi.load_dict({"type": "scene", "l": light}), grid).of(index)).T
+    found = np.array(
+        VoxelSamplePoints(mi.load_dict({"type": "scene", "l": light}), grid).of(index)
+    ).T
     least = LEAST * grid.voxel_size.min()
     before, after = (np.linalg.norm(p - lamp, axis=1) for p in (centres, found))
     near = before < least

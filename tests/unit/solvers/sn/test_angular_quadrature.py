@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.solvers.sn.angular_quadrature import spread, spread_together
-from mitsuba_irrcache.solvers.sn.incident import Sky
+from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -67,7 +67,9 @@ def test_sets_are_even_together(sets, count):
 
 def lights(scenes, batches: int, **emitters) -> list[list[tuple]]:
     """The rows of passes of 8 pairs, under these emitters."""
-    sky = Sky(scenes.load({"type": "irrcache", "solver": "path"}, None, size=2, **emitters))
+    sky = DistantIllumination(
+        scenes.load({"type": "irrcache", "solver": "path"}, None, size=2, **emitters)
+    )
     rows, colour = sky.tables(batches, 8, 3, np.random.default_rng(3))
     np.testing.assert_array_equal(colour, 1)
     return rows
@@ -99,7 +101,7 @@ def test_an_environment_is_sampled_without_bias(scenes, bright):
     image[5, 9] += bright
     emitter = {"type": "envmap", "bitmap": mi.Bitmap(image)}
     scene = scenes.load({"type": "irrcache", "solver": "path"}, None, size=2, emitter=emitter)
-    rng, sky = np.random.default_rng(4), Sky(scene)
+    rng, sky = np.random.default_rng(4), DistantIllumination(scene)
     found = []
     for _ in range(64):
         rows, _ = sky.tables(4, 8, 3, rng)

@@ -10,8 +10,8 @@ import pytest
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.scene.compile import bake_media
 from mitsuba_irrcache.solvers.sn import boundary_condition
-from mitsuba_irrcache.solvers.sn.boundary_condition import Around, Arrivals
-from mitsuba_irrcache.solvers.sn.track_table import Entering
+from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance, SurfaceBoundary
+from mitsuba_irrcache.solvers.sn.track_table import BoundarySource
 from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -26,12 +26,12 @@ class Nothing:
     shines, directional = False, None
 
 
-def swept(lattice: Tracks, found: Arrivals, values: mi.Float, i: int, offset) -> np.ndarray:
+def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, offset) -> np.ndarray:
     """What the lines of direction ``i`` bring to the voxels of ``lattice``, through nothing."""
     dark, rows = np.zeros((1, 2)), np.array([i])
 
     def entering(table):
-        return Entering(*found._placed(lattice, table, rows), values)
+        return BoundarySource(*found._placed(lattice, table, rows), values)
 
     volume = lattice.carry(DIRECTIONS[rows], dark, offset[rows], entering)
     return np.array(volume, dtype=np.float64).reshape(lattice.grid.shape)
@@ -60,7 +60,7 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
     fine = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
     offsets = np.random.default_rng(3).random((len(DIRECTIONS), 2))
     rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
-    found = Arrivals(Nothing, fine, rows, True, (0, 0, 0))
+    found = IncomingRadiance(Nothing, fine, rows, True, (0, 0, 0))
     _, _, hit, ray, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (0, 0, 0))
     lattice, low, high = fine, lower, upper
     if coarse:
@@ -101,7 +101,9 @@ def test_what_returns_is_linear_in_phi(scenes):
     lattice = Tracks(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)
     offsets = np.random.default_rng(1).random((len(DIRECTIONS), 2))
     rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
-    found = Arrivals(Around(scene, medium, [], 1000), lattice, rows, True, (1, 2, 0))
+    found = IncomingRadiance(
+        SurfaceBoundary(scene, medium, [], 1000), lattice, rows, True, (1, 2, 0)
+    )
     returned, voxel = np.array(found.returned[0]) * 4 * np.pi, np.array(found.voxel)
     assert np.array(found.emitted).max() == 0
     _, _, hit, _, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (1, 2, 0))

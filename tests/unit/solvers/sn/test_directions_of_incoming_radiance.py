@@ -10,7 +10,7 @@ import pytest
 from mitsuba_irrcache.cache.angular import Directional
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
-from mitsuba_irrcache.solvers.sn.boundary_condition import Arrivals
+from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance
 from mitsuba_irrcache.solvers.sn.kernel import ONE
 from mitsuba_irrcache.solvers.sn.moments import AnisotropicMultigridLevel, Moments
 from mitsuba_irrcache.solvers.sn.tracks import Tracks
@@ -123,7 +123,7 @@ def test_paths_begin_on_their_lines(scenes, monkeypatch):
     lattice = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
     offsets = np.random.default_rng(3).random((len(WAYS), 2))
     rows = WAYS, np.zeros((len(WAYS), 2, 3)), np.ones(len(WAYS)), offsets
-    found = Arrivals(Nothing, lattice, rows, True, (0, 0, 0))
+    found = IncomingRadiance(Nothing, lattice, rows, True, (0, 0, 0))
     number, _, hit, ray, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (0, 0, 0))
     row, hit = np.array(number) // 2, np.array(hit)
     start = np.array(grid.coordinates.point(ray.o), np.float64)[:, hit].T

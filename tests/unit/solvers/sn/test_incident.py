@@ -6,12 +6,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.solvers.sn.incident import Sky
+from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
-def sky_of(scenes, pixels: np.ndarray) -> tuple[Sky, np.ndarray, np.ndarray]:
+def sky_of(scenes, pixels: np.ndarray) -> tuple[DistantIllumination, np.ndarray, np.ndarray]:
     """A grey sky (row, column), and directions (n, 3) all over the sphere with the radiance that
     Mitsuba has there.
     """
@@ -24,10 +24,14 @@ def sky_of(scenes, pixels: np.ndarray) -> tuple[Sky, np.ndarray, np.ndarray]:
     directions = np.stack([around * np.cos(turn), y, around * np.sin(turn)], axis=1)
     seen = mi.SurfaceInteraction3f()
     seen.wi = mi.Vector3f(np.float32(-directions.T))
-    return Sky(scene), directions, np.array(scene.environment().eval(seen)[0], np.float64)
+    return (
+        DistantIllumination(scene),
+        directions,
+        np.array(scene.environment().eval(seen)[0], np.float64),
+    )
 
 
-def of_passes(sky: Sky, count: int, pairs: int, value) -> np.ndarray:
+def of_passes(sky: DistantIllumination, count: int, pairs: int, value) -> np.ndarray:
     """Integrals of radiance times ``value`` of where it comes from, of ``count`` single passes."""
     rng, found = np.random.default_rng(12), []
     for _ in range(count):

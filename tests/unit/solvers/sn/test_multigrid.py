@@ -11,7 +11,7 @@ from mitsuba_irrcache.solvers.sn import multigrid, tracks
 from mitsuba_irrcache.solvers.sn.anderson import AndersonAcceleration
 from mitsuba_irrcache.solvers.sn.angular_quadrature import spread
 from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.track_table import Entering
+from mitsuba_irrcache.solvers.sn.track_table import BoundarySource
 from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -84,7 +84,7 @@ def test_channels_that_are_swept_together_do_not_mix(random):
         assert (np.abs(expected[0] / expected[1] - 1) > 0.1).any()
 
 
-class Arriving(Entering):
+class Arriving(BoundarySource):
     """Light that does not depend on phi."""
 
     def receive(self, phi: mi.Float) -> None:
@@ -116,7 +116,7 @@ def test_light_without_voxels_sending_is_carried_in_all_channels(random):
 
     def carried(channels: list[int]) -> np.ndarray:
         values = mi.Float(light[channels].ravel().tolist())
-        entering = Entering(places, cells, values, len(channels))
+        entering = BoundarySource(places, cells, values, len(channels))
         carry = of(0).lattice.carry
         return np.array(carry(directions, dark, offsets, lambda _: entering)).reshape(-1, VOXELS)
 
