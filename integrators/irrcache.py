@@ -22,7 +22,7 @@ from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.pipeline.defaults import choose_stock
 from mitsuba_irrcache.pipeline.progressive import Frame, Targets, frames
 from mitsuba_irrcache.render.aovs import AOVS, Layers, parse_aovs
-from mitsuba_irrcache.render.camera import Sight, SimpleSight, sight_of
+from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays, camera_rays_of
 from mitsuba_irrcache.render.denoise import FILTERS, filter_illumination
 from mitsuba_irrcache.render.film import check_film, exclusive, fill_film, planes, render_film
 from mitsuba_irrcache.render.quadrature import QUADRATURES
@@ -207,7 +207,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
         self._stopping = Stopping()
-        self._sight: SimpleSight | Sight | None = None
+        self._sight: ClosedFormCameraRays | TracedCameraRays | None = None
         self._revision = 0  # of the builder, when the sight was made
         #: Mitsuba's own integrators, by name, for scenes without a medium to be seen, and the one
         #: that was chosen for the scene as it is
@@ -262,7 +262,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """
         self._prepared(scene)
 
-    def _prepared(self, scene: mi.Scene) -> SimpleSight | Sight | None:
+    def _prepared(self, scene: mi.Scene) -> ClosedFormCameraRays | TracedCameraRays | None:
         """What sees the cache of ``scene``, complete; None where there is no medium to be seen."""
         require_same_variant(self._variant, mi.variant())
         with self._builder.lock:
@@ -309,9 +309,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """Whether rendering was cancelled, or reached its ``timeout``."""
         return self._stopping.is_due
 
-    def _make_sight(self) -> SimpleSight | Sight | None:
+    def _make_sight(self) -> ClosedFormCameraRays | TracedCameraRays | None:
         """What sees the caches as they are; None where there is no medium to be seen."""
-        return sight_of(
+        return camera_rays_of(
             self._builder.parts,
             self._settings,
             self._hide_emitters,
@@ -412,7 +412,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _render(
         self,
-        sight: SimpleSight | Sight,
+        sight: ClosedFormCameraRays | TracedCameraRays,
         scene: mi.Scene,
         sensor: mi.Sensor,
         seed: int,
@@ -464,7 +464,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _radiance(
         self,
-        sight: SimpleSight | Sight,
+        sight: ClosedFormCameraRays | TracedCameraRays,
         scene: mi.Scene,
         sampler: mi.Sampler,
         ray: mi.Ray3f,

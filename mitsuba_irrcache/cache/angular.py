@@ -99,7 +99,7 @@ class Source:
         return (directions @ self._direction >= self._cosine) & self.far
 
 
-class Directional:
+class AngularBasis:
     """What is to be known of the light's directions in a medium with the phase function
     ``phase``.
     """
@@ -227,7 +227,7 @@ def _legendre(cosine: mi.Float) -> Iterator[mi.Float]:
         before, here = here, ((2 * degree + 1) * cosine * here - degree * before) / (degree + 1)
 
 
-def nothing(directional: Directional | None) -> list[mi.Spectrum]:
+def nothing(directional: AngularBasis | None) -> list[mi.Spectrum]:
     """Sums of light, as `added` has them, 0 so far."""
     moments = 0 if directional is None else directional.count
     return [mi.Spectrum(0) for _ in range(1 + moments)]
@@ -239,9 +239,9 @@ def added(
     towards: mi.Vector3f,
     uncollided: mi.Spectrum,
     scattered: mi.Spectrum,
-    directional: Directional | None,
+    directional: AngularBasis | None,
 ) -> list[mi.Spectrum]:
-    """``sums``, an irradiance and its `Directional.moments` if it has any, with the light that
+    """``sums``, an irradiance and its `AngularBasis.moments` if it has any, with the light that
     comes to ``position`` from one direction.
     """
     found = [uncollided + scattered]
@@ -250,13 +250,13 @@ def added(
     return [a + b for a, b in zip(sums, found, strict=True)]
 
 
-class DirectionalField:
+class AngularField:
     """The factor f at all places. ``phi`` and ``moments`` are given per voxel; each list is one
     channel after the other.
     """
 
     def __init__(
-        self, directional: Directional, grid: Grid, phi: list[mi.Float], moments: list[mi.Float]
+        self, directional: AngularBasis, grid: Grid, phi: list[mi.Float], moments: list[mi.Float]
     ) -> None:
         self.directional, self.grid, self.channels = directional, grid, len(phi)
         rows = []
@@ -276,7 +276,7 @@ class DirectionalField:
         active: mi.Bool,
         with_peak: bool = True,
     ) -> mi.Float | mi.Color3f:
-        """At ``p`` for a ray along ``direction``, for which ``basis`` is that of `Directional`;
+        """At ``p`` for a ray along ``direction``, for which ``basis`` is that of `AngularBasis`;
         ``with_peak`` is as of its `gains`.
         """
         directional = self.directional

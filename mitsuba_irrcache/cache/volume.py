@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import Directional, DirectionalField
+from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.conservative import conserving
 from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
 from mitsuba_irrcache.cache.storage import (
@@ -37,7 +37,7 @@ from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.scene.fingerprint import differing
-from mitsuba_irrcache.scene.voxel_classes import Survey
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.transport.spot_beams import Beam
 
 #: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
@@ -95,13 +95,13 @@ class IrradianceCache:
         self.fingerprint = fingerprint or {}
         self.moments = moments
         #: what the moments are of
-        self.directional: Directional | None = None
+        self.directional: AngularBasis | None = None
         #: how the light of lamps nearby falls off; None where there are none
         self.falloff: InverseSquareFactor | None = None
         #: spot lights, whose irradiance camera rays look up apart; the layers hold its means
         self.beams: list[Beam] = []
         #: where voxels lie among surfaces; None where there are none
-        self.survey: Survey | None = None
+        self.survey: VoxelClasses | None = None
         #: samples taken per voxel from each random stream
         self.streams: dict[int, int] = {}
         self.correlated = correlated
@@ -229,7 +229,7 @@ class IrradianceCache:
         return field
 
     @_consistent
-    def directional_field(self, channels: int) -> DirectionalField | None:
+    def directional_field(self, channels: int) -> AngularField | None:
         """The moments for lookups, where there are any."""
         if not self.moments:
             return None
@@ -240,7 +240,7 @@ class IrradianceCache:
         for values in (phi, means):
             chosen = [v for i, v in enumerate(values) if i % self.channels < channels]
             scattered.append([self._tensor([v]).array for v in chosen])
-        return DirectionalField(self.directional, self.grid, *scattered)
+        return AngularField(self.directional, self.grid, *scattered)
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Variance of the voxels over their squared mean, at most 1; 0 where it is not known."""

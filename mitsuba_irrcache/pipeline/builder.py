@@ -15,7 +15,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.cancellation import Pause
 from mitsuba_irrcache.media.emission import Emission, bake_emission
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.pipeline.cached_medium import CacheSettings, LitMedium
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import bake_media
 from mitsuba_irrcache.scene.fingerprint import Snapshot
@@ -60,7 +60,7 @@ class CacheBuilder:
         #: goes up with every change of a medium or a cache
         self.revision = 0
         #: the media of the scene that can be seen, each with its cache
-        self.parts: list[LitMedium] = []
+        self.parts: list[CachedMedium] = []
         self._snapshot: Snapshot | None = None
         self._stages: list[Stage] = []
         self._checkpointed = 0  # runs that save the caches themselves
@@ -112,7 +112,7 @@ class CacheBuilder:
             wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
             settings = replace(self.settings, samples=self._wanted)
             self.parts = [
-                LitMedium(
+                CachedMedium(
                     scene,
                     medium,
                     settings,
@@ -131,7 +131,7 @@ class CacheBuilder:
         return bake_emission(self._emission, self._emission_scale)
 
     def _refine(
-        self, scene: mi.Scene, part: LitMedium, progress: path_solver.Progress | None
+        self, scene: mi.Scene, part: CachedMedium, progress: path_solver.Progress | None
     ) -> None:
         changed = True  # the solver may be stopped half-way
         try:
@@ -204,7 +204,7 @@ class CacheBuilder:
         return not self._lit
 
     @property
-    def _lit(self) -> list[LitMedium]:
+    def _lit(self) -> list[CachedMedium]:
         return [p for p in self.parts if not p.is_dark]
 
     @contextmanager

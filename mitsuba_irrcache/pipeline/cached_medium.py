@@ -12,7 +12,7 @@ from threading import Lock
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import Directional, sources_of
+from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
 from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
@@ -53,7 +53,7 @@ class CacheSettings:
     with_error: bool = False  # enough samples for a standard error: two batches at least
 
 
-class LitMedium:
+class CachedMedium:
     """A medium with its cache, which is None where no light needs caching (``max_depth`` below
     2).
 
@@ -159,7 +159,7 @@ class LitMedium:
         grid, size_reason = choose_grid(medium, settings.resolution, self.solver)
         directional = None
         if medium.phase is not None:
-            directional = Directional(medium.phase, sources_of(scene))
+            directional = AngularBasis(medium.phase, sources_of(scene))
         moments = directional.count if directional is not None else 0
         together = sn_solver.swept_together(medium, grid.voxel_count)
         _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments, together)

@@ -19,7 +19,7 @@ from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import give_back
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.pipeline.cached_medium import CacheSettings, LitMedium
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.context import Surroundings
 from mitsuba_irrcache.solvers.half_space import HalfSpace
@@ -30,15 +30,15 @@ from mitsuba_irrcache.transport.spot_beams import BeamAlongRays
 FAINT = 0.1
 
 
-def sight_of(
-    parts: list[LitMedium],
+def camera_rays_of(
+    parts: list[CachedMedium],
     settings: CacheSettings,
     hide_emitters: bool = False,
     quadrature: str = "exponential",
     step: float = 1.0,
     layered: bool = False,
     with_error: bool = False,
-) -> SimpleSight | Sight | None:
+) -> ClosedFormCameraRays | TracedCameraRays | None:
     """What sees the caches of ``parts`` as they are; None where there is no medium to be seen.
 
     ``layered`` and ``with_error`` are what `Projection` gathers beside the radiance.
@@ -71,12 +71,12 @@ def sight_of(
     medium = parts[0].medium
     if medium.alone:
         closed_form = parts[0].half_space
-        return SimpleSight(projections[0], settings.max_depth, hide_emitters, closed_form)
+        return ClosedFormCameraRays(projections[0], settings.max_depth, hide_emitters, closed_form)
     depths = settings.max_depth, settings.rr_depth
-    return Sight(medium.surroundings, projections, *depths, hide_emitters)
+    return TracedCameraRays(medium.surroundings, projections, *depths, hide_emitters)
 
 
-class View:
+class RayResult:
     """What rays have found: ``scattered`` light of the media, ``background`` (emitters and
     surfaces, seen through the media, and light of these themselves), the ``transmittance`` of the
     way, ``alpha``, and the sums that `Projection.layers` makes layers of.
@@ -94,7 +94,7 @@ class View:
         self.transmittance, self.alpha, self.gathered = transmittance, alpha, gathered
 
 
-class SimpleSight:
+class ClosedFormCameraRays:
     """Camera rays through the one medium of a simple scene."""
 
     def __init__(
@@ -116,7 +116,7 @@ class SimpleSight:
         ray: mi.Ray3f,
         medium: mi.Medium | None,
         active: mi.Bool,
-    ) -> View:
+    ) -> RayResult:
         """Along ``ray``, which starts in ``medium``."""
         background = mi.Spectrum(0)
         environment = scene.environment()
@@ -148,7 +148,7 @@ class SimpleSight:
         alpha = mi.Float(1)
         if not visible:  # dr.mean would write the number of samples into the kernel
             alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
-        return View(scattered, background, transmittance, alpha, gathered)
+        return RayResult(scattered, background, transmittance, alpha, gathered)
 
     def _left_of(self, transmittance: mi.Spectrum, direction: mi.Vector3f) -> mi.Spectrum:
         """What the medium leaves of the environment in a ``direction``."""
@@ -159,7 +159,7 @@ class SimpleSight:
         return dr.select(narrow, self.projection.unscattered(transmittance), transmittance)
 
 
-class Sight:
+class TracedCameraRays:
     """Camera rays through several ``projections``, one for each medium that can be seen."""
 
     def __init__(
@@ -189,7 +189,7 @@ class Sight:
         ray: mi.Ray3f,
         medium: mi.Medium | None,
         active: mi.Bool,
-    ) -> View:
+    ) -> RayResult:
         """Along ``ray``, which starts in ``medium``."""
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
         offset = 1 - sampler.next_1d(active)
@@ -225,7 +225,7 @@ class Sight:
             clear = dr.select(traced & ~met, weight, 0)
             clear = dr.select(escaped, passed, clear)
             alpha = 1 - dr.sum(clear) / dr.size_v(mi.Spectrum)
-        return View(scattered, background, passed, alpha, gathered)
+        return RayResult(scattered, background, passed, alpha, gathered)
 
     @symbolic
     def _straight(

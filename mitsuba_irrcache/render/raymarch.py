@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import DirectionalField
+from mitsuba_irrcache.cache.angular import AngularField
 from mitsuba_irrcache.cache.uncertainty import UncertaintyField
 from mitsuba_irrcache.core.fast_math import least
 from mitsuba_irrcache.core.jit import symbolic
@@ -33,7 +33,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.empty_space import Clearance
 from mitsuba_irrcache.render.quadrature import curved, emission_weights, segment
-from mitsuba_irrcache.scene.cut_cells import Edges
+from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.transport.spot_beams import BeamAlongRays
 
 #: A ray ends early once nothing ahead, not even the brightest cache voxel or the background seen
@@ -62,8 +62,8 @@ class Projection:
         step: float,
         layered: bool = False,
         uncertainty: UncertaintyField | None = None,
-        directional: DirectionalField | None = None,
-        edges: Edges | None = None,
+        directional: AngularField | None = None,
+        edges: CutCells | None = None,
         falloff: InverseSquareFactor | None = None,
         beams: Sequence[BeamAlongRays] = (),
     ) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.cut_cells import Edges
-from mitsuba_irrcache.scene.voxel_classes import Survey
+from mitsuba_irrcache.scene.cut_cells import CutCells
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
 
 #: Rays from each voxel that look for its medium.
@@ -27,7 +27,7 @@ class Surroundings:
         for grid in grids:
             grid.surroundings = self
 
-    def survey(self, scene: mi.Scene, grid: Grid, medium: MediumGrid) -> Survey:
+    def survey(self, scene: mi.Scene, grid: Grid, medium: MediumGrid) -> VoxelClasses:
         """Of all voxels of the cache's ``grid`` in ``medium``."""
         index = dr.arange(mi.UInt32, grid.voxel_count)
         *votes, within, backs = _survey(scene, self.media, medium, grid, index)
@@ -38,11 +38,11 @@ class Surroundings:
             place = dr.select(count > best, i, place)
             best = dr.maximum(best, count)
         dr.eval(place)
-        edges = Edges(scene, grid)
-        return Survey(grid, place, within, enclosed, edges if edges.count else None)
+        edges = CutCells(scene, grid)
+        return VoxelClasses(grid, place, within, enclosed, edges if edges.count else None)
 
     def pointer(self, place: mi.UInt32) -> mi.MediumPtr:
-        """The medium of a number from `Survey.place`."""
+        """The medium of a number from `VoxelClasses.place`."""
         pointer = dr.zeros(mi.MediumPtr, dr.width(place))
         for i, grid in enumerate(self.media.grids):
             pointer = dr.select(place == i + 1, grid.pointer, pointer)

@@ -26,7 +26,7 @@ SEGMENTS = [
 ]
 
 
-class Edges:
+class CutCells:
     """The cells of a cache over ``grid`` that surfaces cut, and the planes that stand for these."""
 
     def __init__(self, scene: mi.Scene, grid: Grid) -> None:

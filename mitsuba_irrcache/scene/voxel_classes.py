@@ -9,7 +9,7 @@ import numpy as np
 from mitsuba_irrcache.grids.grid import Grid
 
 
-class Survey:
+class VoxelClasses:
     """Where the voxels of ``grid`` are.
 
     ``place`` is 0 for a voxel whose centre is in no medium, else 1 for the first of the scene's,

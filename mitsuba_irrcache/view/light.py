@@ -12,9 +12,9 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
-from mitsuba_irrcache.pipeline.cached_medium import LitMedium
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.progressive import FIRST, OPENING
-from mitsuba_irrcache.render.camera import Sight, SimpleSight, sight_of
+from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays, camera_rays_of
 from mitsuba_irrcache.scene.context import medium_at
 
 #: Caches with more voxels than this are preceded by one of `COARSE` voxels along its longest side,
@@ -39,11 +39,15 @@ class Seen:
     """
 
     def __init__(
-        self, scene: mi.Scene, parts: list[LitMedium], sight: SimpleSight | Sight, layered: bool
+        self,
+        scene: mi.Scene,
+        parts: list[CachedMedium],
+        sight: ClosedFormCameraRays | TracedCameraRays,
+        layered: bool,
     ) -> None:
         self.scene, self.sight, self.layered = scene, sight, layered
         self._parts = parts
-        one = isinstance(sight, SimpleSight)
+        one = isinstance(sight, ClosedFormCameraRays)
         self._projections = [sight.projection] if one else sight.projections
         self._steps = [p.step for p in self._projections]
 
@@ -76,7 +80,7 @@ class Light:
         self._builder = CacheBuilder(replace(settings, samples=DIRECTIONS, with_error=False))
         self._builder.pause.action = pause
         self._builder.early = True
-        self._coarse: LitMedium | None = None
+        self._coarse: CachedMedium | None = None
         #: goes up whenever there is better light to be seen
         self.revision = 0
         #: seconds that the solver took
@@ -86,7 +90,7 @@ class Light:
         self._seen: dict[tuple[bool, bool], tuple[int, Seen]] = {}
 
     @property
-    def parts(self) -> list[LitMedium]:
+    def parts(self) -> list[CachedMedium]:
         """The media with their caches; empty before `prepare`."""
         return self._builder.parts
 
@@ -151,23 +155,23 @@ class Light:
         voxels = self.parts[0].cache.grid.voxel_count
         return self._builder.solver == "sweep" and voxels > MANY_VOXELS
 
-    def _at_once(self) -> LitMedium:
+    def _at_once(self) -> CachedMedium:
         """The medium with a first light on a coarse grid."""
         builder, first = self._builder, self.parts[0]
         settings = replace(builder.settings, resolution=COARSE)
         told = first.solver, "a first look"
-        coarse = LitMedium(self.scene, first.medium, settings, told, "", False, builder.pause)
+        coarse = CachedMedium(self.scene, first.medium, settings, told, "", False, builder.pause)
         coarse.refine(self.scene, coarse.cache.batch, False, None)
         return coarse
 
     def seen(self, layered: bool, with_error: bool) -> Seen:
-        """The light as it is now; more of it, see `sight_of`, if wanted."""
+        """The light as it is now; more of it, see `camera_rays_of`, if wanted."""
         key = layered, with_error
         known = self._seen.get(key)
         if known is None or known[0] != self.revision:
             parts = self.parts if self._coarse is None else [self._coarse]
             s = self.seeing
-            sight = sight_of(
+            sight = camera_rays_of(
                 parts, self.settings, s.hide_emitters, s.quadrature, s.step, layered, with_error
             )
             known = self.revision, Seen(self.scene, parts, sight, layered)

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.angular import Directional, sources_of
+from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.render.raymarch import Projection
@@ -197,7 +197,7 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     index, moments = dr.arange(mi.UInt32, grid.voxel_count), None
     solver, least = sn_solver.Sweep, sn_solver.BATCH
     if medium.phase is not None:
-        moments = Directional(medium.phase, sources_of(scene))
+        moments = AngularBasis(medium.phase, sources_of(scene))
         solver, least = AnisotropicSweep, least_batch(moments.order)
     batch = sn_solver.batch_of(samples, least)
     count = moments.count if moments else 0

@@ -14,7 +14,7 @@ from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.packed_fields import Lookups
 from mitsuba_irrcache.grids.root_field import RootField
-from mitsuba_irrcache.scene.cut_cells import Edges
+from mitsuba_irrcache.scene.cut_cells import CutCells
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -68,7 +68,7 @@ def test_lookups_beside_surfaces(reported):
     """In cells that a surface cuts, up to the far corner of the grid, and beyond."""
     grid, rng = Grid((3, 4, 5), np.eye(4)), np.random.default_rng(2)
     ball = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.6}
-    edges = Edges(mi.load_dict({"type": "scene", "ball": ball}), grid)
+    edges = CutCells(mi.load_dict({"type": "scene", "ball": ball}), grid)
     field = RootField(grid, mi.Float(np.float32(rng.random(60) + 0.5)), 1)
     p = mi.Point3f(np.float32(rng.choice([-0.5, 0.0, 0.4, 1.0, 1.2, 1.5], (3, 500))))
     active = dr.full(mi.Bool, True, 500)

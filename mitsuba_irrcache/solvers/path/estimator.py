@@ -11,7 +11,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.transport.path import Media, Start, emitted_to, power_heuristic, trace
 
 
@@ -47,7 +47,7 @@ def contributions(
     ]
 
 
-def estimate(directional: Directional | None, *args: object) -> list[mi.Spectrum]:
+def estimate(directional: AngularBasis | None, *args: object) -> list[mi.Spectrum]:
     """One sample of the irradiance, uncollided and scattered, and of the moments of the radiance if
     the medium is ``directional``; the others are the arguments of `contributions`.
     """

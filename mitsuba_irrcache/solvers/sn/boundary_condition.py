@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -53,7 +53,7 @@ class SurfaceBoundary:
         medium: MediumGrid,
         lamps: Sequence[mi.EmitterPtr],
         rr_depth: int,
-        directional: Directional | None = None,
+        directional: AngularBasis | None = None,
     ) -> None:
         self.scene, self.media = scene, medium.surroundings.media.around(medium)
         self.pointer, self.lamps = medium.pointer, list(lamps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import Directional, added, nothing
+from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.tracking import free_flight
@@ -20,7 +20,7 @@ def emitted_light(
     position: mi.Point3f,
     count: int,
     seed: tuple[int, int],
-    directional: Directional | None = None,
+    directional: AngularBasis | None = None,
 ) -> list[mi.Spectrum]:
     """Irradiance at ``position`` from the emission of ``medium``, and its moments if it is told by
     its direction: unbiased estimates by ``count`` directions, spread evenly and shifted at random

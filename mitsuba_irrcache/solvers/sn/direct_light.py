@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import Directional, added, nothing
+from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -77,7 +77,7 @@ class Lamps:
         small: Sequence[mi.Emitter],
         lights: Sequence[mi.Emitter],
         p: mi.Point3f,
-        directional: Directional | None = None,
+        directional: AngularBasis | None = None,
     ) -> None:
         self._scene, self._medium, self._p = scene, medium, p
         self._directional = directional

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.solvers.sn.layout import joined, layers_of
 from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
@@ -29,7 +29,7 @@ SMOOTH = 1
 class Moments:
     """Those of a ``directional`` medium."""
 
-    def __init__(self, directional: Directional, order: int | None = None) -> None:
+    def __init__(self, directional: AngularBasis, order: int | None = None) -> None:
         """Up to ``order`` (None: all that there are)."""
         self.directional = directional
         self.order = directional.order if order is None else order

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.solvers.sn.angular_quadrature import spread, spread_together
 from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance, SurfaceBoundary
 from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
@@ -36,7 +36,7 @@ class OrdinateSet:
 
     @staticmethod
     def straight(
-        passes: Sequence[OrdinateSet], directional: Directional | None = None
+        passes: Sequence[OrdinateSet], directional: AngularBasis | None = None
     ) -> list[tuple]:
         """The light of all ``passes`` that comes straight from emitters, as `Tracks.carry` takes
         it; where it is told by its direction, first without that of narrow lights, then that of
@@ -95,7 +95,7 @@ class BoundaryOrdinateSet:
 
     @staticmethod
     def straight(
-        passes: Sequence[BoundaryOrdinateSet], directional: Directional | None = None
+        passes: Sequence[BoundaryOrdinateSet], directional: AngularBasis | None = None
     ) -> list[tuple]:
         """As `OrdinateSet.straight`."""
         directions, light, _, offsets = merged([p.rows for p in passes])

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.angular import Directional, sources_of
+from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.scene.compile import bake_media
 from mitsuba_irrcache.solvers.path.estimator import contributions
@@ -93,7 +93,7 @@ def test_scattered_light_of_one_place(scenes, objects, tolerance, g):
         objects = objects | {"emitter": lamp(*objects["emitter"])}
     scene = scene_of(scenes, hg(g), **objects)
     medium, count = bake_media(scene)[0], 1 << 16
-    directional = Directional(medium.phase, sources_of(scene))
+    directional = AngularBasis(medium.phase, sources_of(scene))
     rng, p = mi.PCG32(count), mi.Point3f(0.2, 0.5, -0.3)
     spread = [rng.next_float32() for _ in range(4)]
     limits = [dr.opaque(mi.UInt32, n) for n in (3, 100)]

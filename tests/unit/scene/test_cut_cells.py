@@ -10,7 +10,7 @@ import pytest
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.scene.compile import bake_media
-from mitsuba_irrcache.scene.cut_cells import Edges
+from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.scene.voxel_classes import neighbourhood
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -46,7 +46,7 @@ def test_light_does_not_pass_a_wall(unit):
     field = RootField(unit, mi.Float(roots), 1)
     p, distance = points()
     plain = field.at_world(p)
-    edges = Edges(wall(), unit)
+    edges = CutCells(wall(), unit)
     sided = np.array(edges.corrected(field, p, plain, mi.Bool(True)))
     expected = np.where(distance > 0, 4.0, 1.0)
     far = np.abs(distance) > 1e-4
@@ -62,7 +62,7 @@ def test_colours_and_uncut_cells(unit):
     field = RootField(unit, mi.Float(roots), 3)
     p, distance = points()
     plain = field.at_world(p)
-    sided = np.array(Edges(wall(), unit).corrected(field, p, plain, mi.Bool(True)))
+    sided = np.array(CutCells(wall(), unit).corrected(field, p, plain, mi.Bool(True)))
     far = np.abs(distance) > 3**0.5 / 8
     np.testing.assert_array_equal(sided[:, far], np.array(plain)[:, far])
     assert (sided != np.array(plain)).any()
@@ -71,7 +71,7 @@ def test_colours_and_uncut_cells(unit):
 def test_empty_space_has_no_edges(unit):
     ball = {"type": "sphere", "center": [3, 3, 3]}
     null = {"type": "sphere", "bsdf": {"type": "null"}}
-    assert Edges(mi.load_dict({"type": "scene", "a": ball, "b": null}), unit).count == 0
+    assert CutCells(mi.load_dict({"type": "scene", "a": ball, "b": null}), unit).count == 0
 
 
 def test_neighbourhood():

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
 from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance
@@ -31,7 +31,7 @@ WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
 
 
 def moments_of(g: float, order: int = 2) -> Moments:
-    return Moments(Directional(Phase(None, g ** np.arange(32), 1.0), []), order)
+    return Moments(AngularBasis(Phase(None, g ** np.arange(32), 1.0), []), order)
 
 
 def lines(extinction: float) -> Tracks:

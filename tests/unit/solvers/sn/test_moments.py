@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.angular import Directional
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
 from mitsuba_irrcache.solvers.sn import tracks
@@ -31,7 +31,7 @@ def mode(request, monkeypatch):
 
 def moments_of(g: float, order: int) -> Moments:
     phase = Phase(None, g ** np.arange(32), 1.0)
-    return Moments(Directional(phase, []), order)
+    return Moments(AngularBasis(phase, []), order)
 
 
 def values(flat: mi.Float, count: int) -> np.ndarray:
