@@ -39,7 +39,7 @@ def take_away_peak(medium: MediumGrid) -> None:
     medium.sigma_t = _combined(lambda s, a: s * (1 - share * a), sigma_t, albedo)
     medium.albedo = _combined(lambda a: a * (1 - share) / (1 - share * a), albedo)
     remaining = _mean(medium.sigma_t)
-    medium.straight = _mean(sigma_t) / remaining if remaining else 1.0
+    medium.unscattered_exponent = _mean(sigma_t) / remaining if remaining else 1.0
     medium.phase = phase
     medium.macrocells = Macrocells.build(medium.sigma_t, medium.boundary)
 

@@ -34,12 +34,12 @@ class MediumGrid:
         #: what it sends out itself; None where it does not (see `emission`)
         self.emission: object | None = None
         #: whether there is no more to its bounds than ``boundary``; others are larger than it
-        self.exact = True
+        self.has_exact_boundary = True
         #: None where it is isotropic
         self.phase: Phase | None = None
         #: the power of transmittance that is left of light if what is scattered into a forward peak
         #: is taken from it, too (see `delta_m`)
-        self.straight = 1.0
+        self.unscattered_exponent = 1.0
         self._with_peak: MediumGrid | None = None
         #: what it is called among others
         self.name = ""
@@ -48,7 +48,7 @@ class MediumGrid:
         self.pointer: mi.MediumPtr | None = None
         self.surroundings: object | None = None
         #: whether this medium in its boundary is all, and the light around it
-        self.alone = True
+        self.is_isolated = True
         self.macrocells = Macrocells.build(sigma_t, boundary)
         if bbox is not None:
             corners = [mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in p)) for p in bbox]

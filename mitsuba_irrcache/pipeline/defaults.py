@@ -112,7 +112,7 @@ def choose_solver(
         return "path", reason
     if solver == "sweep":
         return solver, AS_TOLD
-    if medium.alone:
+    if medium.is_isolated:
         return "sweep", "all light comes from far away or from points"
     return "sweep", "no surface and no other medium is among the voxels"
 
@@ -146,9 +146,9 @@ def _why_not_sweep(
         if not sn_solver.takes(emitter):
             kind = f'"{emitter.id()}" ({emitter.class_name()})'
             return f"emitter {kind} is neither far away nor a point nor an even area"
-    if medium.alone:
+    if medium.is_isolated:
         return None
-    if not medium.exact:
+    if not medium.has_exact_boundary:
         return f"{name} is bounded by other shapes than one box or sphere"
     if max_depth > 2:
         return f"among surfaces it knows one or all orders of scattering, not max_depth {max_depth}"
@@ -308,9 +308,9 @@ def choose_samples(cache: IrradianceCache, solver: str, medium: MediumGrid) -> i
 def swept_samples(max_depth: int, medium: MediumGrid) -> int:
     """Directions per voxel of the solver ``sweep``."""
     once = max_depth == 2 and medium.phase is None
-    if medium.phase is not None and medium.phase.forward and not medium.alone:
+    if medium.phase is not None and medium.phase.forward and not medium.is_isolated:
         return SWEPT_SHARP
-    return (SWEPT if medium.alone else SWEPT_AMONG_SURFACES) * (2 if once else 1)
+    return (SWEPT if medium.is_isolated else SWEPT_AMONG_SURFACES) * (2 if once else 1)
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:

@@ -23,7 +23,7 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.context import Surroundings
 from mitsuba_irrcache.solvers.half_space import HalfSpace
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, behind, is_null, trace
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, is_null, medium_after, trace
 from mitsuba_irrcache.transport.spot_beams import BeamAlongRays
 
 #: Surfaces seen through less than this transmittance are traced by roulette.
@@ -69,7 +69,7 @@ def camera_rays_of(
 
     projections = [project(part.medium, part.shown) for part in parts]
     medium = parts[0].medium
-    if medium.alone:
+    if medium.is_isolated:
         closed_form = parts[0].half_space
         return ClosedFormCameraRays(projections[0], settings.max_depth, hide_emitters, closed_form)
     depths = settings.max_depth, settings.rr_depth
@@ -284,7 +284,7 @@ class TracedCameraRays:
             background += dr.select(shines & lit, left * light, 0)
             stopped |= valid & ~crosses
             escaped |= active & ~valid
-            pointer = dr.select(crosses & null, behind(si, ray.d, pointer), pointer)
+            pointer = dr.select(crosses & null, medium_after(si, ray.d, pointer), pointer)
             onwards = si.spawn_ray(ray.d)
             segment = dr.select(crosses, onwards, segment)
             near = dr.select(crosses, far, near)

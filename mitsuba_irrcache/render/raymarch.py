@@ -141,13 +141,13 @@ class Projection:
     @property
     def blurs(self) -> bool:
         """Whether light in a forward peak counts as not scattered (see `delta_m`)."""
-        return self.directional is not None and self.medium.straight != 1
+        return self.directional is not None and self.medium.unscattered_exponent != 1
 
     def unscattered(self, transmittance: mi.Spectrum) -> mi.Spectrum:
         """What is left of a ``transmittance`` where it counts as scattered."""
         if not self.blurs:
             return transmittance
-        return dr.power(transmittance, dr.opaque(mi.Float, self.medium.straight))
+        return dr.power(transmittance, dr.opaque(mi.Float, self.medium.unscattered_exponent))
 
     def _within_edges(
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool

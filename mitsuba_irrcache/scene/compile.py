@@ -149,7 +149,7 @@ def bake_general(
     for medium, filled in media_of(scene).items():
         exact = _exact_boundary(scene, filled)
         grid = bake(medium, exact or Boundary("box", _extent(medium, filled)))
-        grid.exact, grid.alone = exact is not None, alone
+        grid.has_exact_boundary, grid.is_isolated = exact is not None, alone
         grid.pointer, grid.name = mi.MediumPtr(medium), _name(medium, [g.name for g in grids])
         dr.make_opaque(grid.pointer)
         grids.append(grid)

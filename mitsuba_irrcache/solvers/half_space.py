@@ -55,7 +55,7 @@ def series_error(medium: MediumGrid) -> float:
     """
     if not medium.homogeneous or medium.sigma_t.channels > 1 or medium.bbox is not None:
         return np.inf
-    if not medium.alone or medium.phase is not None or medium.emission is not None:
+    if not medium.is_isolated or medium.phase is not None or medium.emission is not None:
         return np.inf
     edges = np.linalg.norm(medium.frame[:3, :3], axis=0) * medium.sigma_t.maximum
     if not edges.min() > 0:

@@ -94,7 +94,7 @@ def is_null(flags: mi.UInt32) -> mi.Bool:
     return (flags & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
 
 
-def behind(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, pointer: mi.MediumPtr):
+def medium_after(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, pointer: mi.MediumPtr):
     """The medium that a ray is in behind a surface, where it was in ``pointer`` before."""
     return dr.select(si.is_medium_transition(), si.target_medium(direction), pointer)
 
@@ -130,7 +130,7 @@ def visibility(
         far = dr.minimum(si.t, ray.maxt)
         passed, rng = media.transmittance(pointer, ray, far, rng, active)
         through = dr.select(active, through * passed, through)
-        pointer = dr.select(hit, behind(si, ray.d, pointer), pointer)
+        pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
         ray = si.spawn_ray_to(target)
         crossings += 1
         active &= hit & (dr.max(through) > 0) & (crossings < MOST_CROSSINGS)
@@ -139,7 +139,7 @@ def visibility(
 
 
 @symbolic
-def out_of(
+def trace_to_infinity(
     scene: mi.Scene,
     media: Media,
     ray: mi.Ray3f,
@@ -169,14 +169,14 @@ def out_of(
             light += dr.select(shines, through * si.shape.emitter().eval(si, shines), 0)
         passed = si.bsdf().eval_null_transmission(si, hit)
         through = dr.select(hit, through * passed, through)
-        pointer = dr.select(hit, behind(si, ray.d, pointer), pointer)
+        pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
         ray = si.spawn_ray(ray.d)
         crossings += 1
         active &= hit & (dr.max(through) > 0) & (crossings < MOST_CROSSINGS)
     return dr.select(escaped, through, 0), light, rng
 
 
-def emitted_to(
+def sample_emitter(
     scene: mi.Scene,
     media: Media,
     vertex: mi.Interaction3f,
@@ -321,7 +321,7 @@ def trace(
                 phase, collision, record.d, lit & collided, value, density
             )
         lit &= dr.max(value) > 0
-        beyond = dr.select(surface, behind(si, record.d, pointer), pointer)
+        beyond = dr.select(surface, medium_after(si, record.d, pointer), pointer)
         passed, rng = visibility(scene, media, vertex, record.p, beyond, rng, lit)
         share = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
         scattered += dr.select(lit, weight * value * light * passed * share, 0)
@@ -345,7 +345,7 @@ def trace(
             pdf = dr.select(collided, density, pdf)
         outwards = dr.select(skipped, ray.d, si.to_world(bounce.wo))
         onwards = si.spawn_ray(outwards)
-        pointer = dr.select(scatters, behind(si, outwards, pointer), pointer)
+        pointer = dr.select(scatters, medium_after(si, outwards, pointer), pointer)
         ray.o = dr.select(collided, vertex.p, onwards.o)
         ray.d = dr.select(collided, direction, onwards.d)
         turned |= collided

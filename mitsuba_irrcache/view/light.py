@@ -60,7 +60,7 @@ class Seen:
     def medium_at(self, position: np.ndarray) -> object | None:
         """What a camera at ``position`` (3) is in, None for nothing."""
         medium = self._parts[0].medium
-        if medium.alone:
+        if medium.is_isolated:
             return medium if medium.boundary.contains(position) else None
         pointer = medium_at(self.scene, position)
         return None if (pointer == None)[0] else pointer  # noqa: E711

@@ -303,8 +303,8 @@ MUTANTS = (
     Mutant(
         "light passes a sliver of its medium on its way in (arrivals)",
         "solvers/sn/boundary_condition.py",
-        "out_of(around.scene, around.others, ray",
-        "out_of(around.scene, around.media, ray",
+        "around.scene, around.others, ray, pointer",
+        "around.scene, around.media, ray, pointer",
         ("tests/stress/test_stability.py",),
     ),
     Mutant(

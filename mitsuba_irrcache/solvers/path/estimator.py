@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.transport.path import Media, Start, emitted_to, power_heuristic, trace
+from mitsuba_irrcache.transport.path import Media, Start, power_heuristic, sample_emitter, trace
 
 
 def contributions(
@@ -34,7 +34,7 @@ def contributions(
     vertex, always = dr.zeros(mi.Interaction3f), mi.Bool(True)
     vertex.p = position
     sample = mi.Point2f(spread[0], spread[1])
-    record, light, rng = emitted_to(scene, media, vertex, pointer, sample, rng, always)
+    record, light, rng = sample_emitter(scene, media, vertex, pointer, sample, rng, always)
     density = dr.select(record.delta, 0, dr.inv_four_pi)
     light *= power_heuristic(record.pdf, density)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))

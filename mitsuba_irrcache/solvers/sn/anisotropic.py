@@ -46,7 +46,9 @@ class AnisotropicSweep(Sweep):
         self._towards = [s.seen_from(self._places)[0] for s in points]
 
     def _new_level(self, *arguments: object) -> MultigridLevel:
-        return AnisotropicMultigridLevel(*arguments, not self._medium.alone, moments=self._moments)
+        return AnisotropicMultigridLevel(
+            *arguments, not self._medium.is_isolated, moments=self._moments
+        )
 
     def _solved(self, passes: list[OrdinateSet], channels: tuple[int, ...]) -> list[tuple]:
         """As of `Sweep`; narrow lights are not in the moments of the light straight from emitters,

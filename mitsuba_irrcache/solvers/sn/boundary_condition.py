@@ -28,7 +28,7 @@ from mitsuba_irrcache.solvers.sn.layout import joined
 from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.sn.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.sn.tracks import Tracks
-from mitsuba_irrcache.transport.path import Start, out_of, trace
+from mitsuba_irrcache.transport.path import Start, trace, trace_to_infinity
 
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
 #: find what is in the way of an emitter's light are cheaper. What comes from surfaces differs more
@@ -319,7 +319,9 @@ def _follow(
     lit = hit & (dr.max(sum(parts)) > 0)
     if around.shines:
         lit |= hit & (weight > 0)
-    passed, glow, rng = out_of(around.scene, around.others, ray, pointer, around.lamps, rng, lit)
+    passed, glow, rng = trace_to_infinity(
+        around.scene, around.others, ray, pointer, around.lamps, rng, lit
+    )
     parts = [light * passed for light in parts]
     parts[0] += weight * glow
     straight = [dr.select(lit, light, 0) for light in parts]

@@ -116,7 +116,7 @@ class Sweep:
         self._direct: list[list[mi.Spectrum]] = []
         self._emitted: list[list[mi.Spectrum]] = []
         self._around: SurfaceBoundary | None = None
-        if medium.alone:
+        if medium.is_isolated:
             near = self._sky.near_light(medium, self._places, cache.beams)
             self._direct = [[e] for e in near]
             return
@@ -221,7 +221,7 @@ class Sweep:
 
     def _new_level(self, *arguments: object) -> MultigridLevel:
         return MultigridLevel(
-            *arguments, evenly=not self._medium.alone
+            *arguments, evenly=not self._medium.is_isolated
         )  # as `boundary_condition` takes for granted
 
     def _solved(

@@ -39,7 +39,7 @@ def test_transmittance_with_and_without_the_peak(scenes, density, albedo):
         for grid in (found, found.with_peak)
     )
     assert less < 0.95 * whole
-    assert np.exp(-less) ** found.straight == pytest.approx(np.exp(-whole), rel=1e-4)
+    assert np.exp(-less) ** found.unscattered_exponent == pytest.approx(np.exp(-whole), rel=1e-4)
 
 
 def test_a_bright_spot_of_the_sky_through_a_medium(scenes):
