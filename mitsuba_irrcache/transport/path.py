@@ -246,40 +246,40 @@ def trace(
     find there. Paths end with their first collision in such a medium.
     """
     straight, scattered = mi.Spectrum(0), mi.Spectrum(0)
-    weight, eta = mi.Spectrum(1), mi.Float(1)
+    throughput, eta = mi.Spectrum(1), mi.Float(1)
     ray, pointer = mi.Ray3f(start.ray), mi.MediumPtr(start.pointer)
     depth, crossings = mi.UInt32(start.depth), mi.UInt32(0)
     pdf = mi.Float(start.pdf)  #: of the direction, 0 where emitters could not be sampled
     last = dr.zeros(mi.Interaction3f)  #: the vertex before
     last.p = ray.o
-    clear, met = mi.Bool(start.clear), mi.Bool(False)
-    place, heading, where = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.MediumPtr(pointer)
-    left = mi.Spectrum(0)  #: the weight at the end
+    clear, interacted = mi.Bool(start.clear), mi.Bool(False)
+    place, end_direction, where = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.MediumPtr(pointer)
+    end_throughput = mi.Spectrum(0)  #: the throughput at the end
     active = mi.Bool(active) & (depth < max_depth)
     context = mi.BSDFContext()
     while dr.hint(active, label="paths"):
         # Russian roulette as volpath does it; weights stay near one.
-        survival = dr.minimum(dr.max(weight) * dr.square(eta), MOST_SURVIVE)
+        survival = dr.minimum(dr.max(throughput) * dr.square(eta), MOST_SURVIVE)
         survival = dr.select(depth > rr_depth, survival, 1)
-        active &= (rng.next_float32(active) < survival) & (dr.max(weight) > 0)
-        weight = dr.select(active, weight / survival, weight)
+        active &= (rng.next_float32(active) < survival) & (dr.max(throughput) > 0)
+        throughput = dr.select(active, throughput / survival, throughput)
 
         si = scene.ray_intersect(ray, active)
-        collided, t, weight, rng, light = media.fly(
-            pointer, ray, si.t, weight, rng, active & ~clear
+        collided, t, throughput, rng, light = media.fly(
+            pointer, ray, si.t, throughput, rng, active & ~clear
         )
         first = depth == start.depth
         straight += dr.select(first, light, 0)
         scattered += dr.select(first, 0, light)
         clear = mi.Bool(False)
         surface = active & ~collided
-        met |= collided
+        interacted |= collided
         if dr.hint(known is not None, mode="scalar"):
             ends = collided & known(pointer)
             place = dr.select(ends, ray(t), place)
-            heading = dr.select(ends, ray.d, heading)
+            end_direction = dr.select(ends, ray.d, end_direction)
             where = dr.select(ends, pointer, where)
-            left = dr.select(ends, weight, left)
+            end_throughput = dr.select(ends, throughput, end_throughput)
             collided &= ~ends
 
         # Emitters that are met by chance, weighted against sampling them from the last vertex.
@@ -295,7 +295,7 @@ def trace(
         sampled = glows & (pdf > 0)
         density = scene.pdf_emitter_direction(last, record, sampled)
         share = dr.select(sampled, power_heuristic(pdf, density), 1)
-        light = dr.select(glows, weight * emitter.eval(si, glows) * share, 0)
+        light = dr.select(glows, throughput * emitter.eval(si, glows) * share, 0)
         straight += dr.select(first, light, 0)
         scattered += dr.select(first, 0, light)
         surface &= si.is_valid()
@@ -324,13 +324,13 @@ def trace(
         beyond = dr.select(surface, medium_after(si, record.d, pointer), pointer)
         passed, rng = visibility(scene, media, vertex, record.p, beyond, rng, lit)
         share = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
-        scattered += dr.select(lit, weight * value * light * passed * share, 0)
+        scattered += dr.select(lit, throughput * value * light * passed * share, 0)
 
         # Onwards.
         choice = rng.next_float32(active)
         sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
         bounce, value = bsdf.sample(context, si, choice, sample, scatters)
-        weight = dr.select(scatters, weight * value, weight)
+        throughput = dr.select(scatters, throughput * value, throughput)
         eta = dr.select(scatters, eta * bounce.eta, eta)
         turned = scatters & ~mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Null)
         delta = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
@@ -341,7 +341,7 @@ def trace(
             direction, value, density = phase.sample(
                 mi.PhaseFunctionContext(), collision, choice, sample, collided
             )
-            weight = dr.select(collided, weight * value, weight)
+            throughput = dr.select(collided, throughput * value, throughput)
             pdf = dr.select(collided, density, pdf)
         outwards = dr.select(skipped, ray.d, si.to_world(bounce.wo))
         onwards = si.spawn_ray(outwards)
@@ -351,10 +351,10 @@ def trace(
         turned |= collided
         last = dr.select(turned, vertex, last)
         depth = dr.select(turned, depth + 1, depth)
-        met |= turned
+        interacted |= turned
         crossings += 1
         active &= (collided | surface) & (depth < max_depth) & (crossings < MOST_CROSSINGS)
-    return straight, scattered, met, End(place, heading, where, left), rng
+    return straight, scattered, interacted, End(place, end_direction, where, end_throughput), rng
 
 
 def _phase_value(
