@@ -1,9 +1,14 @@
-"""Spot lights, whose beams may be narrower than the voxels of a cache.
+"""Direct irradiance of emitters without extent (spot lights, points, suns), without interpolating it.
 
-The irradiance of a spot light is E(p) V(p): what it would be without any matter, known in closed
-form from the emitter, and the transmittance V of the way from the light, which is smooth. Only V is
-interpolated. A cache holds the mean of E over each voxel times V, from which light is scattered
-further; camera rays see that replaced by E(p) V(p).
+The irradiance of such an emitter at a position p is E(p) exp(-tau(p)): E is what it would be without
+any medium, known in closed form from the emitter; tau is the optical depth of the straight way from
+the emitter, the mean extinction along it times its length in the medium. The length is known in
+closed form from the boundary; only the mean extinction is interpolated between the voxels of the
+cache. It is smooth where a beam is narrower than a voxel, and where matter is so dense that light
+is absorbed within a fraction of a voxel.
+
+A cache holds means over its voxels, which further orders of scattering start from; camera rays see
+those replaced by E(p) exp(-tau(p)).
 """
 
 from __future__ import annotations
@@ -11,22 +16,28 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .grid import Grid, RootField
+from .arithmetic import absorptance, greatest
+from .grid import Grid, GridField, RootField
 from .lamps import Places, point_lights, position_of
 from .medium import MediumGrid
 from .symbolic import symbolic
-from .tracking import medium_transmittance
+from .tracking import optical_depth
 from .transport import visibility
 
-#: Points along each axis of a voxel over which a beam is averaged.
-POINTS = 8
-#: Points of a segment of a camera ray at which a beam is looked at.
-SEGMENT_POINTS = 4
+#: Points along each axis of a voxel over which E, and over which exp(-tau), is averaged.
+POINTS, DEPTH_POINTS = 8, 3
+#: Parts of a segment of a camera ray in which E is taken as constant, where it depends on p.
+PARTS = 4
 
 
 def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
     """The emitters of a scene whose intensity depends on the direction and that have no size."""
     return [e for e in point_lights(scene) if e.class_name() != "PointLight"]
+
+
+def is_sun(emitter: mi.Emitter) -> bool:
+    """Whether an emitter is infinitely far away, in a single direction."""
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
 
 
 class Beam:
@@ -40,61 +51,127 @@ class Beam:
         grid: Grid,
         voxels: mi.UInt32,
     ) -> None:
-        self.emitter, self._grid, self._voxels = emitter, grid, voxels
-        position = mi.Point3f([dr.opaque(mi.Float, float(v)) for v in position_of(emitter)])
+        self.emitter, self._medium, self.distant = emitter, medium, is_sun(emitter)
         p = Places(scene, grid).of(voxels)
-        way = position - p
-        distance = dr.norm(way)
-        ray = mi.Ray3f(p, way / dr.maximum(distance, 1e-30))
-        passed = mi.Spectrum(medium_transmittance(medium, ray, distance, mi.Bool(True)))
+        ray, near, far = self._way(p)
+        length, sigma_t = dr.maximum(far - near, 0), medium.sigma_t.at_world(p)
+        depth = optical_depth(medium, ray, near, far, length > 0, dr.inf)
+        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
+        self._extinction = _on_grid(grid, voxels, mean)
+        #: what surfaces and other media let through at the voxels; None where there are none
+        self._others: RootField | None = None
+        passed = mi.Spectrum(1)
         if medium.surroundings is not None:
-            passed *= _past_others(scene, medium, p, position)
-        mean = self._mean(voxels)
-        dr.eval(passed, mean)
-        #: V at the voxels
-        self.transmittance = passed
-        #: means over the voxels of E, times V
-        self.irradiance = mean * passed
+            position = [dr.opaque(mi.Float, float(v)) for v in position_of(emitter)]
+            passed = _past_others(scene, medium, p, mi.Point3f(position))
+            dr.eval(passed)
+            self._others = _root_field(grid, voxels, passed)
+        #: means of the irradiance over the voxels
+        self.irradiance = passed * self._mean_irradiance(grid, voxels, p)
         dr.eval(self.irradiance)
+        #: the largest E, where it is the same everywhere
+        self.maximum = float(dr.max(dr.max(self.unobstructed(p)))[0]) if self.distant else 0.0
 
     def unobstructed(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
-        """E at world positions, without what the medium absorbs."""
+        """E at world positions."""
         at = dr.zeros(mi.Interaction3f, dr.width(p))
         at.p = p
         _, light = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
         return dr.select(active, light, 0)
 
-    def field(self) -> RootField:
-        """V for lookups, of one channel where all agree."""
-        channels = [dr.sqrt(c) for c in self.transmittance]
-        if all(dr.all(c == channels[0])[0] for c in channels[1:]):
-            channels = channels[:1]
-        count = len(channels)
-        values = dr.zeros(mi.Float, self._grid.voxel_count * count)
-        for c, value in enumerate(channels):
-            dr.scatter(values, value, self._voxels * count + c)
-        dr.eval(values)
-        return RootField(self._grid, values, count)
+    def depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """The optical depth of the medium between world positions and the emitter."""
+        _, near, far = self._way(p)
+        return self._extinction.at_world(p, active) * dr.maximum(far - near, 0)
+
+    def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """Transmittance of all else on that way."""
+        return mi.Float(1) if self._others is None else self._others.at_world(p, active)
+
+    def _way(self, p: mi.Point3f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
+        """Rays from world positions to the emitter, and the distances between which they are in the
+        medium: none where the first one is not the less.
+        """
+        at = dr.zeros(mi.Interaction3f, dr.width(p))
+        at.p = p
+        record, _ = self.emitter.sample_direction(at, mi.Point2f(0.5))
+        ray = mi.Ray3f(p, record.d)
+        hit, near, far = self._medium.intersect(ray)
+        near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
+        return ray, near, dr.select(hit, far, near)
+
+    def _mean_irradiance(self, grid: Grid, voxel: mi.UInt32, centre: mi.Point3f) -> mi.Spectrum:
+        """Means of E times means of exp(-tau) over the part of voxels that is in the medium."""
+        if self.distant:
+            mean = self.unobstructed(centre)
+        else:
+            mean = self._mean(grid, voxel, POINTS)
+        passed, count = self._mean_transmittance(grid, voxel, DEPTH_POINTS)
+        alone = mi.Spectrum(dr.exp(-self.depth(centre)))
+        return mean * dr.select(count > 0, passed / dr.maximum(count, 1), alone)
 
     @symbolic
-    def _mean(self, voxel: mi.UInt32):
+    def _mean(self, grid: Grid, voxel: mi.UInt32, points: int):
         """Means of E over voxels."""
-        corner, total, k = mi.Point3f(*self._grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
-        n = dr.opaque(mi.UInt32, POINTS)
+        corner, total, k = mi.Point3f(*grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
+        n = dr.opaque(mi.UInt32, points)
         while dr.hint(k < n * n * n, label="points in a voxel"):
             place = mi.Point3f(k % n, (k // n) % n, k // (n * n)) + 0.5
-            total += self.unobstructed(self._grid.world.point(corner + place / mi.Float(n)))
+            total += self.unobstructed(grid.world.point(corner + place / mi.Float(n)))
             k += 1
         return total / mi.Float(n * n * n)
 
+    @symbolic
+    def _mean_transmittance(self, grid: Grid, voxel: mi.UInt32, points: int):
+        """Sums of exp(-tau) over those points in voxels that are in the medium, and their number."""
+        corner, total, k = mi.Point3f(*grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
+        n, count = dr.opaque(mi.UInt32, points), mi.Float(0)
+        while dr.hint(k < n * n * n, label="points in a voxel"):
+            place = mi.Point3f(k % n, (k // n) % n, k // (n * n)) + 0.5
+            p = grid.world.point(corner + place / mi.Float(n))
+            inside = self._medium.contains(p)
+            total += dr.select(inside, mi.Spectrum(dr.exp(-self.depth(p, inside))), 0)
+            count += dr.select(inside, mi.Float(1), 0)
+            k += 1
+        return total, count
 
-def beams_of(scene: mi.Scene, medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[Beam]:
-    """The beams of all spot lights of a scene; none in media that do not scatter isotropically,
-    whose caches hold the irradiance of spots apart from that of other lights.
+
+def beams_of(
+    scene: mi.Scene, medium: MediumGrid, grid: Grid, voxels: mi.UInt32, dense: bool
+) -> list[Beam]:
+    """The beams of all spot lights of a scene; where voxels are ``dense`` and there are no surfaces,
+    of points and suns, too. None in media that do not scatter isotropically, whose caches hold the
+    irradiance of such lights apart from that of others.
     """
     if medium.phase is not None or not dr.width(voxels):
         return []
-    return [Beam(scene, emitter, medium, grid, voxels) for emitter in spot_lights(scene)]
+    emitters = spot_lights(scene)
+    if dense and medium.alone:
+        emitters = [e for e in scene.emitters() if is_sun(e) or e in point_lights(scene)]
+    return [Beam(scene, emitter, medium, grid, voxels) for emitter in emitters]
+
+
+def _on_grid(grid: Grid, voxels: mi.UInt32, values: mi.Float | mi.Color3f) -> GridField:
+    """Values at the ``voxels``, for lookups."""
+    channels = [values] if isinstance(values, mi.Float) else list(values)
+    return GridField(grid, _spread(grid, voxels, channels), len(channels))
+
+
+def _root_field(grid: Grid, voxels: mi.UInt32, values: mi.Spectrum) -> RootField:
+    """The same with their roots interpolated, of one channel where all agree."""
+    channels = [dr.sqrt(c) for c in values]
+    if all(dr.all(c == channels[0])[0] for c in channels[1:]):
+        channels = channels[:1]
+    return RootField(grid, _spread(grid, voxels, channels), len(channels))
+
+
+def _spread(grid: Grid, voxels: mi.UInt32, channels: list[mi.Float]) -> mi.Float:
+    """Values of all channels of all voxels, 0 elsewhere."""
+    values, count = dr.zeros(mi.Float, grid.voxel_count * len(channels)), len(channels)
+    for c, value in enumerate(channels):
+        dr.scatter(values, value, voxels * count + c)
+    dr.eval(values)
+    return values
 
 
 def _past_others(
@@ -110,31 +187,61 @@ def _past_others(
 
 
 class BeamAlongRays:
-    """A beam for camera rays: E in closed form, V interpolated."""
+    """A beam for camera rays."""
 
     def __init__(self, beam: Beam) -> None:
-        self._beam, self._transmittance = beam, beam.field()
+        self._beam = beam
 
     def at(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
         """Irradiance at world positions."""
-        passed = mi.Spectrum(self._transmittance.at_world(p, active))
-        return passed * self._beam.unobstructed(p, active)
+        beam = self._beam
+        passed = dr.exp(-beam.depth(p, active)) * beam.past_others(p, active)
+        return mi.Spectrum(passed) * beam.unobstructed(p, active)
+
+    def depth(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
+        """The optical depth between world positions and the emitter."""
+        return self._beam.depth(p, active)
 
     def scattered(
-        self, ray: mi.Ray3f, a: mi.Float, b: mi.Float, weights: tuple, albedo: tuple
+        self,
+        ray: mi.Ray3f,
+        ends: tuple[mi.Float, mi.Float],
+        sigma: tuple,
+        depths: tuple,
+        weights: tuple,
+        albedo: tuple,
     ) -> mi.Spectrum:
-        """Radiance scattered towards the camera between the distances ``a`` and ``b``, where
-        ``weights`` are those of sources that fall and rise linearly, of `projection.segment`, and
-        ``albedo`` is that at both ends. The density of the weights along the segment is taken as
-        linear.
+        """Radiance scattered towards the camera along a segment, from what is known at both of its
+        ``ends`` (distances along the ray): the extinction ``sigma``, the optical ``depths`` of the
+        way from the emitter, the ``albedo``. ``weights`` are those of sources that fall and rise
+        linearly, of `projection.segment`.
+
+        With extinction c and depth s linear in a part of the segment, of optical depth C and from
+        depth s0 to s0 + S, int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), however
+        opaque that part is.
         """
-        near, far = (mi.Spectrum(w) for w in weights)
-        whole = near + far
-        slope = dr.clip(3 * (far - near) / dr.select(whole > 0, whole, 1), -1, 1)
+        a, b = ends
+        near, far = (extinction * (b - a) for extinction in sigma)
+        s0, s1 = depths
+        parts = 1 if self._beam.distant else PARTS
         total = mi.Spectrum(0)
-        for i in range(SEGMENT_POINTS):
-            u = (i + 0.5) / SEGMENT_POINTS
-            p = ray(dr.lerp(a, b, u))
-            share = dr.fma(slope, 2 * u - 1, 1) * (1 / SEGMENT_POINTS)
-            total += share * mi.Spectrum(dr.lerp(*albedo, u)) * self.at(p, mi.Bool(True))
-        return total * whole * dr.inv_four_pi
+        for i in range(parts):
+            u, v = i / parts, (i + 1) / parts
+            before = dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u))
+            within = dr.fma(near, v * (1 - 0.5 * v), far * (0.5 * v * v)) - before
+            both = within + (s1 - s0) * (v - u)
+            exponent = greatest(-both, 0.0) - before - dr.lerp(s0, s1, u)
+            light = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
+            p = ray(dr.lerp(a, b, 0.5 * (u + v)))
+            light = light * self._beam.past_others(p)
+            total += mi.Spectrum(light * dr.lerp(*albedo, 0.5 * (u + v))) * self._beam.unobstructed(p)
+        # As the quadrature rule has it.
+        absorbed = absorptance(0.5 * (near + far))
+        rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
+        return total * mi.Spectrum(rule) * dr.inv_four_pi
+
+
+def _mean_decay(depth: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
+    """The mean of e^-x for x in [0, depth]."""
+    depth = greatest(depth, 1e-20)
+    return absorptance(depth) / depth

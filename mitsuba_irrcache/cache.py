@@ -201,6 +201,7 @@ class IrradianceCache:
         """
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
         brightest = [dr.max(m)[0] for m in means] if self.beams else []
+        brightest += [beam.maximum for beam in self.beams]
         for beam in self.beams:
             means = [dr.maximum(m - e, 0) for m, e in zip(means, beam.irradiance, strict=False)]
         roots, variance = [dr.sqrt(m) for m in means], None

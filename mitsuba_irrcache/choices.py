@@ -25,6 +25,9 @@ AS_TOLD = "as told"
 #: Estimated error of the pixels at the boundary of a medium [%] from which on a warning is logged.
 LARGE_BORDER_ERROR = 3.0
 
+#: The same from which on the light of suns and points is not interpolated.
+SMALL_BORDER_ERROR = 0.2
+
 #: Voxels along the longest side of a cache among surfaces, unless told otherwise: shadows have more
 #: detail than coarse data.
 AMONG_SURFACES = (32, 64)
@@ -312,12 +315,19 @@ def swept_samples(max_depth: int, medium: MediumGrid) -> int:
     return (SWEPT if medium.alone else SWEPT_AMONG_SURFACES) * (2 if once else 1)
 
 
+def border_error(medium: MediumGrid, grid: Grid) -> float:
+    """The estimated error of the pixels at the boundary of a medium that cuts through matter [%],
+    where irradiance is interpolated between the voxels of ``grid``.
+    """
+    return BORDER_ERROR * (_border_extinction(medium) * grid.voxel_size.max()) ** BORDER_ORDER
+
+
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
     """Logs a warning where the cache is too coarse for matter that the boundary cuts: irradiance
     falls off within a fraction of a mean free path there, and no voxel lies beyond.
     """
     depth = _border_extinction(medium) * grid.voxel_size.max()
-    error = BORDER_ERROR * depth**BORDER_ORDER
+    error = border_error(medium, grid)
     if error > LARGE_BORDER_ERROR:
         mi.Log(
             mi.LogLevel.Warn,

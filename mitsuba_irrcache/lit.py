@@ -15,6 +15,8 @@ import mitsuba as mi
 from .beams import beams_of
 from .cache import BATCH, IrradianceCache, active_voxels, marked
 from .choices import (
+    SMALL_BORDER_ERROR,
+    border_error,
     choose_grid,
     choose_samples,
     needs_no_cache,
@@ -187,7 +189,8 @@ class LitMedium:
             grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
         )
         cache.survey, cache.directional = survey, directional
-        cache.beams = beams_of(scene, medium, grid, active) if swept else []
+        dense = border_error(medium, grid) > SMALL_BORDER_ERROR
+        cache.beams = beams_of(scene, medium, grid, active, dense) if swept else []
         cache.falloff = Falloff.of(scene, grid, [beam.emitter for beam in cache.beams])
         self.saved_samples = 0
         if not self.file:

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arithmetic import absorbed, clipped, decay, greatest, least
+from .arithmetic import absorbed, absorptance, clipped, decay, greatest, least
 from .beams import BeamAlongRays
 from .boundary import safe_rcp
 from .directional import DirectionalField
@@ -202,6 +202,7 @@ class Projection:
         radiance, emitted, shine = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
         emission = self.medium.emission
         gathered = self.nothing()
+        depths = [beam.depth(ray(t), active) for beam in self._beams]
         brightest = dr.maximum(self.brightest, dr.max(background))
         brightest += self.brightest_emission * dr.maximum(far - near, 0)
         dark = brightest == 0
@@ -248,9 +249,14 @@ class Projection:
                 falloff = self.falloff.means(lamps, t, end)
                 near_light, far_light = near_light * falloff[0], far_light * falloff[1]
             radiance += transmittance * (near_light + far_light)
-            for beam in self._beams:
+            for i, beam in enumerate(self._beams):
                 albedos = self._albedo_at(ray(t)), self._albedo_at(ray(end))
-                radiance += transmittance * beam.scattered(ray, t, end, weights, albedos)
+                known_depths = dr.select(skip, beam.depth(ray(t), skip), depths[i])
+                next_depth = beam.depth(ray(end), active)
+                radiance += transmittance * beam.scattered(
+                    ray, (t, end), ends[0], (known_depths, next_depth), weights, albedos
+                )
+                depths[i] = next_depth
             if dr.hint(self.layered, mode="scalar"):
                 gathered = _gather(
                     gathered,
@@ -516,17 +522,3 @@ def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
         near, far = near + part * (1 - u), far + part * u
     scale = length * dr.select(thin, 1 - 0.5 * mean, absorbed / dr.select(thin, 1, mean))
     return scale * near, scale * far
-
-
-def absorptance(tau):
-    """1 - e^-tau without cancellation.
-
-    Of a 16th of ``tau`` by its series, then four times 1 - e^-2x = a (2 - a) with a = 1 - e^-x:
-    right to 1e-6, for half an exponential's price.
-    """
-    x = least(tau, 16.0) * (1 / 16)
-    series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 120, -1 / 24), 1 / 6), -1 / 2), 1)
-    a = x * series
-    for _ in range(4):
-        a = a * (2 - a)
-    return a

@@ -194,7 +194,7 @@ class Sky:
     ) -> tuple:
         """A pass of `rows`, with those of suns."""
         colours, rows = dr.size_v(mi.Spectrum), [(directions, light, weights)]
-        lines = max(1, pairs // SUN_SHARE)
+        lines = self._lines(pairs)
         for direction, irradiance in self._suns:
             ways = np.stack([irradiance / lines, np.zeros(colours)])
             rows.append((np.tile(direction, (lines, 1)), np.tile(ways, (lines, 1, 1)), lines * [0]))
@@ -205,6 +205,13 @@ class Sky:
             end = len(offsets) - k * lines
             offsets[end - lines : end] = (offsets[end - 1] + _even(lines)) % 1
         return *joined, offsets
+
+    def sun_rows(self, pairs: int) -> int:
+        """How many of the last rows of a pass are those of suns."""
+        return len(self._suns) * self._lines(pairs)
+
+    def _lines(self, pairs: int) -> int:
+        return max(1, pairs // SUN_SHARE)
 
     def _with_bright(
         self, even: list[tuple], count: int, rng: np.random.Generator
