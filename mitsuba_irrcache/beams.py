@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .arithmetic import absorptance, greatest
+from .conservation import unbiased
 from .grid import Grid, GridField, RootField
 from .lamps import Places, point_lights, position_of
 from .medium import MediumGrid
@@ -28,6 +29,8 @@ from .transport import visibility
 POINTS, DEPTH_POINTS = 8, 3
 #: Parts of a segment of a camera ray in which E is taken as constant, where it depends on p.
 PARTS = 4
+#: Part of a segment over which the slope of a length at its ends is found.
+TANGENT = 1 / 64
 
 
 def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
@@ -57,7 +60,8 @@ class Beam:
         length, sigma_t = dr.maximum(far - near, 0), medium.sigma_t.at_world(p)
         depth = optical_depth(medium, ray, near, far, length > 0, dr.inf)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
-        self._extinction = _on_grid(grid, voxels, mean)
+        #: on the way from the emitter, for lookups
+        self.extinction = _on_grid(grid, voxels, mean)
         #: what surfaces and other media let through at the voxels; None where there are none
         self._others: RootField | None = None
         passed = mi.Spectrum(1)
@@ -81,8 +85,12 @@ class Beam:
 
     def depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """The optical depth of the medium between world positions and the emitter."""
+        return self.extinction.at_world(p, active) * self.length(p)
+
+    def length(self, p: mi.Point3f) -> mi.Float:
+        """The length of the way in the medium between world positions and the emitter."""
         _, near, far = self._way(p)
-        return self._extinction.at_world(p, active) * dr.maximum(far - near, 0)
+        return dr.maximum(far - near, 0)
 
     def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Transmittance of all else on that way."""
@@ -154,7 +162,10 @@ def beams_of(
 def _on_grid(grid: Grid, voxels: mi.UInt32, values: mi.Float | mi.Color3f) -> GridField:
     """Values at the ``voxels``, for lookups."""
     channels = [values] if isinstance(values, mi.Float) else list(values)
-    return GridField(grid, _spread(grid, voxels, channels), len(channels))
+    known = dr.zeros(mi.Bool, grid.voxel_count)
+    dr.scatter(known, mi.Bool(True), voxels)
+    values, count = _spread(grid, voxels, channels), len(channels)
+    return GridField(grid, unbiased(grid, values, known, count), count)
 
 
 def _root_field(grid: Grid, voxels: mi.UInt32, values: mi.Spectrum) -> RootField:
@@ -198,47 +209,70 @@ class BeamAlongRays:
         passed = dr.exp(-beam.depth(p, active)) * beam.past_others(p, active)
         return mi.Spectrum(passed) * beam.unobstructed(p, active)
 
-    def depth(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
-        """The optical depth between world positions and the emitter."""
-        return self._beam.depth(p, active)
+    def mean_extinction(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
+        """The mean extinction between world positions and the emitter."""
+        return self._beam.extinction.at_world(p, active)
 
     def scattered(
         self,
         ray: mi.Ray3f,
         ends: tuple[mi.Float, mi.Float],
         sigma: tuple,
-        depths: tuple,
+        means: tuple,
         weights: tuple,
         albedo: tuple,
     ) -> mi.Spectrum:
         """Radiance scattered towards the camera along a segment, from what is known at both of its
-        ``ends`` (distances along the ray): the extinction ``sigma``, the optical ``depths`` of the
-        way from the emitter, the ``albedo``. ``weights`` are those of sources that fall and rise
+        ``ends`` (distances along the ray): the extinction ``sigma``, the mean extinction on the way
+        from the emitter, the ``albedo``. ``weights`` are those of sources that fall and rise
         linearly, of `projection.segment`.
 
         With extinction c and depth s linear in a part of the segment, of optical depth C and from
         depth s0 to s0 + S, int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), however
         opaque that part is.
         """
-        a, b = ends
+        beam, (a, b) = self._beam, ends
         near, far = (extinction * (b - a) for extinction in sigma)
-        s0, s1 = depths
-        parts = 1 if self._beam.distant else PARTS
-        total = mi.Spectrum(0)
-        for i in range(parts):
-            u, v = i / parts, (i + 1) / parts
-            before = dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u))
-            within = dr.fma(near, v * (1 - 0.5 * v), far * (0.5 * v * v)) - before
-            both = within + (s1 - s0) * (v - u)
-            exponent = greatest(-both, 0.0) - before - dr.lerp(s0, s1, u)
-            light = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
-            p = ray(dr.lerp(a, b, 0.5 * (u + v)))
-            light = light * self._beam.past_others(p)
-            total += mi.Spectrum(light * dr.lerp(*albedo, 0.5 * (u + v))) * self._beam.unobstructed(p)
+        kink, lengths = self._lengths(ray, a, b)
+        middle = dr.lerp(*means, kink) * lengths[1]
+        pieces = (
+            (mi.Float(0), kink, means[0] * lengths[0], middle),
+            (kink, mi.Float(1), middle, means[1] * lengths[2]),
+        )
+        parts, total = 1 if beam.distant else PARTS // 2, mi.Spectrum(0)
+        for begin, end, s0, s1 in pieces:
+            for i in range(parts):
+                u, v = (dr.lerp(begin, end, k / parts) for k in (i, i + 1))
+                before = dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u))
+                within = dr.fma(near, v * (1 - 0.5 * v), far * (0.5 * v * v)) - before
+                both = within + (s1 - s0) / parts
+                exponent = greatest(-both, 0.0) - before - dr.lerp(s0, s1, i / parts)
+                light = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
+                u = 0.5 * (u + v)
+                p = ray(dr.lerp(a, b, u))
+                light = mi.Spectrum(light * beam.past_others(p) * dr.lerp(*albedo, u))
+                total += light * beam.unobstructed(p)
         # As the quadrature rule has it.
         absorbed = absorptance(0.5 * (near + far))
         rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
         return total * mi.Spectrum(rule) * dr.inv_four_pi
+
+    def _lengths(self, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> tuple[mi.Float, list]:
+        """Where between ``a`` and ``b``, as a fraction, the tangents at both ends of the length of
+        the way in the medium meet, and that length at ``a``, there and at ``b``.
+
+        The length is linear between kinks, at which the way leaves the medium by another face: of
+        light that grazes a face one lies next to it.
+        """
+        at = [a, dr.lerp(a, b, TANGENT), dr.lerp(b, a, TANGENT), b]
+        first, second, third, last = (self._beam.length(ray(t)) for t in at)
+        rise, fall = (second - first) * (1 / TANGENT), (last - third) * (1 / TANGENT)
+        bend = rise - fall
+        kink = (last - fall - first) / dr.select(bend != 0, bend, 1)
+        bent = (kink > 0) & (kink < 1) & (bend != 0)
+        kink = dr.select(bent, kink, 0.5)
+        middle = dr.select(bent, dr.fma(rise, kink, first), 0.5 * (first + last))
+        return kink, [first, dr.maximum(middle, 0), last]
 
 
 def _mean_decay(depth: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:

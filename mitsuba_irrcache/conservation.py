@@ -18,6 +18,29 @@ import mitsuba as mi
 from .grid import Grid
 
 
+def unbiased(grid: Grid, values: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:
+    """In place of the ``values`` at the centres of all voxels of ``grid``, those between which
+    interpolation has no error on average, to the fourth order: a twelfth of the second difference
+    less along each axis along which both neighbours are ``known``. At most half of a value is taken
+    away or added.
+    """
+    index = dr.arange(mi.UInt32, grid.voxel_count * channels)
+    voxel = index // channels if channels > 1 else index
+    own_known = dr.gather(mi.Bool, known, voxel)
+    bends, stride = mi.Float(0), mi.UInt32(1)
+    for place, side in zip(grid.places(voxel), grid.sides, strict=True):
+        inside = own_known & (place > 0) & (place + 1 < mi.UInt32(side))
+        for there in (voxel - stride, voxel + stride):
+            inside &= dr.gather(mi.Bool, known, there, inside)
+        step = stride * channels
+        around = [dr.gather(mi.Float, values, i, inside) for i in (index - step, index + step)]
+        bends += dr.select(inside, around[0] + around[1] - 2 * values, 0)
+        stride = stride * mi.UInt32(side)
+    result = values - dr.clip(bends * (1 / 12), -0.5 * values, 0.5 * values)
+    dr.eval(result)
+    return result
+
+
 def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:
     """In place of the ``roots`` of all voxels of ``grid``, those that keep the light of ``known``
     voxels, along axes along which both neighbours are known.

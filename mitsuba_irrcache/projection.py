@@ -202,7 +202,7 @@ class Projection:
         radiance, emitted, shine = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
         emission = self.medium.emission
         gathered = self.nothing()
-        depths = [beam.depth(ray(t), active) for beam in self._beams]
+        means = [beam.mean_extinction(ray(t), active) for beam in self._beams]
         brightest = dr.maximum(self.brightest, dr.max(background))
         brightest += self.brightest_emission * dr.maximum(far - near, 0)
         dark = brightest == 0
@@ -251,12 +251,11 @@ class Projection:
             radiance += transmittance * (near_light + far_light)
             for i, beam in enumerate(self._beams):
                 albedos = self._albedo_at(ray(t)), self._albedo_at(ray(end))
-                known_depths = dr.select(skip, beam.depth(ray(t), skip), depths[i])
-                next_depth = beam.depth(ray(end), active)
+                mean = dr.select(skip, beam.mean_extinction(ray(t), skip), means[i])
+                means[i] = beam.mean_extinction(ray(end), active)
                 radiance += transmittance * beam.scattered(
-                    ray, (t, end), ends[0], (known_depths, next_depth), weights, albedos
+                    ray, (t, end), ends[0], (mean, means[i]), weights, albedos
                 )
-                depths[i] = next_depth
             if dr.hint(self.layered, mode="scalar"):
                 gathered = _gather(
                     gathered,
