@@ -16,7 +16,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .arithmetic import absorptance, greatest
+from .arithmetic import absorptance, clipped, greatest, least
 from .conservation import unbiased
 from .grid import Grid, GridField, RootField
 from .lamps import Places, point_lights, position_of
@@ -27,8 +27,6 @@ from .transport import visibility
 
 #: Points along each axis of a voxel over which E, and over which exp(-tau), is averaged.
 POINTS, DEPTH_POINTS = 8, 3
-#: Parts of a segment of a camera ray in which E is taken as constant, where it depends on p.
-PARTS = 4
 #: Part of a segment over which the slope of a length at its ends is found.
 TANGENT = 1 / 64
 
@@ -233,46 +231,60 @@ class BeamAlongRays:
         """
         beam, (a, b) = self._beam, ends
         near, far = (extinction * (b - a) for extinction in sigma)
-        kink, lengths = self._lengths(ray, a, b)
-        middle = dr.lerp(*means, kink) * lengths[1]
-        pieces = (
-            (mi.Float(0), kink, means[0] * lengths[0], middle),
-            (kink, mi.Float(1), middle, means[1] * lengths[2]),
+        at = self._parts(ray, a, b, 0.5 * (near + far))
+        middles = [0.5 * (u + v) for u, v in zip(at[:-1], at[1:], strict=True)]
+        depths, inner = (
+            [dr.lerp(*means, u) * beam.length(ray(dr.lerp(a, b, u))) for u in places]
+            for places in (at, middles)
         )
-        parts, total = 1 if beam.distant else PARTS // 2, mi.Spectrum(0)
-        for begin, end, s0, s1 in pieces:
-            for i in range(parts):
-                u, v = (dr.lerp(begin, end, k / parts) for k in (i, i + 1))
-                before = dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u))
-                within = dr.fma(near, v * (1 - 0.5 * v), far * (0.5 * v * v)) - before
-                both = within + (s1 - s0) / parts
-                exponent = greatest(-both, 0.0) - before - dr.lerp(s0, s1, i / parts)
-                light = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
-                u = 0.5 * (u + v)
-                p = ray(dr.lerp(a, b, u))
-                light = mi.Spectrum(light * beam.past_others(p) * dr.lerp(*albedo, u))
-                total += light * beam.unobstructed(p)
+        passed = [dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u)) for u in at]
+        total = mi.Spectrum(0)
+        for i, u in enumerate(middles):
+            within = passed[i + 1] - passed[i]
+            both = within + depths[i + 1] - depths[i]
+            # A parabola is higher than its chord by 4 u (1 - u) sag: its mean with weights e^-x u.
+            sag = inner[i] - 0.5 * (depths[i] + depths[i + 1])
+            sag = sag * 4 / (6 + dr.abs(both))
+            exponent = greatest(-both, 0.0) - passed[i] - depths[i] - sag
+            light = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
+            p = ray(dr.lerp(a, b, u))
+            light = mi.Spectrum(light * beam.past_others(p) * dr.lerp(*albedo, u))
+            total += light * beam.unobstructed(p)
         # As the quadrature rule has it.
         absorbed = absorptance(0.5 * (near + far))
         rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
         return total * mi.Spectrum(rule) * dr.inv_four_pi
 
-    def _lengths(self, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> tuple[mi.Float, list]:
-        """Where between ``a`` and ``b``, as a fraction, the tangents at both ends of the length of
-        the way in the medium meet, and that length at ``a``, there and at ``b``.
+    def _parts(
+        self, ray: mi.Ray3f, a: mi.Float, b: mi.Float, depth: mi.Float | mi.Color3f
+    ) -> list[mi.Float]:
+        """Ends of four parts of a segment of this optical ``depth``, as fractions: thirds of what it
+        absorbs, one of which is cut at the kink.
+        """
+        depth = depth if isinstance(depth, mi.Float) else dr.mean(depth)
+        absorbed, thin = absorptance(depth), depth < 1e-3
+        thirds = [
+            dr.select(thin, k, -dr.log(1 - k * absorbed) / dr.select(thin, 1, depth))
+            for k in (1 / 3, 2 / 3)
+        ]
+        first, second = thirds
+        kink = self._kink(ray, a, b)
+        inner = [least(kink, first), clipped(kink, first, second), greatest(kink, second)]
+        return [mi.Float(0), *inner, mi.Float(1)]
 
-        The length is linear between kinks, at which the way leaves the medium by another face: of
-        light that grazes a face one lies next to it.
+    def _kink(self, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> mi.Float:
+        """Where between ``a`` and ``b``, as a fraction, the tangents at both ends of the length of
+        the way in the medium meet; in the middle where they do not.
+
+        In a box the length is linear between kinks, at which the way leaves the medium by another
+        face: of light that grazes a face one lies next to it.
         """
         at = [a, dr.lerp(a, b, TANGENT), dr.lerp(b, a, TANGENT), b]
         first, second, third, last = (self._beam.length(ray(t)) for t in at)
         rise, fall = (second - first) * (1 / TANGENT), (last - third) * (1 / TANGENT)
         bend = rise - fall
         kink = (last - fall - first) / dr.select(bend != 0, bend, 1)
-        bent = (kink > 0) & (kink < 1) & (bend != 0)
-        kink = dr.select(bent, kink, 0.5)
-        middle = dr.select(bent, dr.fma(rise, kink, first), 0.5 * (first + last))
-        return kink, [first, dr.maximum(middle, 0), last]
+        return dr.select((bend != 0) & (kink > 0) & (kink < 1), kink, 0.5)
 
 
 def _mean_decay(depth: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
