@@ -1,17 +1,19 @@
-"""Direct irradiance of emitters without extent (spot lights, points, suns), without interpolating it.
+"""Direct irradiance of emitters without extent (spot lights, points, suns).
 
-The irradiance of such an emitter at a position p is E(p) exp(-tau(p)): E is what it would be without
-any medium, known in closed form from the emitter; tau is the optical depth of the straight way from
-the emitter, the mean extinction along it times its length in the medium. The length is known in
-closed form from the boundary; only the mean extinction is interpolated between the voxels of the
-cache. It is smooth where a beam is narrower than a voxel, and where matter is so dense that light
-is absorbed within a fraction of a voxel.
+The irradiance of such an emitter at a position p is E(p) exp(-tau(p)): E is what it would be
+without any medium, known in closed form from the emitter; tau is the optical depth of the straight
+way from the emitter, the mean extinction along it times its length in the medium. The length is
+known in closed form from the boundary; only the mean extinction is interpolated between the voxels
+of the cache. It is smooth where a beam is narrower than a voxel, and where matter is so dense that
+light is absorbed within a fraction of a voxel.
 
 A cache holds means over its voxels, which further orders of scattering start from; camera rays see
 those replaced by E(p) exp(-tau(p)).
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -129,7 +131,7 @@ class Beam:
 
     @symbolic
     def _mean_transmittance(self, grid: Grid, voxel: mi.UInt32, points: int):
-        """Sums of exp(-tau) over those points in voxels that are in the medium, and their number."""
+        """Sums of exp(-tau) over those points in voxels that are in the medium; their number."""
         corner, total, k = mi.Point3f(*grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
         n, count = dr.opaque(mi.UInt32, points), mi.Float(0)
         while dr.hint(k < n * n * n, label="points in a voxel"):
@@ -145,9 +147,9 @@ class Beam:
 def beams_of(
     scene: mi.Scene, medium: MediumGrid, grid: Grid, voxels: mi.UInt32, dense: bool
 ) -> list[Beam]:
-    """The beams of all spot lights of a scene; where voxels are ``dense`` and there are no surfaces,
-    of points and suns, too. None in media that do not scatter isotropically, whose caches hold the
-    irradiance of such lights apart from that of others.
+    """The beams of all spot lights of a scene; where voxels are ``dense`` and there are no
+    surfaces, of points and suns, too. None in media that do not scatter isotropically,
+    whose caches hold the irradiance of such lights apart from that of others.
     """
     if medium.phase is not None or not dr.width(voxels):
         return []
@@ -232,7 +234,7 @@ class BeamAlongRays:
         beam, (a, b) = self._beam, ends
         near, far = (extinction * (b - a) for extinction in sigma)
         at = self._parts(ray, a, b, 0.5 * (near + far))
-        middles = [0.5 * (u + v) for u, v in zip(at[:-1], at[1:], strict=True)]
+        middles = [0.5 * (u + v) for u, v in pairwise(at)]
         depths, inner = (
             [dr.lerp(*means, u) * beam.length(ray(dr.lerp(a, b, u))) for u in places]
             for places in (at, middles)
@@ -258,8 +260,8 @@ class BeamAlongRays:
     def _parts(
         self, ray: mi.Ray3f, a: mi.Float, b: mi.Float, depth: mi.Float | mi.Color3f
     ) -> list[mi.Float]:
-        """Ends of four parts of a segment of this optical ``depth``, as fractions: thirds of what it
-        absorbs, one of which is cut at the kink.
+        """Ends of four parts of a segment of this optical ``depth``, as fractions: thirds of what
+        it absorbs, one of which is cut at the kink.
         """
         depth = depth if isinstance(depth, mi.Float) else dr.mean(depth)
         absorbed, thin = absorptance(depth), depth < 1e-3
