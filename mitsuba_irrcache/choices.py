@@ -52,6 +52,8 @@ FEWEST, CONTRASTED, BORDERED = 32, 64, 128
 #: The same for the solver ``path``, whose work grows with the voxels and whose noise is about as
 #: large as the first of these, the error that it aims at.
 PATH_TARGET_ERROR, PATH_FEWEST, PATH_MOST = 1.0, 16, 32
+#: The same among surfaces, where the number of paths does not depend on that of the voxels.
+SURFACES_TARGET_ERROR = 0.25
 #: Voxels of a cache that is finer than its data, at most: all orders of scattering in so many take
 #: half a minute on two cores.
 MOST_REFINED = 8_000_000
@@ -222,7 +224,10 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
         grid, reason = Grid.near_cubic(frame, resolution), AS_TOLD
     elif medium.surroundings is not None and solver == "path":
         least, most = AMONG_SURFACES
-        count = np.ceil(_per_path(medium)) if data is None else max(data.shape)
+        extinction = max(_colliding_extinction(medium), _border_extinction(medium))
+        longest = np.linalg.norm(frame[:3, :3], axis=0).max()
+        count = np.ceil(extinction * longest / _edge_of_error(SURFACES_TARGET_ERROR))
+        count = max(count, 0 if data is None else max(data.shape))
         grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
         reason = f"of the medium, {least} to {most} among surfaces"
     else:
@@ -230,10 +235,9 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
 
 
-def _per_path(medium: MediumGrid) -> float:
-    """Voxels along the longest side, two per mean free path."""
-    longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
-    return 2 * longest * medium.sigma_t.maximum
+def _edge_of_error(error: float) -> float:
+    """The optical depth of the edge of a voxel whose estimated error [%] is this."""
+    return (error / BORDER_ERROR) ** (1 / BORDER_ORDER)
 
 
 def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid, str]:
@@ -257,7 +261,7 @@ def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid,
         ratio = np.clip(ratio, 1, MOST_PER_DATA_VOXEL)
         dense = "finer than those of the medium, which is dense"
         wanted[dense if ratio.max() > 1 else "of the medium"] = data.resolution * ratio
-    edge = (target / BORDER_ERROR) ** (1 / BORDER_ORDER)  # in optical depth
+    edge = _edge_of_error(target)
     per_path = f"{1 / edge:.0f} per mean free path"
     for reason, extinction, most in (
         (per_path, mean, CONTRASTED),
