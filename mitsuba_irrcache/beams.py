@@ -23,6 +23,7 @@ from .conservation import unbiased
 from .grid import Grid, GridField, RootField
 from .lamps import Places, point_lights, position_of
 from .medium import MediumGrid
+from .survey import Survey
 from .symbolic import symbolic
 from .tracking import optical_depth
 from .transport import visibility
@@ -53,7 +54,9 @@ class Beam:
         medium: MediumGrid,
         grid: Grid,
         voxels: mi.UInt32,
+        survey: Survey | None = None,
     ) -> None:
+        """``survey`` knows which voxels are inside of surfaces, where there are any among them."""
         self.emitter, self._medium, self.distant = emitter, medium, is_sun(emitter)
         p = Places(scene, grid).of(voxels)
         ray, near, far = self._way(p)
@@ -61,7 +64,7 @@ class Beam:
         depth = optical_depth(medium, ray, near, far, length > 0, dr.inf)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
         #: on the way from the emitter, for lookups
-        self.extinction = _on_grid(grid, voxels, mean)
+        self.extinction = _on_grid(grid, voxels, mean, survey)
         #: what surfaces and other media let through at the voxels; None where there are none
         self._others: RootField | None = None
         passed = mi.Spectrum(1)
@@ -69,7 +72,7 @@ class Beam:
             position = [dr.opaque(mi.Float, float(v)) for v in position_of(emitter)]
             passed = _past_others(scene, medium, p, mi.Point3f(position))
             dr.eval(passed)
-            self._others = _root_field(grid, voxels, passed)
+            self._others = _root_field(grid, voxels, passed, survey)
         #: means of the irradiance over the voxels
         self.irradiance = passed * self._mean_irradiance(grid, voxels, p)
         dr.eval(self.irradiance)
@@ -145,7 +148,12 @@ class Beam:
 
 
 def beams_of(
-    scene: mi.Scene, medium: MediumGrid, grid: Grid, voxels: mi.UInt32, dense: bool
+    scene: mi.Scene,
+    medium: MediumGrid,
+    grid: Grid,
+    voxels: mi.UInt32,
+    dense: bool,
+    survey: Survey | None = None,
 ) -> list[Beam]:
     """The beams of all spot lights of a scene; where voxels are ``dense`` and there are no
     surfaces, of points and suns, too. None in media that do not scatter isotropically,
@@ -156,33 +164,39 @@ def beams_of(
     emitters = spot_lights(scene)
     if dense and medium.alone:
         emitters = [e for e in scene.emitters() if is_sun(e) or e in point_lights(scene)]
-    return [Beam(scene, emitter, medium, grid, voxels) for emitter in emitters]
+    return [Beam(scene, emitter, medium, grid, voxels, survey) for emitter in emitters]
 
 
-def _on_grid(grid: Grid, voxels: mi.UInt32, values: mi.Float | mi.Color3f) -> GridField:
+def _on_grid(
+    grid: Grid, voxels: mi.UInt32, values: mi.Float | mi.Color3f, survey: Survey | None
+) -> GridField:
     """Values at the ``voxels``, for lookups."""
     channels = [values] if isinstance(values, mi.Float) else list(values)
     known = dr.zeros(mi.Bool, grid.voxel_count)
     dr.scatter(known, mi.Bool(True), voxels)
-    values, count = _spread(grid, voxels, channels), len(channels)
+    values, count = _spread(grid, voxels, channels, survey), len(channels)
     return GridField(grid, unbiased(grid, values, known, count), count)
 
 
-def _root_field(grid: Grid, voxels: mi.UInt32, values: mi.Spectrum) -> RootField:
+def _root_field(
+    grid: Grid, voxels: mi.UInt32, values: mi.Spectrum, survey: Survey | None
+) -> RootField:
     """The same with their roots interpolated, of one channel where all agree."""
     channels = [dr.sqrt(c) for c in values]
     if all(dr.all(c == channels[0])[0] for c in channels[1:]):
         channels = channels[:1]
-    return RootField(grid, _spread(grid, voxels, channels), len(channels))
+    return RootField(grid, _spread(grid, voxels, channels, survey), len(channels))
 
 
-def _spread(grid: Grid, voxels: mi.UInt32, channels: list[mi.Float]) -> mi.Float:
-    """Values of all channels of all voxels, 0 elsewhere."""
+def _spread(
+    grid: Grid, voxels: mi.UInt32, channels: list[mi.Float], survey: Survey | None
+) -> mi.Float:
+    """Values of all channels of all voxels; 0 elsewhere, but for voxels inside of surfaces."""
     values, count = dr.zeros(mi.Float, grid.voxel_count * len(channels)), len(channels)
     for c, value in enumerate(channels):
         dr.scatter(values, value, voxels * count + c)
     dr.eval(values)
-    return values
+    return values if survey is None else survey.filled(values, count)
 
 
 def _past_others(

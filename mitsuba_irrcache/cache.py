@@ -39,8 +39,8 @@ BATCH = 8
 SPARSE, FINE = 0.3, 2
 
 LAYERS = ("uncollided", "scattered")
-FORMAT = "mitsuba_irrcache 4"
-WITH_MOMENTS = "mitsuba_irrcache 5"  # of light by its direction
+FORMAT = "mitsuba_irrcache 6"
+WITH_MOMENTS = "mitsuba_irrcache 7"  # of light by its direction
 ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description
 #: What a file may say at most: samples of a stream, and of a batch.
 MOST_SAMPLES, LARGEST_BATCH = 1 << 31, 1 << 16

@@ -196,6 +196,19 @@ def needs_no_cache(
     )
 
 
+def follows_straight_ways(
+    scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
+) -> bool:
+    """Whether all of a straight way within the boundary of ``medium`` is in the medium, unless it
+    ends at a surface.
+    """
+    if medium.alone or not dr.width(active):
+        return medium.alone
+    if not medium.exact or len(medium.surroundings.media.grids) > 1:
+        return False
+    return _hole(scene, medium, grid, sweep.occupied_box(grid, active)) is None
+
+
 def _hole(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
     """A shape behind whose null surface ``medium`` ends, among the voxels of the ``box``."""
     for shape in scene.shapes():

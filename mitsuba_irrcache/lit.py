@@ -19,6 +19,7 @@ from .choices import (
     border_error,
     choose_grid,
     choose_samples,
+    follows_straight_ways,
     needs_no_cache,
     swept_samples,
     warn_of_dense_border,
@@ -190,7 +191,8 @@ class LitMedium:
         )
         cache.survey, cache.directional = survey, directional
         dense = border_error(medium, grid) > SMALL_BORDER_ERROR
-        cache.beams = beams_of(scene, medium, grid, active, dense) if swept else []
+        if swept or follows_straight_ways(scene, medium, grid, active):
+            cache.beams = beams_of(scene, medium, grid, active, dense, survey)
         cache.falloff = Falloff.of(scene, grid, [beam.emitter for beam in cache.beams])
         self.saved_samples = 0
         if not self.file:

@@ -159,6 +159,8 @@ class _Estimator:
         orders = _orders(cache)
         self.scene, self.medium, self.cache = scene, medium, cache
         self.places = Places(scene, cache.grid)
+        # Emitters whose irradiance camera rays do not interpolate is not sampled at the voxels.
+        self._apart = [mi.EmitterPtr(beam.emitter) for beam in cache.beams]
         # Light of the medium itself is found on the way to the next collision.
         self.multiple = orders > 1 or medium.emission is not None
         self.orders, self.seed, self.rr_depth = (
@@ -194,7 +196,9 @@ class _Estimator:
         within = lane - row * per_batch + dr.opaque(mi.UInt32, start)
         place = dr.gather(mi.UInt32, voxels, lane // per_voxel)
         voxel = dr.gather(mi.UInt32, cache.active, place)
-        layers = self._layers(self.places.of(voxel), batch, within, voxel)
+        layers = list(self._layers(self.places.of(voxel), batch, within, voxel))
+        for beam in cache.beams:
+            layers[0] += dr.gather(mi.Spectrum, beam.irradiance, place)
         double = dr.float64_array_t(mi.Float)
         # A layer that is zero throughout comes as a literal without a width.
         none = dr.zeros(mi.Float, dr.width(lane))
@@ -224,6 +228,7 @@ class _Estimator:
                 self.orders,
                 self.rr_depth,
                 self.multiple,
+                self._apart,
             )
         rng, spread = _random_numbers(batch, within, voxel, self.seed)
         pointer = around.pointer(dr.gather(mi.UInt32, self.cache.survey.place, voxel))
@@ -238,6 +243,7 @@ class _Estimator:
             rng,
             max_depth,
             self.rr_depth,
+            self._apart,
         )
 
     def seconds(self, samples: int) -> float:
@@ -264,6 +270,7 @@ def _estimate(
     orders: mi.UInt32,
     rr_depth: mi.UInt32,
     multiple: bool,
+    apart: Sequence[mi.EmitterPtr],
 ):
     """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over
     directions.
@@ -271,7 +278,7 @@ def _estimate(
     rng, spread = _random_numbers(batch, within, voxel, seed)
     always = mi.Bool(True)
     uncollided, rng = direct_light(
-        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always
+        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always, apart
     )
     scattered, glowing = mi.Spectrum(0), medium.emission is not None
     further = 1 if glowing else 0  # flights beyond the last collision
@@ -329,12 +336,17 @@ def direct_light(
     sample: mi.Point2f,
     rng: mi.PCG32,
     active: mi.Bool,
+    apart: Sequence[mi.EmitterPtr] = (),
 ) -> tuple[mi.Spectrum, mi.PCG32]:
-    """One sample of D(x) = int_S2 L_e T dw by emitter sampling and ratio tracking."""
+    """One sample of D(x) = int_S2 L_e T dw by emitter sampling and ratio tracking, without the
+    emitters ``apart``.
+    """
     interaction = dr.zeros(mi.Interaction3f)
     interaction.p = position
     record, radiance = scene.sample_emitter_direction(interaction, sample, False, active)
     lit = active & (record.pdf > 0) & (dr.max(radiance) > 0)
+    for emitter in apart:
+        lit &= record.emitter != emitter
     ray = mi.Ray3f(position, record.d)
     hit, near, far = medium.intersect(ray)
     near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
