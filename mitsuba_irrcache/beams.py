@@ -7,7 +7,8 @@ known in closed form from the boundary; only the mean extinction is interpolated
 of the cache. It is smooth where a beam is narrower than a voxel, and where matter is so dense that
 light is absorbed within a fraction of a voxel.
 
-A cache holds means over its voxels, which further orders of scattering start from; camera rays see
+A cache holds its values at the voxel centres (of spot lights, means of E over the voxels times
+exp(-tau) there), and further orders of scattering start from means over the voxels; camera rays see
 those replaced by E(p) exp(-tau(p)).
 """
 
@@ -73,11 +74,26 @@ class Beam:
             passed = _past_others(scene, medium, p, mi.Point3f(position))
             dr.eval(passed)
             self._others = _root_field(grid, voxels, passed, survey)
-        #: means of the irradiance over the voxels
-        self.irradiance = passed * self._mean_irradiance(grid, voxels, p)
+        self._passed, self._grid, self._voxels, self._centres = passed, grid, voxels, p
+        self._means: mi.Spectrum | None = None
+        #: E at the voxel centres; of a beam that may be narrower, its means over the voxels
+        self._unobstructed = self.unobstructed(p)
+        if emitter in spot_lights(scene):
+            self._unobstructed = self._mean(grid, voxels, POINTS)
+        #: the same of the irradiance
+        self.irradiance = passed * self._unobstructed * mi.Spectrum(dr.exp(-self.depth(p)))
         dr.eval(self.irradiance)
         #: the largest E, where it is the same everywhere
         self.maximum = float(dr.max(dr.max(self.unobstructed(p)))[0]) if self.distant else 0.0
+
+    @property
+    def means(self) -> mi.Spectrum:
+        """Means of the irradiance over the voxels, from which light is scattered further."""
+        if self._means is None:
+            mean = self._mean_transmittance(self._grid, self._voxels)
+            self._means = self._passed * self._mean_unobstructed() * mean
+            dr.eval(self._means)
+        return self._means
 
     def unobstructed(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
         """E at world positions."""
@@ -111,15 +127,17 @@ class Beam:
         near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
         return ray, near, dr.select(hit, far, near)
 
-    def _mean_irradiance(self, grid: Grid, voxel: mi.UInt32, centre: mi.Point3f) -> mi.Spectrum:
-        """Means of E times means of exp(-tau) over the part of voxels that is in the medium."""
-        if self.distant:
-            mean = self.unobstructed(centre)
-        else:
-            mean = self._mean(grid, voxel, POINTS)
-        passed, count = self._mean_transmittance(grid, voxel, DEPTH_POINTS)
-        alone = mi.Spectrum(dr.exp(-self.depth(centre)))
-        return mean * dr.select(count > 0, passed / dr.maximum(count, 1), alone)
+    def _mean_unobstructed(self) -> mi.Spectrum:
+        """Means of E over the voxels."""
+        if self.emitter.class_name() == "PointLight":
+            return self._mean(self._grid, self._voxels, POINTS)
+        return self._unobstructed
+
+    def _mean_transmittance(self, grid: Grid, voxel: mi.UInt32) -> mi.Spectrum:
+        """Means of exp(-tau) over the part of voxels that is in the medium."""
+        passed, count = self._sum_transmittance(grid, voxel, DEPTH_POINTS)
+        centre = mi.Spectrum(dr.exp(-self.depth(self._centres)))
+        return dr.select(count > 0, passed / dr.maximum(count, 1), centre)
 
     @symbolic
     def _mean(self, grid: Grid, voxel: mi.UInt32, points: int):
@@ -133,7 +151,7 @@ class Beam:
         return total / mi.Float(n * n * n)
 
     @symbolic
-    def _mean_transmittance(self, grid: Grid, voxel: mi.UInt32, points: int):
+    def _sum_transmittance(self, grid: Grid, voxel: mi.UInt32, points: int):
         """Sums of exp(-tau) over those points in voxels that are in the medium; their number."""
         corner, total, k = mi.Point3f(*grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
         n, count = dr.opaque(mi.UInt32, points), mi.Float(0)

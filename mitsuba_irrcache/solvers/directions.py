@@ -285,8 +285,8 @@ class Sky:
     def near_light(
         self, medium: MediumGrid, position: mi.Point3f, beams: Sequence[Beam] = ()
     ) -> list[mi.Spectrum]:
-        """Irradiance at ``position`` from each point-like light nearby; from spot lights of
-        ``beams``, which are not marched again, its means over the voxels.
+        """Irradiance at ``position`` from each point-like light nearby; that of ``beams``, which
+        are not marched again, as they know it.
         """
         means = {id(beam.emitter): beam.irradiance for beam in beams}
         return [

@@ -159,8 +159,16 @@ class _Estimator:
         orders = _orders(cache)
         self.scene, self.medium, self.cache = scene, medium, cache
         self.places = Places(scene, cache.grid)
-        # Emitters whose irradiance camera rays do not interpolate is not sampled at the voxels.
+        # Of the beams' emitters none is sampled at the voxels themselves.
         self._apart = [mi.EmitterPtr(beam.emitter) for beam in cache.beams]
+        numbers = [
+            i
+            for i, emitter in enumerate(scene.emitters())
+            if all(beam.emitter != emitter for beam in cache.beams)
+        ]
+        self._others = None
+        if self._apart:
+            self._others = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(numbers))
         # Light of the medium itself is found on the way to the next collision.
         self.multiple = orders > 1 or medium.emission is not None
         self.orders, self.seed, self.rr_depth = (
@@ -228,7 +236,7 @@ class _Estimator:
                 self.orders,
                 self.rr_depth,
                 self.multiple,
-                self._apart,
+                self._others,
             )
         rng, spread = _random_numbers(batch, within, voxel, self.seed)
         pointer = around.pointer(dr.gather(mi.UInt32, self.cache.survey.place, voxel))
@@ -270,7 +278,7 @@ def _estimate(
     orders: mi.UInt32,
     rr_depth: mi.UInt32,
     multiple: bool,
-    apart: Sequence[mi.EmitterPtr],
+    emitters: mi.EmitterPtr | None,
 ):
     """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over
     directions.
@@ -278,7 +286,7 @@ def _estimate(
     rng, spread = _random_numbers(batch, within, voxel, seed)
     always = mi.Bool(True)
     uncollided, rng = direct_light(
-        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always, apart
+        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always, emitters
     )
     scattered, glowing = mi.Spectrum(0), medium.emission is not None
     further = 1 if glowing else 0  # flights beyond the last collision
@@ -336,17 +344,26 @@ def direct_light(
     sample: mi.Point2f,
     rng: mi.PCG32,
     active: mi.Bool,
-    apart: Sequence[mi.EmitterPtr] = (),
+    emitters: mi.EmitterPtr | None = None,
 ) -> tuple[mi.Spectrum, mi.PCG32]:
-    """One sample of D(x) = int_S2 L_e T dw by emitter sampling and ratio tracking, without the
-    emitters ``apart``.
+    """One sample of D(x) = int_S2 L_e T dw by emitter sampling and ratio tracking, from all or some
+    ``emitters`` of the scene.
     """
     interaction = dr.zeros(mi.Interaction3f)
     interaction.p = position
-    record, radiance = scene.sample_emitter_direction(interaction, sample, False, active)
+    if emitters is None:
+        record, radiance = scene.sample_emitter_direction(interaction, sample, False, active)
+    else:
+        count = dr.width(emitters)
+        if not count:
+            return mi.Spectrum(0), rng
+        place = sample.x * count
+        number = dr.minimum(mi.UInt32(place), count - 1)
+        emitter = dr.gather(mi.EmitterPtr, emitters, number, active)
+        sample = mi.Point2f(place - mi.Float(number), sample.y)
+        record, radiance = emitter.sample_direction(interaction, sample, active)
+        radiance = radiance * count
     lit = active & (record.pdf > 0) & (dr.max(radiance) > 0)
-    for emitter in apart:
-        lit &= record.emitter != emitter
     ray = mi.Ray3f(position, record.d)
     hit, near, far = medium.intersect(ray)
     near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)

@@ -354,8 +354,8 @@ class Sweep:
         return phi
 
     def _with_beams(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
-        """Irradiance of each point-like light, and of others behind these; that of spot lights as
-        means over the voxels.
+        """Irradiance of each point-like light, and of others behind these; that of `beams` as they
+        know it.
         """
         beams = {id(beam.emitter): [beam.irradiance] for beam in self.cache.beams}
         lights = self._sky.near
@@ -364,9 +364,11 @@ class Sweep:
 
     def _near_light(self, channel: int) -> list[mi.Float]:
         """Light at the active voxels that does not come along lines, on average over each."""
-        means = {id(beam.irradiance) for beam in self.cache.beams}
+        beams = {id(beam.irradiance): beam for beam in self.cache.beams}
         near = [
-            irradiance[channel] * (1 if id(irradiance) in means else self._spread)
+            beams[id(irradiance)].means[channel]
+            if id(irradiance) in beams
+            else irradiance[channel] * self._spread
             for irradiance, *_ in self._direct
         ]
         return near + [irradiance[channel] for irradiance, *_ in self._emitted]
