@@ -12,6 +12,8 @@ much.) On a CT head it halves the error of the image.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,20 +26,43 @@ def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -
 
     Noise that is not the same in neighbours counts as light that bends, and is enlarged by a third.
     """
+    spread = roots  # M r
+    for bend in _second_differences(grid, known, channels):
+        dr.eval(spread)
+        spread = spread + bend(spread) / 6
+    result = roots * dr.select(spread > 0, dr.sqrt(roots / spread), 1)
+    dr.eval(result)
+    return result
+
+
+def unbiased(grid: Grid, values: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:
+    """In place of the ``values`` at the centres of all voxels of ``grid``, those between which
+    interpolation has no error on average, to the fourth order: a twelfth of the second difference
+    less along each axis along which both neighbours are ``known``. At most half of a value is taken
+    away or added.
+    """
+    bends = sum(bend(values) for bend in _second_differences(grid, known, channels))
+    result = values - dr.clip(bends * (1 / 12), -0.5 * values, 0.5 * values)
+    dr.eval(result)
+    return result
+
+
+def _second_differences(grid: Grid, known: mi.Bool, channels: int) -> Iterator[Callable]:
+    """For each axis a function that takes second differences of values along it, 0 where not both
+    neighbours are ``known``.
+    """
     index = dr.arange(mi.UInt32, grid.voxel_count * channels)
     voxel = index // channels if channels > 1 else index
-    own_known = dr.gather(mi.Bool, known, voxel)
-    spread, stride = roots, mi.UInt32(1)  # M r
+    own_known, stride = dr.gather(mi.Bool, known, voxel), mi.UInt32(1)
     for place, side in zip(grid.places(voxel), grid.sides, strict=True):
-        dr.eval(spread)
         inside = own_known & (place > 0) & (place + 1 < mi.UInt32(side))
         for there in (voxel - stride, voxel + stride):
             inside &= dr.gather(mi.Bool, known, there, inside)
         step = stride * channels
-        around = [dr.gather(mi.Float, spread, i, inside) for i in (index - step, index + step)]
-        bend = around[0] + around[1] - 2 * spread
-        spread = spread + dr.select(inside, bend / 6, 0)
+
+        def bend(values: mi.Float, step=step, inside=inside) -> mi.Float:
+            around = [dr.gather(mi.Float, values, i, inside) for i in (index - step, index + step)]
+            return dr.select(inside, around[0] + around[1] - 2 * values, 0)
+
+        yield bend
         stride = stride * mi.UInt32(side)
-    result = roots * dr.select(spread > 0, dr.sqrt(roots / spread), 1)
-    dr.eval(result)
-    return result

@@ -11,10 +11,10 @@ import numpy as np
 
 from mitsuba_irrcache.errors import CacheFileError
 
-FORMAT = "mitsuba_irrcache 4"
+FORMAT = "mitsuba_irrcache 6"
 
 
-WITH_MOMENTS = "mitsuba_irrcache 5"  # of light by its direction
+WITH_MOMENTS = "mitsuba_irrcache 7"  # of light by its direction
 
 
 ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description

@@ -69,8 +69,8 @@ class UncertaintyField:
 def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     """The errors of ``cache``, which has at least two batches of samples (one tells no noise)."""
     phi, error = cache.mean_and_error()
-    for beam in cache.beams:  # looked up apart, without an error
-        channels = list(beam.irradiance)[: cache.channels]
+    for light in cache.direct_lights:  # looked up apart, without an error
+        channels = list(light.irradiance)[: cache.channels]
         phi = dr.maximum(phi - sum(channels) / len(channels), 0)
     if cache.falloff is not None:
         smooth = 1 / cache.falloff.of_voxels(cache.active)

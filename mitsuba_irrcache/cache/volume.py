@@ -17,6 +17,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.conservative import conserving
+from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
 from mitsuba_irrcache.cache.storage import (
     ARRAYS,
@@ -38,7 +39,6 @@ from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.scene.fingerprint import differing
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
-from mitsuba_irrcache.transport.spot_beams import Beam
 
 #: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
 #: independent of each other, the batches are: means and errors are statistics of batch means.
@@ -99,7 +99,7 @@ class IrradianceCache:
         #: how the light of lamps nearby falls off; None where there are none
         self.falloff: InverseSquareFactor | None = None
         #: spot lights, whose irradiance camera rays look up apart; the layers hold its means
-        self.beams: list[Beam] = []
+        self.direct_lights: list[DirectLight] = []
         #: where voxels lie among surfaces; None where there are none
         self.survey: VoxelClasses | None = None
         #: samples taken per voxel from each random stream
@@ -116,7 +116,7 @@ class IrradianceCache:
     def lie_like(self, other: IrradianceCache) -> None:
         """Takes over what is known of the place of ``other``, another cache of the same medium."""
         self.directional, self.survey = other.directional, other.survey
-        self.falloff, self.beams = other.falloff, other.beams
+        self.falloff, self.direct_lights = other.falloff, other.direct_lights
 
     # ------------------------------------------------------------------ statistics
 
@@ -198,13 +198,14 @@ class IrradianceCache:
 
     @_consistent
     def field(self) -> RootField:
-        """Phi for lookups, without that of `beams`, and over the `falloff` if there is one: one
+        """Phi for lookups, without `direct_lights`, and over the `falloff` if there is one: one
         channel where all channels agree to the last bit. Its maximum is that of Phi, or more.
         """
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
-        brightest = [dr.max(m)[0] for m in means] if self.beams else []
-        for beam in self.beams:
-            means = [dr.maximum(m - e, 0) for m, e in zip(means, beam.irradiance, strict=False)]
+        brightest = [dr.max(m)[0] for m in means] if self.direct_lights else []
+        brightest += [light.maximum for light in self.direct_lights]
+        for light in self.direct_lights:
+            means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]
         roots, variance = [dr.sqrt(m) for m in means], None
         if not self.correlated:  # neighbours that err alike do no harm to interpolation
             noise = [self._relative_variance(m, c) for c, m in enumerate(means)]

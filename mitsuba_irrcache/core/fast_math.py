@@ -54,3 +54,17 @@ def absorbed(depth, passed):
     """1 - e^-depth without cancellation, where e^-depth, ``passed``, is known."""
     series = dr.fma(depth, dr.fma(depth, dr.fma(depth, -1 / 24, 1 / 6), -1 / 2), 1)
     return dr.select(depth < THIN, depth * series, 1 - passed)
+
+
+def absorptance(tau):
+    """1 - e^-tau without cancellation.
+
+    Of a 16th of ``tau`` by its series, then four times 1 - e^-2x = a (2 - a) with a = 1 - e^-x:
+    right to 1e-6, for half an exponential's price.
+    """
+    x = least(tau, 16.0) * (1 / 16)
+    series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 120, -1 / 24), 1 / 6), -1 / 2), 1)
+    a = x * series
+    for _ in range(4):
+        a = a * (2 - a)
+    return a

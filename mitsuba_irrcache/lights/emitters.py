@@ -82,3 +82,8 @@ def position_of(emitter: mi.Emitter) -> np.ndarray:
 def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
     """The emitters of a scene whose intensity depends on the direction and that have no size."""
     return [e for e in point_lights(scene) if e.class_name() != "PointLight"]
+
+
+def is_sun(emitter: mi.Emitter) -> bool:
+    """Whether an emitter is infinitely far away, in a single direction."""
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)

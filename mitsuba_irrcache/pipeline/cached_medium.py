@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.cache.direct_light import direct_lights_of
 from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
@@ -21,8 +22,11 @@ from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.machine.memory import give_back, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import (
+    SMALL_BORDER_ERROR,
+    border_error,
     choose_grid,
     choose_samples,
+    follows_straight_ways,
     needs_no_cache,
     swept_samples,
     warn_of_dense_border,
@@ -33,7 +37,6 @@ from mitsuba_irrcache.solvers.path import solver as path_solver
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
 from mitsuba_irrcache.solvers.sn.anisotropic import AnisotropicSweep, least_batch
 from mitsuba_irrcache.solvers.sn.solver import Sweep
-from mitsuba_irrcache.transport.spot_beams import beams_of
 
 #: Held by the thread that writes a cache file.
 _SAVING = Lock()
@@ -189,8 +192,12 @@ class CachedMedium:
             grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
         )
         cache.survey, cache.directional = survey, directional
-        cache.beams = beams_of(scene, medium, grid, active) if swept else []
-        cache.falloff = InverseSquareFactor.of(scene, grid, [beam.emitter for beam in cache.beams])
+        dense = border_error(medium, grid) > SMALL_BORDER_ERROR
+        if swept or follows_straight_ways(scene, medium, grid, active):
+            cache.direct_lights = direct_lights_of(scene, medium, grid, active, dense, survey)
+        cache.falloff = InverseSquareFactor.of(
+            scene, grid, [light.emitter for light in cache.direct_lights]
+        )
         self.saved_samples = 0
         if not self.file:
             return cache

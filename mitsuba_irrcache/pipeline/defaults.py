@@ -26,6 +26,9 @@ AS_TOLD = "as told"
 #: Estimated error of the pixels at the boundary of a medium [%] from which on a warning is logged.
 LARGE_BORDER_ERROR = 3.0
 
+#: The same from which on the light of suns and points is not interpolated.
+SMALL_BORDER_ERROR = 0.2
+
 #: Voxels along the longest side of a cache among surfaces, unless told otherwise: shadows have more
 #: detail than coarse data.
 AMONG_SURFACES = (32, 64)
@@ -50,6 +53,8 @@ FEWEST, CONTRASTED, BORDERED = 32, 64, 128
 #: The same for the solver ``path``, whose work grows with the voxels and whose noise is about as
 #: large as the first of these, the error that it aims at.
 PATH_TARGET_ERROR, PATH_FEWEST, PATH_MOST = 1.0, 16, 32
+#: The same among surfaces, where the number of paths does not depend on that of the voxels.
+SURFACES_TARGET_ERROR = 0.25
 #: Voxels of a cache that is finer than its data, at most: all orders of scattering in so many take
 #: half a minute on two cores.
 MOST_REFINED = 8_000_000
@@ -192,6 +197,19 @@ def needs_no_cache(
     )
 
 
+def follows_straight_ways(
+    scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
+) -> bool:
+    """Whether all of a straight way within the boundary of ``medium`` is in the medium, unless it
+    ends at a surface.
+    """
+    if medium.is_isolated or not dr.width(active):
+        return medium.is_isolated
+    if not medium.has_exact_boundary or len(medium.surroundings.media.grids) > 1:
+        return False
+    return _hole(scene, medium, grid, sn_solver.occupied_box(grid, active)) is None
+
+
 def _hole(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
     """A shape behind whose null surface ``medium`` ends, among the voxels of the ``box``."""
     for shape in scene.shapes():
@@ -220,7 +238,10 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
         grid, reason = Grid.near_cubic(frame, resolution), AS_TOLD
     elif medium.surroundings is not None and solver == "path":
         least, most = AMONG_SURFACES
-        count = np.ceil(_per_path(medium)) if data is None else max(data.shape)
+        extinction = max(_colliding_extinction(medium), _border_extinction(medium))
+        longest = np.linalg.norm(frame[:3, :3], axis=0).max()
+        count = np.ceil(extinction * longest / _edge_of_error(SURFACES_TARGET_ERROR))
+        count = max(count, 0 if data is None else max(data.shape))
         grid = Grid.near_cubic(frame, int(np.clip(count, least, most)))
         reason = f"of the medium, {least} to {most} among surfaces"
     else:
@@ -228,10 +249,9 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     return grid.shared(medium.sigma_t.grid, medium.albedo.grid), reason
 
 
-def _per_path(medium: MediumGrid) -> float:
-    """Voxels along the longest side, two per mean free path."""
-    longest = np.linalg.norm(medium.frame[:3, :3], axis=0).max()
-    return 2 * longest * medium.sigma_t.maximum
+def _edge_of_error(error: float) -> float:
+    """The optical depth of the edge of a voxel whose estimated error [%] is this."""
+    return (error / BORDER_ERROR) ** (1 / BORDER_ORDER)
 
 
 def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid, str]:
@@ -255,7 +275,7 @@ def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid,
         ratio = np.clip(ratio, 1, MOST_PER_DATA_VOXEL)
         dense = "finer than those of the medium, which is dense"
         wanted[dense if ratio.max() > 1 else "of the medium"] = data.resolution * ratio
-    edge = (target / BORDER_ERROR) ** (1 / BORDER_ORDER)  # in optical depth
+    edge = _edge_of_error(target)
     per_path = f"{1 / edge:.0f} per mean free path"
     for reason, extinction, most in (
         (per_path, mean, CONTRASTED),
@@ -313,12 +333,19 @@ def swept_samples(max_depth: int, medium: MediumGrid) -> int:
     return (SWEPT if medium.is_isolated else SWEPT_AMONG_SURFACES) * (2 if once else 1)
 
 
+def border_error(medium: MediumGrid, grid: Grid) -> float:
+    """The estimated error of the pixels at the boundary of a medium that cuts through matter [%],
+    where irradiance is interpolated between the voxels of ``grid``.
+    """
+    return BORDER_ERROR * (_border_extinction(medium) * grid.voxel_size.max()) ** BORDER_ORDER
+
+
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
     """Logs a warning where the cache is too coarse for matter that the boundary cuts: irradiance
     falls off within a fraction of a mean free path there, and no voxel lies beyond.
     """
     depth = _border_extinction(medium) * grid.voxel_size.max()
-    error = BORDER_ERROR * depth**BORDER_ORDER
+    error = border_error(medium, grid)
     if error > LARGE_BORDER_ERROR:
         mi.Log(
             mi.LogLevel.Warn,

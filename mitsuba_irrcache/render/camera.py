@@ -12,6 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.cache.uncertainty import uncertainty_of
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
@@ -24,7 +25,6 @@ from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.context import Surroundings
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, is_null, medium_after, trace
-from mitsuba_irrcache.transport.spot_beams import BeamAlongRays
 
 #: Surfaces seen through less than this transmittance are traced by roulette.
 FAINT = 0.1
@@ -61,7 +61,7 @@ def camera_rays_of(
             directional=cache.directional_field(field.channels),
             edges=cache.survey.edges if cache.survey is not None else None,
             falloff=cache.falloff,
-            beams=[BeamAlongRays(beam) for beam in cache.beams],
+            direct_lights=[DirectLightAlongRays(light) for light in cache.direct_lights],
         )
         del field  # it has been copied
         give_back(cache.grid.voxel_count)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import absorbed, decay, greatest, least
+from mitsuba_irrcache.core.fast_math import absorbed, absorptance, decay, greatest
 
 QUADRATURES = ("riemann", "trapezoid", "exponential")
 
@@ -97,17 +97,3 @@ def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
         near, far = near + part * (1 - u), far + part * u
     scale = length * dr.select(thin, 1 - 0.5 * mean, absorbed / dr.select(thin, 1, mean))
     return scale * near, scale * far
-
-
-def absorptance(tau):
-    """1 - e^-tau without cancellation.
-
-    Of a 16th of ``tau`` by its series, then four times 1 - e^-2x = a (2 - a) with a = 1 - e^-x:
-    right to 1e-6, for half an exponential's price.
-    """
-    x = least(tau, 16.0) * (1 / 16)
-    series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 120, -1 / 24), 1 / 6), -1 / 2), 1)
-    a = x * series
-    for _ in range(4):
-        a = a * (2 - a)
-    return a

@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularField
+from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.cache.uncertainty import UncertaintyField
 from mitsuba_irrcache.core.fast_math import least
 from mitsuba_irrcache.core.jit import symbolic
@@ -34,7 +35,6 @@ from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.empty_space import Clearance
 from mitsuba_irrcache.render.quadrature import curved, emission_weights, segment
 from mitsuba_irrcache.scene.cut_cells import CutCells
-from mitsuba_irrcache.transport.spot_beams import BeamAlongRays
 
 #: A ray ends early once nothing ahead, not even the brightest cache voxel or the background seen
 #: through the transmittance left, can change its radiance by more than this fraction.
@@ -65,7 +65,7 @@ class Projection:
         directional: AngularField | None = None,
         edges: CutCells | None = None,
         falloff: InverseSquareFactor | None = None,
-        beams: Sequence[BeamAlongRays] = (),
+        direct_lights: Sequence[DirectLightAlongRays] = (),
     ) -> None:
         self.medium = medium
         self.lit = irradiance is not None
@@ -77,7 +77,7 @@ class Projection:
         #: how the light of lamps falls off, which the cache is without
         self.falloff = falloff
         #: spot lights, which are not in the irradiance
-        self._beams = list(beams)
+        self._direct_lights = list(direct_lights)
         #: surfaces that end the light, where there are any, and the light that they choose from
         self._edges = (edges, irradiance) if edges is not None else None
         albedo = _constant_if_it_is(medium.albedo)
@@ -131,8 +131,8 @@ class Projection:
         phi = self._within_edges(p, phi, active)
         if self.falloff is not None:
             phi = phi * self.falloff.at(p)
-        for beam in self._beams:
-            phi = phi + beam.at(p, active)
+        for light in self._direct_lights:
+            phi = phi + light.at(p, active)
         if self.directional is None:
             return phi
         view = self.seen_along(direction)
@@ -191,6 +191,7 @@ class Projection:
         radiance, emitted, shine = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
         emission = self.medium.emission
         gathered = self.nothing()
+        means = [light.mean_extinction(ray(t), active) for light in self._direct_lights]
         brightest = dr.maximum(self.brightest, dr.max(background))
         brightest += self.brightest_emission * dr.maximum(far - near, 0)
         dark = brightest == 0
@@ -237,9 +238,13 @@ class Projection:
                 falloff = self.falloff.means(lamps, t, end)
                 near_light, far_light = near_light * falloff[0], far_light * falloff[1]
             radiance += transmittance * (near_light + far_light)
-            for beam in self._beams:
+            for i, light in enumerate(self._direct_lights):
                 albedos = self._albedo_at(ray(t)), self._albedo_at(ray(end))
-                radiance += transmittance * beam.scattered(ray, t, end, weights, albedos)
+                mean = dr.select(skip, light.mean_extinction(ray(t), skip), means[i])
+                means[i] = light.mean_extinction(ray(end), active)
+                radiance += transmittance * light.scattered(
+                    ray, (t, end), ends[0], (mean, means[i]), weights, albedos
+                )
             if dr.hint(self.layered, mode="scalar"):
                 gathered = _gather(
                     gathered,

@@ -53,11 +53,11 @@ def series_error(medium: MediumGrid) -> float:
     """Estimated error [%] of higher orders of scattering from the half-space; infinite where the
     medium is not of the kind that this module is for.
     """
-    if not medium.homogeneous or medium.sigma_t.channels > 1 or medium.bbox is not None:
+    if not medium.homogeneous or medium.bbox is not None:
         return np.inf
     if not medium.is_isolated or medium.phase is not None or medium.emission is not None:
         return np.inf
-    edges = np.linalg.norm(medium.frame[:3, :3], axis=0) * medium.sigma_t.maximum
+    edges = np.linalg.norm(medium.frame[:3, :3], axis=0) * medium.sigma_t.minimum
     if not edges.min() > 0:
         return np.inf
     if medium.boundary.kind == "sphere":
@@ -117,24 +117,16 @@ class HalfSpace:
     ):
         """Radiance due to one emitter, the mean of ``count`` samples of a rank-1 sequence."""
         active = mi.Bool(active) & (near < far)
-        sigma_t = self.medium.sigma_t.value
         entry = ray(near)
         normal = self.medium.boundary.outward_normal(entry)
         mu = clipped(-dr.dot(normal, ray.d), 1e-6, 1.0)
-        absorbed = 1 - dr.exp(-sigma_t * (far - near))
         step = mi.Vector3f(*SEQUENCE)
         total, k = mi.Spectrum(0), mi.UInt32(0)
         while dr.hint(active & (k < count), label="half-space"):
             u = shift + mi.Float(k) * step
             u -= dr.floor(u)
-            # Single scattering: a collision in proportion to T sigma_t, exact transmittance.
-            tau = -dr.log(1 - u.x * absorbed)
+            total += self._single(emitter, ray, near, far, u, active)
             vertex = dr.zeros(mi.Interaction3f)
-            vertex.p = ray(near + tau / sigma_t)
-            record, light = emitter.sample_direction(vertex, mi.Point2f(u.y, u.z), active)
-            _, _, leave = self.medium.boundary.intersect(mi.Ray3f(vertex.p, record.d))
-            within = dr.minimum(dr.maximum(leave, 0), record.dist)
-            total += light * (absorbed * dr.exp(-sigma_t * within))
             if dr.hint(self._multiple, mode="scalar"):
                 vertex.p = entry
                 record, light = emitter.sample_direction(vertex, mi.Point2f(u.y, u.z), active)
@@ -145,6 +137,31 @@ class HalfSpace:
                 total += dr.select(enters, light * factor, 0)
             k += 1
         return dr.select(active, total * self._albedo * (dr.inv_four_pi / mi.Float(count)), 0)
+
+    def _single(
+        self,
+        emitter: mi.Emitter,
+        ray: mi.Ray3f,
+        near: mi.Float,
+        far: mi.Float,
+        u: mi.Vector3f,
+        active: mi.Bool,
+    ) -> mi.Spectrum:
+        """A sample of single scattering: a collision in proportion to T sigma_t for each channel of
+        the extinction, and the exact transmittance of the way from the emitter.
+        """
+        sigma_t, found = self.medium.sigma_t.value, []
+        vertex = dr.zeros(mi.Interaction3f)
+        for extinction in [sigma_t] if self.medium.sigma_t.channels == 1 else sigma_t:
+            absorbed = 1 - dr.exp(-extinction * (far - near))
+            vertex.p = ray(near - dr.log(1 - u.x * absorbed) / extinction)
+            record, light = emitter.sample_direction(vertex, mi.Point2f(u.y, u.z), active)
+            _, _, leave = self.medium.boundary.intersect(mi.Ray3f(vertex.p, record.d))
+            within = dr.minimum(dr.maximum(leave, 0), record.dist)
+            found.append(light * (absorbed * dr.exp(-extinction * within)))
+        if len(found) == 1:
+            return found[0]
+        return mi.Spectrum([part[c] for c, part in enumerate(found)])
 
     def _looked_up(self, mu: mi.Float, mu0: mi.Float, active: mi.Bool) -> mi.Spectrum:
         """H(mu) H(mu0) - 1, bilinear in the roots of the cosines."""

@@ -87,10 +87,15 @@ def free_flight(
 
 @symbolic
 def optical_depth(
-    medium: MediumGrid, ray: mi.Ray3f, near: mi.Float, far: mi.Float, active: mi.Bool
+    medium: MediumGrid,
+    ray: mi.Ray3f,
+    near: mi.Float,
+    far: mi.Float,
+    active: mi.Bool,
+    most: float = OPAQUE,
 ):
     """Integral of sigma_t along ``ray`` from ``near`` to ``far``, exact up to rounding, for each
-    channel of the extinction; beyond `OPAQUE` in all channels only a lower bound.
+    channel of the extinction; beyond ``most`` in all channels only a lower bound.
 
     Between the planes through the voxel centres extinction is trilinear, so it is a cubic
     polynomial of the distance along the ray: two Gauss points between two planes integrate it
@@ -132,7 +137,7 @@ def optical_depth(
                 depth += dr.select(reads, sigma_t * length, 0)
             t = end
             thinnest = dr.min(depth) if not isinstance(depth, mi.Float) else depth
-            active &= (t < far) & (thinnest < OPAQUE)
+            active &= (t < far) & (thinnest < most)
     return depth
 
 

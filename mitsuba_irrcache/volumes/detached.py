@@ -16,6 +16,8 @@ from pathlib import Path
 from mitsuba_irrcache.errors import IrrcacheError
 
 OPTION = "--data-folder"
+#: Bytes that MetaIO has for a word of a list or a pattern. It writes longer ones over other memory.
+_LONGEST_WORD = 79
 #: More files than any volume has slices.
 _MOST_FILES = 1 << 16
 _FIELDS = {
@@ -35,7 +37,8 @@ def data_files(path: Path, allowed: Sequence[str | os.PathLike] = ()) -> list[Pa
         allowed: folders, beside that of ``path``, in which data files may lie, at any depth.
 
     Raises:
-        IrrcacheError: a data file that is missing or lies elsewhere, links and ``..`` followed.
+        IrrcacheError: a data file that is missing or lies elsewhere, links and ``..`` followed; or
+            a list or pattern whose words are too long for MetaIO.
     """
     kind = "meta" if path.suffix.lower() in (".mha", ".mhd") else "nrrd"
     files: list[Path] = []
@@ -47,10 +50,31 @@ def data_files(path: Path, allowed: Sequence[str | os.PathLike] = ()) -> list[Pa
         end = contents.find(b"\n\n") if kind == "nrrd" else -1  # the voxels of an NRRD follow
         header = contents[:end] if end >= 0 else contents
         for field in _FIELDS[kind].finditer(header):
+            if kind == "meta":
+                _check_words(path, field[1].strip())
             following = header[field.end() :]
             for name in _names(path, os.fsdecode(field[1].strip()), following):
                 files.append(path if name is None else _checked(path, name, allowed))
     return files or [path]
+
+
+def _check_words(path: Path, value: bytes) -> None:
+    """Refuses what MetaIO would split into words if one of them has more bytes than it has places
+    for: it does not look. Single names, and those in the lines after a list, have no such limit.
+    """
+    if b"%" not in value and value[:4].upper() != b"LIST":
+        return
+    if b"\t" in value:  # to MetaIO a part of a word; it divides by the number that it misses then
+        raise IrrcacheError(f"{path} names its data files with a tab; put a space in its place")
+    # Spaces do not end a word that is quoted.
+    words = [value] if b'"' in value else value.split(b" ")
+    longest = max(words, key=len)
+    if len(longest) > _LONGEST_WORD:
+        raise IrrcacheError(
+            f"{path} names its data files by {os.fsdecode(longest)!r}, which has {len(longest)} "
+            f"bytes; no more than {_LONGEST_WORD} can be read. Put the files beside the header and "
+            "name them without their folder, or list their names, each in a line of its own"
+        )
 
 
 def _names(path: Path, value: str, following: bytes) -> list[str | None]:

@@ -247,8 +247,8 @@ MUTANTS = (
     Mutant(
         "light in the voxel of a lamp as in its middle (sweep)",
         "solvers/sn/solver.py",
-        "(1 if id(irradiance) in means else self._spread)",
-        "1",
+        "else irradiance[channel] * self._spread",
+        "else irradiance[channel]",
         ("tests/system/test_lamps.py",),
     ),
     Mutant(
@@ -331,8 +331,8 @@ MUTANTS = (
     Mutant(
         "interpolated roots keep half of the light that bends",
         "cache/conservative.py",
-        "dr.select(inside, bend / 6, 0)",
-        "dr.select(inside, bend / 12, 0)",
+        "bend(spread) / 6",
+        "bend(spread) / 12",
         ("tests/unit/cache/test_conservative.py",),
     ),
     Mutant(

@@ -8,6 +8,8 @@ to how well it does (multiple importance sampling).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,12 +26,14 @@ def contributions(
     rng: mi.PCG32,
     max_depth: mi.UInt32,
     rr_depth: mi.UInt32,
+    apart: Sequence[mi.EmitterPtr] = (),
 ) -> list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]:
     """One sample per lane of the light at ``position``, in the medium ``pointer``: directions (to
     where it comes from), and what comes from there uncollided and scattered. The sum is an
     unbiased estimate of the irradiance; any moment of the radiance follows from the directions.
 
-    ``spread`` are four uniform numbers for the directions.
+    ``spread`` are four uniform numbers for the directions. Light straight from the emitters
+    ``apart``, which have no extent, is left out.
     """
     vertex, always = dr.zeros(mi.Interaction3f), mi.Bool(True)
     vertex.p = position
@@ -37,6 +41,8 @@ def contributions(
     record, light, rng = sample_emitter(scene, media, vertex, pointer, sample, rng, always)
     density = dr.select(record.delta, 0, dr.inv_four_pi)
     light *= power_heuristic(record.pdf, density)
+    for emitter in apart:
+        light = dr.select(record.emitter == emitter, 0, light)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
     start = Start(mi.Ray3f(position, direction), pointer, depth=1, pdf=dr.inv_four_pi)
     straight, scattered, *_ = trace(scene, media, start, max_depth, rr_depth, False, rng, always)

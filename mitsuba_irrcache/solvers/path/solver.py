@@ -159,6 +159,16 @@ class _Estimator:
         orders = _orders(cache)
         self.scene, self.medium, self.cache = scene, medium, cache
         self.places = VoxelSamplePoints(scene, cache.grid)
+        # Emitters of direct lights are not sampled at the voxels themselves.
+        self._apart = [mi.EmitterPtr(light.emitter) for light in cache.direct_lights]
+        numbers = [
+            i
+            for i, emitter in enumerate(scene.emitters())
+            if all(light.emitter != emitter for light in cache.direct_lights)
+        ]
+        self._others = None
+        if self._apart:
+            self._others = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(numbers))
         # Light of the medium itself is found on the way to the next collision.
         self.multiple = orders > 1 or medium.emission is not None
         self.orders, self.seed, self.rr_depth = (
@@ -194,7 +204,9 @@ class _Estimator:
         within = lane - row * per_batch + dr.opaque(mi.UInt32, start)
         place = dr.gather(mi.UInt32, voxels, lane // per_voxel)
         voxel = dr.gather(mi.UInt32, cache.active, place)
-        layers = self._layers(self.places.of(voxel), batch, within, voxel)
+        layers = list(self._layers(self.places.of(voxel), batch, within, voxel))
+        for light in cache.direct_lights:
+            layers[0] += dr.gather(mi.Spectrum, light.irradiance, place)
         double = dr.float64_array_t(mi.Float)
         # A layer that is zero throughout comes as a literal without a width.
         none = dr.zeros(mi.Float, dr.width(lane))
@@ -224,6 +236,7 @@ class _Estimator:
                 self.orders,
                 self.rr_depth,
                 self.multiple,
+                self._others,
             )
         rng, spread = _random_numbers(batch, within, voxel, self.seed)
         pointer = around.pointer(dr.gather(mi.UInt32, self.cache.survey.place, voxel))
@@ -238,6 +251,7 @@ class _Estimator:
             rng,
             max_depth,
             self.rr_depth,
+            self._apart,
         )
 
     def seconds(self, samples: int) -> float:
@@ -264,6 +278,7 @@ def _estimate(
     orders: mi.UInt32,
     rr_depth: mi.UInt32,
     multiple: bool,
+    emitters: mi.EmitterPtr | None,
 ):
     """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over
     directions.
@@ -271,7 +286,7 @@ def _estimate(
     rng, spread = _random_numbers(batch, within, voxel, seed)
     always = mi.Bool(True)
     uncollided, rng = direct_light(
-        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always
+        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always, emitters
     )
     scattered, glowing = mi.Spectrum(0), medium.emission is not None
     further = 1 if glowing else 0  # flights beyond the last collision
@@ -329,11 +344,25 @@ def direct_light(
     sample: mi.Point2f,
     rng: mi.PCG32,
     active: mi.Bool,
+    emitters: mi.EmitterPtr | None = None,
 ) -> tuple[mi.Spectrum, mi.PCG32]:
-    """One sample of D(x) = int_S2 L_e T dw by emitter sampling and ratio tracking."""
+    """One sample of D(x) = int_S2 L_e T dw by emitter sampling and ratio tracking, from all or some
+    ``emitters`` of the scene.
+    """
     interaction = dr.zeros(mi.Interaction3f)
     interaction.p = position
-    record, radiance = scene.sample_emitter_direction(interaction, sample, False, active)
+    if emitters is None:
+        record, radiance = scene.sample_emitter_direction(interaction, sample, False, active)
+    else:
+        count = dr.width(emitters)
+        if not count:
+            return mi.Spectrum(0), rng
+        place = sample.x * count
+        number = dr.minimum(mi.UInt32(place), count - 1)
+        emitter = dr.gather(mi.EmitterPtr, emitters, number, active)
+        sample = mi.Point2f(place - mi.Float(number), sample.y)
+        record, radiance = emitter.sample_direction(interaction, sample, active)
+        radiance = radiance * count
     lit = active & (record.pdf > 0) & (dr.max(radiance) > 0)
     ray = mi.Ray3f(position, record.d)
     hit, near, far = medium.intersect(ray)

@@ -15,9 +15,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import spots_of
+from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.sn.angular_quadrature import STEP, spread_together, strata
-from mitsuba_irrcache.transport.spot_beams import Beam
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 
@@ -108,7 +108,7 @@ class DistantIllumination:
     ) -> tuple:
         """A pass of `rows`, with those of suns."""
         colours, rows = dr.size_v(mi.Spectrum), [(directions, light, weights)]
-        lines = max(1, pairs // SUN_SHARE)
+        lines = self._lines(pairs)
         for direction, irradiance in self._suns:
             ways = np.stack([irradiance / lines, np.zeros(colours)])
             rows.append((np.tile(direction, (lines, 1)), np.tile(ways, (lines, 1, 1)), lines * [0]))
@@ -119,6 +119,13 @@ class DistantIllumination:
             end = len(offsets) - k * lines
             offsets[end - lines : end] = (offsets[end - 1] + _even(lines)) % 1
         return *joined, offsets
+
+    def sun_rows(self, pairs: int) -> int:
+        """How many of the last rows of a pass are those of suns."""
+        return len(self._suns) * self._lines(pairs)
+
+    def _lines(self, pairs: int) -> int:
+        return max(1, pairs // SUN_SHARE)
 
     def _with_bright(
         self, even: list[tuple], count: int, rng: np.random.Generator
@@ -190,12 +197,12 @@ class DistantIllumination:
         return total
 
     def near_light(
-        self, medium: MediumGrid, position: mi.Point3f, beams: Sequence[Beam] = ()
+        self, medium: MediumGrid, position: mi.Point3f, lights: Sequence[DirectLight] = ()
     ) -> list[mi.Spectrum]:
-        """Irradiance at ``position`` from each point-like light nearby; from spot lights of
-        ``beams``, which are not marched again, its means over the voxels.
+        """Irradiance at ``position`` from each point-like light nearby; that of ``lights``, which
+        are not marched again, as they know it.
         """
-        means = {id(beam.emitter): beam.irradiance for beam in beams}
+        means = {id(light.emitter): light.irradiance for light in lights}
         return [
             means[id(e)] if id(e) in means else _from_point(e, medium, position) for e in self.near
         ]

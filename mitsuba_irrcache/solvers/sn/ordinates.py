@@ -29,8 +29,10 @@ class OrdinateSet:
     offsets: light that enters and light from voxels goes the same ways.
     """
 
-    def __init__(self, rows: Rows, channels: Sequence[int]) -> None:
+    def __init__(self, rows: Rows, channels: Sequence[int], suns: int = 0) -> None:
+        """``suns`` of the last rows are those of suns, whose light is wanted apart."""
         directions, light, weights, offsets = rows
+        self._suns = np.arange(len(weights)) >= len(weights) - suns if suns else None
         own = light if light.shape[-1] == 1 else light[..., list(channels)]
         self.rows = directions, own, weights, offsets
 
@@ -40,10 +42,13 @@ class OrdinateSet:
     ) -> list[tuple]:
         """The light of all ``passes`` that comes straight from emitters, as `Tracks.carry` takes
         it; where it is told by its direction, first without that of narrow lights, then that of
-        each.
+        each; where that of suns is wanted apart, it comes last.
         """
         directions, light, _, offsets = merged([p.rows for p in passes])
         parts = [light] if directional is None else directional.apart(directions, light)
+        if passes[0]._suns is not None:
+            suns = np.concatenate([p._suns for p in passes])[:, None, None]
+            parts = [np.where(suns, 0, light), np.where(suns, light, 0)]
         lit = [part.any(axis=(1, 2)) for part in parts]
         return [
             (directions[rows], part[rows], offsets[rows])

@@ -115,10 +115,15 @@ class Sweep:
         # are not known from the direction.
         self._direct: list[list[mi.Spectrum]] = []
         self._emitted: list[list[mi.Spectrum]] = []
+        #: irradiance of suns that camera rays do not interpolate
+        self._suns: list[mi.Spectrum] = []
+        #: what all channels of the light are in units of the first one's
+        self._colour = np.ones(cache.channels)
         self._around: SurfaceBoundary | None = None
         if medium.is_isolated:
-            near = self._sky.near_light(medium, self._places, cache.beams)
+            near = self._sky.near_light(medium, self._places, cache.direct_lights)
             self._direct = [[e] for e in near]
+            self._suns = [d.irradiance for d in cache.direct_lights if d.distant]
             return
         small, large = split(scene, grid, *box)
         self._around = SurfaceBoundary(scene, medium, large, rr_depth, cache.directional)
@@ -162,13 +167,16 @@ class Sweep:
             # Channels that differ by a factor only are one.
             grey = media == 1 and rows[0][1].shape[-1] == 1
 
+            self._colour = colour
+            of_suns = self._sky.sun_rows(pairs) if self._suns else 0
+
             def passes_of(channels: Sequence[int]) -> list[OrdinateSet]:
-                return [OrdinateSet(row, channels) for row in rows]
+                return [OrdinateSet(row, channels, of_suns) for row in rows]
         else:
             seed = self.seed, number
             lattice, colour = self._lattices[0], np.ones(cache.channels)
             passes_of, kinds = arriving(self._around, self._sky, lattice, passes, pairs, rng, seed)
-            self._direct = self._with_beams(self._lamps.light(seed))
+            self._direct = self._with_direct_lights(self._lamps.light(seed))
             grey = media == 1 and is_grey([*kinds, *chain(*self._direct, *self._emitted)])
         found = []
         for channels in self._together(grey):
@@ -303,13 +311,31 @@ class Sweep:
         """Irradiance straight from emitters along lines, on average over passes, in each channel;
         and that from all emitters.
         """
-        values = lattice.carry(*passes[0].straight(passes)[0])
-        swept = self._apart(values * dr.opaque(mi.Float, 1 / len(passes)), len(channels))
+        (rows, *suns), share = passes[0].straight(passes), dr.opaque(mi.Float, 1 / len(passes))
+        interpolated = swept = self._carried(lattice, rows, share, len(channels))
+        if self._suns and self.cache.max_depth != 2:  # from them light is scattered further
+            of_suns = self._carried(lattice, suns[0], share, len(channels))
+            swept = [a + b for a, b in zip(swept, of_suns, strict=True)]
         emitters = *self._direct, *self._emitted
         return swept, [
-            phi + sum(irradiance[c] for irradiance, *_ in emitters)
-            for c, phi in zip(channels, swept, strict=True)
+            phi + sum(irradiance[c] for irradiance, *_ in emitters) + self._of_suns(c)
+            for c, phi in zip(channels, interpolated, strict=True)
         ]
+
+    def _carried(
+        self, lattice: Tracks, rows: tuple, share: mi.Float, channels: int
+    ) -> list[mi.Float]:
+        """Irradiance along ``rows`` at the active voxels, in each channel."""
+        if not len(rows[0]):
+            return [dr.zeros(mi.Float, self.cache.active_count)] * channels
+        return self._apart(lattice.carry(*rows) * share, channels)
+
+    def _of_suns(self, channel: int) -> mi.Float | int:
+        """Irradiance of suns that is not interpolated, over the colour of the light."""
+        if not self._colour[channel] > 0:
+            channel = int(self._colour.argmax())
+        colour = dr.opaque(mi.Float, 1 / float(self._colour[channel]))
+        return sum(irradiance[channel] * colour for irradiance in self._suns)
 
     def _collided(
         self,
@@ -339,20 +365,22 @@ class Sweep:
             dr.eval(phi)
         return phi
 
-    def _with_beams(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
-        """Irradiance of each point-like light, and of others behind these; that of spot lights as
-        means over the voxels.
+    def _with_direct_lights(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
+        """Irradiance of each point-like light, and of others behind these; that of `DirectLight`s
+        as they know it.
         """
-        beams = {id(beam.emitter): [beam.irradiance] for beam in self.cache.beams}
+        known = {id(d.emitter): [d.irradiance] for d in self.cache.direct_lights}
         lights = self._sky.near
-        replaced = [beams.get(id(e), d) for e, d in zip(lights, direct, strict=False)]
+        replaced = [known.get(id(e), d) for e, d in zip(lights, direct, strict=False)]
         return replaced + direct[len(lights) :]
 
     def _near_light(self, channel: int) -> list[mi.Float]:
         """Light at the active voxels that does not come along lines, on average over each."""
-        means = {id(beam.irradiance) for beam in self.cache.beams}
+        lights = {id(d.irradiance): d for d in self.cache.direct_lights}
         near = [
-            irradiance[channel] * (1 if id(irradiance) in means else self._spread)
+            lights[id(irradiance)].means[channel]
+            if id(irradiance) in lights
+            else irradiance[channel] * self._spread
             for irradiance, *_ in self._direct
         ]
         return near + [irradiance[channel] for irradiance, *_ in self._emitted]

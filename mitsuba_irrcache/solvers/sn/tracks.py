@@ -323,17 +323,20 @@ def sharpened(
     places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
     place = flat(places, strides) + begin
 
-    def read(i: mi.UInt32) -> mi.Float:
-        return dr.gather(mi.Float, values, i if channels == 1 else i * channels + channel)
+    def read(i: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:
+        i = i if channels == 1 else i * channels + channel
+        return dr.gather(mi.Float, values, i, active)
 
     value, change = read(place), mi.Float(0)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
         if k == axis or upper[k] - lower[k] < 3:
             continue
         stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))
+        # A voxel beside the box may lie on the border of the grid, with no neighbour beyond it.
+        inside = (at >= first) & (at <= last)
         # At a border, the second difference of the voxel next to it.
         centre = place + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
-        here, below, above = (read(i) for i in (centre, centre - stride, centre + stride))
+        here, below, above = (read(i, inside) for i in (centre, centre - stride, centre + stride))
         # Where no line has left anything, nothing is known.
         change += dr.select((below > 0) & (above > 0), 2 * here - below - above, 0)
     return dr.maximum(dr.fma(change, dr.opaque(mi.Float, RECEIVED), value), 0)

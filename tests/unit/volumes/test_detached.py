@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,9 +50,17 @@ SLICES = {
 
 
 @pytest.fixture
-def folders(tmp_path):
-    """A folder for a header, and one beside it, with data in both and in a folder below."""
-    own, other = tmp_path / "own", tmp_path / "other"
+def folders():
+    """A folder for a header, and one beside it, with data in both and in a folder below. Not in
+    ``tmp_path``, whose full names are too long for patterns in a MetaImage.
+    """
+    with tempfile.TemporaryDirectory() as short:
+        yield filled(Path(short).resolve())
+
+
+def filled(top: Path) -> tuple[Path, Path]:
+    """The folders that `folders` makes in ``top``."""
+    own, other = top / "own", top / "other"
     for folder in (own, own / "below", other):
         folder.mkdir()
         (folder / "voxels.raw").write_bytes(VALUES.tobytes())

@@ -1,0 +1,320 @@
+"""Direct irradiance of emitters without extent (spot lights, points, suns).
+
+The irradiance of such an emitter at a position p is E(p) exp(-tau(p)): E is what it would be
+without any medium, known in closed form from the emitter; tau is the optical depth of the straight
+way from the emitter, the mean extinction along it times its length in the medium. The length is
+known in closed form from the boundary; only the mean extinction is interpolated between the voxels
+of the cache. It is smooth where a beam is narrower than a voxel, and where matter is so dense that
+light is absorbed within a fraction of a voxel.
+
+A cache holds its values at the voxel centres (of spot lights, means of E over the voxels times
+exp(-tau) there), and further orders of scattering start from means over the voxels; camera rays see
+those replaced by E(p) exp(-tau(p)).
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.conservative import unbiased
+from mitsuba_irrcache.core.fast_math import absorptance, clipped, greatest, least
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.grids.fields import GridField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.root_field import RootField
+from mitsuba_irrcache.lights.emitters import is_sun, point_lights, position_of, spot_lights
+from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
+from mitsuba_irrcache.transport.path import visibility
+from mitsuba_irrcache.transport.tracking import optical_depth
+
+#: Points along each axis of a voxel over which E, and over which exp(-tau), is averaged.
+POINTS, DEPTH_POINTS = 8, 3
+#: Part of a segment over which the slope of a length at its ends is found.
+TANGENT = 1 / 64
+
+
+class DirectLight:
+    """The irradiance of ``emitter`` at the ``voxels`` (flat indices) of ``grid`` in ``medium``."""
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        emitter: mi.Emitter,
+        medium: MediumGrid,
+        grid: Grid,
+        voxels: mi.UInt32,
+        survey: VoxelClasses | None = None,
+    ) -> None:
+        """``survey`` knows which voxels are inside of surfaces, where there are any among them."""
+        self.emitter, self._medium, self.distant = emitter, medium, is_sun(emitter)
+        p = VoxelSamplePoints(scene, grid).of(voxels)
+        ray, near, far = self._way(p)
+        length, sigma_t = dr.maximum(far - near, 0), medium.sigma_t.at_world(p)
+        depth = optical_depth(medium, ray, near, far, length > 0, dr.inf)
+        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
+        #: on the way from the emitter, for lookups
+        self.extinction = _on_grid(grid, voxels, mean, survey)
+        #: what surfaces and other media let through at the voxels; None where there are none
+        self._others: RootField | None = None
+        passed = mi.Spectrum(1)
+        if medium.surroundings is not None:
+            position = [dr.opaque(mi.Float, float(v)) for v in position_of(emitter)]
+            passed = _past_others(scene, medium, p, mi.Point3f(position))
+            dr.eval(passed)
+            self._others = _root_field(grid, voxels, passed, survey)
+        self._passed, self._grid, self._voxels, self._centres = passed, grid, voxels, p
+        self._means: mi.Spectrum | None = None
+        #: E at the voxel centres; of a beam that may be narrower, its means over the voxels
+        self._unobstructed = self.unobstructed(p)
+        if emitter in spot_lights(scene):
+            self._unobstructed = self._mean(grid, voxels, POINTS)
+        #: the same of the irradiance
+        self.irradiance = passed * self._unobstructed * mi.Spectrum(dr.exp(-self.depth(p)))
+        dr.eval(self.irradiance)
+        #: the largest E, where it is the same everywhere
+        self.maximum = float(dr.max(dr.max(self.unobstructed(p)))[0]) if self.distant else 0.0
+
+    @property
+    def means(self) -> mi.Spectrum:
+        """Means of the irradiance over the voxels, from which light is scattered further."""
+        if self._means is None:
+            mean = self._mean_transmittance(self._grid, self._voxels)
+            self._means = self._passed * self._mean_unobstructed() * mean
+            dr.eval(self._means)
+        return self._means
+
+    def unobstructed(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
+        """E at world positions."""
+        at = dr.zeros(mi.Interaction3f, dr.width(p))
+        at.p = p
+        _, light = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
+        return dr.select(active, light, 0)
+
+    def depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """The optical depth of the medium between world positions and the emitter."""
+        return self.extinction.at_world(p, active) * self.length(p)
+
+    def length(self, p: mi.Point3f) -> mi.Float:
+        """The length of the way in the medium between world positions and the emitter."""
+        _, near, far = self._way(p)
+        return dr.maximum(far - near, 0)
+
+    def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """Transmittance of all else on that way."""
+        return mi.Float(1) if self._others is None else self._others.at_world(p, active)
+
+    def _way(self, p: mi.Point3f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
+        """Rays from world positions to the emitter, and the distances between which they are in the
+        medium: none where the first one is not the less.
+        """
+        at = dr.zeros(mi.Interaction3f, dr.width(p))
+        at.p = p
+        record, _ = self.emitter.sample_direction(at, mi.Point2f(0.5))
+        ray = mi.Ray3f(p, record.d)
+        hit, near, far = self._medium.intersect(ray)
+        near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
+        return ray, near, dr.select(hit, far, near)
+
+    def _mean_unobstructed(self) -> mi.Spectrum:
+        """Means of E over the voxels."""
+        if self.emitter.class_name() == "PointLight":
+            return self._mean(self._grid, self._voxels, POINTS)
+        return self._unobstructed
+
+    def _mean_transmittance(self, grid: Grid, voxel: mi.UInt32) -> mi.Spectrum:
+        """Means of exp(-tau) over the part of voxels that is in the medium."""
+        passed, count = self._sum_transmittance(grid, voxel, DEPTH_POINTS)
+        centre = mi.Spectrum(dr.exp(-self.depth(self._centres)))
+        return dr.select(count > 0, passed / dr.maximum(count, 1), centre)
+
+    @symbolic
+    def _mean(self, grid: Grid, voxel: mi.UInt32, points: int):
+        """Means of E over voxels."""
+        corner, total, k = mi.Point3f(*grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
+        n = dr.opaque(mi.UInt32, points)
+        while dr.hint(k < n * n * n, label="points in a voxel"):
+            place = mi.Point3f(k % n, (k // n) % n, k // (n * n)) + 0.5
+            total += self.unobstructed(grid.world.point(corner + place / mi.Float(n)))
+            k += 1
+        return total / mi.Float(n * n * n)
+
+    @symbolic
+    def _sum_transmittance(self, grid: Grid, voxel: mi.UInt32, points: int):
+        """Sums of exp(-tau) over those points in voxels that are in the medium; their number."""
+        corner, total, k = mi.Point3f(*grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
+        n, count = dr.opaque(mi.UInt32, points), mi.Float(0)
+        while dr.hint(k < n * n * n, label="points in a voxel"):
+            place = mi.Point3f(k % n, (k // n) % n, k // (n * n)) + 0.5
+            p = grid.world.point(corner + place / mi.Float(n))
+            inside = self._medium.contains(p)
+            total += dr.select(inside, mi.Spectrum(dr.exp(-self.depth(p, inside))), 0)
+            count += dr.select(inside, mi.Float(1), 0)
+            k += 1
+        return total, count
+
+
+def direct_lights_of(
+    scene: mi.Scene,
+    medium: MediumGrid,
+    grid: Grid,
+    voxels: mi.UInt32,
+    dense: bool,
+    survey: VoxelClasses | None = None,
+) -> list[DirectLight]:
+    """The direct light of all spot lights of a scene; where voxels are ``dense`` and there are no
+    surfaces, of points and suns, too. None in media that do not scatter isotropically,
+    whose caches hold the irradiance of such lights apart from that of others.
+    """
+    if medium.phase is not None or not dr.width(voxels):
+        return []
+    emitters = spot_lights(scene)
+    if dense and medium.is_isolated:
+        emitters = [e for e in scene.emitters() if is_sun(e) or e in point_lights(scene)]
+    return [DirectLight(scene, emitter, medium, grid, voxels, survey) for emitter in emitters]
+
+
+def _on_grid(
+    grid: Grid, voxels: mi.UInt32, values: mi.Float | mi.Color3f, survey: VoxelClasses | None
+) -> GridField:
+    """Values at the ``voxels``, for lookups."""
+    channels = [values] if isinstance(values, mi.Float) else list(values)
+    known = dr.zeros(mi.Bool, grid.voxel_count)
+    dr.scatter(known, mi.Bool(True), voxels)
+    values, count = _spread(grid, voxels, channels, survey), len(channels)
+    return GridField(grid, unbiased(grid, values, known, count), count)
+
+
+def _root_field(
+    grid: Grid, voxels: mi.UInt32, values: mi.Spectrum, survey: VoxelClasses | None
+) -> RootField:
+    """The same with their roots interpolated, of one channel where all agree."""
+    channels = [dr.sqrt(c) for c in values]
+    if all(dr.all(c == channels[0])[0] for c in channels[1:]):
+        channels = channels[:1]
+    return RootField(grid, _spread(grid, voxels, channels, survey), len(channels))
+
+
+def _spread(
+    grid: Grid, voxels: mi.UInt32, channels: list[mi.Float], survey: VoxelClasses | None
+) -> mi.Float:
+    """Values of all channels of all voxels; 0 elsewhere, but for voxels inside of surfaces."""
+    values, count = dr.zeros(mi.Float, grid.voxel_count * len(channels)), len(channels)
+    for c, value in enumerate(channels):
+        dr.scatter(values, value, voxels * count + c)
+    dr.eval(values)
+    return values if survey is None else survey.filled(values, count)
+
+
+def _past_others(
+    scene: mi.Scene, medium: MediumGrid, p: mi.Point3f, target: mi.Point3f
+) -> mi.Spectrum:
+    """What surfaces and other media let through between ``p`` and ``target``."""
+    others = medium.surroundings.media.around(medium).without(medium)
+    vertex = dr.zeros(mi.Interaction3f, dr.width(p))
+    vertex.p = p
+    rng = mi.PCG32(dr.width(p))
+    passed, _ = visibility(scene, others, vertex, target, medium.pointer, rng, mi.Bool(True))
+    return passed
+
+
+class DirectLightAlongRays:
+    """The direct light of an emitter for camera rays."""
+
+    def __init__(self, light: DirectLight) -> None:
+        self._light = light
+
+    def at(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
+        """Irradiance at world positions."""
+        light = self._light
+        passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
+        return mi.Spectrum(passed) * light.unobstructed(p, active)
+
+    def mean_extinction(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
+        """The mean extinction between world positions and the emitter."""
+        return self._light.extinction.at_world(p, active)
+
+    def scattered(
+        self,
+        ray: mi.Ray3f,
+        ends: tuple[mi.Float, mi.Float],
+        sigma: tuple,
+        means: tuple,
+        weights: tuple,
+        albedo: tuple,
+    ) -> mi.Spectrum:
+        """Radiance scattered towards the camera along a segment, from what is known at both of its
+        ``ends`` (distances along the ray): the extinction ``sigma``, the mean extinction on the way
+        from the emitter, the ``albedo``. ``weights`` are those of sources that fall and rise
+        linearly, of `quadrature.segment`.
+
+        With extinction c and depth s linear in a part of the segment, of optical depth C and from
+        depth s0 to s0 + S, int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), however
+        opaque that part is.
+        """
+        light, (a, b) = self._light, ends
+        near, far = (extinction * (b - a) for extinction in sigma)
+        at = self._parts(ray, a, b, 0.5 * (near + far))
+        middles = [0.5 * (u + v) for u, v in pairwise(at)]
+        depths, inner = (
+            [dr.lerp(*means, u) * light.length(ray(dr.lerp(a, b, u))) for u in places]
+            for places in (at, middles)
+        )
+        passed = [dr.fma(near, u * (1 - 0.5 * u), far * (0.5 * u * u)) for u in at]
+        total = mi.Spectrum(0)
+        for i, u in enumerate(middles):
+            within = passed[i + 1] - passed[i]
+            both = within + depths[i + 1] - depths[i]
+            # A parabola is higher than its chord by 4 u (1 - u) sag: its mean with weights e^-x u.
+            sag = inner[i] - 0.5 * (depths[i] + depths[i + 1])
+            sag = sag * 4 / (6 + dr.abs(both))
+            exponent = greatest(-both, 0.0) - passed[i] - depths[i] - sag
+            part = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
+            p = ray(dr.lerp(a, b, u))
+            part = mi.Spectrum(part * light.past_others(p) * dr.lerp(*albedo, u))
+            total += part * light.unobstructed(p)
+        # As the quadrature rule has it.
+        absorbed = absorptance(0.5 * (near + far))
+        rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
+        return total * mi.Spectrum(rule) * dr.inv_four_pi
+
+    def _parts(
+        self, ray: mi.Ray3f, a: mi.Float, b: mi.Float, depth: mi.Float | mi.Color3f
+    ) -> list[mi.Float]:
+        """Ends of four parts of a segment of this optical ``depth``, as fractions: thirds of what
+        it absorbs, one of which is cut at the kink.
+        """
+        depth = depth if isinstance(depth, mi.Float) else dr.mean(depth)
+        absorbed, thin = absorptance(depth), depth < 1e-3
+        thirds = [
+            dr.select(thin, k, -dr.log(1 - k * absorbed) / dr.select(thin, 1, depth))
+            for k in (1 / 3, 2 / 3)
+        ]
+        first, second = thirds
+        kink = self._kink(ray, a, b)
+        inner = [least(kink, first), clipped(kink, first, second), greatest(kink, second)]
+        return [mi.Float(0), *inner, mi.Float(1)]
+
+    def _kink(self, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> mi.Float:
+        """Where between ``a`` and ``b``, as a fraction, the tangents at both ends of the length of
+        the way in the medium meet; in the middle where they do not.
+
+        In a box the length is linear between kinks, at which the way leaves the medium by another
+        face: of light that grazes a face one lies next to it.
+        """
+        at = [a, dr.lerp(a, b, TANGENT), dr.lerp(b, a, TANGENT), b]
+        first, second, third, last = (self._light.length(ray(t)) for t in at)
+        rise, fall = (second - first) * (1 / TANGENT), (last - third) * (1 / TANGENT)
+        bend = rise - fall
+        kink = (last - fall - first) / dr.select(bend != 0, bend, 1)
+        return dr.select((bend != 0) & (kink > 0) & (kink < 1), kink, 0.5)
+
+
+def _mean_decay(depth: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
+    """The mean of e^-x for x in [0, depth]."""
+    depth = greatest(depth, 1e-20)
+    return absorptance(depth) / depth

@@ -1,0 +1,86 @@
+"""Words of a MetaImage's header that are too long for SimpleITK's reader are refused.
+
+MetaIO has 80 bytes for each word of the list or pattern that names the data files, and does not
+look whether they are enough. Longer words are written over other memory of the process, which then
+ends at any time later, or calculates with other numbers.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.volumes.readers import read_volume
+
+VALUES = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
+HEADER = """ObjectType = Image
+NDims = 3
+DimSize = 4 3 2
+ElementType = MET_UCHAR
+ElementSpacing = 1 1 1
+ElementDataFile = {}
+"""
+FITS = "s" * 73 + "%d.raw"  # 79 bytes
+assert len(FITS) == 79
+
+#: What a header may not say, and the length of the word for which it is refused.
+TOO_LONG = {
+    "pattern": (f"s{FITS} 0 1 1", 80),
+    "pattern in a folder": ("./" * 60 + "s%d.raw 0 1 1", 127),
+    "number": ("s%d.raw 0 1 " + "0" * 300 + "1", 301),
+    "quoted": ('"' + "s " * 50 + '%d.raw" 0 1 1', 114),
+    "list": ("LIST " + "2" * 100 + "\ns0.raw\ns1.raw", 100),
+    "list in small letters": ("list " + "2" * 100 + "\ns0.raw\ns1.raw", 100),
+    "list in one word": ("LIST" + "2" * 100 + "\ns0.raw\ns1.raw", 104),
+}
+
+
+def written(folder, value: str, slices: str = "s%d.raw"):
+    """A header that names its data files by ``value``, with one file for each slice beside it."""
+    for k in range(2):
+        (folder / (slices % k)).write_bytes(VALUES[k].tobytes())
+    path = folder / "ct.mhd"
+    path.write_text(HEADER.format(value))
+    return path
+
+
+@pytest.mark.parametrize(("value", "length"), TOO_LONG.values(), ids=TOO_LONG)
+def test_words_that_are_too_long_are_refused(tmp_path, value, length):
+    """Before SimpleITK sees them, with their length and the remedy."""
+    with pytest.raises(IrrcacheError, match=f"has {length} bytes.*beside the header"):
+        read_volume(written(tmp_path, value))
+
+
+def test_tabs_are_refused(tmp_path):
+    """MetaIO takes them for a part of a word, and then divides by a step of 0."""
+    with pytest.raises(IrrcacheError, match="with a tab"):
+        read_volume(written(tmp_path, "s%d.raw\t0 1 1"))
+
+
+def test_the_longest_word_is_read_within_its_memory(tmp_path):
+    """In a process of its own, which ends normally."""
+    path = written(tmp_path, f"{FITS} 0 1 1", FITS)
+    program = (
+        "import sys; from mitsuba_irrcache.volumes.readers import read_volume\n"
+        "for _ in range(20): values = read_volume(sys.argv[1]).values\n"
+        "print(values.ravel().tolist())"
+    )
+    command = [sys.executable, "-c", program, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == str(list(range(24)))
+
+
+def test_long_names_without_such_a_limit(tmp_path):
+    """Of a single file, and in the lines of a list."""
+    below = tmp_path / ("d" * 120)
+    below.mkdir()
+    (below / "voxels.raw").write_bytes(VALUES.tobytes())
+    for k in range(2):
+        (below / f"s{k}.raw").write_bytes(VALUES[k].tobytes())
+    for value in (f"{below}/voxels.raw", f"LIST\n{below}/s0.raw\n{below.name}/s1.raw"):
+        np.testing.assert_array_equal(read_volume(written(tmp_path, value)).values, VALUES)
