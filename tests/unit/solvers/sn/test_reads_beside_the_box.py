@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_irrcache.grids.grid import Grid
 
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.sn.tracks import Tracks, sharpened
 
 pytestmark = pytest.mark.usefixtures("rgb")
