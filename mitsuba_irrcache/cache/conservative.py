@@ -19,6 +19,10 @@ import mitsuba as mi
 
 from mitsuba_irrcache.grids.grid import Grid
 
+#: Half the edge of the neighbourhood over which light is conserved where values are noisy, without
+#: the voxel itself, and the largest factor that this takes.
+RADIUS, LARGEST_FACTOR = 2, 3.0
+
 
 def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:
     """In place of the ``roots`` of all voxels of ``grid``, those that keep the light of ``known``
@@ -26,13 +30,54 @@ def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -
 
     Noise that is not the same in neighbours counts as light that bends, and is enlarged by a third.
     """
-    spread = roots  # M r
-    for bend in _second_differences(grid, known, channels):
-        dr.eval(spread)
-        spread = spread + bend(spread) / 6
+    spread = _spread(grid, roots, known, channels)
     result = roots * dr.select(spread > 0, dr.sqrt(roots / spread), 1)
     dr.eval(result)
     return result
+
+
+def conserving_on_average(
+    grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1
+) -> mi.Float:
+    """As `conserving`, for noisy ``roots``: what is interpolated has the sum of the voxels' values
+    over each neighbourhood of 5^3 of them, r sqrt(S(r^2) / S(r M r)) with sums S over it.
+
+    The root of a noisy value is too small on average, the more so the fewer samples it has: by 16 %
+    of the values in a region that few paths reach with 16 samples. Noise is not enlarged.
+    """
+    spread = _spread(grid, roots, known, channels)
+    place = dr.arange(mi.UInt32, grid.voxel_count * channels) // channels
+    own = dr.gather(mi.Bool, known, place)
+    values = [dr.select(own, roots * other, 0) for other in (roots, spread)]
+    own_sum, spread_sum = (_neighbourhood_sums(grid, v, channels) for v in values)
+    factor = dr.select(spread_sum > 0, dr.sqrt(own_sum / spread_sum), 1)
+    result = roots * dr.clip(factor, 1 / LARGEST_FACTOR, LARGEST_FACTOR)
+    dr.eval(result)
+    return result
+
+
+def _spread(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int) -> mi.Float:
+    """M r."""
+    spread = roots
+    for bend in _second_differences(grid, known, channels):
+        dr.eval(spread)
+        spread = spread + bend(spread) / 6
+    return spread
+
+
+def _neighbourhood_sums(grid: Grid, values: mi.Float, channels: int) -> mi.Float:
+    """Sums over the voxels that are at most `RADIUS` away along each axis."""
+    index = dr.arange(mi.UInt32, grid.voxel_count * channels)
+    stride = mi.UInt32(channels)
+    for place, side in zip(grid.places(index // channels), grid.sides, strict=True):
+        dr.eval(values)
+        total = values
+        for step in range(1, RADIUS + 1):
+            below, above = place >= step, place + step < mi.UInt32(side)
+            total += dr.select(below, dr.gather(mi.Float, values, index - step * stride, below), 0)
+            total += dr.select(above, dr.gather(mi.Float, values, index + step * stride, above), 0)
+        values, stride = total, stride * mi.UInt32(side)
+    return values
 
 
 def unbiased(grid: Grid, values: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:

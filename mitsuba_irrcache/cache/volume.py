@@ -16,9 +16,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
-from mitsuba_irrcache.cache.conservative import conserving
+from mitsuba_irrcache.cache.conservative import conserving, conserving_on_average
 from mitsuba_irrcache.cache.direct_light import DirectLight
-from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
+from mitsuba_irrcache.cache.statistics import concatenated, total, totals_of_pairs
 from mitsuba_irrcache.cache.storage import (
     ARRAYS,
     FORMAT,
@@ -209,7 +209,6 @@ class IrradianceCache:
         roots, variance = [dr.sqrt(m) for m in means], None
         if not self.correlated:  # neighbours that err alike do no harm to interpolation
             noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
-            roots = [r * root_correction(v) for r, v in zip(roots, noise, strict=True)]
         if all(dr.all(r == roots[0])[0] for r in roots[1:]):
             roots = roots[:1]
         channels = len(roots)
@@ -217,9 +216,11 @@ class IrradianceCache:
             smooth = dr.rsqrt(self.falloff.of_voxels(self.active))
             roots = [r * smooth for r in roots]
         values = self._tensor(roots).array
+        known = marked(self.grid, self.active)
         if self.correlated:
-            values = conserving(self.grid, values, marked(self.grid, self.active), channels)
-        else:  # it would enlarge the noise by more than it is worth
+            values = conserving(self.grid, values, known, channels)
+        else:
+            values = conserving_on_average(self.grid, values, known, channels)
             variance = self._tensor(noise[:channels]).array
         if self.survey is not None:
             values = self.survey.filled(values, channels)
