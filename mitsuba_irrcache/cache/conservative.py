@@ -19,41 +19,43 @@ import mitsuba as mi
 
 from mitsuba_irrcache.grids.grid import Grid
 
-#: Half the edge of the neighbourhood over which light is conserved where values are noisy, without
-#: the voxel itself, and the largest factor that this takes.
-RADIUS, LARGEST_FACTOR = 2, 3.0
+#: Relative variance of voxels from which on they conserve their light in full.
+NOISY = 0.5
 
 
-def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:
+def conserving(
+    grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1, share: mi.Float | None = None
+) -> mi.Float:
     """In place of the ``roots`` of all voxels of ``grid``, those that keep the light of ``known``
-    voxels, along axes along which both neighbours are known.
+    voxels, along axes along which both neighbours are known; where there is a ``share`` in [0, 1],
+    the factor that does so to this power.
 
     Noise that is not the same in neighbours counts as light that bends, and is enlarged by a third.
     """
     spread = _spread(grid, roots, known, channels)
-    result = roots * dr.select(spread > 0, dr.sqrt(roots / spread), 1)
+    ratio = dr.select(spread > 0, roots / spread, 1)
+    factor = dr.sqrt(ratio)
+    if share is not None:
+        place = dr.arange(mi.UInt32, dr.width(roots)) // channels
+        factor = dr.power(ratio, 0.5 * dr.gather(mi.Float, share, place))
+    result = roots * dr.select(ratio > 0, factor, 1)
     dr.eval(result)
     return result
 
 
-def conserving_on_average(
-    grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1
-) -> mi.Float:
-    """As `conserving`, for noisy ``roots``: what is interpolated has the sum of the voxels' values
-    over each neighbourhood of 5^3 of them, r sqrt(S(r^2) / S(r M r)) with sums S over it.
+def share_of_noise(grid: Grid, variance: mi.Float, known: mi.Bool) -> mi.Float:
+    """How far noisy voxels are to conserve their light, from the mean relative ``variance`` of the
+    voxels around each.
 
-    The root of a noisy value is too small on average, the more so the fewer samples it has: by 16 %
-    of the values in a region that few paths reach with 16 samples. Noise is not enlarged.
+    Where it is small, the mean of interpolated roots is known from it (`root_correction`), and
+    conserving would only enlarge the noise. Where few paths find light, some voxels are bright
+    and most are dark: interpolated roots lose 16 % there with 16 samples per voxel.
     """
-    spread = _spread(grid, roots, known, channels)
-    place = dr.arange(mi.UInt32, grid.voxel_count * channels) // channels
-    own = dr.gather(mi.Bool, known, place)
-    values = [dr.select(own, roots * other, 0) for other in (roots, spread)]
-    own_sum, spread_sum = (_neighbourhood_sums(grid, v, channels) for v in values)
-    factor = dr.select(spread_sum > 0, dr.sqrt(own_sum / spread_sum), 1)
-    result = roots * dr.clip(factor, 1 / LARGEST_FACTOR, LARGEST_FACTOR)
-    dr.eval(result)
-    return result
+    counted = dr.select(known, mi.Float(1), 0)
+    total, count = (_sums_around(grid, v) for v in (variance * counted, counted))
+    share = dr.minimum(total / dr.maximum(count, 1) * (1 / NOISY), 1)
+    dr.eval(share)
+    return share
 
 
 def _spread(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int) -> mi.Float:
@@ -65,17 +67,15 @@ def _spread(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int) -> mi.Fl
     return spread
 
 
-def _neighbourhood_sums(grid: Grid, values: mi.Float, channels: int) -> mi.Float:
-    """Sums over the voxels that are at most `RADIUS` away along each axis."""
-    index = dr.arange(mi.UInt32, grid.voxel_count * channels)
-    stride = mi.UInt32(channels)
-    for place, side in zip(grid.places(index // channels), grid.sides, strict=True):
+def _sums_around(grid: Grid, values: mi.Float) -> mi.Float:
+    """Sums over 3^3 voxels."""
+    index, stride = dr.arange(mi.UInt32, grid.voxel_count), mi.UInt32(1)
+    for place, side in zip(grid.places(index), grid.sides, strict=True):
         dr.eval(values)
+        below, above = place > 0, place + 1 < mi.UInt32(side)
         total = values
-        for step in range(1, RADIUS + 1):
-            below, above = place >= step, place + step < mi.UInt32(side)
-            total += dr.select(below, dr.gather(mi.Float, values, index - step * stride, below), 0)
-            total += dr.select(above, dr.gather(mi.Float, values, index + step * stride, above), 0)
+        total += dr.select(below, dr.gather(mi.Float, values, index - stride, below), 0)
+        total += dr.select(above, dr.gather(mi.Float, values, index + stride, above), 0)
         values, stride = total, stride * mi.UInt32(side)
     return values
 

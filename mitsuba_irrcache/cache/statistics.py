@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import drjit as dr
+import mitsuba as mi
 
 
 def concatenated(pieces: tuple):
@@ -21,3 +22,13 @@ def total(terms):
 def totals_of_pairs(first: list, second: list) -> list:
     """Term by term."""
     return [total(pair) for pair in zip(first, second, strict=True)]
+
+
+def root_correction(variance: mi.Float) -> mi.Float:
+    """Makes interpolated roots of noisy values right on average.
+
+    With relative ``variance`` v of the voxels, E[(sum w_i sqrt(x_i))^2] = mu (1 - (1 - sum w_i^2) v
+    / 4) to first order, and sum w_i^2 is (2/3)^3 on average over a cell. Without it 16 samples read
+    some 1 % too little light.
+    """
+    return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)

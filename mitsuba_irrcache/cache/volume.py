@@ -16,9 +16,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
-from mitsuba_irrcache.cache.conservative import conserving, conserving_on_average
+from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
 from mitsuba_irrcache.cache.direct_light import DirectLight
-from mitsuba_irrcache.cache.statistics import concatenated, total, totals_of_pairs
+from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
 from mitsuba_irrcache.cache.storage import (
     ARRAYS,
     FORMAT,
@@ -206,9 +206,13 @@ class IrradianceCache:
         brightest += [light.maximum for light in self.direct_lights]
         for light in self.direct_lights:
             means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]
-        roots, variance = [dr.sqrt(m) for m in means], None
+        known, roots = marked(self.grid, self.active), [dr.sqrt(m) for m in means]
+        variance = share = None
         if not self.correlated:  # neighbours that err alike do no harm to interpolation
             noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
+            share = share_of_noise(self.grid, self._tensor([sum(noise) / len(noise)]).array, known)
+            rest = 1 - dr.gather(mi.Float, share, self.active)
+            roots = [r * root_correction(v * rest) for r, v in zip(roots, noise, strict=True)]
         if all(dr.all(r == roots[0])[0] for r in roots[1:]):
             roots = roots[:1]
         channels = len(roots)
@@ -216,12 +220,9 @@ class IrradianceCache:
             smooth = dr.rsqrt(self.falloff.of_voxels(self.active))
             roots = [r * smooth for r in roots]
         values = self._tensor(roots).array
-        known = marked(self.grid, self.active)
-        if self.correlated:
-            values = conserving(self.grid, values, known, channels)
-        else:
-            values = conserving_on_average(self.grid, values, known, channels)
+        if not self.correlated:
             variance = self._tensor(noise[:channels]).array
+        values = conserving(self.grid, values, known, channels, share)
         if self.survey is not None:
             values = self.survey.filled(values, channels)
         field = RootField(self.grid, values, channels, variance)

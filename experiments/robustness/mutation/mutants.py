@@ -324,7 +324,7 @@ MUTANTS = (
     Mutant(
         "interpolated roots do not keep the light",
         "cache/volume.py",
-        "values = conserving(self.grid, values, marked(self.grid, self.active), channels)",
+        "values = conserving(self.grid, values, known, channels, share)",
         "values = values + 0",
         ("tests/system/test_lamps.py",),
     ),
