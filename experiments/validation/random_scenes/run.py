@@ -21,9 +21,9 @@ camera without being scattered (volpath at depth 1). A scene *disagrees* where o
 renderings, is beyond three standard errors (4.5 for the worst of 64 blocks) and beyond LIMITS.
 
 Rows are stored in output/random_scenes/<seed>.json, images and references beside them as .npz;
-``--force`` forgets the rows and renders with irrcache again, against the stored references. No scene
-is begun after ``--budget`` seconds: run it again for the others, and with more ``--seconds`` for
-those that are undecided.
+``--force`` forgets the rows and renders with irrcache again, against the stored references. No
+scene is begun after ``--budget`` seconds: run it again for the others, and with more ``--seconds``
+for those that are undecided.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def reference_of(case: RandomScene, seconds: float, folder: Path) -> dict:
 
 
 def stored_reference(case: RandomScene, seconds: float, folder: Path) -> dict:
-    """As `reference_of`, from its file if one of the same scene and as many ``seconds`` is there."""
+    """As `reference_of`, from its file if that is of the same scene and as many ``seconds``."""
     file, drawn = folder / f"{case.seed}-{case.index}-reference.npz", json.dumps(case.as_dict())
     if file.exists():
         with np.load(file) as stored:
