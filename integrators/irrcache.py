@@ -13,7 +13,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core import properties
-from mitsuba_irrcache.core.cancellation import Stopped, Stopping
+from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
@@ -174,7 +174,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         require_llvm()
         check_versions()
         super().__init__(props)
-        props = self._properties = properties.Record(props)
+        props = self._properties = properties.RecordedProperties(props)
         max_depth = properties.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0")
         self._hide_emitters = properties.flag(props, "hide_emitters", False)
         self._filter = properties.choice(props, "filter", "none", FILTERS)
@@ -206,7 +206,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._timeout = properties.number(
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
-        self._stopping = Stopping()
+        self._stopping = StopCondition()
         self._sight: ClosedFormCameraRays | TracedCameraRays | None = None
         self._revision = 0  # of the builder, when the sight was made
         #: Mitsuba's own integrators, by name, for scenes without a medium to be seen, and the one
@@ -269,7 +269,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             self._stopping.begin(self._timeout)
             try:
                 with dr.suspend_grad():
-                    self._builder.update(scene, self._stopping.checked(self.progress))
+                    self._builder.update(scene, self._stopping.raising(self.progress))
             except Stopped:
                 self._log_what_is_missing()
             if self._revision != self._builder.revision:
@@ -401,7 +401,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             return tensor, self.seconds.get("filter", 0.0)
 
         self._stopping.begin()
-        progress = self._stopping.checked(self.progress)
+        progress = self._stopping.raising(self.progress)
         return frames(self._builder, scene, image, Targets(**targets), progress)
 
     def render_forward(self, *args: object, **kwargs: object) -> mi.TensorXf:
