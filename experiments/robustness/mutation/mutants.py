@@ -205,8 +205,8 @@ MUTANTS = (
     Mutant(
         "emitters counted twice: sampled and met (surfaces)",
         "transport/path.py",
-        "share = dr.select(sampled, power_heuristic(pdf, density), 1)",
-        "share = mi.Float(1)",
+        "mis_weight = dr.select(sampled, power_heuristic(pdf, density), 1)",
+        "mis_weight = mi.Float(1)",
         ("tests/system/test_surfaces.py",),
     ),
     Mutant(
