@@ -155,7 +155,7 @@ class ClosedFormCameraRays:
         if not self.projection.blurs:
             return transmittance
         lights = self.projection.directional.directional
-        narrow = lights.shines(mi.Point3f(0), direction, mi.Bool(True), mi.Bool(False))
+        narrow = lights.hits_source(mi.Point3f(0), direction, mi.Bool(True), mi.Bool(False))
         return dr.select(narrow, self.projection.unscattered(transmittance), transmittance)
 
 
@@ -217,7 +217,7 @@ class TracedCameraRays:
             reflected += last.weight * self._irradiance(last) * dr.inv_four_pi
         shown = weight
         if self.narrow is not None:
-            lamp = self.narrow.shines(ray.o, ray.d, far=mi.Bool(False), near=traced)
+            lamp = self.narrow.hits_source(ray.o, ray.d, far=mi.Bool(False), near=traced)
             shown = dr.select(lamp, unscattered / chance, weight)
         background += dr.select(traced, shown * straight + weight * reflected, 0)
         alpha = mi.Float(1)
@@ -279,7 +279,7 @@ class TracedCameraRays:
             light = emitter.eval(si, shines & lit)
             left = mi.Spectrum(passed)
             if dr.hint(self.narrow is not None, mode="scalar"):
-                narrow = self.narrow.shines(ray.o, ray.d, shines & ~valid, shines & valid)
+                narrow = self.narrow.hits_source(ray.o, ray.d, shines & ~valid, shines & valid)
                 left = dr.select(narrow, unscattered, left)
             background += dr.select(shines & lit, left * light, 0)
             stopped |= valid & ~crosses

@@ -268,8 +268,8 @@ MUTANTS = (
     Mutant(
         "light of narrow lights twice (moments)",
         "cache/angular.py",
-        "light = light - own",
-        "light = light - 0 * own",
+        "radiance = radiance - own",
+        "radiance = radiance - 0 * own",
         (PHASE,),
     ),
     Mutant(
@@ -282,8 +282,8 @@ MUTANTS = (
     Mutant(
         "wide lamps as narrow as points (directional)",
         "cache/angular.py",
-        "left *= ratio",
-        "left *= 1",
+        "attenuation *= ratio",
+        "attenuation *= 1",
         ("tests/unit/cache/test_angular.py",),
     ),
     Mutant(
@@ -331,8 +331,8 @@ MUTANTS = (
     Mutant(
         "interpolated roots keep half of the light that bends",
         "cache/conservative.py",
-        "bend(spread) / 6",
-        "bend(spread) / 12",
+        "second_difference(smoothed) / 6",
+        "second_difference(smoothed) / 12",
         ("tests/unit/cache/test_conservative.py",),
     ),
     Mutant(
