@@ -475,7 +475,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """Radiance times ``weight``, alpha, and the layers of the radiance if they are asked
         for.
         """
-        view = sight.look(scene, sampler, mi.Ray3f(ray), medium, active)
+        view = sight.sample(scene, sampler, mi.Ray3f(ray), medium, active)
         layers = None
         if self._layered:
             layers = sight.projection.layers(

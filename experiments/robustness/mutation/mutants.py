@@ -156,7 +156,7 @@ MUTANTS = (
     Mutant(
         "the background in front of the medium",
         "render/camera.py",
-        "background = self._left_of(transmittance, ray.d) * background + emitted",
+        "background = self._attenuation(transmittance, ray.d) * background + emitted",
         "background = background + emitted",
         (CLOSED_FORMS,),
     ),
