@@ -96,11 +96,13 @@ class Source:
         """Mean square angle between the centre of the source and its points, seen from ``p``."""
         if self.far:
             return self._variance
-        way = self.place - mi.Vector3f(p)
-        inverse = dr.rcp(dr.maximum(dr.squared_norm(way), TINY))
-        along = sum(w * dr.dot(row, way) for w, row in zip(way, self._covariance, strict=True))
+        offset = self.place - mi.Vector3f(p)
+        inverse = dr.rcp(dr.maximum(dr.squared_norm(offset), TINY))
+        along_view = sum(
+            w * dr.dot(row, offset) for w, row in zip(offset, self._covariance, strict=True)
+        )
         total = sum(row[i] for i, row in enumerate(self._covariance))
-        return dr.maximum(total - along * inverse, 0) * inverse
+        return dr.maximum(total - along_view * inverse, 0) * inverse
 
     def covers(self, directions: np.ndarray) -> np.ndarray:
         """Whether ``directions`` (..., 3) point to this source; False unless it is ``far``."""
@@ -146,16 +148,16 @@ class AngularBasis:
         """
         smooth = [mi.Spectrum(0)] * len(self._factors)
         narrow = [mi.Spectrum(0)] * len(self.sources)
-        seen = [source.seen_from(position) for source in self.sources]
+        directions_and_cosines = [source.seen_from(position) for source in self.sources]
         for direction, uncollided, scattered in contributions:
-            for k, (towards, cosine) in enumerate(seen):
+            for k, (towards, cosine) in enumerate(directions_and_cosines):
                 own = dr.dot(direction, towards) >= cosine
                 narrow[k] = narrow[k] + dr.select(own, uncollided, 0)
                 if self.sources[k].sharp:
                     uncollided = dr.select(own, 0, uncollided)
             basis = dr.sh_eval(direction, self.order)[1:]
-            light = uncollided + scattered
-            smooth = [m + y * light for m, y in zip(smooth, basis, strict=True)]
+            irradiance = uncollided + scattered
+            smooth = [m + y * irradiance for m, y in zip(smooth, basis, strict=True)]
         return smooth + narrow
 
     def hits_source(
@@ -351,33 +353,33 @@ def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
     """
     rng = np.random.default_rng(3)
     number = np.arange(SPOT_SAMPLES)
-    even = np.stack([(number + 0.5) / SPOT_SAMPLES, number * GOLDEN % 1])
-    samples = mi.Point2f(np.float32((even + rng.random((2, 1))) % 1))
+    points = np.stack([(number + 0.5) / SPOT_SAMPLES, number * GOLDEN % 1])
+    samples = mi.Point2f(np.float32((points + rng.random((2, 1))) % 1))
     record, colours = environment.sample_direction(
         dr.zeros(mi.Interaction3f, SPOT_SAMPLES), samples
     )
     directions = np.array(record.d, dtype=np.float64)
     colours = np.stack([np.broadcast_to(np.array(c), SPOT_SAMPLES) for c in colours])
-    light = colours.mean(axis=0)
-    if not np.isfinite(light).all() or directions.shape != (3, SPOT_SAMPLES):
+    irradiance = colours.mean(axis=0)
+    if not np.isfinite(irradiance).all() or directions.shape != (3, SPOT_SAMPLES):
         return [], np.full((1, len(colours)), np.nan)
-    total, found, numbers = light.sum(), [], np.zeros(SPOT_SAMPLES, int)
+    total, found, numbers = irradiance.sum(), [], np.zeros(SPOT_SAMPLES, int)
     while len(found) < MAX_SPOTS:
-        centre = _brightest(directions, light)
+        centre = _brightest(directions, irradiance)
         own = centre @ directions >= np.cos(MIN_SPOT_RADIUS)
-        if not light[own].sum() > MIN_SPOT_SHARE * total:
+        if not irradiance[own].sum() > MIN_SPOT_SHARE * total:
             break
-        size, variance = _extent(np.arccos(np.clip(centre @ directions, -1, 1)), light)
+        size, variance = _extent(np.arccos(np.clip(centre @ directions, -1, 1)), irradiance)
         found.append(
             Source(centre, size, True, variance if variance > MAX_POINT_RADIUS**2 else None)
         )
-        own = (light > 0) & (centre @ directions >= np.cos(size))
-        light, numbers[own] = np.where(own, 0, light), len(found)
+        own = (irradiance > 0) & (centre @ directions >= np.cos(size))
+        irradiance, numbers[own] = np.where(own, 0, irradiance), len(found)
     shares = [colours[:, numbers == k].sum(axis=1) for k in range(1 + len(found))]
     return found, np.array(shares, dtype=np.float64) / SPOT_SAMPLES
 
 
-def _extent(angles: np.ndarray, light: np.ndarray) -> tuple[float, float]:
+def _extent(angles: np.ndarray, irradiance: np.ndarray) -> tuple[float, float]:
     """Angular radius and mean square angle of a spot, given irradiance samples ``light`` at
     ``angles``.
 
@@ -385,29 +387,31 @@ def _extent(angles: np.ndarray, light: np.ndarray) -> tuple[float, float]:
     """
     circle = 1 - np.cos(MAX_SPOT_RADIUS)
     around = (angles > MAX_SPOT_RADIUS) & (angles < 1.5 * MAX_SPOT_RADIUS)
-    level = light[around].sum() / (np.cos(MAX_SPOT_RADIUS) - np.cos(1.5 * MAX_SPOT_RADIUS))
+    background = irradiance[around].sum() / (
+        np.cos(MAX_SPOT_RADIUS) - np.cos(1.5 * MAX_SPOT_RADIUS)
+    )
     order = np.argsort(angles)
     order = order[angles[order] <= MAX_SPOT_RADIUS]
-    own = np.cumsum(light[order]) - level * (1 - np.cos(angles[order]))
-    whole = own >= ENCLOSED_ENERGY * (light[order].sum() - level * circle)
+    own = np.cumsum(irradiance[order]) - background * (1 - np.cos(angles[order]))
+    encloses = own >= ENCLOSED_ENERGY * (irradiance[order].sum() - background * circle)
     size = (
-        max(MIN_SPOT_RADIUS, float(angles[order][whole.argmax()]))
-        if whole.any()
+        max(MIN_SPOT_RADIUS, float(angles[order][encloses.argmax()]))
+        if encloses.any()
         else MIN_SPOT_RADIUS
     )
     within = angles <= size
-    return size, float((light[within] * angles[within] ** 2).sum() / light[within].sum())
+    return size, float((irradiance[within] * angles[within] ** 2).sum() / irradiance[within].sum())
 
 
-def _brightest(directions: np.ndarray, light: np.ndarray) -> np.ndarray:
+def _brightest(directions: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
     """Direction of the largest concentration of irradiance."""
     z = np.minimum((directions[2] + 1) * 18, 35).astype(int)
     turn = (np.arctan2(directions[1], directions[0]) / (2 * np.pi) % 1 * 72).astype(int) % 72
     cell = z * 72 + turn
-    sums = np.bincount(cell, light)
+    sums = np.bincount(cell, irradiance)
     own = cell == sums.argmax()
     for _ in range(4):
-        mean = directions[:, own] @ light[own]
+        mean = directions[:, own] @ irradiance[own]
         if not np.linalg.norm(mean) > 0:
             break
         centre = mean / np.linalg.norm(mean)

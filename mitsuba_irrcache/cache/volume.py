@@ -309,8 +309,8 @@ class IrradianceCache:
             old, new = (total(t[c :: self.channels]) for t in (self._totals, totals))
             if known and (old is not None or new is not None):
                 n, more = (dr.opaque(self.real, k) for k in (known, count))
-                apart = (0 if old is None else old / n) - (0 if new is None else new / more)
-                spread = total([spread, dr.square(apart) * (n * more / (n + more))])
+                difference = (0 if old is None else old / n) - (0 if new is None else new / more)
+                spread = total([spread, dr.square(difference) * (n * more / (n + more))])
             result.append(total([self._spreads[c], spread]))
         return totals_of_pairs(self._totals, totals), result
 
@@ -331,9 +331,9 @@ class IrradianceCache:
             raise IrrcacheError(
                 f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
             )
-        alike = ("max_depth", "channels", "batch", "correlated", "moments")
+        attributes = ("max_depth", "channels", "batch", "correlated", "moments")
         if self.grid.shape != other.grid.shape or any(
-            getattr(self, name) != getattr(other, name) for name in alike
+            getattr(self, name) != getattr(other, name) for name in attributes
         ):
             raise IrrcacheError(
                 f"IrradianceCache.merge: shape {self.grid.shape} with max_depth {self.max_depth} "

@@ -55,10 +55,10 @@ def decay(x):
     return dr.select(x < UNDERFLOW, dr.reinterpret_array(mi.Float, bits), 0)
 
 
-def absorbed(depth, passed):
-    """Return 1 - e^-depth without cancellation, given the transmittance ``passed`` = e^-depth."""
+def absorbed(depth, transmittance):
+    """Return 1 - e^-depth without cancellation, given the ``transmittance`` e^-depth."""
     series = dr.fma(depth, dr.fma(depth, dr.fma(depth, -1 / 24, 1 / 6), -1 / 2), 1)
-    return dr.select(depth < SERIES_BELOW, depth * series, 1 - passed)
+    return dr.select(depth < SERIES_BELOW, depth * series, 1 - transmittance)
 
 
 def absorptance(tau):

@@ -64,7 +64,11 @@ class Boundary:
         """
         origin = self._to_local.point(ray.o)
         direction = self._to_local.vector(ray.d)
-        return _slabs(origin, direction) if self.kind == "box" else _sphere(origin, direction)
+        return (
+            _intersect_box(origin, direction)
+            if self.kind == "box"
+            else _intersect_sphere(origin, direction)
+        )
 
     def outward_normal(self, p: mi.Point3f) -> mi.Normal3f:
         """Return the outward unit normal at ``p``, a position on the boundary."""
@@ -75,7 +79,7 @@ class Boundary:
         return mi.Normal3f(dr.normalize(self._normals.vector(local)))
 
 
-def _slabs(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+def _intersect_box(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
     """Intersect the cube [-1, 1]^3 by the slab method, also for rays that lie in a face."""
     rcp = safe_rcp(d)
     lower, upper = (-1.0 - o) * rcp, (1.0 - o) * rcp
@@ -84,7 +88,7 @@ def _slabs(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
     return near < far, near, far
 
 
-def _sphere(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+def _intersect_sphere(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
     """Intersect the unit sphere.
 
     Computing the closest approach first preserves accuracy for distant cameras.
@@ -172,8 +176,8 @@ def orientation(scene: mi.Scene, shape: mi.Shape) -> tuple[float, float]:
     """
     first, depth = _crossings(scene, mi.ShapePtr(shape), rays_through(shape))
     dr.eval(first, depth)
-    met = max(int(dr.count(first != 0)[0]), 1)
-    return int(dr.count(first < 0)[0]) / met, int(dr.count(depth != 0)[0]) / met
+    hits = max(int(dr.count(first != 0)[0]), 1)
+    return int(dr.count(first < 0)[0]) / hits, int(dr.count(depth != 0)[0]) / hits
 
 
 @symbolic
@@ -231,7 +235,7 @@ def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
         built = origin + bits @ linear.T
         if _distances(built, corners).min(axis=1).max() <= tolerance:
             frame = np.eye(4)
-            frame[:3, :3] = 0.5 * _conventional(linear)
+            frame[:3, :3] = 0.5 * _ordered_edges(linear)
             frame[:3, 3] = np.mean(corners, axis=0)
             return frame
     return None
@@ -242,7 +246,7 @@ def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs(a[:, None] - b[None]).max(axis=-1)
 
 
-def _conventional(edges: np.ndarray) -> np.ndarray:
+def _ordered_edges(edges: np.ndarray) -> np.ndarray:
     """Order and sign the edges (columns) such that each points along its world axis if possible."""
     along = np.abs(edges) / np.linalg.norm(edges, axis=0)
     best = max(

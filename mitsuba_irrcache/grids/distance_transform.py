@@ -20,18 +20,20 @@ def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.
     places = unravelled(dr.arange(mi.UInt32, dr.width(distance)), [Divisor(nx), Divisor(ny)])
     for place, side, stride in zip(places, (nx, ny, nz), (1, nx, nx * ny), strict=True):
         limits = (dr.opaque(mi.Int32, n) for n in (side, stride))
-        distance = _along(distance, mi.Int32(place), *limits)
+        distance = _transform_axis(distance, mi.Int32(place), *limits)
     return distance
 
 
 @symbolic
-def _along(distance: mi.UInt32, place: mi.Int32, side: mi.Int32, stride: mi.Int32) -> mi.UInt32:
+def _transform_axis(
+    distance: mi.UInt32, place: mi.Int32, side: mi.Int32, stride: mi.Int32
+) -> mi.UInt32:
     """Transform along one axis: minimise max(|k|, distance of the cell at offset k) over k."""
     index = dr.arange(mi.Int32, dr.width(distance))
     k, nearest = mi.Int32(1), mi.Int32(distance)
     while dr.hint(k < nearest, label="clearance"):
-        for there, inside in ((-k, place >= k), (k, place + k < side)):
-            found = dr.gather(mi.UInt32, distance, mi.UInt32(index + there * stride), inside)
+        for offset, inside in ((-k, place >= k), (k, place + k < side)):
+            found = dr.gather(mi.UInt32, distance, mi.UInt32(index + offset * stride), inside)
             found = dr.maximum(k, mi.Int32(found))
             nearest = dr.select(inside, dr.minimum(nearest, found), nearest)
         k += 1

@@ -130,7 +130,7 @@ def _block_bounds(
         dr.eval(least, largest)
     sides = list(sigma_t.grid.shape[::-1])
     for axis in range(3):
-        least, largest = _reduced(least, largest, sides, axis, size, shape[2 - axis])
+        least, largest = _window_bounds(least, largest, sides, axis, size, shape[2 - axis])
         sides[axis] = shape[2 - axis]
     # Widen the bounds, since interpolation may round beyond its eight values.
     least, largest = least * sigma_t.scale * (1 - 1e-6), largest * sigma_t.scale * (1 + 1e-6)
@@ -138,7 +138,7 @@ def _block_bounds(
     return least, largest
 
 
-def _reduced(
+def _window_bounds(
     least: mi.Float, largest: mi.Float, sides: list[int], axis: int, size: int, count: int
 ) -> tuple[mi.Float, mi.Float]:
     """Bounds of ``count`` windows of ``size`` + 2 values along one axis.

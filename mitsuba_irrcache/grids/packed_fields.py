@@ -58,7 +58,7 @@ class Packets:
 
         def numbers(index: mi.UInt32, noise: mi.UInt32) -> list[mi.UInt32]:
             values = zip(planes(index), scales, strict=True)
-            return [_encoded(value * scale, noise) for value, scale in values]
+            return [_encode(value * scale, noise) for value, scale in values]
 
         here = numbers(index, noise)
         if self.paired:
@@ -93,11 +93,11 @@ class Packets:
 
         def edge(place: mi.Int32) -> list[mi.Float]:
             """Interpolate along x."""
-            low = [half for word in load(place) for half in _decoded(word)]
+            low = [half for word in load(place) for half in _decode(word)]
             if self.paired:
                 low, high = low[::2], low[1::2]
             else:
-                high = [half for word in load(place + dx) for half in _decoded(word)]
+                high = [half for word in load(place + dx) for half in _decode(word)]
             return [dr.lerp(a, b, wx) for a, b in zip(low, high, strict=True)][: self.count]
 
         def face(place: mi.Int32) -> list[mi.Float]:
@@ -113,7 +113,7 @@ def _load(words: int) -> type:
     return {1: mi.UInt32, 2: mi.Vector2u, 4: mi.Array4u}[words]
 
 
-def _encoded(value: mi.Float, noise: mi.UInt32) -> mi.UInt32:
+def _encode(value: mi.Float, noise: mi.UInt32) -> mi.UInt32:
     """Encode a value, clamped to [0, 1], in 16 bits; ``noise`` dithers the rounding."""
     bits = dr.reinterpret_array(mi.UInt32, dr.clip(value, 0, 1)) + (noise >> (32 - DROPPED))
     # Flush smaller values to 0: a float with exponent 0 is denormal.
@@ -121,7 +121,7 @@ def _encoded(value: mi.Float, noise: mi.UInt32) -> mi.UInt32:
     return dr.select(representable, (bits - (ZERO_EXPONENT << 23)) >> DROPPED, 0)
 
 
-def _decoded(word: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+def _decode(word: mi.UInt32) -> tuple[mi.Float, mi.Float]:
     """Decode both values of a word, scaled by 2^-`ZERO_EXPONENT`; dropped bits are 0."""
     low = (word & 0xFFFF) << DROPPED
     high = (word >> (16 - DROPPED)) & (0xFFFF << DROPPED)
@@ -137,19 +137,19 @@ class Lookups:
     """
 
     def __init__(self, fields: list[Field], limits: Sequence[float] | None = None) -> None:
-        self.groups: list[Group] = []
+        self.groups: list[PackedGroup] = []
         limits = limits or [dr.inf] * len(fields)
         grids = [f if isinstance(f, GridField) else None for f in fields]
-        alone = [i for i, f in enumerate(grids) if f and f.grid.voxel_count < MAX_VOXELS]
-        self._others = {i: f for i, f in enumerate(fields) if i not in alone}
-        while alone:
-            group = [alone.pop(0)]
-            for i in list(alone):
+        remaining = [i for i, f in enumerate(grids) if f and f.grid.voxel_count < MAX_VOXELS]
+        self._others = {i: f for i, f in enumerate(fields) if i not in remaining}
+        while remaining:
+            group = [remaining.pop(0)]
+            for i in list(remaining):
                 candidate = [fields[j] for j in [*group, i]]
-                if _together(candidate) and sum(f.channels for f in candidate) <= MAX_VALUES:
+                if _on_same_grid(candidate) and sum(f.channels for f in candidate) <= MAX_VALUES:
                     group.append(i)
-                    alone.remove(i)
-            self.groups.append(Group([(i, fields[i], limits[i]) for i in group]))
+                    remaining.remove(i)
+            self.groups.append(PackedGroup([(i, fields[i], limits[i]) for i in group]))
 
     def at_world(self, p: mi.Point3f, active: mi.Bool) -> list:
         """Interpolate at world positions."""
@@ -172,31 +172,31 @@ class AlongRay:
 
     def __init__(self, lookups: Lookups, ray: mi.Ray3f) -> None:
         self.ray, self._lookups = ray, lookups
-        self._ways = [
+        self._group_rays = [
             (group.place(ray.o), group.grid.coordinates.vector(ray.d)) for group in lookups.groups
         ]
 
     def at(self, t: mi.Float, active: mi.Bool) -> list:
         """Interpolate at the distance ``t``."""
-        groups = zip(self._lookups.groups, self._ways, strict=True)
+        groups = zip(self._lookups.groups, self._group_rays, strict=True)
         found = [group.at(dr.fma(d, t, o), active) for group, (o, d) in groups]
         return self._lookups._all(found, self.ray(t), active)
 
 
-def _inner(field: GridField) -> Grid:
+def _base_grid(field: GridField) -> Grid:
     return field.inner if isinstance(field, RootField) else field.grid
 
 
-def _together(fields: list[GridField]) -> bool:
-    first = _inner(fields[0])
-    return all(_inner(f).shared(first) is first for f in fields[1:])
+def _on_same_grid(fields: list[GridField]) -> bool:
+    first = _base_grid(fields[0])
+    return all(_base_grid(f).shared(first) is first for f in fields[1:])
 
 
-class Group:
+class PackedGroup:
     """Fields of one ``grid`` in `Packets`, each with its index in `Lookups` and its upper limit."""
 
     def __init__(self, fields: list[tuple[int, GridField, float]]) -> None:
-        self.grid = _inner(fields[0][1])
+        self.grid = _base_grid(fields[0][1])
         #: index, number of channels, and whether square roots are stored
         self.members = [(i, f.channels, isinstance(f, RootField)) for i, f, _ in fields]
         extended = any(root for *_, root in self.members)

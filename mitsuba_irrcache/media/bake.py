@@ -171,11 +171,12 @@ def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
     interaction = dr.zeros(mi.MediumInteraction3f, 512)
     interaction.p = p
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(interaction, True)
-    mine_t = mi.Spectrum(grid.sigma_t.at_world(p))
-    mine_s = mine_t * grid.albedo.at_world(p)
+    own_sigma_t = mi.Spectrum(grid.sigma_t.at_world(p))
+    own_sigma_s = own_sigma_t * grid.albedo.at_world(p)
     scale = max(grid.sigma_t.maximum, 1e-30)
     error = dr.maximum(
-        dr.max(dr.abs(mi.Spectrum(sigma_t) - mine_t)), dr.max(dr.abs(mi.Spectrum(sigma_s) - mine_s))
+        dr.max(dr.abs(mi.Spectrum(sigma_t) - own_sigma_t)),
+        dr.max(dr.abs(mi.Spectrum(sigma_s) - own_sigma_s)),
     )
     worst = float(dr.max(error)[0]) / scale
     if worst > 0.02:

@@ -152,9 +152,9 @@ def _verify(volume: mi.Volume, field: Field, scale: float) -> None:
     u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
     interaction = dr.zeros(mi.Interaction3f, 512)
     interaction.p = Grid((1, 1, 1), field.grid.to_world).world.point(u)
-    theirs = mi.Spectrum(volume.eval(interaction)) * scale
-    apart = dr.abs(theirs - mi.Spectrum(field.at_world(interaction.p)))
-    if dr.max(dr.max(apart))[0] > TOLERANCE * field.maximum:
+    expected = mi.Spectrum(volume.eval(interaction)) * scale
+    deviation = dr.abs(expected - mi.Spectrum(field.at_world(interaction.p)))
+    if dr.max(dr.max(deviation))[0] > TOLERANCE * field.maximum:
         raise volume_error("emission of the integrator")
 
 

@@ -127,7 +127,7 @@ def _evaluate(
     plugin: mi.PhaseFunction,
     direction: np.ndarray,
     cosines: np.ndarray,
-    turn: np.ndarray | float = 0.0,
+    azimuth: np.ndarray | float = 0.0,
     p: mi.Point3f | None = None,
 ) -> tuple[np.ndarray, float]:
     """Evaluate the phase function for rays along ``direction`` (3, n).
@@ -137,7 +137,7 @@ def _evaluate(
     """
     frame = mi.Frame3f(mi.Vector3f(np.float32(direction)))
     sines = np.sqrt(np.maximum(1 - cosines**2, 0))
-    local = np.array([sines * np.cos(turn), sines * np.sin(turn), cosines])
+    local = np.array([sines * np.cos(azimuth), sines * np.sin(azimuth), cosines])
     place = interaction(mi.Point3f(0) if p is None else p, frame.n)
     outwards = frame.to_world(mi.Vector3f(np.float32(local)))
     value, density = plugin.eval_pdf(mi.PhaseFunctionContext(), place, outwards)
@@ -150,21 +150,21 @@ def _evaluate(
 def _check(plugin: mi.PhaseFunction, boundary: Boundary, name: str) -> None:
     """Reject phase functions that depend on position or on directions other than by the angle."""
     rng = np.random.default_rng(7)
-    cosines, turn = rng.uniform(-1, 1, CHECKS), rng.uniform(0, 2 * np.pi, CHECKS)
+    cosines, azimuth = rng.uniform(-1, 1, CHECKS), rng.uniform(0, 2 * np.pi, CHECKS)
     frame = Grid((1, 1, 1), boundary.frame)
     p = frame.world.point(mi.Point3f(np.float32(rng.uniform(0, 1, (3, CHECKS)))))
     directions = rng.normal(size=(3, CHECKS))
     directions /= np.linalg.norm(directions, axis=0)
-    plain, apart = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], CHECKS), cosines)
-    turned, _ = _evaluate(plugin, directions, cosines, turn, p)
+    reference, deviation = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], CHECKS), cosines)
+    rotated, _ = _evaluate(plugin, directions, cosines, azimuth, p)
     # Single precision resolves angles near 0 to 1e-3 only.
-    tolerance = 0.01 * plain.max()
-    if not np.isfinite(plain).all() or np.abs(turned - plain).max() > tolerance:
+    tolerance = 0.01 * reference.max()
+    if not np.isfinite(reference).all() or np.abs(rotated - reference).max() > tolerance:
         raise UnsupportedSceneError(
             f"irrcache: {name} depends on more than the angle of scattering, which would be "
             'rendered wrongly. Make it "isotropic", "hg" or "rayleigh", or use "volpath".'
         )
-    if apart > tolerance:
+    if deviation > tolerance:
         raise UnsupportedSceneError(
             f"irrcache: {name} is coloured, or its sampling density differs from its values; "
             'use "volpath".'

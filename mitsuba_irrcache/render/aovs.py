@@ -103,8 +103,8 @@ class Layers:
         """Return the channels of one of `AOVS`."""
         if kind == "depth":
             opacity = 1 - luminance(self.transmittance)
-            seen = opacity > LEAST_COLOUR
-            return [dr.select(seen, self.depth / dr.select(seen, opacity, 1), 0)]
+            visible = opacity > LEAST_COLOUR
+            return [dr.select(visible, self.depth / dr.select(visible, opacity, 1), 0)]
         value = getattr(self, kind)
         if AOVS[kind] != "RGB":
             return [value]

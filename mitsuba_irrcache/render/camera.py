@@ -202,13 +202,21 @@ class TracedCameraRays:
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
         offset = 1 - sampler.next_1d(active)
         rng = _stream(sampler, active)
-        scattered, background, passed, gathered, end, pointer, stopped, escaped, unscattered = (
-            self._march_to_surface(scene, ray, pointer, offset, active)
-        )
+        (
+            scattered,
+            background,
+            transmittance,
+            gathered,
+            end,
+            pointer,
+            stopped,
+            escaped,
+            unscattered,
+        ) = self._march_to_surface(scene, ray, pointer, offset, active)
         # Path trace surfaces of low transmittance with Russian roulette.
-        chance = dr.minimum(dr.max(passed) * (1 / ROULETTE_BELOW), 1)
+        chance = dr.minimum(dr.max(transmittance) * (1 / ROULETTE_BELOW), 1)
         traced = stopped & (rng.next_float32(stopped) < chance)
-        weight = dr.select(traced, passed / chance, 0)
+        weight = dr.select(traced, transmittance / chance, 0)
         start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
         direct, reflected, interacted, path_end, _ = trace(
             scene,
@@ -231,9 +239,9 @@ class TracedCameraRays:
         alpha = mi.Float(1)
         if self.hide_emitters or scene.environment() is None:
             transparency = dr.select(traced & ~interacted, weight, 0)
-            transparency = dr.select(escaped, passed, transparency)
+            transparency = dr.select(escaped, transmittance, transparency)
             alpha = 1 - dr.sum(transparency) / dr.size_v(mi.Spectrum)
-        return RayResult(scattered, background, passed, alpha, gathered)
+        return RayResult(scattered, background, transmittance, alpha, gathered)
 
     @symbolic
     def _march_to_surface(
@@ -250,7 +258,7 @@ class TracedCameraRays:
         at the surface and its medium; whether it hit a surface, or left the scene; and the
         transmittance for narrow sources.
         """
-        scattered, background, passed = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(1)
+        scattered, background, transmittance = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(1)
         gathered = self.projection.zero_sums()
         unscattered = mi.Spectrum(1)
         # Measure all distances from the camera, so that depths are correct.
@@ -267,16 +275,16 @@ class TracedCameraRays:
                 hit, entry, leave = projection.medium.intersect(ray)
                 entry, leave = dr.maximum(entry, near), dr.minimum(leave, far)
                 hit &= active & (pointer == projection.medium.pointer)
-                found, through, sums, emitted = projection.march(
+                found, segment_transmittance, sums, emitted = projection.march(
                     ray, entry, leave, max_background, offset, hit
                 )
-                scale = luminance(passed)
-                scattered += passed * found
-                background += dr.select(shows_emitters, passed * emitted, 0)
-                gathered = _added(gathered, sums, passed, scale)
-                passed *= through
+                scale = luminance(transmittance)
+                scattered += transmittance * found
+                background += dr.select(shows_emitters, transmittance * emitted, 0)
+                gathered = _added(gathered, sums, transmittance, scale)
+                transmittance *= segment_transmittance
                 if dr.hint(self.narrow is not None, mode="scalar"):
-                    unscattered *= projection.unscattered(through)
+                    unscattered *= projection.unscattered(segment_transmittance)
             # Add emitters; if they are hidden, continue behind them.
             emitter = si.emitter(scene, active)
             hit_emitter = active & (emitter != None)  # noqa: E711
@@ -287,7 +295,7 @@ class TracedCameraRays:
                 hit_emitter = mi.Bool(False)
             hit_emitter &= crosses | ~valid
             radiance = emitter.eval(si, hit_emitter & shows_emitters)
-            attenuation = mi.Spectrum(passed)
+            attenuation = mi.Spectrum(transmittance)
             if dr.hint(self.narrow is not None, mode="scalar"):
                 narrow = self.narrow.hits_source(
                     ray.o, ray.d, hit_emitter & ~valid, hit_emitter & valid
@@ -301,8 +309,8 @@ class TracedCameraRays:
             segment = dr.select(crosses, next_ray, segment)
             near = dr.select(crosses, far, near)
             crossings += 1
-            active &= crosses & (dr.max(passed) > 0) & (crossings < MOST_CROSSINGS)
-        found = scattered, background, passed, gathered, segment, pointer, stopped, escaped
+            active &= crosses & (dr.max(transmittance) > 0) & (crossings < MOST_CROSSINGS)
+        found = scattered, background, transmittance, gathered, segment, pointer, stopped, escaped
         return *found, unscattered
 
     def _is_known(self, pointer: mi.MediumPtr) -> mi.Bool:
@@ -323,15 +331,15 @@ class TracedCameraRays:
         return result
 
 
-def _added(gathered: list, sums: list, passed: mi.Spectrum, scale: mi.Float) -> list:
-    """Add the sums of a medium that is seen through the transmittance ``passed``."""
+def _added(gathered: list, sums: list, transmittance: mi.Spectrum, scale: mi.Float) -> list:
+    """Add the sums of a medium that is seen through this ``transmittance``."""
     if not sums:
         return gathered
     colour, *rest = gathered
     rest = [old + scale * new for old, new in zip(rest, sums[1:], strict=False)] + rest[
         len(sums) - 1 :
     ]
-    return [colour + passed * sums[0], *rest]
+    return [colour + transmittance * sums[0], *rest]
 
 
 def _stream(sampler: mi.Sampler, active: mi.Bool) -> mi.PCG32:

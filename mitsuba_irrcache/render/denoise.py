@@ -97,15 +97,17 @@ def _adaptive(
         return None
     # Exclude the first probe, which measures the response below, to avoid a bias of the risk.
     variance = sum(dr.square(p) for p in probes[1:]) / (len(probes) - 1)
-    seen = dr.square(luminance(colour))
-    noise = dr.sum(dr.select(valid, variance * seen, 0))
-    signal = dr.sum(dr.select(valid, dr.square(luminance(image)) * seen, 0))
+    weight = dr.square(luminance(colour))
+    noise = dr.sum(dr.select(valid, variance * weight, 0))
+    signal = dr.sum(dr.select(valid, dr.square(luminance(image)) * weight, 0))
     if not (noise > NEGLIGIBLE**2 * signal)[0]:
         return None
     error = dr.select(valid, dr.sqrt(variance), -1)
     # Errors change all channels in proportion to their values.
-    bright = luminance(image)
-    relative = dr.select(valid & (bright > 0), probes[0] / dr.select(bright > 0, bright, 1), 0)
+    intensity = luminance(image)
+    relative = dr.select(
+        valid & (intensity > 0), probes[0] / dr.select(intensity > 0, intensity, 1), 0
+    )
     change = image * relative
     packed = _pack([image, image + PERTURBATION * change], error)
     best = _least_risk(packed, image, change, valid, colour, size)
@@ -152,10 +154,10 @@ def _least_risk(
         dr.gather(mi.Spectrum, interleaved(value), pixel) for value in (image, change, colour)
     )
     response = (perturbed - filtered) / PERTURBATION
-    seen = dr.square(weight)
+    squared_weight = dr.square(weight)
     # Sum over the channels: dr.mean would make the number of pixels a constant of the kernel.
-    risk = dr.sum(seen * (dr.square(filtered - before) + 2 * noise * response))
-    unfiltered = dr.sum(seen * (2 * dr.square(noise)))
+    risk = dr.sum(squared_weight * (dr.square(filtered - before) + 2 * noise * response))
+    unfiltered = dr.sum(squared_weight * (2 * dr.square(noise)))
     risks = np.array(dr.block_sum(risk, count))
     least = int(np.argmin(risks))
     if risks[least] >= np.array(dr.block_sum(unfiltered, count))[0]:

@@ -18,7 +18,7 @@ GAUSS_LEGENDRE = (
 )
 
 
-def curved(before, a, b, ratio: mi.Float) -> tuple:
+def curved(previous, a, b, ratio: mi.Float) -> tuple:
     """Scale the values at both ends of a segment to the mean of an interpolating parabola.
 
     The parabola also passes through the previous value ``before``; ``ratio`` is the length of the
@@ -26,7 +26,7 @@ def curved(before, a, b, ratio: mi.Float) -> tuple:
     the same sign on every ray; this correction removes its mean.
     """
     # Sagitta of the parabola over the mean, which is scaled to 1.
-    bend = ratio * dr.fma(ratio, before - a, b - a)
+    bend = ratio * dr.fma(ratio, previous - a, b - a)
     sag = bend / (3 * (1 + ratio) * (a + b))
     scale = dr.select(a + b > 0, greatest(1 - sag, 0), 1)
     return a * scale, b * scale
@@ -47,30 +47,29 @@ def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
         absorbed = absorptance(sigma_a * length)
         return (absorbed, dr.zeros(type(absorbed))), decay(sigma_a * length)
     tau_a, tau_b = sigma_a * length, sigma_b * length
-    passed = decay(0.5 * (tau_a + tau_b))
+    transmittance = decay(0.5 * (tau_a + tau_b))
     if quadrature == "trapezoid":
-        near, far = 0.5 * tau_a, 0.5 * passed * tau_b
+        near, far = 0.5 * tau_a, 0.5 * transmittance * tau_b
         total, absorbed = near + far, absorptance(0.5 * (tau_a + tau_b))
         share = dr.select(total > absorbed, absorbed / total, 1)
-        return (near * share, far * share), passed
-    return exponential_weights(tau_a, tau_b, passed), passed
+        return (near * share, far * share), transmittance
+    return exponential_weights(tau_a, tau_b, transmittance), transmittance
 
 
-def exponential_weights(tau_a, tau_b, passed) -> tuple:
+def exponential_weights(tau_a, tau_b, transmittance) -> tuple:
     """Weights of the sources at both ends: int_0^1 (1 - u | u) sigma(u) e^-tau(u) du.
 
-    ``tau_a``, ``tau_b`` are the extinctions at the ends times the segment's length, ``passed`` is
-    its transmittance, sigma(u) is linear between them and tau(u) = tau_a u + (tau_b - tau_a) u^2 /
-    2. Integration by parts gives near = int 1 - e^-tau(u) du, evaluated here with three
-    Gauss-Legendre nodes: accurate to 2e-3 up to optical depths of 5, and always within [0, 1]. A
-    source linear in *optical depth* would be simpler, but overestimates the weight of the empty end
-    of a segment that enters a dense medium.
+    ``tau_a``, ``tau_b`` are the extinctions at the ends times the segment's length; sigma(u) is
+    linear between them and tau(u) = tau_a u + (tau_b - tau_a) u^2 / 2. Integration by parts gives
+    near = int 1 - e^-tau(u) du, evaluated here with three Gauss-Legendre nodes: accurate to 2e-3 up
+    to optical depths of 5, and always within [0, 1]. A source linear in *optical depth* would be
+    simpler, but overestimates the weight of the empty end of a segment that enters a dense medium.
     """
     near = 0.0
     for u, weight in GAUSS_LEGENDRE:
         depth = dr.fma(tau_a, u * (1 - 0.5 * u), tau_b * (0.5 * u * u))
         near = dr.fma(absorptance(depth), weight, near)
-    return near, greatest(absorbed(0.5 * (tau_a + tau_b), passed) - near, 0.0)
+    return near, greatest(absorbed(0.5 * (tau_a + tau_b), transmittance) - near, 0.0)
 
 
 def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:

@@ -107,16 +107,16 @@ class Projection:
         """
         p, active = fields.ray(t), mi.Bool(True)
         sigma_t, *rest = fields.at(t, active)
-        known = [rest[-1]] if self.layered else []
+        extras = [rest[-1]] if self.layered else []
         if not self.has_cache:
-            return sigma_t, mi.Float(0), known
+            return sigma_t, mi.Float(0), extras
         phi, albedo = rest
         phi = self._exclude_occluded(p, phi, active)
         if self.uncertainty is not None:
-            known += self.uncertainty.at_world(p, phi, active)
+            extras += self.uncertainty.at_world(p, phi, active)
         if self.directional is not None:
             phi = phi * self.directional.factor(p, *view, active)
-        return sigma_t, albedo * phi * dr.inv_four_pi, known
+        return sigma_t, albedo * phi * dr.inv_four_pi, extras
 
     def angular_terms(self, direction: mi.Vector3f) -> tuple:
         """Precompute the terms of `fetch` that depend on the direction; empty if isotropic."""
@@ -185,8 +185,8 @@ class Projection:
         k, stride = mi.Float(0), mi.Float(1)
         t, step = mi.Float(near), self.step
         per_step = dr.rcp(step)
-        extinction, source, known = self._zero_sample()
-        before, before_source, before_length = extinction, source, mi.Float(dr.inf)
+        extinction, source, extras = self._zero_sample()
+        previous, previous_source, previous_length = extinction, source, mi.Float(dr.inf)
         grey = self.medium.sigma_t.channels == 1
         view = self.angular_terms(ray.d)
         lamps = self.falloff.along(ray) if self.falloff is not None else []
@@ -210,33 +210,33 @@ class Projection:
             k = dr.select(skip, last + 1, k + stride - 1)
             t = dr.select(skip, least(dr.fma(last - 1 + offset, step, near), far), t)
             extinction = dr.select(skip, 0, extinction)
-            before = dr.select(skip, 0, before)
-            before_length = dr.select(skip, step, before_length)
+            previous = dr.select(skip, 0, previous)
+            previous_length = dr.select(skip, step, previous_length)
             emission_at_start = dr.select(skip, 0, emission_at_start)
             end = least(dr.fma(k - 1 + offset, step, near), far)
             end = dr.select(k == 0, near, end)
             end = dr.select(k >= limit, far, end)
-            next_extinction, next_source, next_known = self.fetch(fields, end, view)
+            next_extinction, next_source, next_extras = self.fetch(fields, end, view)
             # Where a segment enters or leaves matter, use the source of the end inside: the cache
             # may have no value at the other end.
             enters = dr.max(mi.Spectrum(extinction)) == 0
             source = dr.select(enters, next_source, source)
-            before_source = dr.select(enters, next_source, before_source)
-            known = _select(enters, next_known, known)
+            previous_source = dr.select(enters, next_source, previous_source)
+            extras = _select(enters, next_extras, extras)
             leaves = dr.max(mi.Spectrum(next_extinction)) == 0
             next_source = dr.select(leaves, source, next_source)
-            next_known = _select(leaves, known, next_known)
+            next_extras = _select(leaves, extras, next_extras)
             length = end - t
-            ratio = length / before_length
+            ratio = length / previous_length
             # Ignore the curvature behind a short first step.
             ratio = dr.select(ratio < 2, ratio, 0)
             ends = (extinction, next_extinction), (source, next_source)
             if dr.hint(self.quadrature == "exponential", mode="scalar"):
                 ends = (
-                    curved(before, extinction, next_extinction, ratio),
-                    curved(before_source, source, next_source, ratio),
+                    curved(previous, extinction, next_extinction, ratio),
+                    curved(previous_source, source, next_source, ratio),
                 )
-            weights, passed = segment(self.quadrature, ends[0], length)
+            weights, segment_transmittance = segment(self.quadrature, ends[0], length)
             near_radiance, far_radiance = weights[0] * ends[1][0], weights[1] * ends[1][1]
             if dr.hint(self.falloff is not None, mode="scalar"):
                 falloff = self.falloff.means(lamps, t, end)
@@ -256,7 +256,7 @@ class Projection:
                     weights[0] * t + weights[1] * end,
                     weights,
                     (near_radiance, far_radiance),
-                    (known, next_known),
+                    (extras, next_extras),
                 )
             if dr.hint(emission is not None, mode="scalar"):
                 emission_at_end = mi.Spectrum(emission.at_world(ray(end), True))
@@ -265,9 +265,9 @@ class Projection:
                     sides[0] * emission_at_start + sides[1] * emission_at_end
                 )
                 emission_at_start = emission_at_end
-            transmittance *= passed
-            before, before_source, before_length = extinction, source, length
-            extinction, source, known = next_extinction, next_source, next_known
+            transmittance *= segment_transmittance
+            previous, previous_source, previous_length = extinction, source, length
+            extinction, source, extras = next_extinction, next_source, next_extras
             # Upper bound of the remaining radiance, relative to the accumulated radiance (1 if both
             # are 0).
             remaining = dr.max(mi.Spectrum(transmittance)) * max_radiance
@@ -292,10 +292,10 @@ class Projection:
 
         albedo = self.medium.albedo.channels
         source = zero(albedo, self._channels) if self.has_cache else mi.Float(0)
-        known = [zero(albedo)] if self.layered else []
+        extras = [zero(albedo)] if self.layered else []
         if self.uncertainty is not None and self.has_cache:
-            known += [mi.Float(0)] * self.uncertainty.count
-        return zero(self.medium.sigma_t.channels), source, known
+            extras += [mi.Float(0)] * self.uncertainty.count
+        return zero(self.medium.sigma_t.channels), source, extras
 
     @property
     def channel_count(self) -> int:
@@ -369,17 +369,17 @@ def _gather(
     transmittance: mi.Float | mi.Color3f,
     distance: mi.Float | mi.Color3f,
     weights: tuple,
-    light: tuple,
-    known: tuple[list, list],
+    radiance: tuple,
+    extras: tuple[list, list],
 ) -> list:
     """Add a segment to colour, depth and errors.
 
     The colour is weighted by the albedo, the depth by the absorptance times distance, and the
     errors are those of the radiance from both ends.
     """
-    (near_albedo, *near_errors), (far_albedo, *far_errors) = known
+    (near_albedo, *near_errors), (far_albedo, *far_errors) = extras
     colour = mi.Spectrum(transmittance * (weights[0] * near_albedo + weights[1] * far_albedo))
-    near, far = (luminance(mi.Spectrum(transmittance * end)) for end in light)
+    near, far = (luminance(mi.Spectrum(transmittance * end)) for end in radiance)
     errors = [near * a + far * b for a, b in zip(near_errors, far_errors, strict=True)]
     added = [colour, luminance(mi.Spectrum(transmittance * distance)), *errors]
     return [old + new for old, new in zip(gathered, added, strict=True)]

@@ -71,26 +71,30 @@ class Media:
             hit, near, end = grid.intersect(ray)
             hit &= active & (pointer == grid.pointer)
             near, end = dr.maximum(near, 0), dr.minimum(end, far)
-            here, place, weight, rng, light = free_flight(grid, ray, near, end, weight, rng, hit)
-            emitted += light
-            albedo = mi.Spectrum(grid.albedo.at_world(ray(place), here))
-            weight = dr.select(here, weight * albedo, weight)
-            t = dr.select(here, place, t)
-            collided |= here
+            collided_here, distance, weight, rng, emission = free_flight(
+                grid, ray, near, end, weight, rng, hit
+            )
+            emitted += emission
+            albedo = mi.Spectrum(grid.albedo.at_world(ray(distance), collided_here))
+            weight = dr.select(collided_here, weight * albedo, weight)
+            t = dr.select(collided_here, distance, t)
+            collided |= collided_here
         return collided, t, weight, rng, emitted
 
     def transmittance(
         self, pointer: mi.MediumPtr, ray: mi.Ray3f, far: mi.Float, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.PCG32]:
         """Estimate the transmittance up to ``far``, unbiased; also return the generator."""
-        through = mi.Spectrum(1)
+        attenuation = mi.Spectrum(1)
         for grid in self.grids:
             hit, near, end = grid.intersect(ray)
             hit &= active & (pointer == grid.pointer)
             near, end = dr.maximum(near, 0), dr.minimum(end, far)
-            passed, rng = transmittance(grid, ray, near, end, rng, hit)
-            through = dr.select(hit & (near < end), through * mi.Spectrum(passed), through)
-        return through, rng
+            factor, rng = transmittance(grid, ray, near, end, rng, hit)
+            attenuation = dr.select(
+                hit & (near < end), attenuation * mi.Spectrum(factor), attenuation
+            )
+        return attenuation, rng
 
 
 def is_null(flags: mi.UInt32) -> mi.Bool:
@@ -128,23 +132,23 @@ def visibility(
     random number generator.
     """
     ray = vertex.spawn_ray_to(target)
-    through, pointer, active = mi.Spectrum(1), mi.MediumPtr(pointer), mi.Bool(active)
+    attenuation, pointer, active = mi.Spectrum(1), mi.MediumPtr(pointer), mi.Bool(active)
     crossings = mi.UInt32(0)
     while dr.hint(active, label="visibility"):
         si = scene.ray_intersect(ray, active)
         hit = active & si.is_valid()
-        passed = si.bsdf().eval_null_transmission(si, hit)
-        through = dr.select(hit, through * passed, through)
-        active &= dr.max(through) > 0
+        factor = si.bsdf().eval_null_transmission(si, hit)
+        attenuation = dr.select(hit, attenuation * factor, attenuation)
+        active &= dr.max(attenuation) > 0
         far = dr.minimum(si.t, ray.maxt)
-        passed, rng = media.transmittance(pointer, ray, far, rng, active)
-        through = dr.select(active, through * passed, through)
+        factor, rng = media.transmittance(pointer, ray, far, rng, active)
+        attenuation = dr.select(active, attenuation * factor, attenuation)
         pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
         ray = si.spawn_ray_to(target)
         crossings += 1
-        active &= hit & (dr.max(through) > 0) & (crossings < MOST_CROSSINGS)
+        active &= hit & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)
     # A line that exceeds the maximum number of crossings does not contribute.
-    return dr.select(crossings < MOST_CROSSINGS, through, 0), rng
+    return dr.select(crossings < MOST_CROSSINGS, attenuation, 0), rng
 
 
 @symbolic
@@ -163,28 +167,28 @@ def trace_to_infinity(
     radiance from emissive media and those ``lamps`` that the ray hits, and the random number
     generator.
     """
-    through, light, escaped = mi.Spectrum(1), mi.Spectrum(0), mi.Bool(False)
+    attenuation, radiance, escaped = mi.Spectrum(1), mi.Spectrum(0), mi.Bool(False)
     ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
     crossings = mi.UInt32(0)
     while dr.hint(active, label="out of the scene"):
         si = scene.ray_intersect(ray, active)
         hit = active & si.is_valid()
         if dr.hint(media.is_emissive, mode="scalar"):
-            *_, rng, emitted = media.sample_distance(pointer, ray, si.t, through, rng, active)
-            light += dr.select(active, emitted, 0)
-        passed, rng = media.transmittance(pointer, ray, si.t, rng, active)
-        through = dr.select(active, through * passed, through)
+            *_, rng, emitted = media.sample_distance(pointer, ray, si.t, attenuation, rng, active)
+            radiance += dr.select(active, emitted, 0)
+        factor, rng = media.transmittance(pointer, ray, si.t, rng, active)
+        attenuation = dr.select(active, attenuation * factor, attenuation)
         escaped |= active & ~hit
         for lamp in lamps:
             hit_lamp = hit & (si.shape.emitter() == lamp)
-            light += dr.select(hit_lamp, through * si.shape.emitter().eval(si, hit_lamp), 0)
-        passed = si.bsdf().eval_null_transmission(si, hit)
-        through = dr.select(hit, through * passed, through)
+            radiance += dr.select(hit_lamp, attenuation * si.shape.emitter().eval(si, hit_lamp), 0)
+        factor = si.bsdf().eval_null_transmission(si, hit)
+        attenuation = dr.select(hit, attenuation * factor, attenuation)
         pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
         ray = si.spawn_ray(ray.d)
         crossings += 1
-        active &= hit & (dr.max(through) > 0) & (crossings < MOST_CROSSINGS)
-    return dr.select(escaped, through, 0), light, rng
+        active &= hit & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)
+    return dr.select(escaped, attenuation, 0), radiance, rng
 
 
 def sample_emitter(
@@ -201,10 +205,10 @@ def sample_emitter(
     Returns the direction sample, radiance over density times the transmittance, and the random
     number generator.
     """
-    record, light = scene.sample_emitter_direction(vertex, sample, False, active)
-    active_em = active & (record.pdf > 0) & (dr.max(light) > 0)
-    passed, rng = visibility(scene, media, vertex, record.p, pointer, rng, active_em)
-    return record, dr.select(active_em, light * passed, 0), rng
+    record, radiance = scene.sample_emitter_direction(vertex, sample, False, active)
+    active_em = active & (record.pdf > 0) & (dr.max(radiance) > 0)
+    attenuation, rng = visibility(scene, media, vertex, record.p, pointer, rng, active_em)
+    return record, dr.select(active_em, radiance * attenuation, 0), rng
 
 
 class Start:
@@ -337,10 +341,12 @@ def trace(
                 phase, collision, record.d, active_em & collided, value, density
             )
         active_em &= dr.max(value) > 0
-        beyond = dr.select(surface, medium_after(si, record.d, pointer), pointer)
-        passed, rng = visibility(scene, media, vertex, record.p, beyond, rng, active_em)
+        medium_em = dr.select(surface, medium_after(si, record.d, pointer), pointer)
+        attenuation, rng = visibility(scene, media, vertex, record.p, medium_em, rng, active_em)
         mis_weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
-        scattered += dr.select(active_em, throughput * value * emitted * passed * mis_weight, 0)
+        scattered += dr.select(
+            active_em, throughput * value * emitted * attenuation * mis_weight, 0
+        )
 
         # Sample the BSDF or the phase function and continue the path.
         choice = rng.next_float32(active)

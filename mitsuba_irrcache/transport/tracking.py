@@ -60,17 +60,17 @@ def free_flight(
         emission_near, emission_far = medium.emission.interval(ray, near, far)
     while dr.hint(active, label="free flight"):
         majorant = walk.majorant(cell, active)
-        wall, following = walk.exit(cell, t)
+        cell_exit, following = walk.exit(cell, t)
         candidate = t - dr.log(1 - rng.next_float32(active)) / majorant
-        leaves = ~(candidate < dr.minimum(wall, far))
-        tentative = active & ~leaves
+        exits_cell = ~(candidate < dr.minimum(cell_exit, far))
+        tentative = active & ~exits_cell
         sigma_t = medium.sigma_t.at_world(ray(candidate), tentative)
         choice = rng.next_float32(active)
         if dr.hint(medium.emission is not None, mode="scalar"):
             begin = dr.maximum(t, emission_near)
-            end = dr.minimum(dr.select(leaves, wall, candidate), emission_far)
-            light, rng = medium.emission.between(ray, begin, end, rng, active & (begin < end))
-            emitted += weight * light
+            end = dr.minimum(dr.select(exits_cell, cell_exit, candidate), emission_far)
+            radiance, rng = medium.emission.between(ray, begin, end, rng, active & (begin < end))
+            emitted += weight * radiance
         if dr.hint(grey, mode="scalar"):
             collides = tentative & (choice * majorant < sigma_t)
         else:
@@ -81,8 +81,8 @@ def free_flight(
             accepted = dr.select(collides, real / probability, (1 - real) / (1 - probability))
             weight = dr.select(tentative, weight * accepted, weight)
         collided |= collides
-        t = dr.select(leaves, wall, candidate)
-        cell = dr.select(leaves, following, cell)
+        t = dr.select(exits_cell, cell_exit, candidate)
+        cell = dr.select(exits_cell, following, cell)
         active &= ~collides & (t < far)
     return collided, t, weight, rng, emitted
 

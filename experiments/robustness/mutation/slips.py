@@ -253,7 +253,7 @@ SLIPS = (
     Mutant(
         "emission beyond the wall of a macrocell (tracking)",
         "transport/tracking.py",
-        "end = dr.minimum(dr.select(leaves, wall, candidate), emission_far)",
+        "end = dr.minimum(dr.select(exits_cell, cell_exit, candidate), emission_far)",
         "end = dr.minimum(candidate, emission_far)",
         (EMISSION,),
     ),
