@@ -342,7 +342,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return self._filter == "bilateral" or bool({"noise", "bias"} & {*self._aovs.values()})
 
     def aov_names(self) -> list[str]:
-        """Names of the channels beside colour and alpha, in the film's order."""
+        """Names of the channels in addition to colour and alpha, in the film's order."""
         return [f"{name}.{c}" for name, kind in self._aovs.items() for c in AOVS[kind]]
 
     def sample(

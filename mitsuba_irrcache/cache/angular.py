@@ -380,8 +380,7 @@ def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
 
 
 def _extent(angles: np.ndarray, irradiance: np.ndarray) -> tuple[float, float]:
-    """Angular radius and mean square angle of a spot, given irradiance samples ``light`` at
-    ``angles``.
+    """Angular radius and mean square angle of a spot, given ``irradiance`` samples at ``angles``.
 
     The radiance around the spot is subtracted as background.
     """

@@ -14,10 +14,10 @@ from mitsuba_irrcache.errors import CacheFileError
 FORMAT = "mitsuba_irrcache 6"
 
 
-WITH_MOMENTS = "mitsuba_irrcache 7"  # of light by its direction
+WITH_MOMENTS = "mitsuba_irrcache 7"  # with angular moments of the radiance
 
 
-ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description
+ARRAYS = ("active", "totals", "spreads")  # arrays of a file in addition to the description
 
 
 #: Upper limits for values read from a file: samples of a stream, and samples of a batch.

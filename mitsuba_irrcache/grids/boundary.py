@@ -129,8 +129,8 @@ def boundary_of(scene: mi.Scene, shape: mi.Shape) -> Boundary:
     if boundary is None:
         raise UnsupportedSceneError(
             f"irrcache: the medium is bounded by {name}, but only boxes (a cube with any to_world, "
-            "or a mesh of that "
-            'form) and spheres are supported so far; bound the medium by a cube, or use "volpath".'
+            "or a mesh of this form) and spheres are supported; bound the medium by a cube, or use "
+            '"volpath".'
         )
     _check_normals(scene, shape, name)
     return boundary
@@ -208,8 +208,7 @@ def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
         some = "the normals" if inwards > 1 - MAX_INWARD_SHARE else f"{inwards:.0%} of the normals"
         raise UnsupportedSceneError(
             f"irrcache: {some} of {name} point inwards, so Mitsuba puts its interior medium "
-            "outside of it; "
-            "mirror its to_world once more (or drop flip_normals)."
+            "outside of it; mirror its to_world once more (or drop flip_normals)."
         )
 
 

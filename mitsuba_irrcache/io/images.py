@@ -19,7 +19,7 @@ def check_output(path: str | Path) -> Path:
     """Return the path of a writable EXR; raise IrrcacheError before any work is done otherwise."""
     path = Path(path)
     if path.suffix.lower() != ".exr":
-        raise IrrcacheError(f'the output "{path}" must end in .exr (a PNG is written beside it).')
+        raise IrrcacheError(f'the output "{path}" must end in .exr (a PNG is written next to it).')
     if not path.parent.is_dir():
         raise IrrcacheError(f'cannot write "{path}": the folder "{path.parent}" does not exist.')
     if path.is_dir():

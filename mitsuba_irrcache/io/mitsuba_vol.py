@@ -94,7 +94,7 @@ def _read_header(path: Path) -> tuple[tuple[int, int, int], int, np.ndarray]:
         fields = _HEADER.unpack(stream.read(_HEADER.size))
     magic, version, encoding, *size, channels = fields[:7]
     if magic != b"VOL":
-        raise IrrcacheError(f"{path} is no Mitsuba volume: it begins with {magic!r}, not b'VOL'")
+        raise IrrcacheError(f"{path} is not a Mitsuba volume: it begins with {magic!r}, not b'VOL'")
     if version != _VERSION or encoding != _FLOAT32:
         raise IrrcacheError(
             f"{path} has version {version} and encoding {encoding}; convert it to version "

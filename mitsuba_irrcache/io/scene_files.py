@@ -49,7 +49,9 @@ def check_scene_file(path: str | Path) -> Path:
     try:
         found, folder, readable = path.is_file(), path.is_dir(), os.access(path, os.R_OK)
     except (OSError, ValueError) as error:  # a name that is too long or contains NUL
-        raise IrrcacheError(f'"{str(path)[:80]!s}" is no name of a scene file: {error}.') from None
+        raise IrrcacheError(
+            f'"{str(path)[:80]!s}" is not a valid name of a scene file: {error}.'
+        ) from None
     if folder:
         inside = sorted(p.name for p in path.glob("*.xml"))[:5]
         there = f", for example {path / inside[0]}" if inside else ""

@@ -35,11 +35,11 @@ def check_placement(emitter: mi.Emitter) -> None:
         return
     lengths = ", ".join(f"{n:.3g}" for n in np.linalg.norm(linear, axis=0))
     raise UnsupportedSceneError(
-        f'irrcache: emitter "{emitter.id()}" ({emitter.class_name()}) has a to_world that is no '
-        f"rotation (its axes have the lengths {lengths}, or are not at right angles), and Mitsuba "
-        "evaluates and samples it differently then. Take scale and shear out of it: distances mean "
-        "nothing for what is infinitely far away. (rotate needs an axis of length 1.) A mirror may "
-        'stay. Otherwise render this scene with "volpath".'
+        f'irrcache: emitter "{emitter.id()}" ({emitter.class_name()}) has a to_world that is not '
+        f"a rotation (its axes have the lengths {lengths}, or are not orthogonal), which Mitsuba "
+        "evaluates and samples inconsistently. Remove scale and shear, which have no meaning for a "
+        "distant emitter; a reflection is supported. (rotate needs an axis of length 1.) Otherwise "
+        'render this scene with "volpath".'
     )
 
 
@@ -62,8 +62,8 @@ def _check_shape(emitter: mi.Emitter) -> None:
     if uneven or max(cosines) > ORTHONORMAL_TOLERANCE:
         raise UnsupportedSceneError(
             f'irrcache: shape "{shape.id()}" (Cylinder) is an emitter and not round: its to_world '
-            f"has the radii {radius:.3g} and {np.linalg.norm(y):.3g}, or a shear, and Mitsuba "
-            "evaluates and samples it differently then. Give it the same scale along x and y, or "
+            f"has the radii {radius:.3g} and {np.linalg.norm(y):.3g}, or a shear, which Mitsuba "
+            "evaluates and samples inconsistently. Give it the same scale along x and y, or "
             'use a mesh. Otherwise render this scene with "volpath".'
         )
 

@@ -44,8 +44,8 @@ class MediumGrid:
         self._with_peak: MediumGrid | None = None
         #: identifier of the medium
         self.name = ""
-        #: Mitsuba's medium, as rays carry it, and what else there is in the scene; None where
-        #: this medium in its boundary is all, and it is isotropic
+        #: pointer to Mitsuba's medium, and the other objects of the scene; None if the medium is
+        #: isolated and isotropic
         self.pointer: mi.MediumPtr | None = None
         self.surroundings: object | None = None
         #: whether the scene has no other medium, no surface and no area emitter

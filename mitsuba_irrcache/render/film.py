@@ -182,7 +182,8 @@ class PixelPositions:
     one sample per pixel do not depend on the seed. Other samplers are used unchanged.
     """
 
-    #: 2^32 over the root of x^3 = x + 1, and over its square
+    #: 2^32 divided by the root of x^3 = x + 1 and by its square: a two-dimensional golden-ratio
+    #: sequence (Roberts 2018)
     STEPS = (3242174889, 2447445414)
 
     def __init__(self, sampler: mi.Sampler, seed: int, spp: int) -> None:
