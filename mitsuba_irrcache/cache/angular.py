@@ -30,14 +30,10 @@ from mitsuba_irrcache.media.phase import Phase
 MAX_LAMP_SINE = 0.95
 #: Angular radius [rad] of sources without extent.
 MIN_ANGULAR_RADIUS = 0.005
-#: Bright spots of an environment: minimum and maximum angular radius, minimum share of the total
-#: irradiance (uniform illumination would have 1/400), and maximum number.
-MIN_SPOT_RADIUS, MAX_SPOT_RADIUS, MIN_SPOT_SHARE, MAX_SPOTS = (
-    float(np.deg2rad(4)),
-    float(np.deg2rad(12)),
-    0.02,
-    4,
-)
+#: Bright spots of an environment: minimum and maximum angular radius.
+MIN_SPOT_RADIUS, MAX_SPOT_RADIUS = float(np.deg2rad(4)), float(np.deg2rad(12))
+#: Their minimum share of the total irradiance (1/400 if it is uniform), and maximum number.
+MIN_SPOT_SHARE, MAX_SPOTS = 0.02, 4
 #: Share of the energy within the maximum radius that the radius of a spot must enclose.
 ENCLOSED_ENERGY = 0.97
 #: Maximum root mean square radius of spots that are treated as points.
@@ -393,11 +389,8 @@ def _extent(angles: np.ndarray, irradiance: np.ndarray) -> tuple[float, float]:
     order = order[angles[order] <= MAX_SPOT_RADIUS]
     own = np.cumsum(irradiance[order]) - background * (1 - np.cos(angles[order]))
     encloses = own >= ENCLOSED_ENERGY * (irradiance[order].sum() - background * circle)
-    size = (
-        max(MIN_SPOT_RADIUS, float(angles[order][encloses.argmax()]))
-        if encloses.any()
-        else MIN_SPOT_RADIUS
-    )
+    size = float(angles[order][encloses.argmax()]) if encloses.any() else MIN_SPOT_RADIUS
+    size = max(MIN_SPOT_RADIUS, size)
     within = angles <= size
     return size, float((irradiance[within] * angles[within] ** 2).sum() / irradiance[within].sum())
 

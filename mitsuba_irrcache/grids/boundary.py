@@ -64,11 +64,8 @@ class Boundary:
         """
         origin = self._to_local.point(ray.o)
         direction = self._to_local.vector(ray.d)
-        return (
-            _intersect_box(origin, direction)
-            if self.kind == "box"
-            else _intersect_sphere(origin, direction)
-        )
+        intersect = _intersect_box if self.kind == "box" else _intersect_sphere
+        return intersect(origin, direction)
 
     def outward_normal(self, p: mi.Point3f) -> mi.Normal3f:
         """Return the outward unit normal at ``p``, a position on the boundary."""
