@@ -159,9 +159,7 @@ class AngularBasis:
     def hits_source(
         self, origin: mi.Point3f, direction: mi.Vector3f, far: mi.Bool, near: mi.Bool
     ) -> mi.Bool:
-        """Whether rays hit a narrow source, given which rays hit something ``far`` or an emitter
-        ``near``.
-        """
+        """Whether rays that hit something ``far``, or an emitter ``near``, hit a narrow source."""
         found = mi.Bool(False)
         for source in self.sources:
             towards, cosine = source.seen_from(origin)

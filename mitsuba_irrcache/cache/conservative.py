@@ -21,8 +21,7 @@ from mitsuba_irrcache.grids.grid import Grid
 
 
 def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:
-    """Correct the square ``roots`` of all voxels of ``grid`` to preserve the values of ``known``
-    voxels.
+    """Correct square ``roots`` such that interpolation preserves the values of ``known`` voxels.
 
     The correction acts along axes along which both neighbours are known. Noise that differs between
     neighbours counts as curvature and is amplified by a third.
@@ -37,8 +36,7 @@ def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -
 
 
 def unbiased(grid: Grid, values: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:
-    """Correct ``values`` at voxel centres such that interpolation has no mean error up to fourth
-    order.
+    """Correct ``values`` such that interpolation has no mean error up to fourth order.
 
     Subtracts 1/12 of the second difference along each axis along which both neighbours are
     ``known``, limited to half of the value.

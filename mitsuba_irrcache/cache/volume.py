@@ -390,9 +390,7 @@ class IrradianceCache:
 
     @classmethod
     def load(cls, path: str | Path) -> IrradianceCache:
-        """Read a cache written by ``save``; raise CacheFileError, naming the file, for anything
-        else.
-        """
+        """Read a file written by ``save``; raise CacheFileError, which names it, for others."""
         path = Path(path)
         try:
             arrays = read_arrays(path)

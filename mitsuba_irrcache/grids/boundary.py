@@ -25,9 +25,7 @@ ORIENTATION_RAYS, MAX_CROSSINGS, MAX_INWARD_SHARE = 256, 256, 0.02
 
 
 class Boundary:
-    """Image of the cube [-1, 1]^3 (``kind="box"``) or the unit sphere (``"sphere"``) under
-    ``to_world``.
-    """
+    """Image of the cube [-1, 1]^3 ("box") or of the unit sphere ("sphere") under ``to_world``."""
 
     def __init__(self, kind: str, to_world: np.ndarray) -> None:
         self.kind = kind
@@ -210,9 +208,7 @@ def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
 
 
 def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
-    """Return the affine map of [-1, 1]^3 onto the box with these vertices, or None if they form
-    none.
-    """
+    """Return the affine map of [-1, 1]^3 onto the box with these vertices; None if it is no box."""
     size = np.ptp(vertices, axis=0).max()
     tolerance = 1e-5 * size + 4 * np.finfo(np.float32).eps * np.abs(vertices).max()
     vertices = np.unique(vertices, axis=0)

@@ -9,8 +9,7 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 
 
 def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.UInt32:
-    """Chebyshev distance of each cell of a grid to the nearest ``occupied`` cell, at most
-    ``reach``.
+    """Chebyshev distance of each grid cell to the nearest ``occupied`` cell, at most ``reach``.
 
     ``shape`` is (z, y, x); distances are in cells.
     """

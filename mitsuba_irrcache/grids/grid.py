@@ -87,9 +87,7 @@ class Grid:
         return (mi.UInt32(z) * ny + mi.UInt32(y)) * nx + mi.UInt32(x)
 
     def corners(self, u: mi.Point3f) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Flat indices and trilinear weights of the eight voxels around the voxel coordinates
-        ``u``.
-        """
+        """Flat indices and trilinear weights of the eight voxels around voxel coordinates ``u``."""
         axes = []
         for c, n in zip(u, self.sides, strict=True):
             lower, weight, more = stencil(c, n)
@@ -103,17 +101,14 @@ class Grid:
 
     @staticmethod
     def near_cubic(to_world: np.ndarray, resolution: int) -> Grid:
-        """Create a grid over ``to_world`` with ``resolution`` nearly cubic voxels along its longest
-        side.
-        """
+        """Create a grid with ``resolution`` nearly cubic voxels along the longest side."""
         sides = np.linalg.norm(np.asarray(to_world, dtype=np.float64)[:3, :3], axis=0)
         counts = np.maximum(1, np.rint(resolution * sides / sides.max())).astype(int)
         return Grid(tuple(int(n) for n in counts[::-1]), to_world)
 
 
 class Affine:
-    """An affine map of points and vectors with opaque entries, so that a new placement reuses
-    kernels.
+    """An affine map of points and vectors with opaque entries: a new placement reuses kernels.
 
     Points are first taken relative to the centre of the unit cube, so that a grid far from the
     world origin loses no more precision than its float32 positions already have.
@@ -134,9 +129,7 @@ class Affine:
 
 
 def stencil(u: mi.Float, n: mi.Int32) -> tuple[mi.Int32, mi.Float, mi.Bool]:
-    """Return the lower voxel around ``u``, the weight of the upper one, and whether that one
-    exists.
-    """
+    """Return the lower voxel around ``u``, the weight of the upper one, and whether it exists."""
     s = clipped(u - 0.5, 0.0, mi.Float(n - 1))
     lower = mi.Int32(s)
     return lower, s - mi.Float(lower), lower < n - 1

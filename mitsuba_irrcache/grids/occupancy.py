@@ -24,8 +24,7 @@ def marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
 
 
 def active_voxels(medium, grid: Grid) -> mi.UInt32:
-    """Flat indices, ascending, of the voxels of ``grid`` that a lookup where ``sigma_t > 0`` can
-    read.
+    """Flat indices, ascending, of the voxels of ``grid`` that lookups where sigma_t > 0 can read.
 
     Every macrocell that is not empty marks the voxels whose trilinear support may overlap it. If
     these are few, the computation is repeated with smaller macrocells.

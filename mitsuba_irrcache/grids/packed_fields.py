@@ -33,8 +33,7 @@ MIN_SCALE = 1e-37
 
 
 class Packets:
-    """Packed copy of several `GridField` on the same ``grid``, at most `MAX_VALUES` values per
-    voxel.
+    """Packed copy of several `GridField` on one ``grid``, at most `MAX_VALUES` per voxel.
 
     ``planes`` maps flat voxel indices to their non-negative values, one array for each value, and
     ``largest`` holds the maximum representable value of each.

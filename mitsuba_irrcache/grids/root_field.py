@@ -14,8 +14,7 @@ STEEPEST = 4.0
 
 
 class RootField(GridField):
-    """Non-negative values whose square *roots* are interpolated trilinearly; constructed from the
-    roots.
+    """Non-negative values whose square *roots*, which it is made of, are interpolated trilinearly.
 
     Irradiance decays about exponentially inside dense media. Interpolating such a convex function
     overestimates it: by +1.3 % of the mean radiance on a CT head, against +0.4 % for square roots

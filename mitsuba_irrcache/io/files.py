@@ -20,8 +20,7 @@ _MASKING = threading.Lock()
 
 @contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
-    """Open a binary file that replaces ``path`` when the block ends, or is removed if the block
-    raises.
+    """Open a binary file that replaces ``path`` when the block ends; delete it if the block raises.
 
     The data is written to a temporary file in the same folder, flushed to disk, then renamed.
     Temporary files left over from killed processes are removed. Raises IrrcacheError if ``path`` is

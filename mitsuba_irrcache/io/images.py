@@ -35,8 +35,7 @@ def write_image(
     metadata: dict[str, object],
     further: Sequence[str] = (),
 ) -> Path:
-    """Write ``image`` (height, width, channel), linear radiance, to ``path`` (.exr) and an sRGB
-    PNG.
+    """Write ``image`` (height, width, channel), linear radiance, to an EXR and an sRGB PNG.
 
     The channels are luminance or RGB, optionally alpha, followed by those named in ``further``,
     which are stored in the EXR only. ``metadata`` is stored in its header with the prefix

@@ -108,9 +108,7 @@ def scene_of_text(
 
 
 def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) -> str:
-    """Return the integrator plugin named in a scene file; "path", Mitsuba's default, if there is
-    none.
-    """
+    """Return the integrator plugin named in a scene file, or "path", Mitsuba's default."""
     _, state = _parse(Path(path), parameters)
     node = _integrator_node(state)
     return "path" if node is None else node.props.plugin_name()
@@ -200,9 +198,7 @@ def _literal(text: str) -> object:
 
 
 def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
-    """Return the scene's integrator: nodes are in file order, so the outermost integrator comes
-    first.
-    """
+    """Return the scene's outermost integrator, which comes first in file order."""
     return next((n for n in state.nodes if n.type == mi.ObjectType.Integrator), None)
 
 

@@ -72,9 +72,7 @@ def children(node: mi.Object) -> dict[str, mi.Object]:
 
 
 def baked_field(volume: mi.Volume, name: str, scale: float) -> Field:
-    """Convert a ``constvolume`` or ``gridvolume``, times ``scale``; error messages call it
-    ``name``.
-    """
+    """Convert a ``constvolume`` or ``gridvolume``, times ``scale``; errors call it ``name``."""
     if volume.class_name() == "ConstVolume":
         return _constant(volume, name, scale)
     if volume.class_name() != "GridVolume":

@@ -45,9 +45,7 @@ class Emission:
         return dr.select(inside, self.field.at(u, active & inside), 0)
 
     def interval(self, ray: mi.Ray3f, near: mi.Float, far: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Clip a ray between ``near`` and ``far`` to the emissive grid; the interval is empty if
-        end <= start.
-        """
+        """Clip a ray between ``near`` and ``far`` to the emissive grid; empty if end <= start."""
         if self.grid is None:
             return near, far
         origin = self.grid.coordinates.point(ray.o)

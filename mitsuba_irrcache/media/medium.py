@@ -57,9 +57,7 @@ class MediumGrid:
 
     @property
     def frame(self) -> np.ndarray:
-        """``to_world`` of the smallest known unit cube that encloses the medium: the extent of its
-        cache.
-        """
+        """``to_world`` of the smallest known unit cube around the medium: extent of its cache."""
         frames = [self.boundary.frame]
         if self.bbox is not None:
             frames.append(axis_aligned(*self.bbox))

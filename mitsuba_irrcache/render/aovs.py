@@ -78,9 +78,7 @@ class Layers:
 
     @property
     def illumination(self) -> mi.Spectrum:
-        """I = E / C: mean of Phi / (4 pi) along the ray, weighted by its contribution; 0 where
-        undefined.
-        """
+        """I = E / C: weighted mean of Phi / (4 pi) along the ray; 0 where undefined."""
         pairs = zip(self.scattered, self.colour, self.valid, strict=True)
         return mi.Spectrum(*(dr.select(ok, e / dr.select(ok, c, 1), 0) for e, c, ok in pairs))
 

@@ -106,9 +106,7 @@ class ClosedFormCameraRays:
         hide_emitters: bool,
         half_space: HalfSpace | None = None,
     ) -> None:
-        """Store the settings; ``half_space`` computes the scattered radiance of a medium without
-        cache.
-        """
+        """Store settings; ``half_space`` computes the radiance of a medium without cache."""
         self.projection, self.medium = projection, projection.medium
         self._half_space = half_space
         self.hide_emitters, self.shows_emitters = hide_emitters, max_depth != 0
@@ -155,9 +153,7 @@ class ClosedFormCameraRays:
         return RayResult(scattered, background, transmittance, alpha, gathered)
 
     def _attenuation(self, transmittance: mi.Spectrum, direction: mi.Vector3f) -> mi.Spectrum:
-        """Transmittance for the environment in a ``direction``, without the forward peak for narrow
-        sources.
-        """
+        """Attenuation of the environment; by the original extinction for narrow sources."""
         if not self.projection.truncates_peak:
             return transmittance
         lights = self.projection.directional.directional
@@ -180,7 +176,8 @@ class TracedCameraRays:
         #: the one with most channels: a medium without cache has no error estimates
         self.projection = max(projections, key=lambda p: p.channel_count)
         self.hide_emitters = hide_emitters
-        #: sources whose direct radiance must exclude scattering into a forward peak, or None
+        #: narrow sources, whose direct radiance is attenuated by the original extinction (see
+        #: `delta_m`); None if no medium is truncated
         self.narrow = next(
             (p.directional.directional for p in projections if p.truncates_peak), None
         )
@@ -202,17 +199,8 @@ class TracedCameraRays:
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
         offset = 1 - sampler.next_1d(active)
         rng = _stream(sampler, active)
-        (
-            scattered,
-            background,
-            transmittance,
-            gathered,
-            end,
-            pointer,
-            stopped,
-            escaped,
-            unscattered,
-        ) = self._march_to_surface(scene, ray, pointer, offset, active)
+        *marched, unscattered = self._march_to_surface(scene, ray, pointer, offset, active)
+        scattered, background, transmittance, gathered, end, pointer, stopped, escaped = marched
         # Path trace surfaces of low transmittance with Russian roulette.
         chance = dr.minimum(dr.max(transmittance) * (1 / ROULETTE_BELOW), 1)
         traced = stopped & (rng.next_float32(stopped) < chance)

@@ -174,8 +174,10 @@ def bilateral(
     stride: mi.Int32,
     strength: mi.Float,
 ):
-    """Filter each ``pixel`` of the image with index ``which`` in ``packed``, with ``stride``
-    between taps.
+    """Filter pixels of the image with index ``which`` in ``packed``.
+
+    ``stride`` is the distance of taps in pixels, ``strength`` the width of the range kernel in
+    standard errors.
     """
     width, height = (dr.opaque(mi.Int32, int(n)) for n in size)
     first = dr.opaque(mi.UInt32, which) * mi.UInt32(width * height)
@@ -217,9 +219,7 @@ def _unpack(packed: mi.Float, pixel: mi.UInt32, active: mi.Bool) -> tuple[mi.Spe
 
 
 def _fill_channels(image: mi.Spectrum, valid: list[mi.Bool]) -> tuple[mi.Spectrum, mi.Bool]:
-    """Replace undefined channels by the mean of the others; also return where any channel is
-    defined.
-    """
+    """Replace undefined channels by the mean of the others; also return where any is defined."""
     known = sum(dr.select(ok, mi.Float(1), 0) for ok in valid)
     mean = sum(dr.select(ok, c, 0) for c, ok in zip(image, valid, strict=True))
     mean /= dr.maximum(known, 1)

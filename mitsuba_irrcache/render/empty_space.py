@@ -54,8 +54,9 @@ class ClearanceAlongRay:
         self.strides = dr.select(forward, strides, -strides)
 
     def exit(self, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Float]:
-        """Whether the position at ``t`` is empty, and the distance, at least ``t``, up to which it
-        is empty.
+        """Whether the position at ``t`` is empty, and the distance up to which it remains empty.
+
+        The distance is at least ``t``.
         """
         u = dr.fma(self.direction, t, self.origin)
         # Clamp before the conversion: floats beyond 2^31 cannot be converted to integers.

@@ -211,9 +211,7 @@ class PixelPositions:
 def camera_ray(
     sensor: mi.Sensor, sampler: mi.Sampler, position: mi.Point2f
 ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-    """Sample a ray through each ``position`` on the film, in pixels; also return the sensor's
-    weight.
-    """
+    """Sample a ray through each ``position`` on the film [pixels]; also return its weight."""
     film = sensor.film()
     scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / int(n)) for n in film.crop_size()))
     on_film = (position - mi.Vector2f(film.crop_offset())) * scale
@@ -234,9 +232,7 @@ def _sampled(
     spp: int,
     radiance: RadianceFunction,
 ) -> tuple[mi.Point2f, list[mi.Float]]:
-    """Trace the samples of a pass; returns their positions on the film and the values of all
-    channels.
-    """
+    """Trace the samples of a pass; return their film positions and the values of all channels."""
     film = sensor.film()
     lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
     index, sample = Divisor(per_pass).split(lane)

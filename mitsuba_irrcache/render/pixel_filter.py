@@ -102,10 +102,9 @@ def _gathered(samples: Samples) -> list[mi.Float]:
 
 @symbolic
 def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
-    """Sum the contributions of each row of samples to the columns of 2 ``reach`` + 1 rows of
-    pixels.
+    """Sum the contributions of each row of samples to the columns of nearby rows of pixels.
 
-    Returns for each of these rows the sums of `reconstructed`, over rows of samples and columns of
+    Returns for each of the 2 ``reach`` + 1 rows the sums of `reconstructed`, over rows of samples and columns of
     the crop window.
     """
     film = samples.film

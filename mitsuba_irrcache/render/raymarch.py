@@ -318,7 +318,7 @@ class Projection:
         background: mi.Spectrum,
         weight: mi.Spectrum,
     ) -> Layers:
-        """Convert the results of `march` to `Layers`; ``weight`` is the sensor's weight of the
+        """Convert results of `march` to `Layers`; ``weight`` is the sensor's weight of the
         radiance.
         """
         colour, depth, *errors = gathered

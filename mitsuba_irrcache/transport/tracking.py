@@ -96,8 +96,7 @@ def optical_depth(
     active: mi.Bool,
     most: float = OPAQUE,
 ):
-    """Integrate sigma_t along ``ray`` from ``near`` to ``far``, exactly up to rounding, per
-    channel.
+    """Integrate sigma_t from ``near`` to ``far``, exactly up to rounding, for each channel.
 
     Once all channels exceed ``most`` the result is only a lower bound. Between planes through the
     voxel centres, trilinear extinction is a cubic polynomial of the distance, which two Gauss
