@@ -111,7 +111,7 @@ class IrradianceCache:
         # Sums of batch means for each moment and channel, in float32.
         self._moments: list = [None] * (moments * channels)
 
-    def lie_like(self, other: IrradianceCache) -> None:
+    def copy_scene_attributes(self, other: IrradianceCache) -> None:
         """Copy the scene-dependent attributes of ``other``, another cache of the same medium."""
         self.directional, self.survey = other.directional, other.survey
         self.falloff, self.direct_lights = other.falloff, other.direct_lights

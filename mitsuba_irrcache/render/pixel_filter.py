@@ -104,8 +104,8 @@ def _gathered(samples: Samples) -> list[mi.Float]:
 def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
     """Sum the contributions of each row of samples to the columns of nearby rows of pixels.
 
-    Returns for each of the 2 ``reach`` + 1 rows the sums of `reconstructed`, over rows of samples and columns of
-    the crop window.
+    Returns for each of the 2 ``reach`` + 1 rows the sums of `reconstructed`, over rows of samples
+    and columns of the crop window.
     """
     film = samples.film
     filter_, width = film.rfilter(), int(film.crop_size().x)
