@@ -66,7 +66,7 @@ class SurfaceBoundary:
     @property
     def shines(self) -> bool:
         """Whether lines meet light by chance."""
-        return bool(self.lamps) or self.others.shines
+        return bool(self.lamps) or self.others.is_emissive
 
 
 class IncomingRadiance:
