@@ -104,6 +104,8 @@ class AngularBasis:
     ``phase``.
     """
 
+    # docs/primer, eq. (1.6)
+
     def __init__(self, phase: Phase, sources: list[Source]) -> None:
         self.phase, self.sources = phase, sources
         self.order = phase.order

@@ -26,6 +26,7 @@ def conserving(grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1) -
 
     Noise that is not the same in neighbours counts as light that bends, and is enlarged by a third.
     """
+    # docs/primer, eq. (2.2)
     spread = roots  # M r
     for bend in _second_differences(grid, known, channels):
         dr.eval(spread)

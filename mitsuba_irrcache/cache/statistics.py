@@ -31,4 +31,5 @@ def root_correction(variance: mi.Float) -> mi.Float:
     / 4) to first order, and sum w_i^2 is (2/3)^3 on average over a cell. Without it 16 samples read
     some 1 % too little light.
     """
+    # docs/primer, eq. (2.3)
     return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)

@@ -46,6 +46,8 @@ class UncertaintyField:
     roots: the relative standard error, and the relative bias.
     """
 
+    # docs/primer, eq. (6.1)
+
     count = PROBES + 1
 
     def __init__(self, grid: Grid, data: mi.Float) -> None:
@@ -68,6 +70,7 @@ class UncertaintyField:
 
 def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     """The errors of ``cache``, which has at least two batches of samples (one tells no noise)."""
+    # docs/primer, eq. (6.2)
     phi, error = cache.mean_and_error()
     for light in cache.direct_lights:  # looked up apart, without an error
         channels = list(light.irradiance)[: cache.channels]

@@ -70,6 +70,8 @@ class IrradianceCache:
     digest.
     """
 
+    # docs/primer, eq. (1.4)
+
     def __init__(
         self,
         grid: Grid,
@@ -301,6 +303,7 @@ class IrradianceCache:
 
     def _merged(self, totals: list, spreads: list, count: int) -> tuple[list, list]:
         """Sums and spreads with those of ``count`` more batches (Chan et al.)."""
+        # docs/primer, eq. (3.5)
         known = self.samples // self.batch
         result = []
         for c, spread in enumerate(spreads):

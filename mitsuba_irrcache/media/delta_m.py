@@ -33,6 +33,7 @@ def take_away_peak(medium: MediumGrid) -> None:
     """Makes of ``medium``, whose phase function has a forward peak, the one that is like it but for
     that.
     """
+    # docs/primer, eq. (4.12)
     medium.keep_peak()
     phase = medium.phase.without_peak()
     share, sigma_t, albedo = phase.forward, medium.sigma_t, medium.albedo

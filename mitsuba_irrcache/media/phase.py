@@ -41,6 +41,8 @@ class Phase:
     that goes on straight (see `delta_m`).
     """
 
+    # docs/primer, eqs. (1.2), (1.5)
+
     def __init__(
         self,
         plugin: mi.PhaseFunction,

@@ -44,6 +44,8 @@ class Layers:
     of samples is the pixel.
     """
 
+    # docs/primer, eq. (5.6)
+
     scattered: mi.Spectrum
     colour: mi.Spectrum
     background: mi.Spectrum

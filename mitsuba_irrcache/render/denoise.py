@@ -127,6 +127,7 @@ def _least_risk(
     filter's response to a small random error of the same statistics as the noise (Ramani, Blu and
     Unser 2008), whatever its correlation between pixels.
     """
+    # docs/primer, eq. (6.4)
     places = dr.compress(valid)
     available = dr.width(places)
     count = min(available, RISK_PIXELS)
@@ -171,6 +172,7 @@ def bilateral(
     """The filtered value of each ``pixel`` of image number ``which`` in ``packed``; ``stride`` are
     the pixels between taps.
     """
+    # docs/primer, eq. (6.3)
     width, height = (dr.opaque(mi.Int32, int(n)) for n in size)
     first = dr.opaque(mi.UInt32, which) * mi.UInt32(width * height)
     image, error = _unpack(packed, first + pixel, True)

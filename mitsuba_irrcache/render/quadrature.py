@@ -25,6 +25,7 @@ def curved(before, a, b, ratio: mi.Float) -> tuple:
     ``ratio`` is the segment's length over that of the one before. What straight lines miss of a
     kink or a curve, they miss to the same side in every ray; here it cancels on average.
     """
+    # docs/primer, eq. (5.5)
     # The sag of the parabola, over a mean of 1.
     bend = ratio * dr.fma(ratio, before - a, b - a)
     sag = bend / (3 * (1 + ratio) * (a + b))
@@ -42,6 +43,7 @@ def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
     ends make it of order 3 where both are smooth) and the transmittance as exact, so that opaque
     and long segments stay right.
     """
+    # docs/primer, eqs. (5.2), (5.3)
     sigma_a, sigma_b = sigma
     if quadrature == "riemann":
         absorbed = absorptance(sigma_a * length)
@@ -65,6 +67,7 @@ def exponential_weights(tau_a, tau_b, passed) -> tuple:
     to optical depths of 5, and within [0, 1] for all. A source linear in *optical depth* would be
     simpler, but weights the empty end of a segment that enters a surface far too much.
     """
+    # docs/primer, eq. (5.4)
     near = 0.0
     for u, weight in GAUSS_LEGENDRE:
         depth = dr.fma(tau_a, u * (1 - 0.5 * u), tau_b * (0.5 * u * u))

@@ -104,6 +104,7 @@ class Projection:
         the falloff; and what layers need to know of the point: the albedo, and the relative errors
         of Phi. ``view`` is what `seen_along` says of the ray.
         """
+        # docs/primer, eq. (1.3)
         p, active = fields.ray(t), mi.Bool(True)
         sigma_t, *rest = fields.at(t, active)
         known = [rest[-1]] if self.layered else []
@@ -175,6 +176,7 @@ class Projection:
         ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is the
         radiance behind the medium, which early termination has to know.
         """
+        # docs/primer, eqs. (1.1), (5.1)
         clear, fields = self.clearance.along(ray), self.lookups.along(ray)
         active = mi.Bool(active) & (near < far)
         # Points of the lattice are counted from 1; number 0 is ``near``, reached by a first step

@@ -101,6 +101,7 @@ def medium_after(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, pointer: m
 
 def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
     """Weight of a sample of density ``a`` that might also have come with density ``b``."""
+    # docs/primer, eq. (3.2)
     a, b = dr.square(a), dr.square(b)
     return dr.select(a > 0, a / (a + b), 0)
 

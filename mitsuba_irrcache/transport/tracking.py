@@ -46,6 +46,7 @@ def free_flight(
     with the probability that the current weights give it, and the weights make up for each
     channel's difference (spectral tracking, Kutz et al. 2017), so that they stay bounded.
     """
+    # docs/primer, eq. (3.3)
     walk = medium.macrocells.walk(ray)
     t = mi.Float(near)
     cell = walk.cell(t)
@@ -159,6 +160,7 @@ def transmittance(
     Analytic for a homogeneous medium; otherwise residual ratio tracking (Novak et al. 2014) with
     each macrocell's smallest extinction as control, so every factor lies in [0, 1].
     """
+    # docs/primer, eq. (3.4)
     if dr.hint(medium.homogeneous, mode="scalar"):
         length = dr.maximum(far - near, 0)
         optical_depth = medium.sigma_t.value * length
