@@ -36,6 +36,8 @@ def test_python(page, monkeypatch, tmp_path):
     image = np.array(known["image"])
     assert image.shape == (16, 16, 3) and np.isfinite(image).all() and image.max() > 0
     assert known["cache"].samples > 0
+    if "merged" in known:
+        assert known["merged"].samples == known["cache"].samples + known["second"].cache.samples
 
 
 def test_a_moved_camera_reuses_the_cache(monkeypatch):

@@ -9,6 +9,11 @@ from pathlib import Path
 import pytest
 
 import mitsuba_irrcache
+from mitsuba_irrcache.cache import uncertainty
+from mitsuba_irrcache.lights import falloff
+from mitsuba_irrcache.pipeline import defaults
+from mitsuba_irrcache.render import denoise, raymarch
+from mitsuba_irrcache.solvers.sn import anderson, multigrid
 
 PACKAGE = Path(mitsuba_irrcache.__file__).parent
 ROOT = Path(__file__).parents[3]
@@ -87,6 +92,58 @@ def test_links_and_images_lead_to_files(page):
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+CONSTANTS = [
+    ("2-representation", r"\\frac\{\((\d+) h\)\^2\}", (falloff.REACH,)),
+    ("4-sweep", r"4\\pi \\cdot ([\d.]+)\) < 1", (multigrid.HARDLY,)),
+    ("4-sweep", r"of at most (\d+) voxels along a side", (multigrid.COARSEST,)),
+    ("4-sweep", r"\$\[-0.5, (\d+)\]\$", (anderson.FARTHEST,)),
+    ("4-sweep", r"is below (\S+) of the field", (multigrid.TOLERANCE,)),
+    ("5-projection", r"by more than (\S+) of what", (raymarch.EARLY_STOP,)),
+    (
+        "5-projection",
+        r"where at most (\d+) % and (\d+) % can",
+        (100 * raymarch.COARSER, 100 * raymarch.COARSEST),
+    ),
+    ("6-error", r"times ([\d.]+) where eq", (uncertainty.KEPT,)),
+    ("6-error", r"\\delta = ([\d.]+)\$", (denoise.PERTURBATION,)),
+    ("6-error", r"\$e\$ is ([\d.]+) of the mean", (denoise.FIXED_WIDTH,)),
+    (
+        "7-defaults",
+        r"\\epsilon_B = ([\d.]+) \\, d\^\{([\d.]+)\}",
+        (defaults.BORDER_ERROR, defaults.BORDER_ORDER),
+    ),
+    (
+        "7-defaults",
+        r"min\(d_v, ([\d.]+)\)\}\{([\d.]+)\} .*\^\{([\d.]+)\} , \\; 1 , \\; (\d+) ",
+        (defaults.OPAQUE, defaults.RESOLVED, defaults.OPAQUE_POWER, defaults.MOST_PER_DATA_VOXEL),
+    ),
+    (
+        "7-defaults",
+        r"\\epsilon = ([\d.]+)\$ % for `sweep`, (\d+) % for `path`",
+        (defaults.TARGET_ERROR, defaults.PATH_TARGET_ERROR),
+    ),
+    (
+        "7-defaults",
+        r"1\. (\d+) along the longest side \(`path`: (\d+)\)",
+        (defaults.FEWEST, defaults.PATH_FEWEST),
+    ),
+    (
+        "7-defaults",
+        r"at most (\d+) along the longest side \(`path`: (\d+)\)",
+        (defaults.CONTRASTED, defaults.PATH_MOST),
+    ),
+    ("7-defaults", r"\\sigma_B\$, at most (\d+) ", (defaults.BORDERED,)),
+]
+
+
+@pytest.mark.parametrize(("page", "text", "values"), CONSTANTS)
+def test_constants_are_those_of_the_code(page, text, values):
+    (path,) = (p for p in PAGES if p.stem == page)
+    found = re.search(text, path.read_text())
+    assert found, f"{page} does not say {text}"
+    assert [float(x) for x in found.groups()] == pytest.approx(values)
 
 
 def test_pages_name_functions_for_their_equations():
