@@ -7,10 +7,12 @@ rules of `MultigridLevel.corrected` and `Projection.march`.
 from __future__ import annotations
 
 import argparse
+import os
 from itertools import pairwise
 from pathlib import Path
 
 import drjit as dr
+import matplotlib
 import mitsuba as mi
 import numpy as np
 
@@ -32,6 +34,9 @@ def main() -> None:
     parser.add_argument("--format", choices=("svg", "png"), default="svg")
     args = parser.parse_args()
     begin()
+    # The same file each time: neither a date nor random identifiers.
+    os.environ["SOURCE_DATE_EPOCH"] = "0"
+    matplotlib.rcParams["svg.hashsalt"] = "irrcache"
     args.output.mkdir(parents=True, exist_ok=True)
     for draw in (tracks, multigrid, march):
         path = args.output / f"{draw.__name__}.{args.format}"
@@ -121,7 +126,7 @@ def multigrid(path: Path) -> None:
 
 def march(path: Path) -> None:
     """Extinction along a camera ray, its transmittance, and the segments that are marched."""
-    t = np.linspace(0, 10, 1001)
+    t = np.linspace(0, 10, 401)
     sigma = _extinction(t)
     through = np.exp(-np.concatenate([[0], np.cumsum(0.5 * (sigma[1:] + sigma[:-1]) * t[1])]))
     points = _marched(step=0.5, offset=0.35, length=10.0)
