@@ -11,6 +11,7 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.render import quadrature
+from mitsuba_irrcache.solvers.sn import anderson
 from mitsuba_irrcache.solvers.sn.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -126,3 +127,25 @@ def test_curvature():
     ends = [float(x[0]) for x in quadrature.curved(*(mi.Float(v) for v in values), mi.Float(rho))]
     np.testing.assert_allclose(ends, [y0 * factor, y1 * factor], rtol=1e-6)
     assert np.mean(ends) == pytest.approx(mean, rel=1e-6)
+
+
+def test_anderson_acceleration():
+    """Eq. (4.11), two steps of an affine map; the limits of theta do not matter here."""
+    rng = np.random.default_rng(8)
+    matrix, b, weight = 0.15 * rng.uniform(0, 1, (6, 6)), rng.uniform(0, 1, 6), rng.uniform(0, 1, 6)
+    factors = mi.Float(weight)
+    steps = anderson.AndersonAcceleration(lambda v: np.array([float(dr.sum(v * factors)[0])]))
+    before, phi = None, np.zeros(6)
+    for _ in range(4):
+        image = matrix @ phi + b
+        expected = image
+        if before is not None:
+            last_residual, last_image = before
+            change = image - phi - last_residual
+            theta = -(weight * (image - phi)) @ change / ((weight * change) @ change)
+            assert -0.5 < theta < anderson.FARTHEST
+            expected = image + theta * (image - last_image)
+        found = np.array(steps.next(mi.Float(phi), mi.Float(image)))
+        np.testing.assert_allclose(found, expected, rtol=2e-4)
+        before, phi = (image - phi, image), expected
+    np.testing.assert_allclose(phi, np.linalg.solve(np.eye(6) - matrix, b), rtol=2e-2)
