@@ -38,11 +38,14 @@ FULL = Size(longest=512, pixels=1024, horizon=300, others=100, reference=3600)
 
 @dataclass(frozen=True)
 class Options:
-    """Size, where files go, and whether to compute again what is there."""
+    """Size, where files go, whether to compute again what is there, and a Markdown file whose
+    tables are to be replaced.
+    """
 
     size: Size = QUICK
     output: Path = Path("output")
     force: bool = False
+    document: Path | None = None
 
     def folder(self, experiment: str) -> Path:
         """The folder of an experiment; the full size has its own."""
@@ -61,6 +64,13 @@ def parser_of(description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
+def add_document(parser: argparse.ArgumentParser) -> None:
+    """The option of experiments whose tables are part of the documentation."""
+    parser.add_argument(
+        "--document", type=Path, help="Markdown file whose marked tables are replaced"
+    )
+
+
 def begin() -> None:
     """Sets Mitsuba's variant."""
     require_llvm()
@@ -68,10 +78,15 @@ def begin() -> None:
     mi.set_log_level(mi.LogLevel.Error)
 
 
-def parse(description: str | None) -> Options:
-    """Options from the command line; sets Mitsuba's variant."""
+def parse(description: str | None, documented: bool = False) -> Options:
+    """Options from the command line, with ``--document`` if ``documented``; sets Mitsuba's
+    variant.
+    """
     parser = parser_of(description)
+    if documented:
+        add_document(parser)
     parser.add_argument("--full", action="store_true", help="the paper's sizes: hours")
     args = parser.parse_args()
     begin()
-    return Options(FULL if args.full else QUICK, args.output, args.force)
+    document = args.document if documented else None
+    return Options(FULL if args.full else QUICK, args.output, args.force, document)

@@ -108,6 +108,8 @@ class Source:
 class AngularBasis:
     """Angular representation of the radiance in a medium with the phase function ``phase``."""
 
+    # docs/primer, eq. (1.6)
+
     def __init__(self, phase: Phase, sources: list[Source]) -> None:
         self.phase, self.sources = phase, sources
         self.order = phase.order

@@ -33,6 +33,7 @@ def conserving(
     The correction acts along axes along which both neighbours are known. Noise that differs between
     neighbours counts as curvature and is amplified by a third.
     """
+    # docs/primer, eq. (2.2)
     smoothed = roots  # M r
     for second_difference in _second_differences(grid, known, channels):
         dr.eval(smoothed)

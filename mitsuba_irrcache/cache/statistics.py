@@ -31,4 +31,5 @@ def root_correction(variance: mi.Float) -> mi.Float:
     / 4) to first order, and the mean of sum w_i^2 over a cell is (2/3)^3. Without the correction,
     16 samples yield an irradiance that is about 1 % too small.
     """
+    # docs/primer, eq. (2.3)
     return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)

@@ -47,6 +47,8 @@ class UncertaintyField:
     multiplied by sqrt(Phi), because lookups interpolate square roots.
     """
 
+    # docs/primer, eq. (6.1)
+
     count = PROBES + 1
 
     def __init__(self, grid: Grid, data: mi.Float) -> None:
@@ -69,6 +71,7 @@ class UncertaintyField:
 
 def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     """Estimate the errors of ``cache``, which must have at least two batches of samples."""
+    # docs/primer, eq. (6.2)
     phi, error = cache.mean_and_error()
     for light in cache.direct_lights:  # these are looked up separately and have no error estimate
         channels = list(light.irradiance)[: cache.channels]

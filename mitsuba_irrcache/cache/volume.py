@@ -66,6 +66,8 @@ class IrradianceCache:
     zero. ``fingerprint`` maps each input (medium, boundary, emitters, settings) to a digest.
     """
 
+    # docs/primer, eq. (1.4)
+
     def __init__(
         self,
         grid: Grid,
@@ -305,6 +307,7 @@ class IrradianceCache:
 
     def _merged(self, totals: list, spreads: list, count: int) -> tuple[list, list]:
         """Combine the sums with those of ``count`` more batches (Chan et al. 1979)."""
+        # docs/primer, eq. (3.5)
         known = self.samples // self.batch
         result = []
         for c, spread in enumerate(spreads):

@@ -36,6 +36,7 @@ class RootField(GridField):
 
     def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Interpolate at the voxel coordinates ``u`` of the grid without its extension."""
+        # docs/primer, eq. (2.1)
         return dr.square(super().at(u + 1, active))
 
     def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:

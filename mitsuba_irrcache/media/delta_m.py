@@ -31,6 +31,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 
 def truncate_forward_peak(medium: MediumGrid) -> None:
     """Truncate the forward peak of the phase function of ``medium``, in place."""
+    # docs/primer, eq. (4.12)
     medium.store_untruncated()
     phase = medium.phase.without_peak()
     share, sigma_t, albedo = phase.forward, medium.sigma_t, medium.albedo

@@ -43,6 +43,8 @@ class Phase:
     p. The latter two exclude the fraction ``forward`` that `delta_m` treats as unscattered.
     """
 
+    # docs/primer, eqs. (1.2), (1.5)
+
     def __init__(
         self,
         plugin: mi.PhaseFunction,

@@ -44,6 +44,8 @@ class Layers:
     so that the mean over samples is the value of the pixel.
     """
 
+    # docs/primer, eq. (5.6)
+
     scattered: mi.Spectrum
     colour: mi.Spectrum
     background: mi.Spectrum

@@ -132,6 +132,7 @@ def _least_risk(
     estimated by the filter's response to a small random error with the statistics of the noise,
     including its correlation between pixels (Ramani, Blu and Unser 2008).
     """
+    # docs/primer, eq. (6.4)
     places = dr.compress(valid)
     available = dr.width(places)
     count = min(available, RISK_PIXELS)
@@ -179,6 +180,7 @@ def bilateral(
     ``stride`` is the distance of taps in pixels, ``strength`` the width of the range kernel in
     standard errors.
     """
+    # docs/primer, eq. (6.3)
     width, height = (dr.opaque(mi.Int32, int(n)) for n in size)
     first = dr.opaque(mi.UInt32, which) * mi.UInt32(width * height)
     image, error = _unpack(packed, first + pixel, True)

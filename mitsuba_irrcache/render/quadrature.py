@@ -25,6 +25,7 @@ def curved(previous, a, b, ratio: mi.Float) -> tuple:
     segment over that of the previous one. Linear interpolation of curved functions has an error of
     the same sign on every ray; this correction removes its mean.
     """
+    # docs/primer, eq. (5.5)
     # Sagitta of the parabola over the mean, which is scaled to 1.
     bend = ratio * dr.fma(ratio, previous - a, b - a)
     sag = bend / (3 * (1 + ratio) * (a + b))
@@ -42,6 +43,7 @@ def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
     distance (order 3 for smooth fields with ``curved`` ends) and uses the exact transmittance, so
     that opaque and long segments remain accurate.
     """
+    # docs/primer, eqs. (5.2), (5.3)
     sigma_a, sigma_b = sigma
     if quadrature == "riemann":
         absorbed = absorptance(sigma_a * length)
@@ -65,6 +67,7 @@ def exponential_weights(tau_a, tau_b, transmittance) -> tuple:
     to optical depths of 5, and always within [0, 1]. A source linear in *optical depth* would be
     simpler, but overestimates the weight of the empty end of a segment that enters a dense medium.
     """
+    # docs/primer, eq. (5.4)
     near = 0.0
     for u, weight in GAUSS_LEGENDRE:
         depth = dr.fma(tau_a, u * (1 - 0.5 * u), tau_b * (0.5 * u * u))

@@ -105,6 +105,7 @@ class Projection:
         optical depth, without the inverse-square factor; and the albedo and the relative errors of
         Phi, as far as layers need them. ``view`` is the result of `angular_terms`.
         """
+        # docs/primer, eq. (1.3)
         p, active = fields.ray(t), mi.Bool(True)
         sigma_t, *rest = fields.at(t, active)
         extras = [rest[-1]] if self.layered else []
@@ -178,6 +179,7 @@ class Projection:
         radiance. ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is
         the radiance behind the medium, required for early termination.
         """
+        # docs/primer, eqs. (1.1), (5.1)
         clearance, fields = self.clearance.along(ray), self.lookups.along(ray)
         active = mi.Bool(active) & (near < far)
         # Points of the lattice are numbered from 1; number 0 is ``near``, reached by a first step

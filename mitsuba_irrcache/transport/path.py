@@ -112,6 +112,7 @@ def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
 
     Power heuristic of multiple importance sampling (Veach and Guibas 1995).
     """
+    # docs/primer, eq. (3.2)
     a, b = dr.square(a), dr.square(b)
     return dr.select(a > 0, a / (a + b), 0)
 

@@ -48,6 +48,7 @@ def free_flight(
     accepted with a probability that depends on the current throughput, which compensates for the
     difference in each channel and stays bounded (spectral tracking, Kutz et al. 2017).
     """
+    # docs/primer, eq. (3.3)
     walk = medium.macrocells.walk(ray)
     t = mi.Float(near)
     cell = walk.cell(t)
@@ -160,6 +161,7 @@ def transmittance(
     Analytic for homogeneous media; otherwise residual ratio tracking (Novak et al. 2014) with the
     minorant of each macrocell as control, so that every factor lies in [0, 1].
     """
+    # docs/primer, eq. (3.4)
     if dr.hint(medium.homogeneous, mode="scalar"):
         length = dr.maximum(far - near, 0)
         optical_depth = medium.sigma_t.value * length

@@ -1,5 +1,5 @@
 """The cache and the picture against closed forms and published tables; no renderer made the
-reference values.
+reference values. `correctness.md` is docs/correctness.md.
 """
 
 from __future__ import annotations
