@@ -69,9 +69,9 @@ def refine_calls(monkeypatch) -> list[int]:
     calls: list[int] = []
     refine = path_solver.refine
 
-    def counted(scene, medium, cache, samples, *args, **kwargs):
+    def counted(scene, media, medium, cache, samples, *args, **kwargs):
         calls.append(samples)
-        return refine(scene, medium, cache, samples, *args, **kwargs)
+        return refine(scene, media, medium, cache, samples, *args, **kwargs)
 
     monkeypatch.setattr(path_solver, "refine", counted)
     return calls

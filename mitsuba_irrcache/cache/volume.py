@@ -18,6 +18,7 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.conservative import conserving
 from mitsuba_irrcache.cache.direct_light import DirectLight
+from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation
 from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
 from mitsuba_irrcache.cache.storage import (
     ARRAYS,
@@ -80,6 +81,7 @@ class IrradianceCache:
         batch: int = BATCH,
         correlated: bool = False,
         moments: int = 0,
+        interpolation: Interpolation = PLAIN,
     ) -> None:
         """``moments`` of the radiance are kept for each channel, where a medium is not isotropic;
         see `angular`. ``correlated``: whether all voxels share their samples, and so their
@@ -94,14 +96,7 @@ class IrradianceCache:
         self.max_depth = max_depth
         self.fingerprint = fingerprint or {}
         self.moments = moments
-        #: what the moments are of
-        self.directional: AngularBasis | None = None
-        #: how the light of lamps nearby falls off; None where there are none
-        self.falloff: InverseSquareFactor | None = None
-        #: spot lights, whose irradiance camera rays look up apart; the layers hold its means
-        self.direct_lights: list[DirectLight] = []
-        #: where voxels lie among surfaces; None where there are none
-        self.survey: VoxelClasses | None = None
+        self.interpolation = interpolation
         #: samples taken per voxel from each random stream
         self.streams: dict[int, int] = {}
         self.correlated = correlated
@@ -113,10 +108,25 @@ class IrradianceCache:
         # Sums of batch means for each moment and channel, in float32.
         self._moments: list = [None] * (moments * channels)
 
-    def lie_like(self, other: IrradianceCache) -> None:
-        """Takes over what is known of the place of ``other``, another cache of the same medium."""
-        self.directional, self.survey = other.directional, other.survey
-        self.falloff, self.direct_lights = other.falloff, other.direct_lights
+    @property
+    def directional(self) -> AngularBasis | None:
+        """See `Interpolation`."""
+        return self.interpolation.directional
+
+    @property
+    def falloff(self) -> InverseSquareFactor | None:
+        """See `Interpolation`."""
+        return self.interpolation.falloff
+
+    @property
+    def direct_lights(self) -> tuple[DirectLight, ...]:
+        """See `Interpolation`."""
+        return self.interpolation.direct_lights
+
+    @property
+    def voxel_classes(self) -> VoxelClasses | None:
+        """See `Interpolation`."""
+        return self.interpolation.voxel_classes
 
     # ------------------------------------------------------------------ statistics
 
@@ -221,8 +231,8 @@ class IrradianceCache:
             values = conserving(self.grid, values, marked(self.grid, self.active), channels)
         else:  # it would enlarge the noise by more than it is worth
             variance = self._tensor(noise[:channels]).array
-        if self.survey is not None:
-            values = self.survey.filled(values, channels)
+        if self.voxel_classes is not None:
+            values = self.voxel_classes.filled(values, channels)
         field = RootField(self.grid, values, channels, variance)
         if self.falloff is not None:
             field.maximum *= self.falloff.maximum(self.active)
@@ -357,8 +367,10 @@ class IrradianceCache:
     # ------------------------------------------------------------------ files
 
     @_consistent
-    def save(self, path: str | Path) -> None:
-        """Writes the cache with all its statistics; the file appears whole or not at all."""
+    def save(self, path: str | Path, fingerprint: dict[str, str] | None = None) -> None:
+        """Writes the cache with all its statistics; the file appears whole or not at all.
+        ``fingerprint`` takes the place of the cache's own.
+        """
         description = {
             "format": WITH_MOMENTS if self.moments else FORMAT,
             "shape": self.grid.shape,
@@ -369,7 +381,7 @@ class IrradianceCache:
             **({"moments": self.moments} if self.moments else {}),
             "max_depth": self.max_depth,
             "streams": {str(seed): n for seed, n in self.streams.items()},
-            "fingerprint": self.fingerprint,
+            "fingerprint": self.fingerprint if fingerprint is None else fingerprint,
         }
         arrays = {
             "active": np.array(self.active),
@@ -387,9 +399,9 @@ class IrradianceCache:
         return np.array([np.array(self._zeros if v is None else v, kind) for v in values])
 
     @classmethod
-    def load(cls, path: str | Path) -> IrradianceCache:
-        """Reads a cache that ``save`` wrote. Raises CacheFileError, naming the file, for anything
-        else.
+    def load(cls, path: str | Path, interpolation: Interpolation = PLAIN) -> IrradianceCache:
+        """Reads a cache that ``save`` wrote; a file does not hold its ``interpolation``. Raises
+        CacheFileError, naming the file, for anything else.
         """
         path = Path(path)
         try:
@@ -400,7 +412,7 @@ class IrradianceCache:
                     f'"{path}" has the format {description["format"]!r}, this version reads '
                     f"{FORMAT!r} and {WITH_MOMENTS!r}."
                 )
-            return cls._restore(description, arrays)
+            return cls._restore(description, arrays, interpolation)
         except CacheFileError:
             raise
         except Exception as error:  # whatever a damaged file makes of itself
@@ -417,7 +429,9 @@ class IrradianceCache:
             raise unreadable(path, error) from error
 
     @classmethod
-    def _restore(cls, description: dict, arrays: dict[str, np.ndarray]) -> IrradianceCache:
+    def _restore(
+        cls, description: dict, arrays: dict[str, np.ndarray], interpolation: Interpolation
+    ) -> IrradianceCache:
         grid = Grid(tuple(int(n) for n in description["shape"]), np.array(description["to_world"]))
         active, totals, spreads = (arrays[name] for name in ARRAYS)
         channels = int(description["channels"])
@@ -463,6 +477,7 @@ class IrradianceCache:
             batch,
             correlated,
             count,
+            interpolation,
         )
         cache._moments = [mi.Float(t) if t.any() else None for t in moments]
         cache.streams = streams

@@ -13,11 +13,12 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.cancellation import Pause
-from mitsuba_irrcache.media.emission import Emission, bake_emission
+from mitsuba_irrcache.media.bake_emission import bake_emission
+from mitsuba_irrcache.media.emission import Emission
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.pipeline.defaults import choose_solver
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.fingerprint import Snapshot
 from mitsuba_irrcache.solvers.path import solver as path_solver
 
@@ -108,12 +109,14 @@ class CacheBuilder:
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             self.parts, self._snapshot = [], None
             self.revision += 1
-            media = bake_media(scene, self._baked_emission())
+            description = compile_scene(scene, self._baked_emission())
+            media = description.visible
             wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
             settings = replace(self.settings, samples=self._wanted)
             self.parts = [
                 CachedMedium(
                     scene,
+                    description,
                     medium,
                     settings,
                     choose_solver(scene, medium, *wanted),

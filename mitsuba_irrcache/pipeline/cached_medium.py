@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
 from mitsuba_irrcache.cache.direct_light import direct_lights_of
+from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
@@ -31,7 +32,9 @@ from mitsuba_irrcache.pipeline.defaults import (
     swept_samples,
     warn_of_dense_border,
 )
+from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.fingerprint import differing, digests
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.solvers.path import solver as path_solver
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
@@ -67,6 +70,7 @@ class CachedMedium:
     def __init__(
         self,
         scene: mi.Scene,
+        description: SceneDescription,
         medium: MediumGrid,
         settings: CacheSettings,
         solver: tuple[str, str],
@@ -75,6 +79,7 @@ class CachedMedium:
         pause: Callable[[], None] = lambda: None,
     ) -> None:
         self.settings, self.medium, self.name = settings, medium, name
+        self.description = description
         self._pause = pause
         #: samples per voxel in the file
         self.saved_samples = 0
@@ -167,10 +172,10 @@ class CachedMedium:
         together = sn_solver.swept_together(medium, grid.voxel_count)
         _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments, together)
         warn_of_dense_border(medium, grid)
-        active, survey = active_voxels(medium, grid), None
-        if medium.surroundings is not None and self.solver == "path":  # else nothing is among them
-            survey = medium.surroundings.survey(scene, grid, medium)
-            active = dr.compress(survey.reach & marked(grid, active))
+        active, classes = active_voxels(medium, grid), None
+        if medium.is_traced and self.solver == "path":  # else nothing is among them
+            classes = VoxelClasses(scene, self.description.media, medium, grid)
+            active = dr.compress(classes.readable & marked(grid, active))
         dark = not scene.emitters() and medium.emission is None
         if medium.albedo.maximum == 0 or dark:
             active = mi.UInt32()
@@ -188,32 +193,33 @@ class CachedMedium:
             wanted = -(-wanted // 2) if settings.with_error else wanted
             least = sn_solver.BATCH if directional is None else least_batch(directional.order)
             batch = sn_solver.batch_of(wanted, least)
-        cache = IrradianceCache(
-            grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
-        )
-        cache.survey, cache.directional = survey, directional
-        dense = border_error(medium, grid) > SMALL_BORDER_ERROR
+        dense, direct_lights = border_error(medium, grid) > SMALL_BORDER_ERROR, []
         if swept or follows_straight_ways(scene, medium, grid, active):
-            cache.direct_lights = direct_lights_of(scene, medium, grid, active, dense, survey)
-        cache.falloff = InverseSquareFactor.of(
-            scene, grid, [light.emitter for light in cache.direct_lights]
-        )
+            direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes)
+        falloff = InverseSquareFactor.of(scene, grid, [light.emitter for light in direct_lights])
+        interpolation = Interpolation(directional, falloff, direct_lights, classes)
+
+        def empty(fingerprint: dict[str, str]) -> IrradianceCache:
+            return IrradianceCache(
+                grid, active, channels, depth, fingerprint, batch, swept, moments, interpolation
+            )
+
         self.saved_samples = 0
         if not self.file:
-            return cache
-        cache.fingerprint = self._fingerprint(scene, cache)
-        return self._resume(cache, edited)
+            return empty({})
+        return self._resume(empty(self._fingerprint(scene, grid, moments)), edited) or empty({})
 
-    def _fingerprint(self, scene: mi.Scene, cache: IrradianceCache) -> dict[str, str]:
-        moments = f", moments {cache.moments}" if cache.moments else ""
-        return digests(scene, self.medium) | {
-            "settings": f"solver {self.solver}, max_depth {cache.max_depth}, "
-            f"grid {cache.grid.shape[::-1]}{moments}"
+    def _fingerprint(self, scene: mi.Scene, grid: Grid, moments: int) -> dict[str, str]:
+        count = f", moments {moments}" if moments else ""
+        return digests(scene, self.description.media, self.medium) | {
+            "settings": f"solver {self.solver}, max_depth {self.settings.max_depth}, "
+            f"grid {grid.shape[::-1]}{count}"
         }
 
-    def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache:
-        """The cache on disk where it is of the same light; a foreign file is refused, never
-        overwritten.
+    def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache | None:
+        """The cache on disk where it is one of the same scene, else the empty ``cache``; None where
+        the file is of the scene before it was ``edited``, and is not to be overwritten. Raises
+        CacheFileError for the file of another scene.
         """
         file = Path(self.file)
         if not os.path.exists(file):  # says no, where Path.exists may raise
@@ -227,13 +233,12 @@ class CachedMedium:
                     f'"{file.parent}"; name another one.'
                 )
             return cache
-        stored = IrradianceCache.load(file)
+        stored = IrradianceCache.load(file, cache.interpolation)
         others = differing(cache.fingerprint, stored.fingerprint)
         if not others:
             _check_like(cache, stored, file)
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
-            stored.lie_like(cache)
             return stored
         if edited:
             mi.Log(
@@ -241,8 +246,7 @@ class CachedMedium:
                 f'irrcache: the scene was edited ({", ".join(others)}): "{file}" keeps the '
                 "light of before.",
             )
-            cache.fingerprint = {}
-            return cache
+            return None
         detail = (
             f" ({stored.fingerprint.get('settings')} in the file, {cache.fingerprint['settings']} "
             "here)"
@@ -260,7 +264,7 @@ class CachedMedium:
         cache, settings = self.cache, self.settings
         if self._opening is None:
             self._opening = path_solver.Opening(
-                scene, self.medium, cache, settings.seed, settings.rr_depth
+                scene, self.description.media, self.medium, cache, settings.seed, settings.rr_depth
             )
         size = min(samples // 2, cache.batch)
         if size <= self._opening.size:
@@ -277,8 +281,8 @@ class CachedMedium:
                 cache.max_depth,
                 batch=size,
                 moments=cache.moments,
+                interpolation=cache.interpolation,
             )
-            self._preview.lie_like(cache)
             self._opening.fill(self._preview)
         return True
 
@@ -292,14 +296,21 @@ class CachedMedium:
             self._sweep.refine(missing, progress)
         else:
             path_solver.refine(
-                scene, self.medium, cache, missing, settings.seed, settings.rr_depth, progress
+                scene,
+                self.description.media,
+                self.medium,
+                cache,
+                missing,
+                settings.seed,
+                settings.rr_depth,
+                progress,
             )
         give_back(cache.grid.voxel_count)
 
     def save_as(self, scene: mi.Scene, file: str | Path) -> None:
         """Writes a copy of the cache that fits ``scene`` to a file of any name."""
-        self.cache.fingerprint = self._fingerprint(scene, self.cache)
-        self.cache.save(file)
+        cache = self.cache
+        cache.save(file, self._fingerprint(scene, cache.grid, cache.moments))
 
     def save(self) -> None:
         """Writes the cache to its file, where it has one that has fewer samples, also by now: other

@@ -13,6 +13,7 @@ from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels
+from mitsuba_irrcache.lights.emitters import kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.compile import media_of
 from mitsuba_irrcache.scene.consistency import described
@@ -148,7 +149,7 @@ def _why_not_sweep(
     """Why light cannot be swept through ``medium``; None where it can."""
     name = f'medium "{medium.name}"'
     for emitter in scene.emitters():
-        if not sn_solver.takes(emitter):
+        if kind_of(emitter) not in sn_solver.EMITTERS:
             kind = f'"{emitter.id()}" ({emitter.class_name()})'
             return f"emitter {kind} is neither far away nor a point nor an even area"
     if medium.is_isolated:
@@ -162,8 +163,8 @@ def _why_not_sweep(
     if not dr.width(active):
         return None
     box = sn_solver.occupied_box(grid, active)
-    for other in medium.surroundings.media.grids:
-        if other is not medium and boxes_meet(grid, *box, corners_of(other.frame)):
+    for other in medium.others:
+        if boxes_meet(grid, *box, corners_of(other.frame)):
             return f'medium "{other.name}" reaches into {name}'
     hole = _hole(scene, medium, grid, box)
     if hole:
@@ -205,7 +206,7 @@ def follows_straight_ways(
     """
     if medium.is_isolated or not dr.width(active):
         return medium.is_isolated
-    if not medium.has_exact_boundary or len(medium.surroundings.media.grids) > 1:
+    if not medium.has_exact_boundary or medium.others:
         return False
     return _hole(scene, medium, grid, sn_solver.occupied_box(grid, active)) is None
 
@@ -236,7 +237,7 @@ def choose_grid(medium: MediumGrid, resolution: int, solver: str) -> tuple[Grid,
     voxels = MOST_VOXELS if medium.phase is None else MOST_DIRECTIONAL
     if resolution:
         grid, reason = Grid.near_cubic(frame, resolution), AS_TOLD
-    elif medium.surroundings is not None and solver == "path":
+    elif medium.is_traced and solver == "path":
         least, most = AMONG_SURFACES
         extinction = max(_colliding_extinction(medium), _border_extinction(medium))
         longest = np.linalg.norm(frame[:3, :3], axis=0).max()
@@ -321,7 +322,7 @@ def choose_samples(cache: IrradianceCache, solver: str, medium: MediumGrid) -> i
     """
     if solver == "sweep":
         return swept_samples(cache.max_depth, medium)
-    paths = 2**24 if cache.survey is None else 2**22
+    paths = 2**24 if cache.voxel_classes is None else 2**22
     return int(np.clip(paths // max(cache.active_count, 1), 16, 256))
 
 

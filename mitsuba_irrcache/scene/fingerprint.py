@@ -12,6 +12,7 @@ import numpy as np
 
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.transport.path import Media
 
 #: Arrays of up to so many bytes are compared by their contents, all of them up to the second number
 #: of bytes in a scene; of larger arrays, so many values are.
@@ -160,8 +161,10 @@ def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
     return repr(value) if array.dtype == object else (array.dtype.str, array.tobytes())
 
 
-def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
-    """SHA-256 of the contents of each ingredient of the light in ``medium``."""
+def digests(scene: mi.Scene, media: Media, medium: MediumGrid) -> dict[str, str]:
+    """SHA-256 of the contents of each ingredient of the irradiance in ``medium``, which is one of
+    the ``media`` of the scene.
+    """
     boundary = medium.boundary
     found = {
         "medium": _medium_digest(medium),
@@ -169,9 +172,8 @@ def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
         "emitters": digest_of_emitters(scene),
         "variant": "grey" if mi.is_monochromatic else "rgb",
     }
-    if medium.surroundings is not None:
-        media = medium.surroundings.media.grids
-        found["media"] = _digest(*sorted(_medium_digest(grid) for grid in media))
+    if medium.is_traced:
+        found["media"] = _digest(*sorted(_medium_digest(grid) for grid in media.grids))
         found["surfaces"] = digest_of_surfaces(scene)
         found[RESPONSES] = responses(scene)
     return found

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.media.phase import interaction
@@ -28,23 +29,32 @@ MOST_CROSSINGS = 1024
 MOST_SURVIVE = 0.95
 
 
-class Media:
-    """The media of a scene. Which one a ray is in is told by Mitsuba's pointers; null is none."""
+class Media(Immutable):
+    """The media of a scene. Rays know the medium they are in by Mitsuba's pointer; null is none."""
 
     def __init__(self, grids: Sequence[MediumGrid]) -> None:
-        self.grids = list(grids)
+        self.grids = tuple(grids)
         self.isotropic = all(grid.phase is None for grid in self.grids)
 
     @property
-    def shines(self) -> bool:
-        """Whether there is light of their own in any of them."""
+    def emit(self) -> bool:
+        """Whether any of them emits radiance itself."""
         return any(grid.emission is not None for grid in self.grids)
 
-    def around(self, medium: MediumGrid) -> Media:
-        """The same for paths that end in ``medium``, whose light is known, and in no other one:
-        there forward peaks are scattered like all else.
+    @classmethod
+    def around(cls, medium: MediumGrid) -> Media:
+        """The media of its scene for paths that end in ``medium``, whose radiance is known, and in
+        no other one: there light scattered into forward peaks counts as scattered.
         """
-        return Media([grid if grid is medium else grid.with_peak for grid in self.grids])
+        before, after = medium.others[: medium.number], medium.others[medium.number :]
+        return cls([*before, medium, *after])
+
+    def pointer_of(self, number: mi.UInt32) -> mi.MediumPtr:
+        """Mitsuba's medium with this number: 1 for the first one, 0 for none."""
+        pointer = dr.zeros(mi.MediumPtr, dr.width(number))
+        for i, grid in enumerate(self.grids):
+            pointer = dr.select(number == i + 1, grid.pointer, pointer)
+        return pointer
 
     def without(self, medium: MediumGrid) -> Media:
         """All but one."""
@@ -158,7 +168,7 @@ def trace_to_infinity(
     while dr.hint(active, label="out of the scene"):
         si = scene.ray_intersect(ray, active)
         hit = active & si.is_valid()
-        if dr.hint(media.shines, mode="scalar"):
+        if dr.hint(media.emit, mode="scalar"):
             *_, rng, glow = media.fly(pointer, ray, si.t, through, rng, active)
             light += dr.select(active, glow, 0)
         passed, rng = media.transmittance(pointer, ray, si.t, rng, active)

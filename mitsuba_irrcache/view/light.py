@@ -15,7 +15,7 @@ from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.progressive import FIRST, OPENING
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays, camera_rays_of
-from mitsuba_irrcache.scene.context import medium_at
+from mitsuba_irrcache.scene.medium_probe import medium_at
 
 #: Caches with more voxels than this are preceded by one of `COARSE` voxels along its longest side,
 #: so that new light is there at once.

@@ -12,7 +12,7 @@ import pytest
 
 from experiments.performance.kinds.run import box, smoke
 from mitsuba_irrcache.pipeline.defaults import choose_solver
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.sn import multigrid, tracks
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
 
@@ -333,7 +333,7 @@ def test_the_choice_of_solver(scenes):
     )
     for objects in lights:
         scene = scenes.load({"type": "irrcache", "solver": "auto"}, soft_cloud(scenes), **objects)
-        (medium,) = bake_media(scene)
+        (medium,) = compile_scene(scene).visible
         solver, reason = choose_solver(scene, medium, "auto")
         assert solver == "sweep" and "far away or from points" in reason
         assert choose_solver(scene, medium, "path") == ("path", "as told")

@@ -22,6 +22,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.path import estimator as volume_path
+from mitsuba_irrcache.transport.path import Media
 from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 
 #: Paths in one kernel launch: enough to fill any machine, few enough to bound memory (about 100
@@ -34,6 +35,7 @@ Progress = Callable[[int, int], None]
 
 def refine(
     scene: mi.Scene,
+    media: Media,
     medium: MediumGrid,
     cache: IrradianceCache,
     samples: int,
@@ -50,7 +52,7 @@ def refine(
     if not cache.active_count or _orders(cache) < 1 or dark:
         cache.note_samples(seed, samples)
         return
-    estimator = _Estimator(scene, medium, cache, seed, rr_depth)
+    estimator = _Estimator(scene, media, medium, cache, seed, rr_depth)
     total, done = cache.active_count * samples, 0
     if total > 16 * LANES:
         seconds = estimator.seconds(total)
@@ -115,11 +117,17 @@ class Opening:
     """
 
     def __init__(
-        self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int, rr_depth: int
+        self,
+        scene: mi.Scene,
+        media: Media,
+        medium: MediumGrid,
+        cache: IrradianceCache,
+        seed: int,
+        rr_depth: int,
     ) -> None:
         self.cache, self.seed = cache, seed
         self.size = 0  #: samples of each batch so far
-        self._estimator = _Estimator(scene, medium, cache, seed, rr_depth)
+        self._estimator = _Estimator(scene, media, medium, cache, seed, rr_depth)
         # In blocks of voxels, for each layer and channel: the sums of both batches.
         self._totals: list[list] = []
 
@@ -151,13 +159,14 @@ class _Estimator:
     def __init__(
         self,
         scene: mi.Scene,
+        media: Media,
         medium: MediumGrid,
         cache: IrradianceCache,
         seed: int,
         rr_depth: int,
     ) -> None:
         orders = _orders(cache)
-        self.scene, self.medium, self.cache = scene, medium, cache
+        self.scene, self.media, self.medium, self.cache = scene, media, medium, cache
         self.places = VoxelSamplePoints(scene, cache.grid)
         # Emitters of direct lights are not sampled at the voxels themselves.
         self._apart = [mi.EmitterPtr(light.emitter) for light in cache.direct_lights]
@@ -223,8 +232,7 @@ class _Estimator:
         self, position: mi.Point3f, batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32
     ) -> Sequence[mi.Spectrum]:
         """One sample of both layers per lane, and of the moments."""
-        around = self.medium.surroundings
-        if around is None:
+        if not self.medium.is_traced:
             return _estimate(
                 self.scene,
                 self.medium,
@@ -239,12 +247,13 @@ class _Estimator:
                 self._others,
             )
         rng, spread = _random_numbers(batch, within, voxel, self.seed)
-        pointer = around.pointer(dr.gather(mi.UInt32, self.cache.survey.place, voxel))
+        number = dr.gather(mi.UInt32, self.cache.voxel_classes.medium_number, voxel)
+        pointer = self.media.pointer_of(number)
         max_depth = dr.select(self.orders < 0xFFFFFFFF, self.orders + 1, self.orders)
         return volume_path.estimate(
             self.cache.directional,
             self.scene,
-            around.media,
+            self.media,
             position,
             pointer,
             spread,
