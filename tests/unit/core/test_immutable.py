@@ -9,6 +9,8 @@ import pytest
 from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.core.jit import symbolic
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 
 class Base(Immutable):
     def __init__(self, scale) -> None:

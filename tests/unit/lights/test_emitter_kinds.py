@@ -12,31 +12,37 @@ import pytest
 import mitsuba_irrcache
 from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind, kind_of
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 PACKAGE = Path(mitsuba_irrcache.__file__).parent
-IMAGE = mi.Bitmap(np.ones((4, 8, 3), np.float32))
+IMAGE = np.ones((4, 8, 3), np.float32)
 KINDS = {
-    "constant": ({}, EmitterKind.CONSTANT_ENVIRONMENT),
-    "envmap": ({"bitmap": IMAGE}, EmitterKind.ENVIRONMENT_MAP),
-    "sunsky": ({}, EmitterKind.ENVIRONMENT_MAP),
-    "directional": ({}, EmitterKind.SUN),
-    "point": ({}, EmitterKind.POINT),
-    "spot": ({}, EmitterKind.SPOT),
-    "projector": ({"irradiance": {"type": "bitmap", "bitmap": IMAGE}}, EmitterKind.PROJECTOR),
-    "area": ({}, EmitterKind.AREA),
-    "directionalarea": ({}, EmitterKind.DIRECTIONAL_AREA),
+    "constant": EmitterKind.CONSTANT_ENVIRONMENT,
+    "envmap": EmitterKind.ENVIRONMENT_MAP,
+    "sunsky": EmitterKind.ENVIRONMENT_MAP,
+    "directional": EmitterKind.SUN,
+    "point": EmitterKind.POINT,
+    "spot": EmitterKind.SPOT,
+    "projector": EmitterKind.PROJECTOR,
+    "area": EmitterKind.AREA,
+    "directionalarea": EmitterKind.DIRECTIONAL_AREA,
 }
 
 
 def emitter_of(plugin: str) -> mi.Emitter:
-    described = {"type": plugin} | KINDS[plugin][0]
-    if KINDS[plugin][1] in (EmitterKind.AREA, EmitterKind.DIRECTIONAL_AREA):
+    described = {"type": plugin}
+    if plugin == "envmap":
+        described["bitmap"] = mi.Bitmap(IMAGE)
+    if plugin == "projector":
+        described["irradiance"] = {"type": "bitmap", "bitmap": mi.Bitmap(IMAGE)}
+    if KINDS[plugin] in (EmitterKind.AREA, EmitterKind.DIRECTIONAL_AREA):
         return mi.load_dict({"type": "rectangle", "emitter": described}).emitter()
     return mi.load_dict(described)
 
 
 @pytest.mark.parametrize("plugin", KINDS)
 def test_kinds_of_mitsubas_emitters(plugin):
-    assert kind_of(emitter_of(plugin)) is KINDS[plugin][1]
+    assert kind_of(emitter_of(plugin)) is KINDS[plugin]
 
 
 def test_emitters_by_kind():
@@ -44,7 +50,7 @@ def test_emitters_by_kind():
     found = EmittersByKind(emitters)
     assert len(found) == 3
     assert found.of(EmitterKind.SPOT, EmitterKind.POINT) == [emitters[0], emitters[2]]
-    assert [kind for _, kind in found] == [KINDS[p][1] for p in ("point", "constant", "spot")]
+    assert [kind for _, kind in found] == [KINDS[p] for p in ("point", "constant", "spot")]
     assert not EmittersByKind([])
 
 
