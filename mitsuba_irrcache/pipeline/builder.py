@@ -20,7 +20,7 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.fingerprint import Snapshot
-from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.solvers.base import Progress as SolverProgress
 
 __all__ = ["CacheBuilder", "CacheSettings", "Progress"]
 
@@ -65,7 +65,7 @@ class CacheBuilder:
         self._snapshot: Snapshot | None = None
         self._stages: list[Stage] = []
         self._checkpointed = 0  # runs that save the caches themselves
-        #: whether the first two batches may be shown in pieces; see `path.solver.Opening`
+        #: whether the first two batches may be shown in pieces; see `Solver.preview`
         self.early = False
         #: its action is called often while the solver ``sweep`` is at work, between launches: other
         #: things may be computed meanwhile; what it raises drops the batch that is computed
@@ -83,8 +83,13 @@ class CacheBuilder:
 
     @property
     def solver(self) -> str:
-        """Of all caches: path or sweep."""
-        return self.parts[0].solver if self.parts else ""
+        """Name of the solver of the first medium."""
+        return self.parts[0].solver.name if self.parts else ""
+
+    @property
+    def has_preview(self) -> bool:
+        """Whether the first two batches of the first medium may be shown while incomplete."""
+        return bool(self.parts) and self.parts[0].solver.has_preview
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
         """Makes media and caches fit ``scene``."""
@@ -133,9 +138,7 @@ class CacheBuilder:
             return None
         return bake_emission(self._emission, self._emission_scale)
 
-    def _refine(
-        self, scene: mi.Scene, part: CachedMedium, progress: path_solver.Progress | None
-    ) -> None:
+    def _refine(self, scene: mi.Scene, part: CachedMedium, progress: SolverProgress | None) -> None:
         changed = True  # the solver may be stopped half-way
         try:
             early = self.early or any(stage.early for stage in self._stages)
@@ -235,9 +238,7 @@ class CacheBuilder:
                 self.save()
 
 
-def _of_the_caches(
-    progress: Progress | None, number: int, count: int
-) -> path_solver.Progress | None:
+def _of_the_caches(progress: Progress | None, number: int, count: int) -> SolverProgress | None:
     """``progress`` for a solver, which knows neither its stage nor that there are more caches."""
     if progress is None:
         return None

@@ -185,7 +185,7 @@ class _Run:
         goal = self.targets.cache_spp if self.targets.given else self.builder.samples
         self.stage.early = not 0 < goal < OPENING
         self._update(FIRST if self.stage.early else goal, lambda: None)
-        if self.builder.cache is not None and self.builder.solver != "path":
+        if self.builder.cache is not None and not self.builder.has_preview:
             self._opening = 0
             self.schedule.batch = self.schedule.first = self.builder.cache.batch
         self.goal = self.targets.cache_spp or math.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -10,6 +11,8 @@ import numpy as np
 
 from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.consistency import described
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
 #: Rays that look for surfaces, per voxel and axis: through the corners and the middle of its face.
@@ -30,18 +33,14 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
     near = [s for s in scene.shapes() if _is_solid(s) and _may_meet(s, grid, lower, upper)]
     for shape in near:
         if _begins_within(shape, grid, lower, upper):
-            return _name(shape)
+            return described(shape)
     if near:
         for axis in range(3):
             for offset in OFFSETS:
                 found = _met(scene, near, grid, lower, upper, axis, offset)
                 if found is not None:
-                    return _name(found)
+                    return described(found)
     return None
-
-
-def _name(shape: mi.Shape) -> str:
-    return f'shape "{shape.id()}" ({shape.class_name()})'
 
 
 def _is_solid(shape: mi.Shape) -> bool:
@@ -142,3 +141,19 @@ def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
         crossings += 1
         active &= ~solid & (crossings < MOST_CROSSINGS)
     return found
+
+
+def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
+    """A shape behind whose null surface ``medium`` ends, in the ``box`` of voxels of ``grid``; None
+    where there is none.
+    """
+    for shape in scene.shapes():
+        outer = shape.exterior_medium()
+        null = shape.bsdf() is not None and is_null(int(shape.bsdf().flags()))
+        if outer is None or not null or not dr.all(mi.MediumPtr(outer) == medium.pointer):
+            continue
+        ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
+        corners = np.array(list(itertools.product(*ends.T)))
+        if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
+            return described(shape)
+    return None

@@ -17,10 +17,10 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.compile import compile_scene
-from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.solvers.base import SolverTask
+from mitsuba_irrcache.solvers.path.solver import PathSolver
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
 from mitsuba_irrcache.solvers.sn.anisotropic import AnisotropicSweep, least_batch
-from mitsuba_irrcache.transport.path import Media
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -129,12 +129,14 @@ def column(scene, depths: tuple[float, float], voxels: int, samples: int, max_de
     """The medium of a wide slab below z = 0, and a cache on the z axis from depths[0] to depths[1]:
     where the light varies with depth only, a grid one voxel wide holds all of it.
     """
-    medium = compile_scene(scene).visible[0]
+    description = compile_scene(scene)
+    (medium,) = description.visible
     place = np.diag([1.0, 1.0, depths[1] - depths[0], 1.0])
     place[:3, 3] = -0.5, -0.5, -depths[1]
     grid = Grid((voxels, 1, 1), place)
     cache = IrradianceCache(grid, dr.arange(mi.UInt32, voxels), 3, max_depth)
-    path_solver.refine(scene, Media([medium]), medium, cache, samples, seed=1, rr_depth=1000)
+    task = SolverTask(scene, description, medium, cache, seed=1, rr_depth=1000)
+    PathSolver(task).refine(samples)
     return medium, cache
 
 

@@ -224,12 +224,12 @@ def test_the_choice_of_solver(scenes):
         depth = 4 if "depth" in reason else -1
         scene = load(scenes, scene_sky(scenes) | more)
         (medium, *_) = compile_scene(scene).visible
-        assert choose_solver(scene, medium, "auto", depth)[0] == "path"
+        assert choose_solver(scene, medium, "auto", depth)[0].name == "path"
         with pytest.raises(IrrcacheError, match=f"(?s)sweep.*{reason}.*path"):
             filled(scene, max_depth=depth)
     scene = load(scenes, scene_occluder(scenes))
     (medium,) = compile_scene(scene).visible
-    assert choose_solver(scene, medium, "auto")[0] == "sweep"
+    assert choose_solver(scene, medium, "auto")[0].name == "sweep"
 
 
 def test_standard_error_is_the_scatter(scenes):

@@ -11,17 +11,25 @@ cache, the others the *scattered* one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.volume import BATCH, LAYERS, IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.occluders import hole_in
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
+from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask, register
+from mitsuba_irrcache.solvers.grid_size import SizeAmongSurfaces, SizeRule
 from mitsuba_irrcache.solvers.path import estimator as volume_path
+from mitsuba_irrcache.solvers.sn.solver import occupied_box
 from mitsuba_irrcache.transport.path import Media
 from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 
@@ -29,51 +37,112 @@ from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 #: bytes each).
 LANES = 1 << 21
 
-#: called with (samples done, samples in all), both in voxels times samples
-Progress = Callable[[int, int], None]
+#: Samples of all voxels together by default, without and among surfaces, where each is more work;
+#: and samples per voxel, at least and at most.
+PATHS, PATHS_AMONG_SURFACES = 2**24, 2**22
+FEWEST_SAMPLES, MOST_SAMPLES = 16, 256
 
 
-def refine(
-    scene: mi.Scene,
-    media: Media,
-    medium: MediumGrid,
-    cache: IrradianceCache,
-    samples: int,
-    seed: int,
-    rr_depth: int,
-    progress: Progress | None = None,
-) -> None:
-    """Adds ``samples`` per voxel (a multiple of ``BATCH``) of the random stream ``seed``.
+@register
+class PathSolver(Solver):
+    """Traces paths from the voxel centres, in any scene."""
 
-    The stream goes on where an earlier call with the same seed stopped. If ``progress`` raises,
-    passes that are complete stay in the cache.
-    """
-    dark = not scene.emitters() and medium.emission is None
-    if not cache.active_count or _orders(cache) < 1 or dark:
-        cache.note_samples(seed, samples)
-        return
-    estimator = _Estimator(scene, media, medium, cache, seed, rr_depth)
-    total, done = cache.active_count * samples, 0
-    if total > 16 * LANES:
-        seconds = estimator.seconds(total)
-        mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
-    lanes = _lanes(cache)
-    block = min(cache.active_count, lanes // BATCH)
-    batches_at_once = max(1, lanes // (BATCH * block))
-    remaining = samples // BATCH
-    while remaining:
-        count = min(batches_at_once, remaining)
-        first = cache.streams.get(seed, 0) // BATCH
-        layers = []
-        for voxels in _blocks(cache.active_count, block):
-            if layers and progress is not None:
+    name = "path"
+    #: Its noise in smaller voxels would exceed the error of larger ones, and its work grows with
+    #: their number; among surfaces the number of paths does not depend on that of the voxels.
+    size_rule = SizeRule(
+        target_error=1.0,
+        fewest=16,
+        most_by_contrast=32,
+        most_by_border=32,
+        refines_dense_data=False,
+        most=128,
+        among_surfaces=SizeAmongSurfaces(32, 64, target_error=0.25),
+    )
+    has_preview = True
+
+    @classmethod
+    def why_not(
+        cls, scene: mi.Scene, medium: MediumGrid, max_depth: int, resolution: int
+    ) -> str | None:
+        return None
+
+    @classmethod
+    def why(cls, medium: MediumGrid) -> str:
+        return "it supports all scenes"
+
+    @classmethod
+    def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
+        paths = PATHS_AMONG_SURFACES if medium.is_traced else PATHS
+        return int(np.clip(paths // max(active_count, 1), FEWEST_SAMPLES, MOST_SAMPLES))
+
+    @classmethod
+    def batch_size(
+        cls, medium: MediumGrid, max_depth: int, samples: int, basis: AngularBasis | None
+    ) -> int:
+        return BATCH
+
+    @classmethod
+    def numbers_per_voxel(
+        cls, medium: MediumGrid, max_depth: int, moments: int, voxels: int, channels: int
+    ) -> int:
+        # Sums are in float64.
+        return channels * (3 * 2 + 3) + 5 + channels * moments * 3
+
+    @classmethod
+    def voxel_classes(
+        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid
+    ) -> VoxelClasses | None:
+        return VoxelClasses(scene, media, medium, grid) if medium.is_traced else None
+
+    @classmethod
+    def knows_direct_lights(
+        cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
+    ) -> bool:
+        """Whether all of a straight line within the boundary of ``medium`` is in the medium, unless
+        it ends at a surface.
+        """
+        if medium.is_isolated or not dr.width(active):
+            return medium.is_isolated
+        if not medium.has_exact_boundary or medium.others:
+            return False
+        return hole_in(scene, medium, grid, occupied_box(grid, active)) is None
+
+    def __init__(self, task: SolverTask) -> None:
+        self._task = task
+
+    def refine(self, samples: int, progress: Progress | None = None) -> None:
+        task = self._task
+        cache, seed = task.cache, task.seed
+        dark = not task.description.emitters and task.medium.emission is None
+        if not cache.active_count or _orders(cache) < 1 or dark:
+            cache.note_samples(seed, samples)
+            return
+        estimator = _Estimator(task)
+        total, done = cache.active_count * samples, 0
+        if total > 16 * LANES:
+            seconds = estimator.seconds(total)
+            mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
+        lanes = _lanes(cache)
+        block = min(cache.active_count, lanes // BATCH)
+        batches_at_once = max(1, lanes // (BATCH * block))
+        remaining = samples // BATCH
+        while remaining:
+            count = min(batches_at_once, remaining)
+            first = cache.streams.get(seed, 0) // BATCH
+            layers = []
+            for voxels in _blocks(cache.active_count, block):
+                if layers and progress is not None:
+                    progress(done, total)
+                layers.append(estimator.batches(voxels, first, count))
+                done += dr.width(voxels) * BATCH * count
+            cache.add(seed, BATCH * count, layers)
+            if progress is not None:
                 progress(done, total)
-            layers.append(estimator.batches(voxels, first, count))
-            done += dr.width(voxels) * BATCH * count
-        cache.add(seed, BATCH * count, layers)
-        if progress is not None:
-            progress(done, total)
-        remaining -= count
+            remaining -= count
+
+    def preview(self) -> Opening:
+        return Opening(self._task)
 
 
 def _orders(cache: IrradianceCache) -> int:
@@ -111,23 +180,15 @@ def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
     return (layers, tuple(spreads), *([moments] if moments else []))
 
 
-class Opening:
+class Opening(Preview):
     """The first two batches of a stream, a few samples of both at a time, for early images: two are
     enough for a standard error. Complete, they are what `refine` begins with.
     """
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        media: Media,
-        medium: MediumGrid,
-        cache: IrradianceCache,
-        seed: int,
-        rr_depth: int,
-    ) -> None:
-        self.cache, self.seed = cache, seed
+    def __init__(self, task: SolverTask) -> None:
+        self.cache, self.seed = task.cache, task.seed
         self.size = 0  #: samples of each batch so far
-        self._estimator = _Estimator(scene, media, medium, cache, seed, rr_depth)
+        self._estimator = _Estimator(task)
         # In blocks of voxels, for each layer and channel: the sums of both batches.
         self._totals: list[list] = []
 
@@ -156,17 +217,15 @@ class Opening:
 class _Estimator:
     """One kernel for all passes: whatever differs between them is opaque to it."""
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        media: Media,
-        medium: MediumGrid,
-        cache: IrradianceCache,
-        seed: int,
-        rr_depth: int,
-    ) -> None:
+    def __init__(self, task: SolverTask) -> None:
+        scene, medium, cache = task.scene, task.medium, task.cache
         orders = _orders(cache)
-        self.scene, self.media, self.medium, self.cache = scene, media, medium, cache
+        self.scene, self.media, self.medium, self.cache = (
+            scene,
+            task.description.media,
+            medium,
+            cache,
+        )
         self.places = VoxelSamplePoints(scene, cache.grid)
         # Emitters of direct lights are not sampled at the voxels themselves.
         self._apart = [mi.EmitterPtr(light.emitter) for light in cache.direct_lights]
@@ -181,7 +240,7 @@ class _Estimator:
         # Light of the medium itself is found on the way to the next collision.
         self.multiple = orders > 1 or medium.emission is not None
         self.orders, self.seed, self.rr_depth = (
-            dr.opaque(mi.UInt32, n) for n in (orders, seed, rr_depth)
+            dr.opaque(mi.UInt32, n) for n in (orders, task.seed, task.rr_depth)
         )
 
     def batches(self, voxels: mi.UInt32, first: int, count: int) -> tuple:

@@ -18,7 +18,6 @@ import numpy as np
 
 from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.emitters import EmitterKind
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.sn.boundary_condition import SurfaceBoundary
@@ -46,10 +45,6 @@ NO_LIGHT, CHECKED = 1e-7, 8
 
 #: called with (samples done, samples in all), both in voxels times directions
 Progress = Callable[[int, int], None]
-
-
-#: Kinds of emitters whose light can be carried along lines, or sampled from the voxels.
-EMITTERS = frozenset(EmitterKind) - {EmitterKind.DIRECTIONAL_AREA, EmitterKind.UNKNOWN}
 
 
 def swept_together(medium: MediumGrid, voxels: int) -> bool:
