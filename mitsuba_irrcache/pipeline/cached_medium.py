@@ -1,4 +1,4 @@
-"""One medium of a scene, and the cache of the light in it."""
+"""One visible medium of a scene, and its cache."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _SAVING = Lock()
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """What a cache is asked to be; see the plugin's documentation."""
+    """Properties of the integrator that caches depend on; see the plugin's documentation."""
 
     max_depth: int = -1
     rr_depth: int = 5
@@ -53,8 +53,8 @@ class CacheSettings:
 
 
 class CachedMedium:
-    """A medium with its cache, which is None where no light needs caching (``max_depth`` below
-    2).
+    """A medium with its cache, which is None where none is needed (``max_depth`` below 2, or a
+    closed form).
 
     ``solver`` is a result of `choose_solver`; ``name`` distinguishes the medium from other visible
     ones of the scene, "" where there are none; ``edited``: the scene is an edited version of one
@@ -83,7 +83,7 @@ class CachedMedium:
         self._preview: IrradianceCache | None = None
         self._kept_solver: Solver | None = None
         self.cache: IrradianceCache | None = None
-        #: closed form in place of a cache; None where there is one, or nothing to be computed
+        #: closed form that replaces the cache; None where there is a cache, or nothing is scattered
         self.half_space: HalfSpace | None = None
         if settings.max_depth in (0, 1):
             return
@@ -100,12 +100,12 @@ class CachedMedium:
 
     @property
     def label(self) -> str:
-        """Before a message about it."""
+        """Prefix of messages about it."""
         return f'medium "{self.name}": ' if self.name else ""
 
     @property
     def file(self) -> str:
-        """Its own where there are several media, with the medium's name in it."""
+        """File of the cache; of several media, each has its own with the medium's name in it."""
         if not self.settings.file or not self.name:
             return self.settings.file
         file = Path(self.settings.file)
@@ -114,12 +114,12 @@ class CachedMedium:
 
     @property
     def shown(self) -> IrradianceCache | None:
-        """The cache, or the incomplete batches that stand for it so far."""
+        """The cache to be rendered, or a preview of it while its first batches are incomplete."""
         return self._preview or self.cache
 
     def target(self, samples: int) -> int:
-        """Samples per voxel to build up to where ``samples`` (0: chosen) are wanted, a multiple of
-        the cache's batch.
+        """Samples per voxel to build up to for ``samples`` (0: the default), a multiple of the
+        cache's batch.
         """
         batch = self.cache.batch
         samples = samples or self.solver.default_samples(
@@ -129,12 +129,12 @@ class CachedMedium:
 
     @property
     def is_dark(self) -> bool:
-        """Whether the cache is zero, or there is none: samples change nothing."""
+        """Whether the cache is known to be zero, or there is none: samples change nothing."""
         return self.cache is None or not self.cache.active_count
 
     def refine(self, scene: mi.Scene, samples: int, early: bool, progress: Progress | None) -> bool:
-        """Fills the cache up to ``samples`` (0: chosen), the first two batches in pieces if
-        ``early``; whether anything may have changed.
+        """Fills the cache up to ``samples`` (0: the default), the first two batches bit by bit if
+        ``early``; returns whether anything may have changed.
         """
         if early and self.solver.has_preview and not self.is_dark and not self.cache.samples:
             return self._open(scene, samples, progress)
@@ -145,13 +145,14 @@ class CachedMedium:
         if not self.is_dark and not self.cache.is_finite:
             self.cache, self._kept_solver = self._start_cache(scene, edited=False), None
             raise IrrcacheError(
-                f"irrcache: {self.label}the light in the medium is not finite in single precision; "
-                "lower the radiance of the emitters, and look through sigma_t and albedo."
+                f"irrcache: {self.label}the irradiance in the medium is not finite in single "
+                "precision; "
+                "lower the radiance of the emitters, and check sigma_t and albedo."
             )
         return True
 
     def close(self) -> bool:
-        """Drops incomplete batches; whether there were any."""
+        """Drops incomplete batches; returns whether there were any."""
         dropped = self._preview is not None
         self._opening = self._preview = None
         return dropped
@@ -244,7 +245,7 @@ class CachedMedium:
         CacheFileError for the file of another scene.
         """
         file = Path(self.file)
-        if not os.path.exists(file):  # says no, where Path.exists may raise
+        if not os.path.exists(file):  # returns False where Path.exists may raise
             if not os.path.isdir(file.parent):
                 raise IrrcacheError(
                     f'irrcache: cache_file "{file}": the folder "{file.parent}" does not exist.'
@@ -266,7 +267,7 @@ class CachedMedium:
             mi.Log(
                 mi.LogLevel.Warn,
                 f'irrcache: the scene was edited ({", ".join(others)}): "{file}" keeps the '
-                "light of before.",
+                "irradiance of the scene before.",
             )
             return None
         detail = (
@@ -282,7 +283,7 @@ class CachedMedium:
         )
 
     def _open(self, scene: mi.Scene, samples: int, progress: Progress | None) -> bool:
-        """Adds to the first two batches up to ``samples`` in all; whether anything was added."""
+        """Adds to the first two batches up to ``samples`` in all; returns whether it added any."""
         cache = self.cache
         if self._opening is None:
             self._opening = self._new_solver(scene).preview()
@@ -333,8 +334,8 @@ class CachedMedium:
         cache.save(file, self._fingerprint(scene, cache.grid, cache.moments))
 
     def save(self) -> None:
-        """Writes the cache to its file, where it has one that has fewer samples, also by now: other
-        processes may share it. The light is not lost with a file that cannot be written.
+        """Saves the cache to its file unless the file, possibly updated by another process, already
+        holds at least as many samples. Logs a warning where the file cannot be written.
         """
         file, cache = self.file, self.cache
         if not file or cache is None or not cache.fingerprint:
@@ -342,7 +343,7 @@ class CachedMedium:
         if cache.samples <= self.saved_samples:
             return
         try:
-            with _SAVING:  # no other thread writes the file between looking and writing
+            with _SAVING:  # no other thread writes the file between check and writing
                 if not self._is_ahead(file):
                     cache.save(file)
             self.saved_samples = cache.samples
@@ -350,23 +351,23 @@ class CachedMedium:
             mi.Log(
                 mi.LogLevel.Warn,
                 f"irrcache: {self.label}the cache was not saved: {str(error).rstrip('.')}. It is "
-                "used all the same.",
+                "used nevertheless.",
             )
 
     def _is_ahead(self, file: str) -> bool:
-        """Whether another process has written as many samples of the same light meanwhile. Raises
-        CacheFileError if it is other light.
+        """Whether another process has written as many samples of the same scene meanwhile. Raises
+        CacheFileError if the file now belongs to another scene.
         """
         if not Path(file).exists():
             return False
         fingerprint, samples = IrradianceCache.description_of(file)
         if differing(fingerprint, self.cache.fingerprint):
-            raise CacheFileError(f'"{file}" has come to hold the light of another scene')
+            raise CacheFileError(f'"{file}" has been replaced by the cache of another scene')
         return samples >= self.cache.samples
 
 
 def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> None:
-    """Raises CacheFileError if a file says of itself what it is not."""
+    """Raises CacheFileError if the contents of a file contradict its fingerprint."""
     alike = ("active_count", "channels", "correlated", "max_depth", "moments")
     unlike = [name for name in alike if getattr(cache, name) != getattr(stored, name)]
     if stored.grid.shared(cache.grid) is not cache.grid:

@@ -1,8 +1,8 @@
-"""What irrcache finds in a scene, and what it has to refuse.
+"""From Mitsuba's scene to its description, and which scenes are refused.
 
-A scene is *simple* if all there is to it is one medium in a box or sphere, and light that comes
-from far away or from points: then nothing has to be intersected, and every ray's way is known in
-closed form. In all other scenes Mitsuba's ray tracing says where surfaces and boundaries are.
+A medium is *isolated* if the scene has no other medium and no surface, it fills a box or sphere,
+and all emitters are distant or points: then no ray has to be intersected with shapes. In all other
+scenes Mitsuba's ray tracing finds surfaces and boundaries.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from mitsuba_irrcache.scene.consistency import (
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
 
-#: The distance at which Mitsuba's rays leave a surface should not exceed this part of the shortest
+#: The offset of Mitsuba's secondary rays from a surface should not exceed this part of the shortest
 #: side of a medium.
 LARGEST_OFFSET = 0.002
-#: Steps between positions in single precision that a side of a medium, and a voxel, must have.
+#: Number of positions in single precision that a side of a medium, and a voxel, must have.
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
 
 
@@ -154,18 +154,18 @@ def _warn_that_none_is_visible(emission: Emission | None) -> None:
 
 
 def _check_distance(name: str, distance: float, finest: float) -> None:
-    """Refuses a medium so far away from the origin that positions in it cannot be told apart."""
+    """Refuses a medium too far from the origin for the resolution of single precision."""
     step = float(np.spacing(np.float32(distance)))
     if step > finest:
         _refuse(
-            f'medium "{name}" is {distance:.2g} away from the origin, where single precision tells '
-            f"positions {step:.1g} apart only",
+            f'medium "{name}" is {distance:.2g} away from the origin, where positions in single '
+            f"precision are {step:.1g} apart",
             " Scale it up, or move it to the origin.",
         )
 
 
 def media_of(scene: mi.Scene) -> dict[mi.Medium, list[mi.Shape]]:
-    """All media of a scene, each with the shapes that it fills."""
+    """All media of a scene, each with the shapes whose interior it is."""
     found: dict[mi.Medium, list[mi.Shape]] = {}
     for shape in scene.shapes():
         interior, exterior = shape.interior_medium(), shape.exterior_medium()
@@ -222,8 +222,8 @@ def _unique_name(medium: mi.Medium, taken: list[str]) -> str:
 
 
 def _extent(medium: mi.Medium, filled: list[mi.Shape]) -> np.ndarray:
-    """``to_world`` of the cube [-1, 1]^3 over the world box of ``medium``: of the shapes that it
-    fills, and of its own grid.
+    """``to_world`` of the cube [-1, 1]^3 over the world box of ``medium``: the intersection of the
+    boxes of the shapes that it fills and of its own grid.
     """
     boxes = []
     if filled:
@@ -256,25 +256,25 @@ def _refuse_unbounded(medium: mi.Medium, shapes: list[mi.Shape]) -> None:
         more = f" and of {len(around) - 1} more" if len(around) > 1 else ""
         role = f"is the exterior of {described(around[0])}{more}, and "
     _refuse(
-        f'medium "{medium.id()}" ({medium.class_name()}) {role}fills no shape: it would reach to '
-        "infinity, and a cache cannot",
+        f'medium "{medium.id()}" ({medium.class_name()}) {role}fills no shape: it would be '
+        "infinite, and a cache cannot be",
         " Put a closed shape with a null BSDF, such as a cube, around everything that has it as "
         "its interior. Walls and objects within that shape need neither interior nor exterior, "
-        "since rays that they send back stay in the medium; only glass does.",
+        "since rays that they reflect stay in the medium; only glass does.",
     )
 
 
 def _check_shape(scene: mi.Scene, shape: mi.Shape) -> None:
     if shape.class_name() == "Instance" and _has_media(scene, shape):
         _refuse(
-            f"{described(shape)} is an instance of shapes with media, of which there is no "
-            "telling where they are",
+            f"{described(shape)} is an instance of shapes with media, whose positions Mitsuba does "
+            "not report",
             " Place these shapes in the scene themselves.",
         )
 
 
 def _has_media(scene: mi.Scene, instance: mi.Shape) -> bool:
-    """Whether rays through an instance come into a medium there."""
+    """Whether rays through an instance enter a medium there."""
     return bool(dr.any(_meets_media(scene, mi.ShapePtr(instance), rays_through(instance))))
 
 
@@ -294,7 +294,7 @@ def _meets_media(scene: mi.Scene, instance: mi.ShapePtr, ray: mi.Ray3f):
 
 
 def _warn_of_scale(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
-    """Tells where Mitsuba's rays, which leave a surface at some distance from it, lose light."""
+    """Warns where the offset of Mitsuba's rays from surfaces is large compared to a medium."""
     corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
     offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
     for grid in grids:
@@ -303,8 +303,8 @@ def _warn_of_scale(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
             mi.Log(
                 mi.LogLevel.Warn,
                 f'irrcache: medium "{grid.name}" is {size:.2g} thin, and rays that leave surfaces '
-                f"in this scene skip up to {offset:.1g}, as in volpath: light is lost. Scale the "
-                "scene up, or move it to the origin.",
+                f"in this scene skip up to {offset:.1g}, as in volpath: the image is too dark. "
+                "Scale the scene up, or move it to the origin.",
             )
 
 

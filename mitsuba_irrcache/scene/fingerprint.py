@@ -1,4 +1,4 @@
-"""What a cache depends on: quick identities within a process, digests of the contents for files."""
+"""What a cache depends on: identities of objects within a process, digests for files."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _ELSEWHERE = re.compile(
 
 
 class Snapshot:
-    """The objects and parameters of a scene that its light depends on, as they are now. Comparing
-    two of them launches no kernel unless a parameter was edited in between.
+    """The objects and parameters of a scene that its caches depend on, as they are now. Comparing
+    two snapshots launches no kernel unless a parameter was edited in between.
 
     It holds references of its own to Dr.Jit's variables, not to Mitsuba's members, which change
     with the scene. As long as it does, no other variable can get the index of one of them, and
@@ -206,7 +206,7 @@ def _agree(name: str, mine: str | None, theirs: str | None) -> bool:
 
 
 def responses(scene: mi.Scene) -> str:
-    """What rays find at the shapes of a scene: numbers in [0, 1] for each of them.
+    """Responses of the shapes of a scene to random rays: numbers in [0, 1] for each shape.
 
     Some options of Mitsuba's plugins are neither parameters nor in their descriptions (the filter
     of a bitmap, the normals of an sdfgrid, invalid normals of a bump map, ...). They show in how
@@ -246,7 +246,7 @@ def responses(scene: mi.Scene) -> str:
         0.5 + 0.5 * dr.dot(axis, sample.wo),
         *(_squashed(value) for value in (reflected, weight, emitted)),
     ]
-    # Weights tell apart what is the same on average.
+    # Random weights distinguish responses that have the same mean.
     sums = [dr.block_sum(dr.select(valid, value, 0) * draws[12], PROBES) for value in found]
     numbers = np.nan_to_num(np.array(sums, dtype=np.float64) / PROBES, nan=1.0)
     return " ".join(f"{number:.6f}" for number in numbers.T.ravel())

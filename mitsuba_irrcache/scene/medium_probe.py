@@ -17,7 +17,7 @@ def medium_at(scene: mi.Scene, position: np.ndarray) -> mi.MediumPtr:
 
 @symbolic
 def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
-    """The medium at ``p``, as the first shape along ``direction`` tells that has a medium; none
+    """The medium at ``p`` according to the first shape along ``direction`` that has a medium; none
     where there is no such shape.
     """
     ray, pointer = mi.Ray3f(p, direction), dr.zeros(mi.MediumPtr, dr.width(p))
@@ -25,9 +25,9 @@ def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
     while dr.hint(active, label="probe"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        tells = active & si.is_medium_transition()
-        pointer = dr.select(tells, si.target_medium(-direction), pointer)
+        transition = active & si.is_medium_transition()
+        pointer = dr.select(transition, si.target_medium(-direction), pointer)
         ray = si.spawn_ray(direction)
         crossings += 1
-        active &= ~tells & (crossings < MOST_CROSSINGS)
+        active &= ~transition & (crossings < MOST_CROSSINGS)
     return pointer

@@ -147,7 +147,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
 
 
 def _colliding_extinction(medium: MediumGrid) -> float:
-    """The mean extinction over collisions in even light, int sigma_t^2 / int sigma_t
+    """The mean extinction over collisions in uniform radiance, int sigma_t^2 / int sigma_t
     [1/scene unit].
     """
     sigma_t = medium.sigma_t
@@ -161,15 +161,15 @@ def _colliding_extinction(medium: MediumGrid) -> float:
 
 
 def border_error(medium: MediumGrid, grid: Grid) -> float:
-    """The estimated error of the pixels at the boundary of a medium that cuts through matter [%],
-    where irradiance is interpolated between the voxels of ``grid``.
+    """The estimated error [%] of pixels at the boundary of a medium that is dense there, where
+    irradiance is interpolated between the voxels of ``grid``.
     """
     return BORDER_ERROR * (_border_extinction(medium) * grid.voxel_size.max()) ** BORDER_ORDER
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
-    """Logs a warning where the cache is too coarse for matter that the boundary cuts: irradiance
-    falls off within a fraction of a mean free path there, and no voxel lies beyond.
+    """Logs a warning where the cache is too coarse for a medium that is dense at its boundary:
+    irradiance falls off within a fraction of a mean free path there, and no voxel lies beyond.
     """
     depth = _border_extinction(medium) * grid.voxel_size.max()
     error = border_error(medium, grid)
@@ -183,7 +183,7 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
 
 
 def _border_extinction(medium: MediumGrid) -> float:
-    """What 95 % of the medium's faces do not exceed: sigma_t [1/scene unit]."""
+    """The 95th percentile of sigma_t on the faces of the medium [1/scene unit]."""
     rng = mi.PCG32(4096)
     face = dr.arange(mi.UInt32, 4096) % 6
     place = [rng.next_float32() for _ in range(3)]
