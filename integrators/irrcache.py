@@ -28,8 +28,9 @@ from mitsuba_irrcache.render.denoise import FILTERS, filter_illumination
 from mitsuba_irrcache.render.film import check_film, exclusive, fill_film, planes, render_film
 from mitsuba_irrcache.render.quadrature import QUADRATURES
 from mitsuba_irrcache.scene.consistency import check_sensor
+from mitsuba_irrcache.solvers.base import registered
 
-SOLVERS = ("auto", "path", "sweep")
+SOLVERS = ("auto", *sorted(solver.name for solver in registered()))
 _NO_GRADIENTS = 'irrcache computes no gradients; use the integrator "prbvolpath" for them.'
 
 

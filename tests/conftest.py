@@ -67,13 +67,13 @@ def refine_calls(monkeypatch) -> list[int]:
     from mitsuba_irrcache.solvers.path import solver as path_solver
 
     calls: list[int] = []
-    refine = path_solver.refine
+    refine = path_solver.PathSolver.refine
 
-    def counted(scene, medium, cache, samples, *args, **kwargs):
+    def counted(solver, samples, *args):
         calls.append(samples)
-        return refine(scene, medium, cache, samples, *args, **kwargs)
+        return refine(solver, samples, *args)
 
-    monkeypatch.setattr(path_solver, "refine", counted)
+    monkeypatch.setattr(path_solver.PathSolver, "refine", counted)
     return calls
 
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import kind_of
 from mitsuba_irrcache.media.phase import Phase
 
 #: Maximum sine of the angular radius of a lamp that is treated as narrow.
@@ -316,12 +317,12 @@ def sources_of(scene: mi.Scene) -> list[Source]:
     """Find the narrow sources of a scene."""
     found, lamps = [], []
     for emitter in scene.emitters():
-        flags = emitter.flags()
-        if mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
+        kind = kind_of(emitter)
+        if kind.has_one_direction:
             found.append(Source(_sampled(emitter).d.numpy().ravel(), MIN_ANGULAR_RADIUS, far=True))
-        elif mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
+        elif kind.is_point_like:
             found.append(Source(_sampled(emitter).p.numpy().ravel(), 0.0, far=False))
-        elif emitter.is_environment():
+        elif kind.is_environment:
             found += spots_of(emitter)[0]
     for shape in scene.shapes():
         if shape.is_emitter():

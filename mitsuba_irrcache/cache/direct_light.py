@@ -29,7 +29,7 @@ from mitsuba_irrcache.lights.emitters import is_sun, point_lights, position_of, 
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
-from mitsuba_irrcache.transport.path import visibility
+from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import optical_depth
 
 #: Points along each axis of a voxel over which E, and over which exp(-tau), is averaged.
@@ -62,7 +62,7 @@ class DirectLight:
         #: what surfaces and other media let through at the voxels; None where there are none
         self._others: RootField | None = None
         passed = mi.Spectrum(1)
-        if medium.surroundings is not None:
+        if medium.is_traced:
             position = [dr.opaque(mi.Float, float(v)) for v in position_of(emitter)]
             passed = _past_others(scene, medium, p, mi.Point3f(position))
             dr.eval(passed)
@@ -215,7 +215,7 @@ def _past_others(
     scene: mi.Scene, medium: MediumGrid, p: mi.Point3f, target: mi.Point3f
 ) -> mi.Spectrum:
     """What surfaces and other media let through between ``p`` and ``target``."""
-    others = medium.surroundings.media.around(medium).without(medium)
+    others = Media.around(medium).without(medium)
     vertex = dr.zeros(mi.Interaction3f, dr.width(p))
     vertex.p = p
     rng = mi.PCG32(dr.width(p))

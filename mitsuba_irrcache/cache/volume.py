@@ -16,6 +16,7 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
 from mitsuba_irrcache.cache.direct_light import DirectLight
+from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation
 from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
 from mitsuba_irrcache.cache.storage import (
     ARRAYS,
@@ -78,6 +79,7 @@ class IrradianceCache:
         batch: int = BATCH,
         correlated: bool = False,
         moments: int = 0,
+        interpolation: Interpolation = PLAIN,
     ) -> None:
         """Create an empty cache.
 
@@ -94,15 +96,8 @@ class IrradianceCache:
         self.max_depth = max_depth
         self.fingerprint = fingerprint or {}
         self.moments = moments
-        #: angular basis of the moments
-        self.directional: AngularBasis | None = None
-        #: inverse-square factor of nearby lamps, or None
-        self.falloff: InverseSquareFactor | None = None
-        #: spot lights, which camera rays evaluate separately; the layers contain their means
-        self.direct_lights: list[DirectLight] = []
-        #: classification of voxels relative to surfaces, or None
-        self.survey: VoxelClasses | None = None
-        #: number of samples per voxel of each random stream
+        self.interpolation = interpolation
+        #: samples taken per voxel from each random stream
         self.streams: dict[int, int] = {}
         self.correlated = correlated
         self.real = mi.Float if correlated else dr.float64_array_t(mi.Float)
@@ -113,10 +108,25 @@ class IrradianceCache:
         # Sums of batch means for each moment and channel, in float32.
         self._moments: list = [None] * (moments * channels)
 
-    def copy_scene_attributes(self, other: IrradianceCache) -> None:
-        """Copy the scene-dependent attributes of ``other``, another cache of the same medium."""
-        self.directional, self.survey = other.directional, other.survey
-        self.falloff, self.direct_lights = other.falloff, other.direct_lights
+    @property
+    def directional(self) -> AngularBasis | None:
+        """See `Interpolation`."""
+        return self.interpolation.directional
+
+    @property
+    def falloff(self) -> InverseSquareFactor | None:
+        """See `Interpolation`."""
+        return self.interpolation.falloff
+
+    @property
+    def direct_lights(self) -> tuple[DirectLight, ...]:
+        """See `Interpolation`."""
+        return self.interpolation.direct_lights
+
+    @property
+    def voxel_classes(self) -> VoxelClasses | None:
+        """See `Interpolation`."""
+        return self.interpolation.voxel_classes
 
     # ------------------------------------------------------------------ statistics
 
@@ -227,8 +237,8 @@ class IrradianceCache:
         if not self.correlated:
             variance = self._tensor(noise[:channels]).array
         values = conserving(self.grid, values, known, channels, share)
-        if self.survey is not None:
-            values = self.survey.filled(values, channels)
+        if self.voxel_classes is not None:
+            values = self.voxel_classes.filled(values, channels)
         field = RootField(self.grid, values, channels, variance)
         if self.falloff is not None:
             field.maximum *= self.falloff.maximum(self.active)
@@ -364,8 +374,10 @@ class IrradianceCache:
     # ------------------------------------------------------------------ files
 
     @_consistent
-    def save(self, path: str | Path) -> None:
-        """Write the cache with all its statistics, atomically."""
+    def save(self, path: str | Path, fingerprint: dict[str, str] | None = None) -> None:
+        """Writes the cache with all its statistics; the file appears whole or not at all.
+        ``fingerprint`` takes the place of the cache's own.
+        """
         description = {
             "format": WITH_MOMENTS if self.moments else FORMAT,
             "shape": self.grid.shape,
@@ -376,7 +388,7 @@ class IrradianceCache:
             **({"moments": self.moments} if self.moments else {}),
             "max_depth": self.max_depth,
             "streams": {str(seed): n for seed, n in self.streams.items()},
-            "fingerprint": self.fingerprint,
+            "fingerprint": self.fingerprint if fingerprint is None else fingerprint,
         }
         arrays = {
             "active": np.array(self.active),
@@ -394,8 +406,10 @@ class IrradianceCache:
         return np.array([np.array(self._zeros if v is None else v, kind) for v in values])
 
     @classmethod
-    def load(cls, path: str | Path) -> IrradianceCache:
-        """Read a file written by ``save``; raise CacheFileError, which names it, for others."""
+    def load(cls, path: str | Path, interpolation: Interpolation = PLAIN) -> IrradianceCache:
+        """Reads a cache that ``save`` wrote; a file does not hold its ``interpolation``. Raises
+        CacheFileError, naming the file, for anything else.
+        """
         path = Path(path)
         try:
             arrays = read_arrays(path)
@@ -405,7 +419,7 @@ class IrradianceCache:
                     f'"{path}" has the format {description["format"]!r}, this version reads '
                     f"{FORMAT!r} and {WITH_MOMENTS!r}."
                 )
-            return cls._restore(description, arrays)
+            return cls._restore(description, arrays, interpolation)
         except CacheFileError:
             raise
         except Exception as error:  # a damaged file may cause any exception
@@ -425,7 +439,9 @@ class IrradianceCache:
             raise unreadable(path, error) from error
 
     @classmethod
-    def _restore(cls, description: dict, arrays: dict[str, np.ndarray]) -> IrradianceCache:
+    def _restore(
+        cls, description: dict, arrays: dict[str, np.ndarray], interpolation: Interpolation
+    ) -> IrradianceCache:
         grid = Grid(tuple(int(n) for n in description["shape"]), np.array(description["to_world"]))
         active, totals, spreads = (arrays[name] for name in ARRAYS)
         channels = int(description["channels"])
@@ -471,6 +487,7 @@ class IrradianceCache:
             batch,
             correlated,
             count,
+            interpolation,
         )
         cache._moments = [mi.Float(t) if t.any() else None for t in moments]
         cache.streams = streams

@@ -1,14 +1,99 @@
-"""Classification of emitters, and rejection of placements that Mitsuba handles inconsistently."""
+"""What kinds of emitters there are, and placements that Mitsuba itself does not get right."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from enum import Enum
 
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.errors import UnsupportedSceneError
 
 #: Tolerated deviation of the columns of a rotation from orthonormality.
 ORTHONORMAL_TOLERANCE = 2e-3
+
+
+class EmitterKind(Enum):
+    """What an emitter is to irrcache. A new kind is added here and in `kind_of`; solvers say which
+    kinds they support.
+    """
+
+    #: infinitely far away, from all directions with the same radiance
+    CONSTANT_ENVIRONMENT = "constant environment"
+    #: infinitely far away, with a radiance that depends on the direction
+    ENVIRONMENT_MAP = "environment map"
+    #: infinitely far away, from a single direction
+    SUN = "sun"
+    #: at a position, with the same intensity in all directions
+    POINT = "point"
+    #: at a position, within a cone
+    SPOT = "spot"
+    #: at a position, with an intensity that depends on the direction in any other way
+    PROJECTOR = "projector"
+    #: on a surface, in all directions
+    AREA = "area"
+    #: on a surface, in a single direction
+    DIRECTIONAL_AREA = "directional area"
+    UNKNOWN = "unknown"
+
+    @property
+    def is_environment(self) -> bool:
+        """Whether rays that leave the scene meet it."""
+        return self in (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP)
+
+    @property
+    def has_one_direction(self) -> bool:
+        """Whether it emits in a single direction."""
+        return self in (EmitterKind.SUN, EmitterKind.DIRECTIONAL_AREA)
+
+    @property
+    def is_point_like(self) -> bool:
+        """Whether it has a position and no extent."""
+        return self in POINT_LIKE
+
+
+#: Kinds that have a position and no extent; and those of them whose intensity depends on direction.
+POINT_LIKE = (EmitterKind.POINT, EmitterKind.SPOT, EmitterKind.PROJECTOR)
+SPOT_LIKE = (EmitterKind.SPOT, EmitterKind.PROJECTOR)
+
+
+def kind_of(emitter: mi.Emitter) -> EmitterKind:
+    """The kind of an emitter, by Mitsuba's flags and, where these are the same, its plugin."""
+    flags, name = emitter.flags(), emitter.class_name()
+    if mi.has_flag(flags, mi.EmitterFlags.Surface):
+        if mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
+            return EmitterKind.DIRECTIONAL_AREA
+        if mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
+            return EmitterKind.UNKNOWN
+        return EmitterKind.AREA
+    if mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
+        return EmitterKind.SUN
+    if mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
+        kinds = {"PointLight": EmitterKind.POINT, "SpotLight": EmitterKind.SPOT}
+        return kinds.get(name, EmitterKind.PROJECTOR)
+    if mi.has_flag(flags, mi.EmitterFlags.Infinite):
+        is_constant = name == "ConstantBackgroundEmitter"
+        return EmitterKind.CONSTANT_ENVIRONMENT if is_constant else EmitterKind.ENVIRONMENT_MAP
+    return EmitterKind.UNKNOWN
+
+
+class EmittersByKind(Immutable):
+    """The emitters of a scene, in its order, with their kinds."""
+
+    def __init__(self, emitters: Sequence[mi.Emitter]) -> None:
+        self._emitters = tuple((emitter, kind_of(emitter)) for emitter in emitters)
+
+    def __len__(self) -> int:
+        return len(self._emitters)
+
+    def __iter__(self) -> Iterator[tuple[mi.Emitter, EmitterKind]]:
+        return iter(self._emitters)
+
+    def of(self, *kinds: EmitterKind) -> list[mi.Emitter]:
+        """The emitters of these kinds."""
+        return [emitter for emitter, kind in self._emitters if kind in kinds]
 
 
 def check_placement(emitter: mi.Emitter) -> None:
@@ -19,13 +104,10 @@ def check_placement(emitter: mi.Emitter) -> None:
     and the sampled directions are not of unit length, which BSDFs and phase functions rely on.
     Likewise for emissive cylinders that are not circular.
     """
-    flags = emitter.flags()
-    if mi.has_flag(flags, mi.EmitterFlags.Surface):
+    kind = kind_of(emitter)
+    if kind in (EmitterKind.AREA, EmitterKind.DIRECTIONAL_AREA):
         _check_shape(emitter)
-    if not (
-        mi.has_flag(flags, mi.EmitterFlags.Infinite)
-        or mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
-    ):
+    if not (kind.is_environment or kind.has_one_direction):
         return
     params = mi.traverse(emitter)
     if "to_world" not in params:
@@ -69,9 +151,18 @@ def _check_shape(emitter: mi.Emitter) -> None:
 
 
 def point_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """The emitters of a scene with a position but no extent."""
-    flag = mi.EmitterFlags.DeltaPosition
-    return [e for e in scene.emitters() if mi.has_flag(e.flags(), flag)]
+    """The emitters of a scene that have a position and no extent."""
+    return EmittersByKind(scene.emitters()).of(*POINT_LIKE)
+
+
+def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
+    """Those of them whose intensity depends on the direction."""
+    return EmittersByKind(scene.emitters()).of(*SPOT_LIKE)
+
+
+def is_sun(emitter: mi.Emitter) -> bool:
+    """Whether an emitter is infinitely far away, in a single direction."""
+    return kind_of(emitter) is EmitterKind.SUN
 
 
 def position_of(emitter: mi.Emitter) -> np.ndarray:
@@ -79,13 +170,3 @@ def position_of(emitter: mi.Emitter) -> np.ndarray:
     params = mi.traverse(emitter)
     position = params["position"] if "position" in params else params["to_world"].translation()
     return np.array(position, dtype=np.float64).ravel()
-
-
-def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """The point-like emitters of a scene whose intensity depends on the direction."""
-    return [e for e in point_lights(scene) if e.class_name() != "PointLight"]
-
-
-def is_sun(emitter: mi.Emitter) -> bool:
-    """Whether an emitter is infinitely distant with a single direction."""
-    return mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)

@@ -48,8 +48,7 @@ def bake(medium: mi.Medium, boundary: Boundary) -> MediumGrid:
         )
     bounded = medium.class_name() == "HeterogeneousMedium"
     bbox = _clipping_box(volumes["sigma_t"], boundary) if bounded else None
-    grid = MediumGrid(sigma_t, albedo, boundary, bbox)
-    grid.phase = phase
+    grid = MediumGrid(sigma_t, albedo, boundary, bbox, phase=phase, name=medium.id())
     _verify(medium, grid, name)
     return grid
 

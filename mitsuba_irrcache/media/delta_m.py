@@ -25,22 +25,25 @@ import numpy as np
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.media.medium import MediumGrid
 
 
-def truncate_forward_peak(medium: MediumGrid) -> None:
-    """Truncate the forward peak of the phase function of ``medium``, in place."""
+def without_forward_peak(medium: MediumGrid) -> MediumGrid:
+    """``medium``, whose phase function has a forward peak, scaled by delta-M: light scattered into
+    the peak counts as not scattered.
+    """
     # docs/primer, eq. (4.12)
-    medium.store_untruncated()
     phase = medium.phase.without_peak()
     share, sigma_t, albedo = phase.forward, medium.sigma_t, medium.albedo
-    medium.sigma_t = _combined(lambda s, a: s * (1 - share * a), sigma_t, albedo)
-    medium.albedo = _combined(lambda a: a * (1 - share) / (1 - share * a), albedo)
-    remaining = _mean(medium.sigma_t)
-    medium.unscattered_exponent = _mean(sigma_t) / remaining if remaining else 1.0
-    medium.phase = phase
-    medium.macrocells = Macrocells.build(medium.sigma_t, medium.boundary)
+    scaled = _combined(lambda s, a: s * (1 - share * a), sigma_t, albedo)
+    remaining = _mean(scaled)
+    return medium.replaced(
+        sigma_t=scaled,
+        albedo=_combined(lambda a: a * (1 - share) / (1 - share * a), albedo),
+        phase=phase,
+        unscattered_exponent=_mean(sigma_t) / remaining if remaining else 1.0,
+        original=medium,
+    )
 
 
 def _mean(field: Field) -> float:

@@ -7,6 +7,7 @@ paper, but is specified directly, so that media without extinction can be emissi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import drjit as dr
@@ -15,16 +16,12 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.boundary import safe_rcp
-from mitsuba_irrcache.grids.fields import ConstantField, Field
+from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.grids.occupancy import active_voxels, marked
-from mitsuba_irrcache.media.bake import baked_field, volume_error
-from mitsuba_irrcache.media.medium import MediumGrid
 
-#: Tolerated deviation from Mitsuba's own values, relative to the maximum.
-TOLERANCE = 0.02
-#: Tolerance in voxels of the test whether a point is inside a grid: rays end exactly on its faces.
+#: Voxels around a grid that still count as in it: rays end on the very faces of media.
 SLACK = 1e-3
 
 
@@ -81,79 +78,22 @@ class Emission:
         return marked(grid, active_voxels(own, grid))
 
 
-def bake_emission(value: object, scale: float) -> Emission | None:
-    """Convert the integrator's ``emission`` property times ``scale``; None if it is 0 everywhere.
-
-    The property is a number, a colour, or a ``constvolume`` or ``gridvolume`` in world space.
-    Raises IrrcacheError for anything else, and for values that are negative or not finite.
+def check_emission_is_within(emission: Emission, frames: Sequence[np.ndarray]) -> None:
+    """Raises IrrcacheError where no part of the emission lies in a medium; ``frames`` are the
+    ``to_world`` of unit cubes that enclose the media.
     """
-    if not np.isfinite(scale) or scale < 0:
+    if not frames:
         raise IrrcacheError(
-            f"irrcache: emission_scale is {scale:g}; it must be finite and not negative."
+            "irrcache: there is emission, but no medium, and only media emit light. Put a medium "
+            "around it; its sigma_t may be 0."
         )
-    if isinstance(value, mi.Volume):
-        field = baked_field(value, "emission of the integrator", scale)
-        _verify(value, field, scale)
-    else:
-        field = ConstantField(_numbers(value, scale), scale)
-    return Emission(field) if field.maximum > 0 else None
-
-
-def place_emission(emission: Emission | None, media: list[MediumGrid]) -> None:
-    """Assign the emission to all ``media``; raise IrrcacheError if it overlaps none of them."""
-    if emission is None:
-        return
-    if not media:
-        raise IrrcacheError(
-            "irrcache: there is emission, but no medium, and only media emit. Put a medium around "
-            "it; its sigma_t may be 0."
-        )
-    if emission.grid is not None and not any(_overlap(emission.grid, m.frame) for m in media):
+    if emission.grid is not None and not any(_overlap(emission.grid, f) for f in frames):
         lower, upper = _box(emission.grid.to_world)
         raise IrrcacheError(
             f"irrcache: the emission fills {lower} to {upper}, where there is no medium, and only "
-            "media emit. Place it by its to_world in world space, or put a medium around it; its "
-            "sigma_t may be 0."
+            "media emit light. Place it by its to_world in world space, or put a medium around it; "
+            "its sigma_t may be 0."
         )
-    for medium in media:
-        medium.emission = emission
-
-
-def _numbers(value: object, scale: float) -> np.ndarray:
-    """Convert a number or colour to one or three values; times ``scale`` they must be finite."""
-    try:
-        values = np.array(value, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
-        values = np.zeros(0)
-    if values.size not in (1, 3):
-        raise IrrcacheError(
-            f"irrcache: emission is {value!r}; it must be a number, a colour (rgb), or a "
-            'volume of type "constvolume" or "gridvolume".'
-        )
-    with np.errstate(over="ignore"):
-        scaled = np.float32(values * max(scale, 1.0))
-    if not np.isfinite(scaled).all() or values.min() < 0:
-        raise IrrcacheError(
-            f"irrcache: emission is {values}, times emission_scale {scale:g}; it must be finite in "
-            "single precision and not negative."
-        )
-    if values.size == 3 and mi.is_monochromatic:
-        values = np.array(mi.luminance(mi.Color3f(values))).ravel()
-    return values[:1] if np.ptp(values) == 0 else values
-
-
-def _verify(volume: mi.Volume, field: Field, scale: float) -> None:
-    """Compare the converted values with Mitsuba's own at random points inside the volume."""
-    if field.grid is None or not field.maximum > 0:
-        return
-    rng = mi.PCG32(512)
-    u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-    interaction = dr.zeros(mi.Interaction3f, 512)
-    interaction.p = Grid((1, 1, 1), field.grid.to_world).world.point(u)
-    expected = mi.Spectrum(volume.eval(interaction)) * scale
-    deviation = dr.abs(expected - mi.Spectrum(field.at_world(interaction.p)))
-    if dr.max(dr.max(deviation))[0] > TOLERANCE * field.maximum:
-        raise volume_error("emission of the integrator")
 
 
 def _box(to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

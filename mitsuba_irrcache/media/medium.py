@@ -2,23 +2,39 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
+from mitsuba_irrcache.media.emission import Emission
 from mitsuba_irrcache.media.phase import Phase
 
 
-class MediumGrid:
-    """A medium with ``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and ``bbox``.
+class MediumGrid(Immutable):
+    """``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and the world box ``bbox``.
 
-    ``bbox`` is a world box, or None if the medium is not clipped.
+    Attributes:
+        bbox: lower and upper corner; None: unbounded.
+        emission: emission coefficient of the medium; None where it emits nothing.
+        phase: None where scattering is isotropic.
+        name: unique among the media of a scene.
+        pointer: Mitsuba's medium, by which rays know the medium they are in. None where rays are
+            not traced through the scene's shapes, since an isotropic medium in its boundary is all
+            there is.
+        number: place in the scene's list of media.
+        others: the other media of the scene in the order of that list, before delta-M scaling.
+        is_isolated: whether this medium in its boundary is all there is beside emitters.
+        has_exact_boundary: whether the medium fills ``boundary``, which otherwise encloses it.
+        unscattered_exponent: power of the transmittance that gives the share of light that is not
+            scattered at all, where light scattered into a forward peak counts as transmitted (see
+            `delta_m`).
+        original: the medium before delta-M scaling; None where it is not scaled.
+        macrocells: local majorants of ``sigma_t``.
     """
 
     def __init__(
@@ -27,33 +43,41 @@ class MediumGrid:
         albedo: Field,
         boundary: Boundary,
         bbox: tuple[np.ndarray, np.ndarray] | None = None,
+        *,
+        emission: Emission | None = None,
+        phase: Phase | None = None,
+        name: str = "",
+        pointer: mi.MediumPtr | None = None,
+        number: int = 0,
+        others: tuple[MediumGrid, ...] = (),
+        is_isolated: bool = True,
+        has_exact_boundary: bool = True,
+        unscattered_exponent: float = 1.0,
+        original: MediumGrid | None = None,
+        macrocells: Macrocells | None = None,
     ) -> None:
-        self.sigma_t = sigma_t
-        self.albedo = albedo
-        self.boundary = boundary
-        self.bbox = bbox
-        #: volumetric emission, or None (see `emission`)
-        self.emission: object | None = None
-        #: whether ``boundary`` is the exact shape of the medium, not a bounding shape
-        self.has_exact_boundary = True
-        #: None for isotropic scattering
-        self.phase: Phase | None = None
-        #: exponent that converts the transmittance of the truncated medium to the original one
-        #: (see `delta_m`)
-        self.unscattered_exponent = 1.0
-        self._with_peak: MediumGrid | None = None
-        #: identifier of the medium
-        self.name = ""
-        #: pointer to Mitsuba's medium, and the other objects of the scene; None if the medium is
-        #: isolated and isotropic
-        self.pointer: mi.MediumPtr | None = None
-        self.surroundings: object | None = None
-        #: whether the scene has no other medium, no surface and no area emitter
-        self.is_isolated = True
-        self.macrocells = Macrocells.build(sigma_t, boundary)
+        self.sigma_t, self.albedo, self.boundary, self.bbox = sigma_t, albedo, boundary, bbox
+        self.emission, self.phase = emission, phase
+        self.name, self.pointer = name, pointer
+        self.number, self.others = number, others
+        self.is_isolated, self.has_exact_boundary = is_isolated, has_exact_boundary
+        self.unscattered_exponent, self.original = unscattered_exponent, original
+        self.macrocells = macrocells or Macrocells.build(sigma_t, boundary)
         if bbox is not None:
             corners = [mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in p)) for p in bbox]
             self._clip = mi.BoundingBox3f(*corners)
+
+    def replaced(self, **changes: object) -> MediumGrid:
+        """A medium with other attributes; ``macrocells`` are those of its extinction."""
+        attributes = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        if "sigma_t" in changes or "boundary" in changes:
+            del attributes["macrocells"]
+        return MediumGrid(**attributes | changes)
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether rays in the medium are traced through the scene's shapes."""
+        return self.pointer is not None
 
     @property
     def frame(self) -> np.ndarray:
@@ -74,17 +98,8 @@ class MediumGrid:
 
     @property
     def shortest_edge(self) -> float:
-        """Shortest edge of an extinction voxel [scene units]; infinite for a homogeneous medium."""
+        """Edge of a voxel of the extinction [scene units]; infinite where nothing varies."""
         return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
-
-    @property
-    def with_peak(self) -> MediumGrid:
-        """The medium before truncation of its forward peak."""
-        return self._with_peak or self
-
-    def store_untruncated(self) -> None:
-        """Store a copy of the untruncated medium."""
-        self._with_peak = copy(self)
 
     def contains(self, p: mi.Point3f) -> mi.Bool:
         """Whether points lie in the medium."""

@@ -22,7 +22,7 @@ from mitsuba_irrcache.machine.memory import give_back
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.raymarch import Projection
-from mitsuba_irrcache.scene.context import Surroundings
+from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, is_null, medium_after, trace
 
@@ -59,7 +59,7 @@ def camera_rays_of(
             layered,
             uncertainty=uncertainty_of(cache) if with_error else None,
             directional=cache.directional_field(field.channels),
-            edges=cache.survey.edges if cache.survey is not None else None,
+            edges=cache.voxel_classes.cut_cells if cache.voxel_classes is not None else None,
             falloff=cache.falloff,
             direct_lights=[DirectLightAlongRays(light) for light in cache.direct_lights],
         )
@@ -73,7 +73,7 @@ def camera_rays_of(
         closed_form = parts[0].half_space
         return ClosedFormCameraRays(projections[0], settings.max_depth, hide_emitters, closed_form)
     depths = settings.max_depth, settings.rr_depth
-    return TracedCameraRays(medium.surroundings, projections, *depths, hide_emitters)
+    return TracedCameraRays(parts[0].description, projections, *depths, hide_emitters)
 
 
 class RayResult:
@@ -166,14 +166,15 @@ class TracedCameraRays:
 
     def __init__(
         self,
-        surroundings: Surroundings,
+        description: SceneDescription,
         projections: list[Projection],
         max_depth: int,
         rr_depth: int,
         hide_emitters: bool,
     ) -> None:
-        self.surroundings, self.projections = surroundings, projections
-        #: the one with most channels: a medium without cache has no error estimates
+        self.media, self.projections = description.media, projections
+        self.brightest = description.brightest
+        #: the one that gathers most: a dark medium has no errors to tell
         self.projection = max(projections, key=lambda p: p.channel_count)
         self.hide_emitters = hide_emitters
         #: narrow sources, whose direct radiance is attenuated by the original extinction (see
@@ -208,7 +209,7 @@ class TracedCameraRays:
         start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
         direct, reflected, interacted, path_end, _ = trace(
             scene,
-            self.surroundings.media,
+            self.media,
             start,
             self.max_depth,
             self.rr_depth,
@@ -252,7 +253,7 @@ class TracedCameraRays:
         # Measure all distances from the camera, so that depths are correct.
         segment, pointer, near = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Float(0)
         stopped, escaped, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
-        max_background = mi.Spectrum(self.surroundings.brightest)
+        max_background = mi.Spectrum(self.brightest)
         crossings = mi.UInt32(0)
         shows_emitters = self.max_depth > 0
         while dr.hint(active, label="march to surface"):

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.media.phase import interaction
@@ -28,11 +29,11 @@ MOST_CROSSINGS = 1024
 MAX_SURVIVAL = 0.95
 
 
-class Media:
-    """The media of a scene; Mitsuba's medium pointer (or null) identifies the one a ray is in."""
+class Media(Immutable):
+    """The media of a scene. Rays know the medium they are in by Mitsuba's pointer; null is none."""
 
     def __init__(self, grids: Sequence[MediumGrid]) -> None:
-        self.grids = list(grids)
+        self.grids = tuple(grids)
         self.isotropic = all(grid.phase is None for grid in self.grids)
 
     @property
@@ -40,12 +41,20 @@ class Media:
         """Whether any medium has volumetric emission."""
         return any(grid.emission is not None for grid in self.grids)
 
-    def around(self, medium: MediumGrid) -> Media:
-        """Return the media for paths that end in ``medium``, where the radiance is known.
-
-        All other media are replaced by those with their forward peaks (see `delta_m`).
+    @classmethod
+    def around(cls, medium: MediumGrid) -> Media:
+        """The media of its scene for paths that end in ``medium``, whose radiance is known, and in
+        no other one: there light scattered into forward peaks counts as scattered.
         """
-        return Media([grid if grid is medium else grid.with_peak for grid in self.grids])
+        before, after = medium.others[: medium.number], medium.others[medium.number :]
+        return cls([*before, medium, *after])
+
+    def pointer_of(self, number: mi.UInt32) -> mi.MediumPtr:
+        """Mitsuba's medium with this number: 1 for the first one, 0 for none."""
+        pointer = dr.zeros(mi.MediumPtr, dr.width(number))
+        for i, grid in enumerate(self.grids):
+            pointer = dr.select(number == i + 1, grid.pointer, pointer)
+        return pointer
 
     def without(self, medium: MediumGrid) -> Media:
         """Return all media except one."""

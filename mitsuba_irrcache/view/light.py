@@ -15,7 +15,7 @@ from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.progressive import FIRST, OPENING
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays, camera_rays_of
-from mitsuba_irrcache.scene.context import medium_at
+from mitsuba_irrcache.scene.medium_probe import medium_at
 
 #: Caches with more voxels than this are preceded by one of `COARSE` voxels along its longest side,
 #: so that new light is there at once.
@@ -141,7 +141,7 @@ class Light:
         elif first and self._is_slow:
             self._coarse = self._at_once()
         else:
-            if builder.solver == "path" and done < OPENING:
+            if builder.has_preview and done < OPENING:
                 builder.samples = max(2 * done, FIRST)
             else:
                 builder.samples = done + batch
@@ -153,14 +153,22 @@ class Light:
     def _is_slow(self) -> bool:
         """Whether a coarse grid would be much quicker."""
         voxels = self.parts[0].cache.grid.voxel_count
-        return self._builder.solver == "sweep" and voxels > MANY_VOXELS
+        return not self._builder.has_preview and voxels > MANY_VOXELS
 
     def _at_once(self) -> CachedMedium:
         """The medium with a first light on a coarse grid."""
         builder, first = self._builder, self.parts[0]
         settings = replace(builder.settings, resolution=COARSE)
-        told = first.solver, "a first look"
-        coarse = CachedMedium(self.scene, first.medium, settings, told, "", False, builder.pause)
+        coarse = CachedMedium(
+            self.scene,
+            first.description,
+            first.medium,
+            settings,
+            (first.solver, "a first look"),
+            "",
+            False,
+            builder.pause,
+        )
         coarse.refine(self.scene, coarse.cache.batch, False, None)
         return coarse
 

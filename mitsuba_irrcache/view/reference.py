@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.render.pixel_filter import pixel_of
-from mitsuba_irrcache.scene.context import medium_at
+from mitsuba_irrcache.scene.medium_probe import medium_at
 from mitsuba_irrcache.view.bands import Bands
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Light

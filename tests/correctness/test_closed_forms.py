@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.render.raymarch import Projection
-from mitsuba_irrcache.scene.compile import bake_media, bake_scene
-from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.solvers.base import SolverTask
+from mitsuba_irrcache.solvers.path.solver import PathSolver
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
 from mitsuba_irrcache.solvers.sn.anisotropic import AnisotropicSweep, least_batch
 
@@ -127,12 +129,14 @@ def column(scene, depths: tuple[float, float], voxels: int, samples: int, max_de
     """The medium of a wide slab below z = 0, and a cache on the z axis from depths[0] to depths[1]:
     where the light varies with depth only, a grid one voxel wide holds all of it.
     """
-    medium = bake_scene(scene)
+    description = compile_scene(scene)
+    (medium,) = description.visible
     place = np.diag([1.0, 1.0, depths[1] - depths[0], 1.0])
     place[:3, 3] = -0.5, -0.5, -depths[1]
     grid = Grid((voxels, 1, 1), place)
     cache = IrradianceCache(grid, dr.arange(mi.UInt32, voxels), 3, max_depth)
-    path_solver.refine(scene, medium, cache, samples, seed=1, rr_depth=1000)
+    task = SolverTask(scene, description, medium, cache, seed=1, rr_depth=1000)
+    PathSolver(task).refine(samples)
     return medium, cache
 
 
@@ -190,7 +194,7 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     """The medium of a slab of ``depth``, and its light by the solver ``sweep``, in so many layers,
     each of ``columns`` x ``columns`` voxels, by so many ``samples``, directions.
     """
-    (medium,) = bake_media(scene)
+    (medium,) = compile_scene(scene).visible
     place = np.diag([width, width, depth, 1.0])
     place[:3, 3] = -width / 2, -width / 2, -depth
     grid = Grid((layers, columns, columns), place)
@@ -201,8 +205,10 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
         solver, least = AnisotropicSweep, least_batch(moments.order)
     batch = sn_solver.batch_of(samples, least)
     count = moments.count if moments else 0
-    cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True, moments=count)
-    cache.directional = moments
+    cache = IrradianceCache(
+        grid, index, 3, -1, batch=batch, correlated=True, moments=count,
+        interpolation=Interpolation(moments),
+    )  # fmt: skip
     solver(scene, medium, cache, 1).refine(max(samples, batch))
     return medium, cache
 

@@ -161,8 +161,9 @@ def test_a_hole_in_a_medium_is_not_swept_as_if_it_was_full(scenes, depth):
         images.append(scenes.image(scene, spp=spp).mean())
         if name == "irrcache":
             assert scene.integrator().caches
-            told = choose_solver(scene, scene.integrator()._builder.medium, "auto", depth)
-            assert told[0] == "path" and '"hole"' in told[1], told
+            medium = scene.integrator()._builder.medium
+            solver, reason = choose_solver(scene, medium, "auto", depth)
+            assert solver.name == "path" and '"hole"' in reason, reason
     assert images[0] / images[1] == pytest.approx(1, abs=0.002)
 
 

@@ -15,6 +15,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline import builder, progressive
 from mitsuba_irrcache.pipeline.progressive import render_progressive
+from mitsuba_irrcache.solvers.path import solver as path_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -121,20 +122,20 @@ class Clock:
         self.now = 0.0
         monkeypatch.setattr(progressive, "perf_counter", lambda: self.now)
         monkeypatch.setattr(builder, "perf_counter", lambda: self.now)
-        refine = builder.path_solver.refine
+        refine = path_solver.PathSolver.refine
 
-        def slow_refine(scene, medium, cache, samples, *args, **kwargs):
-            refine(scene, medium, cache, samples, *args, **kwargs)
+        def slow_refine(solver, samples, *args):
+            refine(solver, samples, *args)
             self.now += sample * samples
 
-        grow = builder.path_solver.Opening.grow
+        grow = path_solver.Opening.grow
 
         def slow_grow(opening, size, *args):
             self.now += sample * 2 * (size - opening.size)
             grow(opening, size, *args)
 
-        monkeypatch.setattr(builder.path_solver, "refine", slow_refine)
-        monkeypatch.setattr(builder.path_solver.Opening, "grow", slow_grow)
+        monkeypatch.setattr(path_solver.PathSolver, "refine", slow_refine)
+        monkeypatch.setattr(path_solver.Opening, "grow", slow_grow)
         self.image = image
 
     def slow_images(self, scene: mi.Scene) -> None:
@@ -212,7 +213,7 @@ def test_stopped_within_a_pass(cloud, tmp_path, monkeypatch, error):
     """The launches that were complete are in cache and file, the one that was not is in neither;
     the rest makes it the cache of one go.
     """
-    monkeypatch.setattr(builder.path_solver, "LANES", 1 << 12)
+    monkeypatch.setattr(path_solver, "LANES", 1 << 12)
     file = tmp_path / "light.npz"
     scene, whole = cloud(cache_file=str(file)), cloud()
     integrator, frames = scene.integrator(), []

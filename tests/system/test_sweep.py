@@ -12,7 +12,8 @@ import pytest
 
 from experiments.performance.kinds.run import box, smoke
 from mitsuba_irrcache.pipeline.defaults import choose_solver
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.solvers.base import solver_named
 from mitsuba_irrcache.solvers.sn import multigrid, tracks
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
 
@@ -333,10 +334,10 @@ def test_the_choice_of_solver(scenes):
     )
     for objects in lights:
         scene = scenes.load({"type": "irrcache", "solver": "auto"}, soft_cloud(scenes), **objects)
-        (medium,) = bake_media(scene)
+        (medium,) = compile_scene(scene).visible
         solver, reason = choose_solver(scene, medium, "auto")
-        assert solver == "sweep" and "far away or from points" in reason
-        assert choose_solver(scene, medium, "path") == ("path", "as told")
+        assert solver.name == "sweep" and "far away or points" in reason
+        assert choose_solver(scene, medium, "path") == (solver_named("path"), "as requested")
         scene.integrator().prepare(scene)
         assert scene.integrator().cache.correlated
 

@@ -8,7 +8,7 @@ import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline.defaults import choose_solver
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.sn import solver as sweep
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -223,13 +223,13 @@ def test_the_choice_of_solver(scenes):
     for reason, more in refused.items():
         depth = 4 if "depth" in reason else -1
         scene = load(scenes, scene_sky(scenes) | more)
-        (medium, *_) = bake_media(scene)
-        assert choose_solver(scene, medium, "auto", depth)[0] == "path"
+        (medium, *_) = compile_scene(scene).visible
+        assert choose_solver(scene, medium, "auto", depth)[0].name == "path"
         with pytest.raises(IrrcacheError, match=f"(?s)sweep.*{reason}.*path"):
             filled(scene, max_depth=depth)
     scene = load(scenes, scene_occluder(scenes))
-    (medium,) = bake_media(scene)
-    assert choose_solver(scene, medium, "auto")[0] == "sweep"
+    (medium,) = compile_scene(scene).visible
+    assert choose_solver(scene, medium, "auto")[0].name == "sweep"
 
 
 def test_standard_error_is_the_scatter(scenes):

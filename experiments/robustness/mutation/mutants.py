@@ -288,9 +288,9 @@ MUTANTS = (
     ),
     Mutant(
         "forward peaks of other media taken away, too",
-        "transport/path.py",
-        "grid if grid is medium else grid.with_peak",
-        "grid",
+        "scene/compile.py",
+        "tuple(grid for grid in grids if grid is not medium)",
+        "tuple(without_forward_peak(g) if g.phase else g for g in grids if g is not medium)",
         ("tests/unit/media/test_delta_m.py",),
     ),
     Mutant(

@@ -23,12 +23,12 @@ from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.context import probe
+from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.solvers.sn.layout import joined
 from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.sn.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.sn.tracks import Tracks
-from mitsuba_irrcache.transport.path import Start, trace, trace_to_infinity
+from mitsuba_irrcache.transport.path import Media, Start, trace, trace_to_infinity
 
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only
 #: find what is in the way of an emitter's light are cheaper. What comes from surfaces differs more
@@ -55,7 +55,7 @@ class SurfaceBoundary:
         rr_depth: int,
         directional: AngularBasis | None = None,
     ) -> None:
-        self.scene, self.media = scene, medium.surroundings.media.around(medium)
+        self.scene, self.media = scene, Media.around(medium)
         self.pointer, self.lamps = medium.pointer, list(lamps)
         #: the others: what leaves this one, which is convex, meets none of it going straight on
         self.others = self.media.without(medium)

@@ -16,8 +16,9 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.transport.path import visibility
+from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 #: Solid angle of an emitter, on average over the voxels, from which on lines are relied upon to
@@ -32,10 +33,7 @@ SAMPLES, MOST_SAMPLES = 4, 16
 
 def is_lamp(emitter: mi.Emitter) -> bool:
     """Whether it is an area light that shines in all directions."""
-    flags = emitter.flags()
-    return mi.has_flag(flags, mi.EmitterFlags.Surface) and not mi.has_flag(
-        flags, mi.EmitterFlags.Delta
-    )
+    return kind_of(emitter) is EmitterKind.AREA
 
 
 def split(
@@ -81,7 +79,7 @@ class Lamps:
     ) -> None:
         self._scene, self._medium, self._p = scene, medium, p
         self._directional = directional
-        self._others = medium.surroundings.media.around(medium).without(medium)
+        self._others = Media.around(medium).without(medium)
         self._small = len(small)
         if small:
             pointers = [mi.EmitterPtr(e) for e in small]

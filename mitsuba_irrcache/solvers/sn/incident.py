@@ -16,6 +16,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import spots_of
 from mitsuba_irrcache.cache.direct_light import DirectLight
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.sn.angular_quadrature import STEP, spread_together, strata
 from mitsuba_irrcache.transport.tracking import medium_transmittance
@@ -51,9 +52,10 @@ class DistantIllumination:
         self._spots: tuple | None = None
         self._suns, self.near = [], []
         for emitter in scene.emitters():
-            if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
+            kind = kind_of(emitter)
+            if kind is EmitterKind.SUN:
                 self._suns.append(_sun(emitter))
-            elif mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+            elif kind.is_point_like:
                 self.near.append(emitter)
 
     def tables(
@@ -84,7 +86,7 @@ class DistantIllumination:
         even = spread_together(passes, pairs, rng)
         varies = (
             self._environment is not None
-            and self._environment.class_name() != "ConstantBackgroundEmitter"
+            and kind_of(self._environment) is not EmitterKind.CONSTANT_ENVIRONMENT
         )
         if varies:
             found = self._with_bright(even, max(1, pairs // BRIGHT_SHARE), rng)

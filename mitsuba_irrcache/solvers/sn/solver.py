@@ -22,7 +22,7 @@ from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.sn.boundary_condition import SurfaceBoundary
 from mitsuba_irrcache.solvers.sn.direct_emission import emitted_light
-from mitsuba_irrcache.solvers.sn.direct_light import Lamps, is_lamp, split
+from mitsuba_irrcache.solvers.sn.direct_light import Lamps, split
 from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
 from mitsuba_irrcache.solvers.sn.layout import side_by_side
 from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
@@ -45,15 +45,6 @@ NO_LIGHT, CHECKED = 1e-7, 8
 
 #: called with (samples done, samples in all), both in voxels times directions
 Progress = Callable[[int, int], None]
-
-
-def takes(emitter: mi.Emitter) -> bool:
-    """Whether the light of an emitter can be swept: it comes from far away, or from a point, or
-    from an area that shines in all directions.
-    """
-    flags = mi.EmitterFlags.Infinite, mi.EmitterFlags.DeltaDirection, mi.EmitterFlags.DeltaPosition
-    surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-    return is_lamp(emitter) if surface else any(mi.has_flag(emitter.flags(), f) for f in flags)
 
 
 def swept_together(medium: MediumGrid, voxels: int) -> bool:

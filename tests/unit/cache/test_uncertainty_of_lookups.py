@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation
 from mitsuba_irrcache.cache.uncertainty import PROBES, uncertainty_of
 from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
@@ -20,10 +21,12 @@ SIDE = 8
 LAMPS = [(0.53, 0.41, 0.62), (0.5, 0.5, 0.5), (0.4375, 0.5625, 0.4375)]
 
 
-def cache_of(light: np.ndarray, error: np.ndarray, correlated: bool) -> IrradianceCache:
+def cache_of(
+    light: np.ndarray, error: np.ndarray, correlated: bool, interpolation: Interpolation = PLAIN
+) -> IrradianceCache:
     """A grey cache of two batches whose mean is ``light``, with this standard error."""
     grid, voxels = Grid((SIDE,) * 3, np.eye(4)), mi.UInt32(np.arange(SIDE**3, dtype=np.uint32))
-    cache = IrradianceCache(grid, voxels, 1, -1, correlated=correlated)
+    cache = IrradianceCache(grid, voxels, 1, -1, correlated=correlated, interpolation=interpolation)
     total, spread = cache.real(2 * light), cache.real(2 * error**2)
     cache.add(0, 2 * BATCH, [((total, None), (spread,))])
     return cache
@@ -63,8 +66,7 @@ def test_errors_beside_a_lamp_are_relative_to_its_light(lamp, correlated):
     index = mi.UInt32(np.arange(SIDE**3, dtype=np.uint32))
     light = np.array(falloff.of_voxels(index), dtype=np.float64)
     assert light.max() > 20 * light.min()
-    cache = cache_of(light, 0.03 * light, correlated)
-    cache.falloff = falloff
+    cache = cache_of(light, 0.03 * light, correlated, Interpolation(falloff=falloff))
     found = np.abs(lookups(cache, 0.5 / SIDE)[1])
     if correlated:
         np.testing.assert_allclose(found, 0.03, rtol=2e-3)

@@ -21,8 +21,9 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels
 from mitsuba_irrcache.io.mitsuba_vol import read_vol
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.compile import bake_scene
-from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.solvers.base import SolverTask
+from mitsuba_irrcache.solvers.path.solver import PathSolver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -36,14 +37,16 @@ def make(scenes):
     sigma_t = scenes.texture((4, 3, 5), 0.0, 2.0, 1)
     shape = scenes.boundary(scenes.medium(sigma_t, 0.8, to_world), to_world)
     scene = scenes.load({"type": "irrcache", "solver": "path"}, shape)
-    medium = bake_scene(scene)
+    description = compile_scene(scene)
+    (medium,) = description.visible
 
     def run(*calls: tuple[int, int], max_depth: int = 3, resolution: int = 6) -> IrradianceCache:
         grid = Grid.near_cubic(medium.frame, resolution)
         active = active_voxels(medium, grid)
         cache = IrradianceCache(grid, active, 3, max_depth, {"medium": "a", "emitters": "b"})
         for seed, samples in calls:
-            path_solver.refine(scene, medium, cache, samples, seed, rr_depth=100)
+            task = SolverTask(scene, description, medium, cache, seed, rr_depth=100)
+            PathSolver(task).refine(samples)
         return cache
 
     return run

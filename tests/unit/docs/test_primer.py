@@ -11,7 +11,9 @@ import pytest
 import mitsuba_irrcache
 from mitsuba_irrcache.cache import uncertainty
 from mitsuba_irrcache.lights import falloff
-from mitsuba_irrcache.pipeline import defaults
+from mitsuba_irrcache.solvers import grid_size
+from mitsuba_irrcache.solvers.path.solver import PathSolver
+from mitsuba_irrcache.solvers.sweep import SweepSolver
 from mitsuba_irrcache.render import denoise, raymarch
 from mitsuba_irrcache.solvers.sn import anderson, multigrid
 
@@ -112,29 +114,34 @@ CONSTANTS = [
     (
         "7-defaults",
         r"\\epsilon_B = ([\d.]+) \\, d\^\{([\d.]+)\}",
-        (defaults.BORDER_ERROR, defaults.BORDER_ORDER),
+        (grid_size.BORDER_ERROR, grid_size.BORDER_ORDER),
     ),
     (
         "7-defaults",
         r"min\(d_v, ([\d.]+)\)\}\{([\d.]+)\} .*\^\{([\d.]+)\} , \\; 1 , \\; (\d+) ",
-        (defaults.OPAQUE, defaults.RESOLVED, defaults.OPAQUE_POWER, defaults.MOST_PER_DATA_VOXEL),
+        (
+            grid_size.OPAQUE,
+            grid_size.RESOLVED,
+            grid_size.OPAQUE_POWER,
+            grid_size.MOST_PER_DATA_VOXEL,
+        ),
     ),
     (
         "7-defaults",
         r"\\epsilon = ([\d.]+)\$ % for `sweep`, (\d+) % for `path`",
-        (defaults.TARGET_ERROR, defaults.PATH_TARGET_ERROR),
+        (grid_size.TARGET_ERROR, PathSolver.size_rule.target_error),
     ),
     (
         "7-defaults",
         r"1\. (\d+) along the longest side \(`path`: (\d+)\)",
-        (defaults.FEWEST, defaults.PATH_FEWEST),
+        (SweepSolver.size_rule.fewest, PathSolver.size_rule.fewest),
     ),
     (
         "7-defaults",
         r"at most (\d+) along the longest side \(`path`: (\d+)\)",
-        (defaults.CONTRASTED, defaults.PATH_MOST),
+        (SweepSolver.size_rule.most_by_contrast, PathSolver.size_rule.most_by_contrast),
     ),
-    ("7-defaults", r"\\sigma_B\$, at most (\d+) ", (defaults.BORDERED,)),
+    ("7-defaults", r"\\sigma_B\$, at most (\d+) ", (SweepSolver.size_rule.most_by_border,)),
 ]
 
 

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
-from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.scene.compile import compile_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def baked(scenes, medium, to_world=None, kind="cube"):
-    return bake_scene(scenes.load({"type": "volpath"}, scenes.boundary(medium, to_world, kind)))
+    return compile_scene(
+        scenes.load({"type": "volpath"}, scenes.boundary(medium, to_world, kind))
+    ).visible[0]
 
 
 def mitsubas(medium: dict, p: mi.Point3f) -> tuple[np.ndarray, np.ndarray]:
@@ -52,7 +54,7 @@ def test_data_are_not_copied(scenes):
     scene = scenes.load({"type": "volpath"}, scenes.boundary(medium))
     params = mi.traverse(scene)
     (key,) = [k for k in params.keys() if k.endswith("sigma_t.data")]
-    assert bake_scene(scene).sigma_t.data.index == params[key].array.index
+    assert compile_scene(scene).visible[0].sigma_t.data.index == params[key].array.index
 
 
 @pytest.mark.parametrize("values", [1.5, (0.5, 1.0, 2.0)])

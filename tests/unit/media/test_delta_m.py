@@ -9,7 +9,8 @@ import pytest
 
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.media.phase import LARGEST_PEAK, PEAK, Phase
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.transport.path import Media
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -74,9 +75,8 @@ def test_what_is_absorbed_stays(scenes, sigma_t, albedo):
             colour = value if plain else {"type": "rgb", "value": list(value)}
             volume = {"type": "constvolume", "value": colour}
             medium[name] = volume if medium["type"] == "heterogeneous" else colour
-    found = bake_media(
-        scenes.load({"type": "irrcache", "solver": "path"}, scenes.boundary(medium), 8)
-    )[0]
+    scene = scenes.load({"type": "irrcache", "solver": "path"}, scenes.boundary(medium), 8)
+    found = compile_scene(scene).visible[0]
     z, y, x = (np.ravel(i) for i in np.indices((4, 5, 6)))
     centres = np.float32([(x + 0.5) / 3 - 1, (y + 0.5) / 2.5 - 1, (z + 0.5) / 2 - 1])
 
@@ -131,9 +131,9 @@ def test_other_media_keep_their_peaks(scenes):
     """To paths that know the light of one medium, another one scatters as it is."""
     place = scenes.placement((1, 1, 1), center=(3, 0, 0))
     other = scenes.boundary(scenes.medium(2.0, 0.5) | {"phase": hg(0.7)}, place)
-    sharp, medium = bake_media(scene_of(scenes, {}, other=other))
-    around = medium.surroundings.media.around(medium).grids
-    assert around == [sharp.with_peak, medium]
+    sharp, medium = compile_scene(scene_of(scenes, {}, other=other)).visible
+    around = Media.around(medium).grids
+    assert around == (sharp.original, medium)
     assert around[0].sigma_t.maximum == pytest.approx(2.0)
     left = 2.0 * (1 - sharp.phase.forward * 0.5)
     assert sharp.sigma_t.maximum == pytest.approx(left, rel=1e-5)

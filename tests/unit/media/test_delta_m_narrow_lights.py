@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -31,12 +31,12 @@ def test_transmittance_with_and_without_the_peak(scenes, density, albedo):
     place = scenes.placement((2.0, 1.0, 1.5))
     medium = scenes.medium(density, albedo, place) | {"phase": PHASE}
     scene = scenes.load({"type": "irrcache", "solver": "auto"}, scenes.boundary(medium, place), 8)
-    found = bake_media(scene)[0]
+    found = compile_scene(scene).visible[0]
     x = mi.Float(np.linspace(-0.99, 0.99, 2001))
     line = mi.Point3f(x, 0.2, -0.3)
     less, whole = (
         1.98 * np.array(dr.mean(grid.sigma_t.at_world(line) + 0 * x))[0]
-        for grid in (found, found.with_peak)
+        for grid in (found, found.original)
     )
     assert less < 0.95 * whole
     assert np.exp(-less) ** found.unscattered_exponent == pytest.approx(np.exp(-whole), rel=1e-4)
@@ -71,7 +71,7 @@ def test_light_scattered_once_from_narrow_lights(scenes):
     """
     medium = scenes.medium(1.3, 0.7) | {"phase": PHASE}
     scene = scenes.load({"type": "irrcache", "solver": "auto"}, scenes.boundary(medium), 8)
-    found = bake_media(scene)[0]
+    found = compile_scene(scene).visible[0]
     assert found.phase.forward > 0.1
     cosine = np.linspace(-0.99, 0.99, 50)
     towards = mi.Vector3f(np.float32([np.sqrt(1 - cosine**2), 0 * cosine, cosine]))

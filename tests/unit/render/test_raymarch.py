@@ -95,7 +95,8 @@ class Analytic:
 def analytic_projection(quadrature: str, step: float) -> Projection:
     boundary = Boundary("box", np.diag([LENGTH / 2, 1, 1, 1.0]))
     medium = MediumGrid(ConstantField(np.array([4.0])), ConstantField(np.array([1.0])), boundary)
-    medium.sigma_t = Analytic(lambda x: 1.5 + dr.sin(3 * x))
+    sigma_t = Analytic(lambda x: 1.5 + dr.sin(3 * x))
+    medium = medium.replaced(sigma_t=sigma_t, macrocells=medium.macrocells)
     irradiance = Analytic(lambda x: 4 * dr.pi * (1 + 0.8 * dr.cos(2 * x + 0.5)))
     projection = Projection(medium, irradiance, quadrature, 1.0)
     projection.step = dr.opaque(mi.Float, step)
@@ -204,8 +205,8 @@ def test_skipping_empty_macrocells_changes_nothing():
     near, offset = dr.maximum(near, 0), mi.Float(rng.uniform(0.01, 1, count).astype(np.float32))
     results = []
     for cells in (medium.macrocells, occupied):
-        medium.macrocells = cells
-        projection = Projection(medium, irradiance, "exponential", 1.0)
+        divided = medium.replaced(macrocells=cells)
+        projection = Projection(divided, irradiance, "exponential", 1.0)
         radiance, passed, *_ = projection.march(ray, near, far, mi.Spectrum(1), offset, hit)
         results.append([np.array(v.x) for v in (radiance, passed)])
     assert results[0][0].max() > 0.1

@@ -117,7 +117,8 @@ def test_waves_behind_what_hides_them(offset):
         ConstantField(np.array([1.0])),
         Boundary("box", np.eye(4)),
     )
-    medium.sigma_t = Along(lambda x: extinction(x, dr), 12.0)
+    sigma_t = Along(lambda x: extinction(x, dr), 12.0)
+    medium = medium.replaced(sigma_t=sigma_t, macrocells=medium.macrocells)
     irradiance = Along(lambda x: 4 * dr.pi * light(x, dr), 4 * np.pi * 1.9)
     projection = Projection(medium, irradiance, "exponential", 1.0)
     projection.step = dr.opaque(mi.Float, 2.0 / steps)

@@ -9,9 +9,9 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.cut_cells import CutCells
-from mitsuba_irrcache.scene.voxel_classes import neighbourhood
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses, neighbourhood
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -103,18 +103,19 @@ def test_survey(scenes):
     ball = {"type": "sphere", "center": [0.5, 0, 0], "radius": 0.4}
     outer = scenes.boundary({"type": "ref", "id": "fog"})
     scene = scenes.load({"type": "volpath"}, outer, fog=fog, inner=inner, ball=ball)
-    grids = {grid.name: grid for grid in bake_media(scene)}
+    description = compile_scene(scene)
+    grids = {grid.name: grid for grid in description.visible}
     assert len(grids) == 2
     medium = grids["fog"]
     grid = Grid.near_cubic(medium.frame, 16)
-    survey = medium.surroundings.survey(scene, grid, medium)
+    classes = VoxelClasses(scene, description.media, medium, grid)
     centers = np.array(grid.centers(dr.arange(mi.UInt32, grid.voxel_count)))
     in_sphere = np.linalg.norm(centers - [[-0.5], [0], [0]], axis=0) < 0.4
     in_ball = np.linalg.norm(centers - [[0.5], [0], [0]], axis=0) < 0.4
-    order = [g.name for g in medium.surroundings.media.grids]
+    order = [g.name for g in description.media.grids]
     expected = np.where(in_sphere, 2 - order.index("fog"), order.index("fog") + 1)
-    np.testing.assert_array_equal(np.array(survey.place), expected)
-    np.testing.assert_array_equal(np.array(survey.enclosed), in_ball)
+    np.testing.assert_array_equal(np.array(classes.medium_number), expected)
+    np.testing.assert_array_equal(np.array(classes.enclosed), in_ball)
     deep = np.linalg.norm(centers - [[-0.5], [0], [0]], axis=0) < 0.4 - 2 * 3**0.5 * 0.125
-    assert not np.array(survey.reach)[deep].any()
-    assert np.array(survey.reach)[~in_sphere].all()
+    assert not np.array(classes.readable)[deep].any()
+    assert np.array(classes.readable)[~in_sphere].all()

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.fingerprint import Snapshot, digests
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -72,7 +72,8 @@ def test_comparing_snapshots_runs_no_kernel(scenes, kernels):
 
 
 def digest(scene) -> dict[str, str]:
-    return digests(scene, bake_scene(scene))
+    media = compile_scene(scene).media
+    return digests(scene, media, media.grids[0])
 
 
 def test_digests_are_those_of_the_contents(scenes):

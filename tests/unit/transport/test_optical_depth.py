@@ -83,5 +83,5 @@ def test_parts_add_up_and_opaque_matter_ends_the_march():
     np.testing.assert_allclose(sum(parts), whole, rtol=1e-4, atol=1e-5)
     dense = medium((6, 5, 4), 1, 1e4)
     dense.sigma_t.scale = dr.opaque(mi.Float, 1e4)
-    dense.macrocells = type(dense.macrocells).build(dense.sigma_t, dense.boundary)
+    dense = dense.replaced(sigma_t=dense.sigma_t)  # with the macrocells of what it is now
     assert np.array(optical_depth(dense, ray, near, far, hit))[whole > 0.1].min() > OPAQUE

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.path.estimator import contributions
 from mitsuba_irrcache.transport.path import power_heuristic, visibility
 
@@ -21,12 +21,13 @@ def irradiance(scene, position, max_depth=INFINITE, count=COUNT) -> tuple[np.nda
     """Mean irradiance at a position in the first medium, uncollided and scattered, and the standard
     error of their sum.
     """
-    medium = bake_media(scene)[0]
+    description = compile_scene(scene)
+    medium = description.visible[0]
     rng = mi.PCG32(count)
     spread = [rng.next_float32() for _ in range(4)]
     found = contributions(
         scene,
-        medium.surroundings.media,
+        description.media,
         mi.Point3f(position),
         medium.pointer,
         spread,
@@ -94,10 +95,10 @@ def test_visibility(scenes):
     }  # fmt: skip
     shape = scenes.boundary(scenes.medium((0.2, 0.4, 0.6), 0.5), to_world)
     scene = scenes.load({"type": "volpath"}, shape, **objects)
-    medium = next(m for m in bake_media(scene) if m.sigma_t.channels == 3)
+    media = compile_scene(scene).media
+    medium = next(m for m in media.grids if m.sigma_t.channels == 3)
     vertex = dr.zeros(mi.Interaction3f, 2)
     target = mi.Point3f([9.0, 0.0], [0.0, 9.0], [0.0, 0.0])
-    media = medium.surroundings.media
     through, _ = visibility(
         scene, media, vertex, target, mi.MediumPtr(medium.pointer), mi.PCG32(2), mi.Bool(True)
     )

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.transport.path import visibility
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -24,11 +24,12 @@ def test_transmittance_between_two_places(scenes, varies):
     shape = scenes.boundary(scenes.medium(density if varies else 1.1, 0.5, place), place)
     beside = {"type": "sphere", "center": [0, 4, 0]}
     scene = scenes.load({"type": "volpath"}, shape, 2, beside=beside)
-    (medium,) = bake_media(scene)
+    media = compile_scene(scene).media
+    (medium,) = media.grids
     vertex = dr.zeros(mi.Interaction3f, count)
     vertex.p = mi.Point3f(-0.6, 0.1, 0.2)
     through, _ = visibility(
-        scene, medium.surroundings.media, vertex, mi.Point3f(0.5, 0.1, 0.2),
+        scene, media, vertex, mi.Point3f(0.5, 0.1, 0.2),
         mi.MediumPtr(medium.pointer), mi.PCG32(count), mi.Bool(True),
     )  # fmt: skip
     found = np.array(through.x + dr.zeros(mi.Float, count), np.float64)

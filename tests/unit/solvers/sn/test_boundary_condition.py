@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.sn import boundary_condition
 from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance, SurfaceBoundary
 from mitsuba_irrcache.solvers.sn.track_table import BoundarySource
@@ -96,7 +96,7 @@ def test_what_returns_is_linear_in_phi(scenes):
     wall["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
     shape = scenes.boundary(scenes.medium(40.0, 1.0))
     scene = scenes.load({"type": "irrcache", "solver": "path"}, shape, 4, emitter=None, wall=wall)
-    (medium,) = bake_media(scene)
+    (medium,) = compile_scene(scene).visible
     grid = Grid((8, 8, 8), medium.frame)
     lattice = Tracks(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)
     offsets = np.random.default_rng(1).random((len(DIRECTIONS), 2))

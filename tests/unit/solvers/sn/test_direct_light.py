@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.sn.direct_light import Lamps, is_lamp
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -31,7 +31,7 @@ def test_lamps_add_up(scenes, count):
     scene = scenes.load(
         {"type": "irrcache", "solver": "path"}, shape, 2, emitter=None, sun=None, **objects
     )
-    (medium,) = bake_media(scene)
+    (medium,) = compile_scene(scene).visible
     small = [e for e in scene.emitters() if is_lamp(e)]
     assert len(small) == count
     centre = mi.Point3f(dr.zeros(mi.Float, 4096), 0, 0)

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.sn.resampling import albedo_of_collisions
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 def at_voxels(scenes, density: np.ndarray, albedo: np.ndarray | float, sides: int) -> np.ndarray:
     """The albedo of collisions in a cube of ``sides`` voxels an edge (z, y, x, channel)."""
     shape = scenes.boundary(scenes.medium(density, albedo))
-    medium = bake_scene(scenes.load({"type": "volpath"}, shape))
+    medium = compile_scene(scenes.load({"type": "volpath"}, shape)).visible[0]
     grid = Grid((sides,) * 3, medium.frame)
     voxels = dr.arange(mi.UInt32, grid.voxel_count)
     found = albedo_of_collisions(medium, grid, voxels)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.sn.resampling import baked, detail_of
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -17,7 +17,7 @@ SHAPE = (4, 6, 12)  # z, y, x
 def medium_of(scenes, density: np.ndarray):
     place = scenes.placement((2.4, 1.2, 0.8), turn=20)
     shape = scenes.boundary(scenes.medium(density, 0.5, place), place)
-    return bake_scene(scenes.load({"type": "volpath"}, shape))
+    return compile_scene(scenes.load({"type": "volpath"}, shape)).visible[0]
 
 
 @pytest.mark.parametrize("block", [(1, 2, 3), (4, 1, 2), (2, 3, 1), (2, 1, 6)], ids=str)

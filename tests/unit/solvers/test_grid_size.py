@@ -1,4 +1,4 @@
-"""What is chosen where nothing is told: voxels of the cache, and directions."""
+"""Defaults of the cache: voxels, and directions."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.fields import ConstantField, GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.pipeline import defaults
-from mitsuba_irrcache.pipeline.defaults import choose_grid
+from mitsuba_irrcache.solvers import grid_size
+from mitsuba_irrcache.solvers.base import solver_named
+from mitsuba_irrcache.solvers.grid_size import choose_grid
 from mitsuba_irrcache.solvers.sn import solver as sn_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -27,7 +28,7 @@ def medium(values: np.ndarray, edges=(1.0, 1.0, 1.0)) -> MediumGrid:
 
 
 def chosen(values: np.ndarray, edges=(1.0, 1.0, 1.0), solver="sweep") -> tuple[int, ...]:
-    return choose_grid(medium(values, edges), 0, solver)[0].shape
+    return choose_grid(medium(values, edges), 0, solver_named(solver).size_rule)[0].shape
 
 
 def in_air(count: int, sigma_t: float) -> np.ndarray:
@@ -79,10 +80,12 @@ def test_contrast_and_a_cut_boundary_ask_for_voxels():
 
 def test_homogeneous_media_get_what_their_data_would():
     """A homogeneous medium, and the same matter on a grid."""
+    rule = solver_named("sweep").size_rule
     for sigma_t in (0.5, 10.0, 1000.0):
         grid = medium(np.full((4, 4, 4), sigma_t))
         same = MediumGrid(ConstantField(np.array([sigma_t])), grid.albedo, grid.boundary)
-        assert choose_grid(same, 0, "sweep")[0].shape == choose_grid(grid, 0, "sweep")[0].shape
+        shapes = [choose_grid(m, 0, rule)[0].shape for m in (same, grid)]
+        assert shapes[0] == shapes[1]
 
 
 def test_a_little_bone_in_much_air():
@@ -93,9 +96,9 @@ def test_a_little_bone_in_much_air():
 
 
 def test_finer_voxels_have_a_limit(monkeypatch):
-    monkeypatch.setattr(defaults, "MOST_REFINED", 70000)
+    monkeypatch.setattr(grid_size, "MOST_REFINED", 70000)
     assert chosen(in_air(40, 40000.0)) == (41, 41, 41)
-    monkeypatch.setattr(defaults, "MOST_VOXELS", 30000)
+    monkeypatch.setattr(grid_size, "MOST_VOXELS", 30000)
     assert chosen(in_air(40, 40000.0)) == (31, 31, 31)
 
 
