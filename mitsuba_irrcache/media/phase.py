@@ -36,14 +36,14 @@ PROBES = 1024
 
 
 class Phase:
-    """A phase function that is not isotropic: Mitsuba's ``plugin``, its ``moments`` g_0 = 1, g_1,
+    """A phase function: Mitsuba's ``plugin`` (None for `ISOTROPIC`), its ``moments`` g_0 = 1, g_1,
     ..., and its ``peak``, the maximum of 4 pi p. These are without the share ``forward`` of light
     that goes on straight (see `delta_m`).
     """
 
     def __init__(
         self,
-        plugin: mi.PhaseFunction,
+        plugin: mi.PhaseFunction | None,
         moments: np.ndarray,
         peak: float,
         forward: float = 0.0,
@@ -59,8 +59,17 @@ class Phase:
         return float(np.abs(self.moments[order + 1 :]).max())
 
     @property
+    def is_isotropic(self) -> bool:
+        """Whether it is of order 0: a cache of the irradiance holds all that it needs."""
+        return not self.tail(0)
+
+    @property
     def order(self) -> int | None:
-        """Of the spherical harmonics that a cache has to hold; None where there were too many."""
+        """Highest degree of the spherical harmonics that a cache has to hold; None where there were
+        too many.
+        """
+        if self.is_isotropic:
+            return 0
         if self.forward:
             return int(np.flatnonzero(self.moments)[-1])
         return next((n for n in range(1, HIGHEST + 1) if self.tail(n) <= TAIL), None)
@@ -88,6 +97,10 @@ class Phase:
         return 4 * dr.pi / (1 - self.forward) * value[0]
 
 
+#: Isotropic scattering, of order 0.
+ISOTROPIC = Phase(None, np.eye(1, MOMENTS)[0], 1.0)
+
+
 def interaction(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f:
     """A collision at ``p`` of a path that came along ``direction``."""
     found = dr.zeros(mi.MediumInteraction3f)
@@ -96,21 +109,21 @@ def interaction(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f
     return found
 
 
-def phase_of(medium: mi.Medium, boundary: Boundary, name: str) -> Phase | None:
-    """The phase function of ``medium``, which lies in ``boundary``; None where it is isotropic.
+def phase_of(medium: mi.Medium, boundary: Boundary, name: str) -> Phase:
+    """The phase function of ``medium``, which lies in ``boundary``.
 
     Raises UnsupportedSceneError for those that depend on anything but the scattering angle.
     """
     plugin = medium.phase_function()
     if plugin.class_name() == "IsotropicPhaseFunction":
-        return None
+        return ISOTROPIC
     cosines, weights = _gauss_legendre()
     values, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], NODES), cosines)
     known = np.polynomial.legendre.legvander(cosines, MOMENTS - 1)
     moments = 2 * np.pi * (weights * values) @ known
     _check(plugin, boundary, f"{name} has the phase function {plugin.class_name()}, which")
     if np.abs(moments[1:]).max() < 1e-6:
-        return None
+        return ISOTROPIC
     ends, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], 2), np.array([-1.0, 1.0]))
     return Phase(plugin, moments / moments[0], 4 * np.pi * max(values.max(), ends.max()))
 
