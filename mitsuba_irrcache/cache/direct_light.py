@@ -171,7 +171,7 @@ def direct_lights_of(
     surfaces, of points and suns, too. None in media that do not scatter isotropically,
     whose caches hold the irradiance of such lights apart from that of others.
     """
-    if medium.phase is not None or not dr.width(voxels):
+    if not medium.phase.is_isotropic or not dr.width(voxels):
         return []
     emitters = spot_lights(scene)
     if dense and medium.is_isolated:

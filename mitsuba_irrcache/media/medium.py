@@ -12,7 +12,7 @@ from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.media.emission import Emission
-from mitsuba_irrcache.media.phase import Phase
+from mitsuba_irrcache.media.phase import ISOTROPIC, Phase
 
 
 class MediumGrid(Immutable):
@@ -21,7 +21,7 @@ class MediumGrid(Immutable):
     Attributes:
         bbox: lower and upper corner; None: unbounded.
         emission: emission coefficient of the medium; None where it emits nothing.
-        phase: None where scattering is isotropic.
+        phase: phase function, the same everywhere.
         name: unique among the media of a scene.
         pointer: Mitsuba's medium, by which rays know the medium they are in. None where rays are
             not traced through the scene's shapes, since an isotropic medium in its boundary is all
@@ -45,7 +45,7 @@ class MediumGrid(Immutable):
         bbox: tuple[np.ndarray, np.ndarray] | None = None,
         *,
         emission: Emission | None = None,
-        phase: Phase | None = None,
+        phase: Phase = ISOTROPIC,
         name: str = "",
         pointer: mi.MediumPtr | None = None,
         number: int = 0,

@@ -37,17 +37,18 @@ CHECKS = 1024
 
 
 class Phase:
-    """An anisotropic phase function.
+    """A phase function.
 
-    ``plugin`` is Mitsuba's, ``moments`` are g_0 = 1, g_1, ..., and ``peak`` is the maximum of 4 pi
-    p. The latter two exclude the fraction ``forward`` that `delta_m` treats as unscattered.
+    ``plugin`` is Mitsuba's (None for `ISOTROPIC`), ``moments`` are g_0 = 1, g_1, ..., and ``peak``
+    is the maximum of 4 pi p. The latter two exclude the fraction ``forward`` that `delta_m` treats
+    as unscattered.
     """
 
     # docs/primer, eqs. (1.2), (1.5)
 
     def __init__(
         self,
-        plugin: mi.PhaseFunction,
+        plugin: mi.PhaseFunction | None,
         moments: np.ndarray,
         peak: float,
         forward: float = 0.0,
@@ -63,8 +64,15 @@ class Phase:
         return float(np.abs(self.moments[order + 1 :]).max())
 
     @property
+    def is_isotropic(self) -> bool:
+        """Whether it is of order 0: a cache of the irradiance holds all that it needs."""
+        return not self.tail(0)
+
+    @property
     def order(self) -> int | None:
         """Required order of the spherical harmonics in a cache; None if above the maximum."""
+        if self.is_isotropic:
+            return 0
         if self.forward:
             return int(np.flatnonzero(self.moments)[-1])
         return next((n for n in range(1, MAX_ORDER + 1) if self.tail(n) <= MAX_TAIL), None)
@@ -92,6 +100,10 @@ class Phase:
         return 4 * dr.pi / (1 - self.forward) * value[0]
 
 
+#: Isotropic scattering, of order 0.
+ISOTROPIC = Phase(None, np.eye(1, MOMENTS)[0], 1.0)
+
+
 def interaction(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f:
     """Return the medium interaction at ``p`` of a ray with this direction."""
     found = dr.zeros(mi.MediumInteraction3f)
@@ -100,21 +112,21 @@ def interaction(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f
     return found
 
 
-def phase_of(medium: mi.Medium, boundary: Boundary, name: str) -> Phase | None:
-    """Return the phase function of ``medium``, which fills ``boundary``; None if it is isotropic.
+def phase_of(medium: mi.Medium, boundary: Boundary, name: str) -> Phase:
+    """Return the phase function of ``medium``, which fills ``boundary``.
 
     Raises UnsupportedSceneError if it depends on anything but the scattering angle.
     """
     plugin = medium.phase_function()
     if plugin.class_name() == "IsotropicPhaseFunction":
-        return None
+        return ISOTROPIC
     cosines, weights = _gauss_legendre()
     values, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], NODES), cosines)
     known = np.polynomial.legendre.legvander(cosines, MOMENTS - 1)
     moments = 2 * np.pi * (weights * values) @ known
     _check(plugin, boundary, f"{name} has the phase function {plugin.class_name()}, which")
     if np.abs(moments[1:]).max() < 1e-6:
-        return None
+        return ISOTROPIC
     ends, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], 2), np.array([-1.0, 1.0]))
     return Phase(plugin, moments / moments[0], 4 * np.pi * max(values.max(), ends.max()))
 

@@ -167,7 +167,7 @@ class CachedMedium:
         )
         grid, size_reason = choose_grid(medium, settings.resolution, solver.size_rule)
         basis = None
-        if medium.phase is not None:
+        if not medium.phase.is_isotropic:
             basis = AngularBasis(medium.phase, sources_of(scene))
         moments = basis.count if basis is not None else 0
         self._check_memory(grid, moments)

@@ -72,7 +72,7 @@ def choose_solver(
         )
     reason = REQUESTED if solver != "auto" else " and ".join(reasons)
     reason = reason or chosen.why(medium)
-    if medium.phase is not None and medium.phase.forward:
+    if medium.phase.forward:
         _check_forward_peak(medium, chosen, reason, max_depth)
     return chosen, reason
 

@@ -119,7 +119,7 @@ def _baked(
         grids.append(grid)
         if _is_visible(scene, medium):
             visible.add(grid.name)
-            if grid.phase is not None and not grid.phase.has_peak:
+            if not grid.phase.has_peak:
                 refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
     return grids, visible
 
@@ -138,7 +138,7 @@ def _among_others(grids: list[MediumGrid], number: int, visible: set[str]) -> Me
     """
     medium = grids[number]
     others = tuple(grid for grid in grids if grid is not medium)
-    if medium.name in visible and medium.phase is not None and medium.phase.has_peak:
+    if medium.name in visible and medium.phase.has_peak:
         medium = without_forward_peak(medium)
     return medium.replaced(others=others) if others else medium
 

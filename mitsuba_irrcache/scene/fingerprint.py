@@ -262,7 +262,7 @@ def _squashed(value: mi.Spectrum) -> mi.Float:
 
 def _medium_digest(medium: MediumGrid) -> str:
     parts = [*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()]
-    if medium.phase is not None:
+    if not medium.phase.is_isotropic:
         parts.append(np.float32(medium.phase.moments))
     if medium.emission is not None:
         parts += ["emission", *_field_parts(medium.emission.field)]

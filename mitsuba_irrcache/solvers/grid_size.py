@@ -83,7 +83,7 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
     the medium is dense, within the limits of the ``rule``.
     """
     data, frame = medium.sigma_t.grid, medium.frame
-    voxels = MOST_VOXELS if medium.phase is None else MOST_DIRECTIONAL
+    voxels = MOST_VOXELS if medium.phase.is_isotropic else MOST_DIRECTIONAL
     if resolution:
         grid, reason = Grid.near_cubic(frame, resolution), REQUESTED
     elif medium.is_traced and rule.among_surfaces is not None:

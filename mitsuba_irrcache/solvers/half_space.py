@@ -55,7 +55,8 @@ def series_error(medium: MediumGrid) -> float:
     """
     if not medium.homogeneous or medium.bbox is not None:
         return np.inf
-    if not medium.is_isolated or medium.phase is not None or medium.emission is not None:
+    isotropic = medium.phase.is_isotropic
+    if not medium.is_isolated or not isotropic or medium.emission is not None:
         return np.inf
     edges = np.linalg.norm(medium.frame[:3, :3], axis=0) * medium.sigma_t.minimum
     if not edges.min() > 0:

@@ -83,9 +83,9 @@ class SweepSolver(Solver):
 
     @classmethod
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
-        if medium.phase is not None and medium.phase.forward and not medium.is_isolated:
+        if medium.phase.forward and not medium.is_isolated:
             return SWEPT_SHARP
-        once = max_depth == 2 and medium.phase is None
+        once = max_depth == 2 and medium.phase.is_isotropic
         return (SWEPT if medium.is_isolated else SWEPT_AMONG_SURFACES) * (2 if once else 1)
 
     @classmethod

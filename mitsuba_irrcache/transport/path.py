@@ -34,7 +34,7 @@ class Media(Immutable):
 
     def __init__(self, grids: Sequence[MediumGrid]) -> None:
         self.grids = tuple(grids)
-        self.isotropic = all(grid.phase is None for grid in self.grids)
+        self.isotropic = all(grid.phase.is_isotropic for grid in self.grids)
 
     @property
     def is_emissive(self) -> bool:

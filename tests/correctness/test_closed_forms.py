@@ -200,7 +200,7 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     grid = Grid((layers, columns, columns), place)
     index, moments = dr.arange(mi.UInt32, grid.voxel_count), None
     solver, least = sn_solver.Sweep, sn_solver.BATCH
-    if medium.phase is not None:
+    if not medium.phase.is_isotropic:
         moments = AngularBasis(medium.phase, sources_of(scene))
         solver, least = AnisotropicSweep, least_batch(moments.order)
     batch = sn_solver.batch_of(samples, least)

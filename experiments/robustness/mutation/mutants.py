@@ -290,7 +290,8 @@ MUTANTS = (
         "forward peaks of other media taken away, too",
         "scene/compile.py",
         "tuple(grid for grid in grids if grid is not medium)",
-        "tuple(without_forward_peak(g) if g.phase else g for g in grids if g is not medium)",
+        "tuple(without_forward_peak(g) if g.phase.has_peak else g for g in grids if g is not "
+        "medium)",
         ("tests/unit/media/test_delta_m.py",),
     ),
     Mutant(

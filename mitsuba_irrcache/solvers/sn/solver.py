@@ -49,7 +49,8 @@ Progress = Callable[[int, int], None]
 
 def swept_together(medium: MediumGrid, voxels: int) -> bool:
     """Whether the channels of light in a cache of so many ``voxels`` go the same ways at once."""
-    return medium.phase is None and medium.sigma_t.channels == 1 and voxels <= TOGETHER
+    isotropic = medium.phase.is_isotropic
+    return isotropic and medium.sigma_t.channels == 1 and voxels <= TOGETHER
 
 
 def batch_of(samples: int, least: int) -> int:

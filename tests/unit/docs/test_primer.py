@@ -11,11 +11,11 @@ import pytest
 import mitsuba_irrcache
 from mitsuba_irrcache.cache import uncertainty
 from mitsuba_irrcache.lights import falloff
+from mitsuba_irrcache.render import denoise, raymarch
 from mitsuba_irrcache.solvers import grid_size
 from mitsuba_irrcache.solvers.path.solver import PathSolver
-from mitsuba_irrcache.solvers.sweep import SweepSolver
-from mitsuba_irrcache.render import denoise, raymarch
 from mitsuba_irrcache.solvers.sn import anderson, multigrid
+from mitsuba_irrcache.solvers.sweep import SweepSolver
 
 PACKAGE = Path(mitsuba_irrcache.__file__).parent
 ROOT = Path(__file__).parents[3]
