@@ -1,4 +1,4 @@
-"""``irrcache view``: look at a scene or a volume in the browser."""
+"""``irrcache view``: display a scene or a volume in the browser."""
 
 from __future__ import annotations
 
@@ -23,9 +23,7 @@ from mitsuba_irrcache.volumes.scene import SceneSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``irrcache view``: those of ``render`` for a scene, of ``import`` for a
-    volume.
-    """
+    """Declare the options: those of ``render`` for a scene and of ``import`` for a volume."""
     importer.add_input(parser, "scene XML, or what irrcache import reads: ")
     add_scene_options(parser)
     parser.add_argument(
@@ -49,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Shows it until Ctrl-C."""
+    """Run the viewer until Ctrl-C."""
     require("viser", "view", "irrcache view")
     if args.mode.startswith("llvm"):
         require_llvm()
@@ -70,7 +68,7 @@ def _show(args: argparse.Namespace) -> None:
     free_at_once()
     document, appearance = _document(args)
     session, server = Session(document), None
-    gc.freeze()  # collections look through what the viewer makes, not through all modules
+    gc.freeze()  # collections then scan the objects created below only
     try:
         session.start()
         server = Server(session, args.host, args.port, args.output, appearance)
@@ -88,11 +86,11 @@ def _show(args: argparse.Namespace) -> None:
         if server is not None:
             server.stop()
         session.stop()
-        gc.unfreeze()  # what is left then, modules find and report at the end
+        gc.unfreeze()  # so that the libraries report no leaked objects at exit
 
 
 def _document(args: argparse.Namespace) -> tuple:
-    """The scene as a document, and where it is made of data, these."""
+    """Return the scene as a document and, if it is made from a volume, the volume's appearance."""
     from mitsuba_irrcache.view.appearance import Appearance
     from mitsuba_irrcache.view.document import Document
 
@@ -113,7 +111,7 @@ def _document(args: argparse.Namespace) -> tuple:
 
 
 def _wait() -> None:
-    """Until Ctrl-C, or a request to terminate."""
+    """Wait for Ctrl-C or a request to terminate."""
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
