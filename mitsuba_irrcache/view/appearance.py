@@ -39,7 +39,7 @@ class Appearance:
         return isinstance(self.mapping, TransferFunction)
 
     def grids(self, mapping: TransferFunction | DensityMapping) -> dict[str, np.ndarray]:
-        """Return extinction (z, y, x) and albedo (z, y, x, 3), keyed by the names of their files."""
+        """Return extinction (z, y, x) and albedo (z, y, x, 3), keyed by their file names."""
         sigma_t, albedo = mapping.apply(self.volume.values)
         if not sigma_t.any():
             raise IrrcacheError("all of the volume would be transparent; raise an opacity.")

@@ -24,7 +24,7 @@ class Bands:
 
     @contextmanager
     def timed(self, band: range) -> Iterator[None]:
-        """Measure the time of a block that computes ``band``, and adapt the size of the next one."""
+        """Measure the duration of a block that computes ``band``, to adapt the next size."""
         started = perf_counter()
         yield
         self._learn(len(band), perf_counter() - started)

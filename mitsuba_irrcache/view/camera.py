@@ -92,7 +92,7 @@ def camera_of(sensor: mi.Sensor, centre: np.ndarray) -> Camera:
 
 
 def sensors_of(scene: mi.Scene) -> dict[str, mi.Sensor]:
-    """Return the sensors of a scene that an orbiting camera can represent, by name, in scene order."""
+    """Return the sensors that an orbiting camera can represent, by name, in scene order."""
     found: dict[str, mi.Sensor] = {}
     for number, sensor in enumerate(scene.sensors()):
         if sensor.class_name() in SENSORS:
@@ -130,9 +130,7 @@ class Placement:
 
 
 def cameras_of(scene: mi.Scene, placement: Placement) -> dict[str, Camera]:
-    """Return cameras at the positions of the scene's sensors, by name; a default one if there is
-    none.
-    """
+    """Return cameras at the scene's sensors, by name; a default camera if there is none."""
     centre = placement.centre
     found = {name: camera_of(sensor, centre) for name, sensor in sensors_of(scene).items()}
     if found:

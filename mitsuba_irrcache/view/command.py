@@ -24,14 +24,14 @@ from mitsuba_irrcache.volumes.scene import SceneSettings
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options: those of ``render`` for a scene and of ``import`` for a volume."""
-    importer.add_input(parser, "scene XML, or what irrcache import reads: ")
+    importer.add_input(parser, "scene XML, or any volume that irrcache import reads: ")
     add_scene_options(parser)
     parser.add_argument(
         "-i", "--integrator", metavar="irrcache{KEY=VALUE,...}", help="properties of irrcache"
     )
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FOLDER",
-        help="where files are saved, made if it is not there (default: in the browser)",
+        help="folder for saved files, created if missing (default: download)",
     )  # fmt: skip
     parser.add_argument(
         "--host", default="127.0.0.1",
@@ -39,7 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "address that is printed (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--port", type=whole(1, 65535), default=8080, help="or the next one that is free"
+        "--port",
+        type=whole(1, 65535),
+        default=8080,
+        help="port; the next free one is used if it is taken",
     )
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
@@ -97,7 +100,9 @@ def _document(args: argparse.Namespace) -> tuple:
     path, parameters = Path(args.input[0]), parse_parameters(args.define)
     if path.suffix.lower() == ".xml":
         if importer.has_appearance(args):
-            raise IrrcacheError("a scene has its medium: --preset and the like are for volumes.")
+            raise IrrcacheError(
+                "--preset, --transfer-function and --density are for volumes, not for scenes."
+            )
         integrator = args.integrator
         if integrator is None and integrator_of(path, parameters) in REPLACED:
             integrator = "irrcache"

@@ -157,7 +157,7 @@ class Document:
     def set_lighting(self, lighting: Lighting) -> None:
         """Change the environment and the sun."""
         if not lighting.environment >= 0 or not lighting.sun >= 0:
-            raise IrrcacheError("light cannot be negative; give 0 for none.")
+            raise IrrcacheError("a light source cannot be negative; give 0 for none.")
         self._set_environment(lighting)
         self._set_sun(lighting)
         self.lighting = lighting
@@ -173,8 +173,7 @@ class Document:
         integrator: dict[str, tuple[str, str]],
         note: str,
     ) -> list[Path]:
-        """Save the scene with ``camera`` and a film of ``size`` (width, height), and its new
-        volumes.
+        """Save the scene as seen by ``camera``, with a film of ``size`` (width, height).
 
         Volumes are written if they are not on disk yet. ``medium`` says whether the camera is
         inside the medium; ``integrator`` holds properties to set, as (kind, value) by name;
@@ -246,9 +245,7 @@ class Document:
         return next((e for e in root.findall("emitter") if e.get("type") == "directional"), None)
 
     def _lighting(self) -> Lighting:
-        """Return the illumination of the original scene; its sun has the mean over the colour
-        channels.
-        """
+        """Return the illumination of the original scene; the sun's is the mean of its channels."""
         sun = self._sun(self._root)
         if sun is None:
             return Lighting()

@@ -80,7 +80,7 @@ def _samples(session: Session, view: View, layered: bool) -> Samples:
 
 
 def _write_caches(session: Session, path: Path) -> dict[str, Path]:
-    """Write the caches of all media under the names that the integrator's ``cache_file`` implies."""
+    """Write the caches of all media under names derived from the integrator's ``cache_file``."""
     light, files = session.light, {}
     for part in light.parts:
         if part.is_dark or not part.cache.samples:

@@ -167,7 +167,7 @@ class Light:
         return coarse
 
     def seen(self, layered: bool, with_error: bool) -> Seen:
-        """Return a copy of the current caches; `camera_rays_of` computes further layers if asked."""
+        """Return a copy of the current caches; `camera_rays_of` computes the requested layers."""
         key = layered, with_error
         known = self._seen.get(key)
         if known is None or known[0] != self.revision:

@@ -27,7 +27,7 @@ class LightPanel:
             self.editing = Editing(self.refuse)
             target = gui.add_number(
                 "target error %", 100 * session.target_error, min=0.01, max=100.0, step=0.01,
-                hint="standard error of the light, relative to its mean, at which it is done",
+                hint="relative standard error of the caches at which refinement stops",
             )  # fmt: skip
             depth = gui.add_number(
                 "max_depth", document.settings.max_depth, min=-1, step=1,

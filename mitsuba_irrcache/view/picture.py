@@ -92,7 +92,7 @@ class Samples:
 
     @property
     def layers(self) -> Layers:
-        """Return the layers as means over the samples; without layers, all radiance is background."""
+        """Return the layers as means over the samples; without layers, all is background."""
         scale = dr.opaque(mi.Float, 1 / self.count)
         means = [s * scale for s in self._sums]
         if not self.seen.layered:
@@ -120,7 +120,7 @@ class Samples:
         return _display(self._shown(look, extent), look, self.size)
 
     def channels(self, aovs: tuple[str, ...], filtered: bool = False) -> tuple[np.ndarray, list]:
-        """Return the image and further layers as float32 (height, width, channel), and their names."""
+        """Return image and layers as float32 (height, width, channel), and the channel names."""
         image, layers = self.image(filtered), self.layers
         planes, names = [], []
         for kind in aovs:

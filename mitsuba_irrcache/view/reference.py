@@ -56,7 +56,7 @@ class Reference:
         return self._passes >= MOST_SAMPLES
 
     def refine(self) -> bool:
-        """Render one more sample per pixel of a band; return whether all pixels have equally many."""
+        """Add one sample per pixel to a band; return whether all pixels have equally many."""
         band = self._bands.at(self._first, self._pixels)
         half, place = self._passes % 2, slice(band.start, band.stop)
         with self._bands.timed(band):

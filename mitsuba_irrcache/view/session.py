@@ -112,7 +112,7 @@ class Session:
                 self._news.notify_all()
 
     def edit(self, change: Callable[[Document], None]) -> None:
-        """Change the document and rebuild the caches; raise IrrcacheError if the change is refused."""
+        """Change the document and rebuild the caches; raise IrrcacheError if that is refused."""
         self.call(lambda: self._edit(change))
 
     def call(self, action: Callable[[], object]) -> object:
@@ -154,9 +154,7 @@ class Session:
         return self._shown
 
     def complete(self, seen: Seen, view: View) -> Samples | None:
-        """Return the samples of ``view`` if a window has all of them; for the session's thread
-        only.
-        """
+        """Return all samples of ``view`` if a window has them; for the session's thread only."""
         return next((w.samples for w in self._windows if w.is_complete(seen, view)), None)
 
     # ------------------------------------------------------------------ the thread
@@ -181,7 +179,7 @@ class Session:
             except Superseded:
                 continue
             except Exception as error:
-                LOG.exception("the viewer could not show or improve something")
+                LOG.exception("the viewer failed to render an image or to refine the caches")
                 self._give_up(error)
         self._light = self._shown = None
         self._windows.clear()

@@ -74,12 +74,12 @@ class Visitor:
             self._exposure = gui.add_slider("exposure", -8.0, 8.0, 0.1, 0.0, hint="stops")
             self._tone = gui.add_dropdown("tone mapping", tuple(TONES))
             self._filter = gui.add_checkbox(
-                "filter", False, hint="of the illumination; fades as the light improves"
+                "filter", False, hint="of the illumination; weaker as the caches converge"
             )
             self._compare = gui.add_checkbox(
-                "compare with volpath", False, hint="beside it, slowly, while nothing moves"
+                "compare with volpath", False, hint="side by side, refined while no camera moves"
             )
-        with gui.add_folder("Keep", order=5, expand_by_default=False):
+        with gui.add_folder("Save", order=5, expand_by_default=False):
             self._name = gui.add_text("name", "view")
             self._cache = gui.add_checkbox("with the cache", False)
             self._save = gui.add_button(

@@ -120,7 +120,7 @@ class Window:
             self._reference = None
 
     def lacks(self, light: Light, revision: int, first: bool) -> bool:
-        """Return whether an image at rest lacks samples; if ``first``, whether it has none at all."""
+        """Return whether an image at rest lacks samples, or has none at all if ``first``."""
         if self.view is None:
             return False
         if self.fresh or not self.view.shows_place_of(self._resting) or self._light is not light:
@@ -195,9 +195,7 @@ class Window:
     def compared(
         self, light: Light, view: View, extent: tuple[float, float], improving: bool
     ) -> Picture | None:
-        """Add samples to the reference; return an image if the reference is new or all of it
-        changed.
-        """
+        """Add samples to the reference; return an image if each of its pixels has a new sample."""
         known = self._reference_of(light, view)
         if known is None:
             self._reference = known = Reference(light, view.camera, view.part)

@@ -62,7 +62,7 @@ def test_looking_around(browser, started):
     assert difference(closer, turned) > 3
 
     # What is kept renders to what is on the screen.
-    window.page.get_by_text("Keep", exact=True).click()
+    window.page.get_by_text("Save", exact=True).click()
     window.page.get_by_role("button", name="save", exact=True).click()
     window.page.get_by_text("saved view").wait_for(timeout=20000)
     kept = folder / "kept" / "view.xml"
@@ -84,7 +84,7 @@ def test_looking_around(browser, started):
     elsewhere = settled(other)
     assert difference(elsewhere, denser) > 3
     assert difference(screen(window), denser) < 0.5
-    other.page.get_by_text("Keep", exact=True).click()
+    other.page.get_by_text("Save", exact=True).click()
     other.enter("name", "../escaped")
     other.page.get_by_role("button", name="save", exact=True).click()
     other.page.get_by_text("is no name for a file").first.wait_for()

@@ -95,7 +95,7 @@ def test_transfer_functions_and_archives_come_and_go(browser, tmp_path):
         page.get_by_text("Refused:").first.wait_for(state="hidden")
         assert difference(back, first) < 1.5
 
-        page.get_by_text("Keep", exact=True).click()
+        page.get_by_text("Save", exact=True).click()
         with page.expect_download(timeout=90_000) as download:
             page.get_by_role("button", name="download", exact=True).click()
             page.get_by_text("downloaded view.zip").wait_for(timeout=80_000)

@@ -51,7 +51,7 @@ def imported(module: str, path: Path) -> set[str]:
     for type checkers; ``""`` is the package itself.
     """
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -111,7 +111,7 @@ class User:
         """All that can be kept."""
         name = window.page.get_by_role("button", name=re.compile("^(save|download)$"))
         if not name.is_visible():
-            window.page.get_by_text("Keep", exact=True).click()
+            window.page.get_by_text("Save", exact=True).click()
         name.click()
         window.page.get_by_text(re.compile("^(saved|downloaded) ")).first.wait_for(
             timeout=1000 * PATIENCE

@@ -87,7 +87,7 @@ def copied(folder: Path) -> Path:
 def apply(mutant: Mutant, package: Path) -> None:
     """Changes the one place; raises ValueError where it is not there, or not the only one."""
     file = package / mutant.file
-    text = file.read_text()
+    text = file.read_text(encoding="utf-8")
     if text.count(mutant.old) != 1:
         raise ValueError(f'{mutant.file} has {text.count(mutant.old)} times "{mutant.old}"')
     file.write_text(text.replace(mutant.old, mutant.new))

@@ -208,6 +208,6 @@ def test_scenes_of_others_are_skipped_without_data(tmp_path, monkeypatch, capsys
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda m: m.name)
 def test_mutants_fit_the_library(mutant):
     """Each still has one place to change, changes it, and names tests that there are."""
-    text = (PROJECT / "mitsuba_irrcache" / mutant.file).read_text()
+    text = (PROJECT / "mitsuba_irrcache" / mutant.file).read_text(encoding="utf-8")
     assert text.count(mutant.old) == 1 and mutant.new != mutant.old
     assert all((PROJECT / test).is_file() for test in mutant.tests)
