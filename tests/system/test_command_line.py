@@ -330,7 +330,7 @@ def test_budget(folder, capsys):
 
 
 def test_an_integrator_with_another_prepare(folder):
-    """``--budget`` refuses Mitsuba's differentiable integrators, whose ``prepare`` builds no
+    """``render`` accepts Mitsuba's differentiable integrators, whose ``prepare`` builds no
     cache.
     """
     assert run("render", folder / "scene.xml", "-i", "prbvolpath", "--spp", 1) == 0
