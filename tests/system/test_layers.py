@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 ALL = ",".join(AOVS)
 SKY = {"type": "constant", "radiance": 1.0}
-#: Emission of the sky outside of a small bright window, which makes the cache noisy.
+#: A dark sky with a small bright window, whose irradiance is noisy in the cache.
 WINDOW = np.full((8, 16, 3), 0.02, np.float32)
 WINDOW[2:4, 5:7] = 12.0
 

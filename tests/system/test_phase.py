@@ -148,9 +148,7 @@ def loaded(scenes, phase: dict, **settings) -> mi.Scene:
 
 
 def test_files(scenes, tmp_path):
-    """Angular moments are saved, loaded and merged; another phase function has another
-    fingerprint.
-    """
+    """Angular moments are saved, loaded and merged; a file of another phase function is refused."""
     file = str(tmp_path / "light.npz")
     first = loaded(scenes, hg(0.4), cache_file=file)
     before = scenes.image(first, spp=2)

@@ -287,8 +287,7 @@ def test_constants_are_not_looked_up(scenes, kernels):
 
 
 def test_grey_light_is_swept_once(scenes, kernels):
-    """A grey medium in RGB takes the launches of a single channel, and a coloured one three
-    times more.
+    """A grey medium in RGB takes the launches of one channel, a coloured one three times as many.
 
     The channels of a grey medium under a coloured sky differ by a factor.
     """

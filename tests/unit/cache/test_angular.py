@@ -1,4 +1,4 @@
-"""Phase functions by their moments, and light by its direction."""
+"""Phase functions and their angular moments, and radiance by direction."""
 
 from __future__ import annotations
 
@@ -84,8 +84,9 @@ LIGHTS = {
 @pytest.mark.parametrize(("objects", "tolerance"), LIGHTS.values(), ids=LIGHTS)
 @pytest.mark.parametrize("g", [0.5, -0.3])
 def test_scattered_light_of_one_place(scenes, objects, tolerance, g):
-    """From the moments, and from all directions one by one: relative to the mean, 4 pi p weighted
-    with the same samples.
+    """Scattered radiance from moments agrees with the sum over directions.
+
+    The sum weights the same samples by 4 pi p; the difference is relative to the mean.
     """
     if isinstance(objects.get("emitter"), float):
         objects = objects | {"emitter": lamp(objects["emitter"])}

@@ -1,4 +1,4 @@
-"""Roots whose interpolant has the light of the voxels."""
+"""Square-root fields whose interpolated square has the integral of the voxel values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def grid(rgb) -> Grid:
 
 
 def kept(grid: Grid, phi: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
-    """Roots of light; ``phi`` is (z, y, x, channel), ``known`` (z, y, x)."""
+    """Return the conservative roots of ``phi`` (z, y, x, channel) at ``known`` (z, y, x) voxels."""
     roots = mi.Float(np.sqrt(phi).ravel().astype(np.float32))
     known = np.ones(phi.shape[:3], bool) if known is None else known
     result = conserving(grid, roots, mi.Bool(known.ravel()), phi.shape[-1])
@@ -29,7 +29,7 @@ def kept(grid: Grid, phi: np.ndarray, known: np.ndarray | None = None) -> np.nda
 
 
 def mean_lookup(grid: Grid, roots: np.ndarray) -> float:
-    """Of one channel, far from the border: of 6^3 points between voxels."""
+    """Return the mean of one channel at 6^3 points per cell, far from the border."""
     field = RootField(grid, mi.Float(roots.ravel()), 1)
     points = 1.5 + (np.arange(6 * (SIDE - 3)) + 0.5) / 6
     u = np.stack(np.meshgrid(points, points, points)).reshape(3, -1)
@@ -37,21 +37,23 @@ def mean_lookup(grid: Grid, roots: np.ndarray) -> float:
 
 
 def ball(radius: float) -> np.ndarray:
-    """Light that ends at its surface, (z, y, x, 1)."""
+    """Return a field that is zero outside of a ball, (z, y, x, 1)."""
     z, y, x = np.indices((SIDE,) * 3) + 0.5 - SIDE / 2 + np.reshape([0.1, 0.3, 0.2], (3, 1, 1, 1))
     return (np.sqrt(x**2 + y**2 + z**2) < radius).astype(float)[..., None]
 
 
 def layers(values: np.ndarray) -> np.ndarray:
-    """Light that differs along z only."""
+    """Return a field that varies along z only."""
     return values[:, None, None, None] * np.ones((1, SIDE, SIDE, 1))
 
 
 @pytest.mark.parametrize("radius", [1.5, 5.5])
 @pytest.mark.parametrize("dim", [0.0, 0.2])
 def test_what_ends_keeps_its_light(grid, radius, dim):
-    """As much as is in the voxels, to an eighth of what interpolated roots lose: 3 to 40 % of what
-    is in the ball.
+    """Fields with a sharp end are conserved.
+
+    The error of the sum is an eighth of that of plainly interpolated roots, which lose 3 to 40 % of
+    the field in the ball.
     """
     phi, lit = dim + ball(radius) * (1 - dim), (SIDE - 3) ** 3
     total, left = phi.sum() - dim * SIDE**3, dim * lit
@@ -65,8 +67,9 @@ def test_what_ends_keeps_its_light(grid, radius, dim):
     ("k", "error", "before"), [(0.5, 0.001, 0.009), (1.0, 0.003, 0.04), (2.0, 0.03, 0.15)]
 )
 def test_light_that_matter_swallows(grid, k, error, before):
-    """e^-kx between two voxels: the mean of lookups, relative to the integral; ``before`` is what
-    interpolated roots are off by at least.
+    """The mean of lookups agrees with the integral of e^-kx between two voxels.
+
+    ``before`` is the minimum error of plainly interpolated roots.
     """
     phi = np.exp(-k * np.arange(SIDE))
     u = np.full((3, 64), SIDE / 2)
@@ -81,8 +84,10 @@ def test_light_that_matter_swallows(grid, k, error, before):
 
 
 def test_smooth_light_is_right_on_average(grid):
-    """A cosine of 12 voxels' length on top of 2: the mean over any cell, to 0.3 %, where plain
-    interpolation is off by up to 2.2 %.
+    """The mean of a smooth field over any cell agrees to 0.3 %.
+
+    The field is a cosine of 12 voxels' length on top of 2, where plain interpolation is off by up
+    to 2.2 %.
     """
     w = 2 * np.pi / 12
     x = np.arange(SIDE) + 0.5
@@ -107,8 +112,9 @@ def test_channels_are_apart(grid):
 
 
 def test_what_is_not_known_does_not_count(grid):
-    """Voxels without light of their own, and the border: neighbours keep their values along that
-    axis. Light that changes evenly does not bend.
+    """Unknown voxels and the border do not affect their neighbours along the axis.
+
+    A field that varies linearly is unchanged.
     """
     phi, known = layers((1 + np.arange(SIDE)) ** 2.0), np.ones((SIDE,) * 3, bool)
     known[:, :10] = False

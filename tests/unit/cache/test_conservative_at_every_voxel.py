@@ -1,6 +1,4 @@
-"""Roots that keep the light of the voxels, at every voxel of a grid: whatever the side it is on,
-and whatever lies beside it.
-"""
+"""Conservative roots at every voxel of a grid, at its sides and beside unknown voxels."""
 
 from __future__ import annotations
 
@@ -20,7 +18,7 @@ KNOWN = RNG.random(SHAPE) < 0.8
 
 
 def kept(light: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """The roots made of ``light``, both (z, y, x)."""
+    """Return the roots of ``light``, both (z, y, x)."""
     roots = mi.Float(np.float32(np.sqrt(light)).ravel())
     found = conserving(Grid(light.shape, np.eye(4)), roots, mi.Bool(known.ravel()))
     return np.array(found).reshape(light.shape)
@@ -28,13 +26,13 @@ def kept(light: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("axis", range(3))
 def test_mirrored_light_has_mirrored_roots(axis):
-    """No end of an axis differs from the other, and no neighbour from the opposite one."""
+    """Mirrored fields have mirrored roots."""
     mirrored = kept(np.flip(LIGHT, axis), np.flip(KNOWN, axis))
     np.testing.assert_allclose(mirrored, np.flip(kept(LIGHT, KNOWN), axis), rtol=1e-5)
 
 
 def test_values_that_are_not_known_do_not_matter():
-    """Any values at the unknown voxels give the same roots at all others."""
+    """Values at unknown voxels do not affect the roots at others."""
     results = [kept(np.where(KNOWN, LIGHT, other), KNOWN)[KNOWN] for other in (0.0, 1.0, 1e4)]
     np.testing.assert_array_equal(results[0], results[1])
     np.testing.assert_array_equal(results[0], results[2])
@@ -43,9 +41,11 @@ def test_values_that_are_not_known_do_not_matter():
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("count", "lit"), [(3, 1), (5, 1), (5, 3), (4, 2)])
 def test_one_lit_voxel_of_a_row_keeps_its_light(axis, count, lit):
-    """Interpolated roots rise and fall linearly between the lit voxel and its dark neighbours, so
-    their square has the integral r^2 (1/3 + 1/3): this is the light of the voxel, also where it is
-    next to the last one of either end.
+    """The integral of a single nonzero voxel in a row is conserved.
+
+    Interpolated roots rise and fall linearly between this voxel and its zero neighbours, so their
+    square has the integral r^2 (1/3 + 1/3). This must equal the voxel's value, also next to the
+    last voxel of either end.
     """
     shape = np.ones(3, int)
     shape[2 - axis] = count

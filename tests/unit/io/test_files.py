@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic file creation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_nothing_is_left_after_an_error(tmp_path, error):
 
 
 def test_permissions_are_those_of_a_new_file(tmp_path):
-    """Not the 0600 of a temporary file: a shared folder stays shared."""
+    """Permissions are those of a new file, not the 0600 of a temporary file."""
     with atomic_write(tmp_path / "a.bin"):
         pass
     (tmp_path / "b.bin").write_bytes(b"")

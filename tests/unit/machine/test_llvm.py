@@ -1,4 +1,4 @@
-"""Finding an LLVM that Dr.Jit can use, and refusing the others before they abort the process."""
+"""The search for an LLVM that Dr.Jit can use; others are refused before they abort the process."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def minimum_17(monkeypatch):
 
 @pytest.fixture
 def folder_of_libraries(tmp_path, monkeypatch, minimum_17):
-    """A machine whose only LLVM libraries are those that a test puts into this folder."""
+    """Restrict the search to LLVM libraries in this folder."""
     monkeypatch.setattr(llvm, "_llvm_patterns", lambda: [f"{tmp_path}/libLLVM*.so*"])
     monkeypatch.setenv(llvm.LLVM_VARIABLE, "")
     return tmp_path

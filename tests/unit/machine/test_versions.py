@@ -1,4 +1,4 @@
-"""Lower bounds come from the package's own metadata and are compared as versions."""
+"""Lower bounds are read from the package's metadata and compared as versions."""
 
 from __future__ import annotations
 
