@@ -1,4 +1,4 @@
-"""%."""
+"""Cache and image against closed forms and published tables; no reference was rendered."""
 
 import math
 
@@ -100,6 +100,7 @@ def test_white_furnace(scenes, scale):
 
     rr_depth is beyond every path here (optical depth 20 and more would need thousands of orders
     with Russian roulette at full weight); the mean over all voxels is known to 0.2 %, the pixels to
+    1 %.
     """
     to_world = scenes.placement((2.0, 1.2, 0.4), turn=40)
     sigma_t = scenes.texture((4, 6, 5), 0.0, 1.0, 11)

@@ -61,7 +61,10 @@ def test_stages_of_images_are_kept_apart():
 
 
 def test_an_average_knows_its_error():
-    """The standard error of means of 8 images is their scatter, and alpha has none."""
+    """The standard error of means of 8 images is their scatter, and alpha has none.
+
+    The bound is for 4096 pixels; the error is that of the mean over the colours.
+    """
     images = np.random.default_rng(1).normal(1.0, [0.1, 0.2, 0.3, 9.0], (8, 64, 64, 4))
     average = Average()
     for image in images:

@@ -1,4 +1,4 @@
-"""What makes a cache stale, and what does not."""
+"""Which scene changes invalidate a cache, and which do not."""
 
 from __future__ import annotations
 
@@ -43,7 +43,10 @@ EDITS = {
 
 @pytest.mark.parametrize("ending", EDITS)
 def test_edits_of_the_light_are_seen(scenes, ending):
-    """By name, and by nothing else than that name (and what Mitsuba derives from it)."""
+    """Each edit that affects the irradiance is reported by its parameter's name and no other.
+
+    Parameters that Mitsuba derives from it are excepted.
+    """
     scene = cloud_scene(scenes)
     before = Snapshot(scene)
     assert Snapshot(scene).changes(before) == []
@@ -76,7 +79,7 @@ def digest(scene) -> dict[str, str]:
 
 
 def test_digests_are_those_of_the_contents(scenes):
-    """Equal for the same scene loaded twice, whatever its integrator or sensor."""
+    """A scene loaded twice has equal fingerprints, whatever its integrator or sensor."""
     first = digest(cloud_scene(scenes))
     assert first == digest(cloud_scene(scenes))
     sensor = scenes.description({}, None, size=5)["sensor"] | {"fov": 10.0}

@@ -1,4 +1,4 @@
-"""Crop, clip, resample and bake keep the place, the range and the mean of what they work on."""
+"""Crop, clip, resample and bake preserve positions, range and mean of the values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def noise(shape=(8, 9, 10)) -> np.ndarray:
 
 
 def linear_in_world(shape=(8, 9, 10)) -> VolumeData:
-    """The value at every voxel centre is an affine function of its world position."""
+    """Return a volume whose values are an affine function of the world position."""
     placed = volume(np.zeros(shape))
     z, y, x = np.indices(shape)
     index = np.stack([x, y, z, np.ones_like(x)], axis=-1)
@@ -66,7 +66,7 @@ def test_rescale():
 
 @pytest.mark.parametrize("size", [(5, 5, 4), (20, 27, 8), (7, 18, 3), (10, 9, 8)])
 def test_resampling_keeps_an_affine_function_in_place(size):
-    """Away from the border, where smoothing and clamping bend it."""
+    """Resampling preserves an affine function, except at the border, where it is clamped."""
     resampled = processing.resample(linear_in_world((24, 27, 30)), size)
     x, y, z = (n // 2 for n in size)
     world = resampled.index_to_world @ (x, y, z, 1)
@@ -86,7 +86,7 @@ def test_resampling_stays_in_range_and_in_its_box(size):
 
 
 def test_downsampling_is_antialiased():
-    """A checkerboard at the limit of resolution becomes grey, not a moire pattern."""
+    """A checkerboard at the limit of resolution becomes grey, without a moire pattern."""
     board = (np.indices((24, 24, 24)).sum(axis=0) % 2).astype(np.float32)
     assert processing.resample(VolumeData(board), (8, 8, 8)).values.std() < 0.02
 
@@ -135,7 +135,9 @@ def test_supersampling_a_linear_mapping_keeps_its_mean():
 
 
 def test_supersampling_converges_to_the_exact_average():
-    """A ramp crosses a step transfer function: each voxel's extinction is its share above it."""
+    """With a ramp and a step transfer function, a voxel's extinction is its share above the
+    step.
+    """
     ramp = np.broadcast_to(np.arange(0.0, 200.0, 15.0), (3, 3, 14)).copy()
     source = VolumeData(ramp)
     crossing = 100.0 / 15.0 + 0.5  # in voxels from the face, so voxel 7 lies above by 0.83
@@ -148,7 +150,7 @@ def test_supersampling_converges_to_the_exact_average():
 
 
 def test_averaged_albedo_is_weighted_by_extinction():
-    """Where only one side of a voxel is occupied, its albedo is that side's."""
+    """The albedo of a voxel of which only one side is occupied is that side's."""
     ramp = np.broadcast_to(np.arange(0.0, 200.0, 15.0), (3, 3, 14)).copy()
     albedo = processing.bake(VolumeData(ramp), STEP, (14, 3, 3), supersample=16)[2]
     assert (albedo <= 1).all()
@@ -167,7 +169,11 @@ def test_bake_returns_the_grid_it_is_for():
 
 @pytest.mark.parametrize("supersample", [1, 10**20])
 def test_more_voxels_than_memory_holds_are_refused(supersample):
-    """In bytes and with the remedy, before anything is made of them; of any number of digits."""
+    """More voxels than fit in memory are refused before allocation, in bytes and with the
+    remedy.
+
+    Sizes of any number of digits are tested.
+    """
     volume = VolumeData(np.ones((4, 4, 4), np.float32), (1.0, 1.0, 1.0))
     size = (4, 4, 4) if supersample > 1 else (10**6, 10**6, 10**6)
     with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB, and \d+\.\d GiB are free; ask"):

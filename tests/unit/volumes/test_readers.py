@@ -1,4 +1,4 @@
-"""Files come in whole, in the right order and place, or are refused with the reason."""
+"""Files are read completely, in the right order and position, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def write_image(path: Path, values: np.ndarray, compress: bool = False) -> Path:
 
 
 def write_dicom(folder: Path, positions, uid="1.2.826.0.1.9", tag="a", shear=0.0) -> None:
-    """Slices of the value 20 times their position, stored as (value + 1000) / 2.
+    """Write DICOM slices of the value 20 times their position, stored as (value + 1000) / 2.
 
     File names do not follow the positions.
     """
@@ -124,7 +124,9 @@ def test_dicom_is_sorted_by_position_and_rescaled(tmp_path):
 
 @pytest.mark.parametrize("how", ["data", "about the file"])
 def test_dicom_that_promises_more_than_it_has(tmp_path, how):
-    """One wrong byte in a slice of a kilobyte took gigabytes; it is refused by name now."""
+    """A DICOM slice of a kilobyte with one wrong byte, which would allocate gigabytes, is
+    refused.
+    """
     write_dicom(tmp_path / "ct", [0.0, 1.0, 2.0])
     file = tmp_path / "ct" / "a07.dcm"
     content = file.read_bytes()
@@ -144,7 +146,7 @@ def test_dicom_that_promises_more_than_it_has(tmp_path, how):
 
 @pytest.mark.parametrize("count", [0, -3, 11, 2147483648])
 def test_meta_images_of_impossible_dimensions(tmp_path, count):
-    """2^31 of them ended the process."""
+    """MetaImages of impossible dimensions are refused; 2^31 crashed the process."""
     file = write_image(tmp_path / "a.mha", ramp())
     file.write_bytes(file.read_bytes().replace(b"NDims = 3", b"NDims = %d" % count))
     with pytest.raises(IrrcacheError, match=rf"a\.mha says that it has {count} dimensions"):
@@ -319,7 +321,7 @@ def test_failed_write_leaves_the_old_file_alone(tmp_path):
     assert os.listdir(tmp_path) == ["a.vol"]
 
 
-# Damage
+# Damaged files
 
 
 @pytest.mark.parametrize("name", ["a.nrrd", "a.nii", "a.nii.gz", "a.mha"])
@@ -387,7 +389,7 @@ def test_unsupported_extension_is_named(tmp_path):
         read_volume(tmp_path / "a.png")
 
 
-# Data of others
+# Third-party data
 
 
 @pytest.mark.data
@@ -409,6 +411,6 @@ def test_unc_head_is_read_in_order():
     )
     assert volume.values.max() == 3272
     np.testing.assert_allclose(volume.values.mean(), 379.5, atol=0.1)
-    # Neighbouring slices look alike in the right order only.
+    # Neighbouring slices are similar in the right order only.
     flat = volume.values.reshape(113, -1).astype(float)
     assert np.abs(np.diff(flat, axis=0)).mean() < 100

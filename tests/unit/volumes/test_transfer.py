@@ -1,4 +1,4 @@
-"""Transfer functions: what they map to, and which documents are refused, by index."""
+"""Transfer functions: their mapping, and refusal of invalid documents with the index."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_presets_are_usable_and_survive_a_round_trip(name, tmp_path):
     np.testing.assert_array_equal(loaded.sigma_t(values), preset.sigma_t(values))
     np.testing.assert_array_equal(loaded.albedo(values), preset.albedo(values))
     assert (loaded.unit, loaded.percentiles) == (preset.unit, preset.percentiles)
-    # Air is empty, and the mean free path stays above 1 mm: caches have voxels of 2 to 4 mm.
+    # Air is empty, and the mean free path is above 1 mm: caches have voxels of 2 to 4 mm.
     assert preset.sigma_t(np.array([-1000.0]))[0] == 0
     assert preset.sigma_t(values).max() < 1.0
 

@@ -29,10 +29,10 @@ from mitsuba_irrcache.volumes.phantom.vessels import MURRAY_EXPONENT, vessel_tre
 
 SIZE = np.array([380.0, 240.0, 330.0])
 
-# Voxels of 2.5 mm and of 5/3 mm: both are blocked to 5 mm where they are compared.
+# Voxels of 2.5 mm and of 5/3 mm: both are averaged to 5 mm where they are compared.
 COARSE, FINE = (132, 96, 152), (198, 144, 228)
 
-# Place (LPS, mm), radius of the ball averaged over in mm, and the HU expected there.
+# Position (LPS, mm), radius in mm of the ball that is averaged, and the expected HU.
 PLACES = {
     "air beside the patient": ((-180, -100, 20), 8, (-1000, -1000)),
     "trachea": ((0, -4, 290), 4, (-1024, -850)),
@@ -59,7 +59,7 @@ def fine():
 
 
 def axes(volume):
-    """Open grid of the voxel centres in mm, read from the volume's own placement."""
+    """Return the open grid of the voxel centres in mm, from the volume's own placement."""
     matrix = volume.index_to_world
     x, y, z = (matrix[i, i] * np.arange(n) + matrix[i, 3] for i, n in enumerate(volume.size))
     return x[None, None, :], y[None, :, None], z[:, None, None]
@@ -77,7 +77,7 @@ def blocked(volume, factor):
 
 
 def lungs(volume):
-    """Masks of the two largest connected pieces of lung, the patient's right one first."""
+    """Return masks of the two largest connected parts of lung, the patient's right one first."""
     tissue = (volume.values > -960) & (volume.values < -650)
     labels, count = ndimage.label(ndimage.binary_erosion(tissue))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
