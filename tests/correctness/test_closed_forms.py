@@ -60,7 +60,7 @@ SPHERES = [
 
 
 @pytest.mark.parametrize(("radius", "centre", "half", "mean"), SPHERES)
-def test_uncollided_light_in_a_sphere(scenes, radius, centre, half, mean):
+def test_uncollided_fluence_in_a_sphere(scenes, radius, centre, half, mean):
     """Uncollided fluence in a homogeneous sphere under a white sky agrees at every voxel.
 
     Transmittance is analytic, so only the directions are random: the pooled mean is known to 0.1 %,
@@ -225,7 +225,7 @@ SWEPT_HALF_SPACES = [
         for row in SWEPT_HALF_SPACES
     ],
 )
-def test_half_space_by_sweeps(scenes, albedo, leaving, depth):
+def test_half_space_by_sweep(scenes, albedo, leaving, depth):
     """``sweep`` reproduces half-spaces under a white sky with slabs 11 diffusion lengths deep or
     more.
 
@@ -289,7 +289,7 @@ def test_sunlit_slabs(scenes, name, depth, albedo, leaving):
     ("name", "depth", "albedo", "leaving"),
     [*SUNLIT_SLABS[:3], pytest.param(*SUNLIT_SLABS[3], marks=pytest.mark.slow)],
 )
-def test_sunlit_slabs_by_sweeps(scenes, name, depth, albedo, leaving):
+def test_sunlit_slabs_by_sweep(scenes, name, depth, albedo, leaving):
     """DISORT 1a, 1b, 1d, 1e by ``sweep``, to 1 %.
 
     Of these 0.4 are the discretisation of layers of 1/32 (1/512 of the thin slabs), and 0.5 the
@@ -366,7 +366,7 @@ def test_point_light(scenes, solver):
 
 
 @pytest.mark.parametrize(("radius", "centre", "half", "mean"), SPHERES[:4])
-def test_uncollided_light_in_a_sphere_by_sweeps(scenes, radius, centre, half, mean):
+def test_uncollided_fluence_in_a_sphere_by_sweep(scenes, radius, centre, half, mean):
     """The volume mean of the uncollided fluence in a sphere agrees with 24 voxels across.
 
     Boundary voxels are cut, and the medium in them is spread over the whole voxel: 1 % up to a

@@ -61,13 +61,13 @@ def assert_same(found: tuple, expected: tuple) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_again_and_by_other_threads(kind, threads):
+def test_repeated_and_with_other_thread_counts(kind, threads):
     for count in (threads, 7):
         dr.set_thread_count(count)
         assert_same(look(kind), once(kind))
 
 
-def test_among_surfaces(threads):
+def test_with_surfaces(threads):
     """`sweep` with surfaces is deterministic: along tracks and for emitters sampled at voxels."""
 
     def again() -> tuple[np.ndarray, np.ndarray]:

@@ -70,7 +70,7 @@ def test_killed_while_writing(tmp_path):
     assert any(tmp_path.glob(".light.cache.*.tmp"))  # some were killed while writing
 
 
-def test_what_killed_processes_left_is_removed(tmp_path):
+def test_temporary_files_of_killed_processes_are_removed(tmp_path):
     old, new = tmp_path / ".a.bin.x.tmp", tmp_path / ".a.bin.y.tmp"
     for path in (old, new, tmp_path / ".b.bin.x.tmp"):
         path.write_bytes(b"half")
@@ -195,7 +195,7 @@ def rewritten(file: Path, **changes) -> None:
     ],
     ids=str,
 )
-def test_files_that_lie_are_refused(tmp_path, lie):
+def test_inconsistent_cache_files_are_refused(tmp_path, lie):
     """Cache files with the scene's fingerprint but one inconsistent entry are refused."""
     file = tmp_path / "light.cache"
     filled(file, 8)
@@ -207,7 +207,7 @@ def test_files_that_lie_are_refused(tmp_path, lie):
 @pytest.mark.parametrize(
     ("value", "said"), [(-1e-3, "negative"), (1e300, "not finite"), (np.nan, "not finite")]
 )
-def test_impossible_light_is_refused(tmp_path, value, said):
+def test_invalid_irradiance_is_refused(tmp_path, value, said):
     """Irradiance that is negative, or beyond single precision, is refused."""
     file = tmp_path / "light.cache"
     filled(file, 8)
@@ -219,7 +219,7 @@ def test_impossible_light_is_refused(tmp_path, value, said):
         IrradianceCache.load(file)
 
 
-def test_volumes_that_were_tampered_with():
+def test_damaged_volumes():
     """20 damaged volume files are read or refused, in a process of its own.
 
     ``make stress`` tries all formats.
@@ -229,7 +229,7 @@ def test_volumes_that_were_tampered_with():
     assert tally.tried == 20 and not tally.failed, tally
 
 
-def test_caches_that_were_tampered_with(tmp_path):
+def test_damaged_caches(tmp_path):
     """60 damaged caches are refused by name, or read with finite values."""
     (cache_format,) = (f for f in formats.FORMATS if f.name == "light.cache")
     file = tmp_path / "light.cache"
@@ -256,7 +256,7 @@ def tried(case: Path, run_case, mutate, count: int) -> int:
     return refused
 
 
-def test_properties_that_nobody_should_write(tmp_path, monkeypatch):
+def test_random_properties(tmp_path, monkeypatch):
     """50 scenes with random properties are rendered, or refused by a message that names the
     fault.
 
@@ -276,7 +276,7 @@ def test_properties_that_nobody_should_write(tmp_path, monkeypatch):
     assert not any(here.iterdir())
 
 
-def test_command_lines_that_nobody_should_type(tmp_path):
+def test_random_command_lines(tmp_path):
     """30 random command lines succeed, or print an error and leave no files."""
     case = tmp_path / "command.json"
     commands.write_valid(case)
@@ -290,7 +290,7 @@ def test_command_lines_that_nobody_should_type(tmp_path):
     [["render", "none.xml", "-o", "\udc80.exr"], ["import", "\udc80", "--density", "-o", "x"]],
     ids=["render", "import"],
 )
-def test_arguments_that_are_no_text_are_refused_without_a_traceback(tmp_path, arguments):
+def test_undecodable_arguments_are_refused_without_a_traceback(tmp_path, arguments):
     """Arguments that are no valid text are refused without a traceback.
 
     Runs in a process of its own, because the message has to be encoded.
@@ -330,7 +330,7 @@ def test_properties_of_another_type_are_refused(name, value):
 
 @pytest.mark.parametrize("solver", ["sweep", "path"])
 @pytest.mark.parametrize("depth", [2, -1])
-def test_light_beyond_single_precision_is_refused_by_name(solver, depth):
+def test_radiance_beyond_single_precision_is_refused(solver, depth):
     """Radiance beyond single precision is refused by name, every time."""
     sky = {"type": "constant", "radiance": 1e38}
     built = scene(SETTINGS | {"solver": solver, "max_depth": depth}, Matter(2.0), sky)
@@ -339,7 +339,7 @@ def test_light_beyond_single_precision_is_refused_by_name(solver, depth):
             built.integrator().prepare(built)
 
 
-def test_any_number_of_orders_ends():
+def test_any_max_depth_terminates():
     """2^31 - 1 orders by `sweep` end as soon as the next order is negligible.
 
     The mean equals that of all orders within the tolerance of the iteration.
@@ -355,7 +355,7 @@ def test_any_number_of_orders_ends():
     assert light(12).mean() < 0.997 * found.mean()
 
 
-def test_memory_is_predicted(tmp_path):
+def test_memory_is_checked_before_allocation(tmp_path):
     """A cache beyond the memory limit is refused before allocation, with its bytes and the
     remedy.
     """
@@ -395,7 +395,7 @@ def test_absurd_numbers_of_samples_of_an_empty_scene_are_refused():
         empty.integrator().render(empty, spp=1 << 20)
 
 
-def test_another_variant_in_the_middle():
+def test_switching_the_variant_and_back():
     """After switching to another variant and back, a scene renders as before."""
     built = scene(SETTINGS, Matter())
     before = np.array(mi.render(built, spp=1))

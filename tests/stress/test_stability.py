@@ -41,7 +41,7 @@ def chosen() -> list[Case]:
     return [case for case in cases() if case.name in CHOSEN.get(case.hazard, ())]
 
 
-def test_the_choice_names_cases_that_there_are(rgb):
+def test_selected_cases_exist(rgb):
     assert len(chosen()) == sum(map(len, CHOSEN.values()))
 
 
@@ -57,7 +57,7 @@ def test_hazards(hazard):
     assert not [described(row) for row in rows if not row["held"]]
 
 
-def test_no_segment_makes_light():
+def test_segments_conserve_energy():
     """The weights of the trapezoid rule do not exceed the opacity of a segment.
 
     They once were half the optical depth, so that an opaque wall was 20 times brighter than the

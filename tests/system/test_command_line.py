@@ -100,7 +100,7 @@ def test_render(folder, capsys):
     assert set(os.listdir(folder)) == {"scene.xml", "density.vol", "out.exr", "out.png"}
 
 
-def test_a_process_ends_with_all_that_it_had_to_say(folder):
+def test_process_ends_with_complete_output(folder):
     """The process exits at once with image, status and both outputs, and reports no leaks."""
 
     def process(scene: str) -> subprocess.CompletedProcess:
@@ -116,7 +116,7 @@ def test_a_process_ends_with_all_that_it_had_to_say(folder):
     assert failed.returncode == 1 and "there is no scene file" in failed.stderr
 
 
-def test_the_picture_is_mi_renders(folder):
+def test_image_equals_mi_render(folder):
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", "--spp", 8, "--seed", 3) == 0
     scene = mi.load_file(str(folder / "scene.xml"), integrator="irrcache")
     expected = np.array(mi.render(scene, spp=8, seed=3))
@@ -187,7 +187,7 @@ BAD_CALLS = {
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD_CALLS.values(), ids=BAD_CALLS)
-def test_bad_calls(folder, capsys, monkeypatch, arguments, message):
+def test_invalid_calls(folder, capsys, monkeypatch, arguments, message):
     """Invalid calls exit with status 1 and one line that names the fault; no traceback, no file."""
     monkeypatch.chdir(folder)
     before = set(os.listdir(folder))
@@ -329,7 +329,7 @@ def test_budget(folder, capsys):
     assert header.getattribute("irrcache:seconds_image") > 0
 
 
-def test_an_integrator_with_another_prepare(folder):
+def test_integrator_whose_prepare_builds_no_cache(folder):
     """``render`` accepts Mitsuba's differentiable integrators, whose ``prepare`` builds no
     cache.
     """
@@ -384,7 +384,7 @@ def test_stopped_before_the_first_image(folder, capsys, monkeypatch):
     assert set(os.listdir(folder)) == before
 
 
-def test_errors_reach_a_script_too(folder, scenes):
+def test_errors_have_their_cause_in_scripts(folder, scenes):
     """The RuntimeError of mi.render has the package's error with its remedy as its cause."""
     (folder / "odd.xml").write_text(SCENE.replace("EXTRA", EXTRAS["medium without bounds"][0]))
     scene = mi.load_file(str(folder / "odd.xml"), integrator="irrcache")

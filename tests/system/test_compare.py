@@ -92,7 +92,7 @@ def read(report: Path) -> dict:
     return json.loads((report / "results.json").read_text())
 
 
-def test_finished_measurements_are_kept(report):
+def test_finished_measurements_survive_a_crash(report):
     """The other measurements are complete; the killed integrator's first snapshot is included."""
     stock, killed, ours = read(report)["measurements"]
     for measurement in (stock, ours):

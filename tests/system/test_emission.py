@@ -71,7 +71,7 @@ def test_heterogeneous_slab(scenes, quadrature):
         assert found[..., c].mean() == pytest.approx(expected, rel=tolerance)
 
 
-def test_flame_in_empty_space(scenes):
+def test_emission_in_empty_voxels(scenes):
     """Emission in empty voxels is rendered, and attenuated by the medium in front of it."""
     sigma_t = np.zeros((32, 8, 8), np.float32)
     sigma_t[28:] = 1.0
@@ -96,7 +96,7 @@ def _profile(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_uncollided_light_in_a_sphere(scenes, solver):
+def test_uncollided_fluence_in_a_sphere(scenes, solver):
     """In an emitting sphere Phi = int_S2 j / sigma (1 - e^(-sigma s)) dw, with s the way out."""
     shape = scenes.boundary(scenes.medium(1.0, 0.5), scenes.placement(), "sphere")
     settings = {"solver": solver, "max_depth": 2, "resolution": 15, "cache_spp": 512}
@@ -135,7 +135,7 @@ def test_equilibrium(scenes, solver):
     assert less.mean() < found.mean() - 1e-3
 
 
-def test_equilibrium_among_surfaces(scenes):
+def test_equilibrium_with_surfaces(scenes):
     """Equilibrium holds with grey spheres that emit what they do not reflect, and with two
     media.
 
@@ -173,7 +173,7 @@ def glowing(bsdf: dict, radiance: float, center, radius: float = 0.5) -> dict:
 
 
 @pytest.mark.parametrize("phase", [{"type": "isotropic"}, {"type": "hg", "g": 0.6}])
-def test_equilibrium_around(scenes, phase):
+def test_equilibrium_by_sweep_with_surfaces(scenes, phase):
     """``sweep`` preserves equilibrium with two media and a grey sphere outside of both.
 
     The sphere emits what it does not reflect.
@@ -195,7 +195,7 @@ def test_equilibrium_around(scenes, phase):
 
 
 @pytest.mark.parametrize(("max_depth", "samples"), [(2, 512), (-1, 64)])
-def test_fire_in_a_room(scenes, max_depth, samples):
+def test_emission_in_a_room(scenes, max_depth, samples):
     """``sweep`` agrees with ``path`` on emission that reaches a medium by walls and another
     medium.
 

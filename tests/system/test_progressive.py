@@ -45,7 +45,7 @@ def assert_same(a: IrradianceCache, b: IrradianceCache) -> None:
         np.testing.assert_array_equal(mine, theirs)
 
 
-def test_the_end_is_what_one_go_builds(scenes, cloud):
+def test_final_cache_equals_a_single_build(scenes, cloud):
     """The final cache and image equal those of a single build bit by bit, with other passes.
 
     The first frame has a few samples of two batches; each further frame has more samples and a
@@ -78,7 +78,7 @@ def test_the_relative_error_is_that_of_the_voxels(cloud):
     assert cache.relative_error == pytest.approx(expected, rel=1e-4)
 
 
-def test_images_meanwhile_show_the_cache_as_it_is(scenes, cloud, refine_calls):
+def test_images_between_frames_use_the_current_cache(scenes, cloud, refine_calls):
     """Rendering other views between frames takes no cache samples, and shows the current cache."""
     scene = cloud()
     run = render_progressive(scene, spp=2, seed=3, cache_spp=math.inf)
@@ -182,7 +182,7 @@ def test_wanted_times(cloud, monkeypatch):
     assert [round(f.elapsed, 1) for f in frames] == pytest.approx([0.1, 2, 4], abs=0.15)
 
 
-def test_what_the_caller_does_does_not_count(cloud, monkeypatch):
+def test_time_of_the_caller_does_not_count(cloud, monkeypatch):
     clock, scene = Clock(monkeypatch, sample=0.01, image=0.1), cloud()
     clock.slow_images(scene)
     elapsed = []
@@ -243,7 +243,7 @@ def test_stopped_within_a_pass(cloud, tmp_path, monkeypatch, error):
     assert_same(integrator.cache, whole.integrator().cache)
 
 
-def test_the_file_is_written_now_and_then(cloud, tmp_path, monkeypatch):
+def test_file_is_written_at_intervals(cloud, tmp_path, monkeypatch):
     """Files are written at most every 30 s and at the end, after passes of 8 s or more.
 
     A render that is not progressive saves at its end only.
@@ -304,7 +304,7 @@ def test_a_raised_target_refines(scenes, cloud, refine_calls):
 
 
 @pytest.mark.parametrize("samples", [-8, 2.5, True, math.inf])
-def test_a_target_that_makes_no_sense(cloud, samples):
+def test_invalid_target(cloud, samples):
     integrator = cloud().integrator()
     with pytest.raises(IrrcacheError, match="cache_spp is"):
         integrator.cache_spp = samples
@@ -357,7 +357,7 @@ def test_other_integrators_are_named(cloud):
         {"standard_error": math.inf}, {"seconds": 0}, {"seconds": math.nan}, {"times": [1, -1]},
     ],
 )  # fmt: skip
-def test_targets_that_make_no_sense(cloud, targets):
+def test_invalid_targets(cloud, targets):
     """Invalid targets are refused when the function is called, with their value and the remedy."""
     (name,) = targets
     with pytest.raises(IrrcacheError, match=f"{name} is .*must be"):

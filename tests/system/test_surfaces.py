@@ -283,7 +283,7 @@ def test_layers_add_up(scenes):
     assert background.mean() > 0.1 * image.mean() and values[..., 12].mean() > 0
 
 
-def test_media_that_only_glass_shows_are_volpaths(scenes):
+def test_media_behind_glass_only_are_path_traced(scenes):
     glass = {"bsdf": {"type": "dielectric"}, "interior": fog()}
     pictures = []
     for name in ("irrcache", "volpath"):
@@ -295,7 +295,7 @@ def test_media_that_only_glass_shows_are_volpaths(scenes):
     np.testing.assert_array_equal(*pictures)
 
 
-def test_sweep_is_refused_among_surfaces(scenes):
+def test_sweep_is_refused_with_surfaces(scenes):
     scene = loaded(scenes, scene_ball(scenes, None), solver="sweep")
     with pytest.raises(IrrcacheError, match=r"sweep.*path.*auto"):
         scene.integrator().prepare(scene)

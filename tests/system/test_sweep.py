@@ -113,7 +113,7 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
         assert np.abs(phi - 1).mean() < 1e-3
 
 
-def test_sunlight_along_an_axis(scenes):
+def test_sun_along_an_axis(scenes):
     """The irradiance of a sun along an axis is exp(-sigma_t z) at voxel centres, in every batch.
 
     An average over a slice would vary between batches. The sharpening by second differences acts
@@ -129,7 +129,7 @@ def test_sunlight_along_an_axis(scenes):
     assert np.abs(found - 1).max() < h**2 / 36 * 1.1 * np.exp(h)
 
 
-def test_sunlight_across_is_of_order_two(scenes):
+def test_oblique_sun_is_of_order_two(scenes):
     """The error for an oblique sun in a homogeneous cube decreases with the square of the voxel
     size.
 
@@ -151,7 +151,7 @@ def test_sunlight_across_is_of_order_two(scenes):
     assert (np.abs(errors) < bound).all(), errors
 
 
-def test_a_cube_in_the_sky(scenes):
+def test_cube_under_a_white_sky(scenes):
     """Under a white sky, the error in a homogeneous cube decreases with order 1.5.
 
     The irradiance has a logarithmic slope at the faces: 16, 5.4 and 1.9 % of the mean too much;
@@ -203,7 +203,7 @@ def light_named(name: str) -> dict:
 @pytest.mark.parametrize(
     ("name", "max_depth"), [*((name, -1) for name in LIGHTS), ("sky", 3), ("environment", 3)]
 )
-def test_scattered_light_is_paths(scenes, name, max_depth):
+def test_scattered_fluence_agrees_with_path(scenes, name, max_depth):
     """The scattered fluence agrees with ``path`` in each layer of a smooth medium.
 
     The bound for sums over all voxels is 4 standard errors and 1 % of discretisation. Tracks with
@@ -219,7 +219,7 @@ def test_scattered_light_is_paths(scenes, name, max_depth):
     assert_like(ours, theirs, "scattered", 0.01)
 
 
-def test_each_order_alone(scenes):
+def test_each_order_of_scattering(scenes):
     """Orders 1, 2 and 3, as differences of max_depth, agree with ``path`` to 1.5 % each.
 
     An order that is missing or counted twice would be hidden in the sum of all.

@@ -146,7 +146,7 @@ def test_a_progressive_run_beside_renderings(make):
         assert scene.integrator().cache.streams == {0: 32}
 
 
-def test_the_cache_is_whole_whenever_it_is_asked_for(make):
+def test_cache_is_consistent_while_refined(make):
     """A cache that is read while other threads refine it has sums that match its number of
     samples.
     """
@@ -204,7 +204,7 @@ def test_a_failure_in_one_thread_leaves_the_others_their_cache(make):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_the_umask_is_what_it_was(tmp_path):
+def test_umask_is_unchanged(tmp_path):
     """The umask is unchanged by concurrent saves, although reading it requires setting it."""
     before = os.umask(0o027)
     try:

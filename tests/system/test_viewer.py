@@ -41,7 +41,7 @@ def started(tmp_path_factory):
     assert not re.search("Traceback|rror|leaked|Warning", log), log
 
 
-def test_looking_around(browser, started):
+def test_edit_save_reload_and_second_window(browser, started):
     """Drag, wheel, edit, save, reload and a second window change the image as expected.
 
     Saved scenes render to the displayed image.

@@ -63,7 +63,7 @@ def browser():
         yield browser
 
 
-def test_transfer_functions_and_archives_come_and_go(browser, tmp_path):
+def test_transfer_functions_and_archives_are_exchanged(browser, tmp_path):
     """Transfer functions and scenes are exchanged through the browser.
 
     A saved JSON is accepted by ``irrcache import``, and a loaded one changes the image. Without an
@@ -114,7 +114,7 @@ def test_transfer_functions_and_archives_come_and_go(browser, tmp_path):
     assert difference(again, back) < 1.5
 
 
-def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
+def test_cameras_and_environment_of_a_scene_with_surfaces(browser, tmp_path, scenes):
     """The viewer offers a scene's cameras, rotates its environment and compares with volpath.
 
     One of the cameras is in the medium.
@@ -155,7 +155,7 @@ def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
 
 
 @pytest.mark.slow
-def test_half_a_minute_of_everything(browser, tmp_path):
+def test_random_interactions(browser, tmp_path):
     """Half a minute of random interactions causes no error, however many the machine completes."""
     usage = use(browser, [*CHEST, "--port", "8730"], 30, 5, tmp_path / "log.txt")
     assert usage.errors == []

@@ -81,7 +81,7 @@ def test_heterogeneous_cube(scenes, compare, max_depth):
         compare(shape, max_depth).check()
 
 
-def test_prbvolpath_sees_the_same(scenes, compare):
+def test_prbvolpath_renders_the_same(scenes, compare):
     """prbvolpath, to which errors about gradients refer, renders the same image."""
     to_world = scenes.placement()
     compare(scenes.boundary(cloud(scenes, to_world), to_world), stock="prbvolpath").check()

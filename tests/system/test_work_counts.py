@@ -48,7 +48,7 @@ def test_the_cache_is_built_once(scenes, scene, refine_calls):
     assert refine_calls == [32]
 
 
-def test_a_second_picture_runs_the_projection_only(scenes, scene, kernels):
+def test_second_image_runs_the_ray_march_only(scenes, scene, kernels):
     """A second image launches one kernel per pass, no solver kernel, and compiles none."""
     first = kernels(lambda: scenes.image(scene, spp=2))
     second = kernels(lambda: scenes.image(scene, spp=2, seed=1))
@@ -240,7 +240,7 @@ def test_wrappers_use_the_cache(scenes, refine_calls):
     assert image[..., :3].mean() == pytest.approx(plain.mean(), rel=0.01)
 
 
-def test_gradients_do_not_leak_into_the_cache(scenes, scene):
+def test_gradients_do_not_change_the_cache(scenes, scene):
     """A medium with gradients enabled renders like one without."""
     expected = scenes.image(scene, spp=4)
     params = mi.traverse(scene)
@@ -286,7 +286,7 @@ def test_constants_are_not_looked_up(scenes, kernels):
     assert varied[1] == constant[1] == homogeneous[1] == 0
 
 
-def test_grey_light_is_swept_once(scenes, kernels):
+def test_grey_media_are_solved_in_one_channel(scenes, kernels):
     """A grey medium in RGB takes the launches of one channel, a coloured one three times as many.
 
     The channels of a grey medium under a coloured sky differ by a factor.
@@ -321,7 +321,7 @@ def test_no_filter_no_layers(scenes, kernels):
     assert counts[0][0] < counts[1][0] and counts[0][1] < counts[1][1]
 
 
-def test_only_single_scattering_keeps_one_number_per_voxel(scenes, kernels):
+def test_single_scattering_takes_no_solution(scenes, kernels):
     """max_depth 2 takes launches for 16 pairs of directions without a solution; max_depth 3
     takes more.
     """
@@ -345,7 +345,7 @@ def stored() -> float:
     return float(size) * {"B": 2**-20, "KiB": 2**-10, "MiB": 1, "GiB": 2**10}[unit]
 
 
-def test_few_numbers_per_voxel_are_kept(scenes):
+def test_few_numbers_per_voxel_are_stored(scenes):
     """Grey single scattering stores at most four numbers per voxel besides the medium's own.
 
     These are two words for the ray march, the irradiance, the indices of occupied voxels, and half

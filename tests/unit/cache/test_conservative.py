@@ -49,7 +49,7 @@ def layers(values: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("radius", [1.5, 5.5])
 @pytest.mark.parametrize("dim", [0.0, 0.2])
-def test_what_ends_keeps_its_light(grid, radius, dim):
+def test_fields_with_a_sharp_end_are_conserved(grid, radius, dim):
     """Fields with a sharp end are conserved.
 
     The error of the sum is an eighth of that of plainly interpolated roots, which lose 3 to 40 % of
@@ -66,7 +66,7 @@ def test_what_ends_keeps_its_light(grid, radius, dim):
 @pytest.mark.parametrize(
     ("k", "error", "before"), [(0.5, 0.001, 0.009), (1.0, 0.003, 0.04), (2.0, 0.03, 0.15)]
 )
-def test_light_that_matter_swallows(grid, k, error, before):
+def test_exponential_decay_is_conserved(grid, k, error, before):
     """The mean of lookups agrees with the integral of e^-kx between two voxels.
 
     ``before`` is the minimum error of plainly interpolated roots.
@@ -83,7 +83,7 @@ def test_light_that_matter_swallows(grid, k, error, before):
         assert low < found / exact - 1 < high
 
 
-def test_smooth_light_is_right_on_average(grid):
+def test_smooth_field_is_conserved_per_cell(grid):
     """The mean of a smooth field over any cell agrees to 0.3 %.
 
     The field is a cosine of 12 voxels' length on top of 2, where plain interpolation is off by up
@@ -103,7 +103,7 @@ def test_smooth_light_is_right_on_average(grid):
     assert errors[1] < 0.003 < 0.02 < errors[0]
 
 
-def test_channels_are_apart(grid):
+def test_channels_are_independent(grid):
     one = ball(4.0)
     other = np.roll(one, 3, axis=0) * 0.5
     both = kept(grid, np.concatenate([one, other, one], axis=-1))
@@ -111,7 +111,7 @@ def test_channels_are_apart(grid):
         np.testing.assert_allclose(both[..., c : c + 1], kept(grid, alone), rtol=1e-5)
 
 
-def test_what_is_not_known_does_not_count(grid):
+def test_unknown_neighbours_are_ignored(grid):
     """Unknown voxels and the border do not affect their neighbours along the axis.
 
     A field that varies linearly is unchanged.

@@ -56,7 +56,7 @@ def rewrite(file, seal: bool, change) -> None:
         np.savez(stream, description=encoded, **arrays)
 
 
-def test_a_file_that_is_written_anew_is_read(file):
+def test_unchanged_rewritten_file_is_read(file):
     """A file rewritten without a change is read, so that other tests fail by their change only."""
     rewrite(file, True, lambda description, arrays: None)
     assert IrradianceCache.load(file).samples == 2 * BATCH
@@ -146,7 +146,7 @@ def test_caches_whose_samples_differ_in_kind_are_not_merged(other):
 
 @pytest.mark.parametrize("solver", ["sweep", "path"])
 @pytest.mark.parametrize("samples", [1, 8, 32, 64])
-def test_what_needs_an_error_gets_two_batches(scenes, solver, samples):
+def test_error_estimates_take_two_batches(scenes, solver, samples):
     """A cache that needs an error estimate takes two batches; otherwise one suffices."""
     shape = scenes.boundary(scenes.medium(1.0, 0.5))
     common = {"type": "irrcache", "solver": solver, "resolution": 2, "max_depth": 2}

@@ -161,7 +161,7 @@ def test_a_probe_at_a_voxel_is_its_standard_error(plain):
     np.testing.assert_allclose(np.abs(signs(plain)), 1, rtol=1e-4)
 
 
-def test_signs_are_fair_coins(plain):
+def test_probe_signs_are_balanced_and_independent(plain):
     """Signs are balanced, and independent between probes and between neighbours.
 
     Correlations of 24 kinds are each within 4.5 standard deviations of 0 (chance of a false alarm
@@ -176,7 +176,7 @@ def test_signs_are_fair_coins(plain):
     assert np.abs(means).max() < 4.5 / np.sqrt(sign[0].size)
 
 
-def test_the_probes_of_a_cache_do_not_change(plain):
+def test_probes_of_a_cache_are_constant(plain):
     """The probes of a cache are the same each time.
 
     Otherwise noise images would flicker, and the strength of the filter would vary between frames.
@@ -285,7 +285,7 @@ def test_dark_voxels_give_no_nan(shape):
                 assert np.isfinite(np.array(relative * light)).all()
 
 
-def test_lanes_that_are_off_read_nothing():
+def test_masked_lanes_read_nothing():
     """Masked lanes of a lookup read nothing, as in a ray march, where their position is
     arbitrary.
     """

@@ -40,7 +40,7 @@ def lookups(cache: IrradianceCache, inside: float) -> tuple[np.ndarray, np.ndarr
     return np.array(phi, dtype=np.float64), np.array([np.array(e) for e in probes], np.float64)
 
 
-def test_errors_that_voxels_share_do_not_average_out():
+def test_common_errors_of_voxels_do_not_average_out():
     """An error of 3 % common to all voxels is an error of 3 % in every lookup and probe.
 
     For independent voxels it would be half of that in the middle of eight.
@@ -54,7 +54,7 @@ def test_errors_that_voxels_share_do_not_average_out():
 
 @pytest.mark.parametrize("lamp", LAMPS, ids=str)
 @pytest.mark.parametrize("correlated", [True, False])
-def test_errors_beside_a_lamp_are_relative_to_its_light(lamp, correlated):
+def test_errors_near_a_point_light_are_relative_to_its_irradiance(lamp, correlated):
     """Errors near a point light are relative to its irradiance.
 
     With the inverse-square field 3 % too large in every voxel, no lookup is off by more, and those

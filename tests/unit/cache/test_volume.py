@@ -57,7 +57,7 @@ def values(tensor) -> np.ndarray:
 
 @pytest.mark.parametrize("turn", [0.0, 45.0])
 @pytest.mark.parametrize("resolution", [7, 16, 40])
-def test_active_voxels_are_those_that_are_needed(scenes, turn, resolution):
+def test_active_voxels_are_those_that_lookups_read(scenes, turn, resolution):
     """Active are all voxels that a lookup with sigma_t > 0 reads, and none far from the medium.
 
     This is checked at 2e5 points, also beyond a grid that is smaller than its boundary; "far" is
@@ -156,7 +156,7 @@ def test_no_standard_error_from_one_batch(make):
     assert np.isnan(values(make((0, BATCH)).standard_error)).all()
 
 
-def test_resuming_is_the_same_as_going_on(make):
+def test_resuming_equals_a_single_run(make):
     """32 samples and then 32 more equal 64 at once, to the rounding of float32 sums."""
     parts, whole = make((5, 32), (5, 32)), make((5, 64))
     assert parts.streams == whole.streams == {5: 64}
@@ -177,7 +177,7 @@ def test_streams_are_independent(make):
 # Merging
 
 
-def test_merging_is_one_longer_run(make):
+def test_merging_equals_one_longer_run(make):
     """Merged caches of seeds 1 and 2 equal one run over both streams, weighted by samples."""
     merged, other = make((1, 64)), make((2, 32))
     expected = (64 * values(merged.irradiance) + 32 * values(other.irradiance)) / 96
@@ -200,7 +200,7 @@ def test_equal_seeds_are_refused(make):
     assert cache.samples == 32
 
 
-def test_other_light_is_refused(make):
+def test_caches_of_other_emitters_are_not_merged(make):
     cache, other = make((1, 16)), make((2, 16))
     other.fingerprint["emitters"] = "c"
     with pytest.raises(IrrcacheError, match="emitters differs"):
@@ -208,7 +208,7 @@ def test_other_light_is_refused(make):
 
 
 @pytest.mark.parametrize("change", [{"resolution": 5}, {"max_depth": 2}])
-def test_other_shapes_are_refused(make, change):
+def test_caches_of_other_shapes_are_not_merged(make, change):
     with pytest.raises(IrrcacheError, match="does not fit"):
         make((1, 16)).merge(make((2, 16), **change))
 
@@ -276,7 +276,7 @@ def test_damaged_files_are_refused_by_name(make, tmp_path, how):
         IrradianceCache.load(file)
 
 
-def test_a_bomb_is_refused_before_it_is_read(make, tmp_path):
+def test_oversized_header_is_refused_before_reading(make, tmp_path):
     """A small file whose header declares 2^40 values is refused before its data are read."""
     file = tmp_path / "light.npz"
     with zipfile.ZipFile(file, "w") as archive:

@@ -124,7 +124,7 @@ def test_the_doctor_lists_all_extras(working, capsys):
 
 
 @pytest.mark.parametrize("variant", ["foo", "", "llvm_ad_rgbx"])
-def test_the_doctor_refuses_variants_that_are_none(working, capsys, variant):
+def test_the_doctor_refuses_unknown_variants(working, capsys, variant):
     assert main(["doctor", "-m", variant or " "]) == 1
     out, error = capsys.readouterr()
     assert not out and f'no variant "{variant or " "}"' in error and "llvm_ad_rgb" in error
@@ -132,14 +132,14 @@ def test_the_doctor_refuses_variants_that_are_none(working, capsys, variant):
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral"])
 @pytest.mark.parametrize("json", [[], ["--json"]])
-def test_all_is_not_well_where_irrcache_does_not_run(working, capsys, variant, json):
+def test_doctor_fails_if_irrcache_does_not_run(working, capsys, variant, json):
     """The doctor reports a failure if irrcache does not run, whatever Mitsuba itself can do."""
     assert main(["doctor", "-m", variant, *json]) == 1
     printed = capsys.readouterr().out
     assert "All is well" not in printed and "llvm_ad_mono" in printed
 
 
-def test_all_is_not_well_without_a_remedy(monkeypatch):
+def test_doctor_failure_without_a_remedy(monkeypatch):
     """After a failure without a remedy, the last line is the verdict."""
     monkeypatch.setattr(doctor, "_probe", lambda variant, environment: "broken")
     report = doctor.examine(["llvm_ad_rgb"]) | {"remedies": []}
@@ -157,7 +157,7 @@ def refused(capsys, *arguments: str) -> str:
     return error
 
 
-def test_scenes_that_are_no_files(tmp_path, capsys, monkeypatch, rgb):
+def test_invalid_scene_files_are_refused(tmp_path, capsys, monkeypatch, rgb):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.xml").mkdir()
     (tmp_path / "empty.xml").touch()
@@ -186,7 +186,7 @@ def test_scenes_that_are_no_files(tmp_path, capsys, monkeypatch, rgb):
     assert set(os.listdir(tmp_path)) == before
 
 
-def test_volumes_and_outputs_that_are_no_files(tmp_path, capsys, monkeypatch, rgb):
+def test_invalid_volume_and_output_files_are_refused(tmp_path, capsys, monkeypatch, rgb):
     import mitsuba as mi
     import numpy as np
 
@@ -230,7 +230,7 @@ def options(name: str) -> list[argparse.Action]:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("text", ["x", "", "40x32x24", "nan", "1,,2", ":", "9" * 5000])
-def test_wrong_values_are_answered_in_words(name, text):
+def test_errors_of_wrong_values_name_no_functions(name, text):
     """Errors of wrong values contain no function names; all are argparse errors."""
     for action in options(name):
         try:

@@ -62,7 +62,7 @@ def test_mean_error_with_correlated_noise(truth):
     assert np.std(errors) == pytest.approx(np.mean(stated), rel=0.4)
 
 
-def test_blocks_see_blotches_not_noise(truth, rng):
+def test_block_error_measures_blotches(truth, rng):
     """Of two errors with equal RMSE, the blotched one has a block error 8 times larger."""
     a, b = halves(truth, rng, 1e-6)
     fine = truth + rng.normal(0, 0.05, SHAPE)

@@ -42,7 +42,7 @@ def test_a_budget_is_met_to_half_a_launch(seconds):
         assert abs(snapshot.total - snapshot.budget) <= 0.5 * seconds + 1e-9
 
 
-def test_budgets_that_the_cache_outlasts():
+def test_budgets_shorter_than_the_cache():
     """If the cache takes longer than several budgets, the first image counts for the largest of
     them.
 
@@ -54,13 +54,13 @@ def test_budgets_that_the_cache_outlasts():
     assert frames[1][0].total == pytest.approx(8.0, abs=0.25)
 
 
-def test_stages_of_images_are_kept_apart():
+def test_stages_of_images_are_separate():
     """Times of image and filter are separate if the integrator filters its images itself."""
     ((snapshot, _),) = accumulate(Renderer(0.3, filter=0.2), None, [2.0], 4, {"cache": 1.0})
     assert snapshot.seconds == pytest.approx({"cache": 1.0, "image": 0.6, "filter": 0.4})
 
 
-def test_an_average_knows_its_error():
+def test_error_of_an_average():
     """The standard error of means of 8 images is their scatter, and alpha has none.
 
     The bound is for 4096 pixels; the error is that of the mean over the colours.
@@ -133,7 +133,7 @@ def test_averages_are_filtered(denoise):
         ("volpath{filter=blur}", False),
     ],
 )
-def test_who_is_filtered_here(tmp_path, integrator, expected):
+def test_which_integrators_are_filtered_here(tmp_path, integrator, expected):
     """Images are filtered here if the integrator lacks the property, which it is not given then."""
     subject = runners.Subject(tmp_path, {}, integrator)
     assert subject.is_filtered_here is expected
@@ -181,7 +181,7 @@ def test_snapshots_are_means_of_one_cache():
     assert means == [pytest.approx((7 + 1 + 2 + 3) / 4), pytest.approx((9 + 4 + 5 + 6) / 4)]
 
 
-def test_budgets_that_a_frame_outlasts():
+def test_budgets_shorter_than_a_frame():
     """If a frame takes longer than several budgets, it counts for the largest of them,
     unchanged.
     """
@@ -190,7 +190,7 @@ def test_budgets_that_a_frame_outlasts():
     assert second == (4, "8", 8, pytest.approx(4.4))
 
 
-def test_a_run_is_not_continued_in_vain():
+def test_no_frame_is_requested_after_the_last_budget():
     """No frame is requested after the last budget."""
 
     def frames():
@@ -214,7 +214,7 @@ class Refining:
         yield frame(1.2, 4)
 
 
-def test_any_integrator_may_offer_frames(monkeypatch):
+def test_third_party_progressive_integrator(monkeypatch):
     """Once the cache is complete, further images use the rest of the budgets."""
     integrator = Refining()
     scene = SimpleNamespace(integrator=lambda: integrator)
@@ -239,7 +239,7 @@ def test_any_integrator_may_offer_frames(monkeypatch):
 @pytest.mark.parametrize(
     ("integrator", "expected"), [("irrcache", True), ("volpath", False), ("prbvolpath", False)]
 )
-def test_who_has_a_cache(scenes, integrator, expected):
+def test_which_integrators_have_a_cache(scenes, integrator, expected):
     """The method "prepare" of Mitsuba's differentiable integrators is not taken for a cache
     build.
     """
@@ -250,7 +250,7 @@ def test_who_has_a_cache(scenes, integrator, expected):
 
 
 @pytest.mark.usefixtures("rgb")
-def test_who_lets_the_effort_be_chosen(tmp_path):
+def test_which_integrators_accept_an_effort(tmp_path):
     scene = tmp_path / "scene.xml"
     scene.write_text('<scene version="3.0.0"><integrator type="volpath"/></scene>')
     for integrator, expected in (

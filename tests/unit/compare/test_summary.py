@@ -49,7 +49,7 @@ def test_bias_is_not_extrapolated(errors):
     assert time_to(curve(errors), 5e-4).how == "never"
 
 
-def test_what_the_reference_cannot_resolve_is_not_extrapolated():
+def test_unresolved_errors_are_not_extrapolated():
     assert time_to(curve(0.1 / np.sqrt(TIMES), resolved=0.05), 0.01).how == "never"
 
 

@@ -20,7 +20,7 @@ LARGEST = 2**32 - 1
 @settings(max_examples=200, deadline=None)
 @given(number=st.integers(1, LARGEST), index=st.lists(st.integers(0, LARGEST), min_size=1))
 @pytest.mark.parametrize("nearby", [False, True])
-def test_quotients_and_rests(nearby, number, index):
+def test_quotients_and_remainders(nearby, number, index):
     """Quotients and remainders are exact for all 32-bit numbers, tested next to multiples."""
     index = np.array(index, dtype=np.uint64)
     if nearby:

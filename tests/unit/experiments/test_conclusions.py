@@ -97,7 +97,7 @@ def test_verdict_on_fading(errors, difference, worse, close):
     assert (verdict.worse, verdict.close) == (worse, close)
 
 
-def test_memory_is_taken_apart():
+def test_memory_is_split_into_components():
     """Memory is split into a base and bytes per voxel and per pixel, for realistic magnitudes."""
     rows = [
         {"voxels": n**3, "pixels": m**2, "bytes": 3e8 + 112 * n**3 + 40 * m**2}
@@ -153,14 +153,14 @@ def test_full_size_has_folders_of_its_own(tmp_path):
     assert Options(QUICK, tmp_path).folder("a") != Options(FULL, tmp_path).folder("a")
 
 
-def test_phantoms_stand_in_for_missing_data(monkeypatch, tmp_path):
+def test_phantoms_replace_missing_data(monkeypatch, tmp_path):
     monkeypatch.setattr(scenes, "DATA", tmp_path)
     for name in ("chest", "head", "abdomen"):
         assert scenes.SOURCES[scenes.available(name)].arguments[0] == "phantom"
     assert scenes.available("phantom") == "phantom"
 
 
-def test_times_that_are_bounds_are_shown_as_bounds():
+def test_bounded_times_are_shown_as_bounds():
     """If the first image is good enough already, the speed-up is shown as a lower bound."""
     row = compared(
         {methods.PATH_TRACING: Reached(60.0, "measured"), methods.CACHE: Reached(5.0, "at most")}
@@ -169,7 +169,7 @@ def test_times_that_are_bounds_are_shown_as_bounds():
     assert table.rows == [["0.01", "60 s (1 ×)", "≤ 5 s (≥ 12 ×)"]]
 
 
-def test_from_nothing_to_a_figure(rgb, monkeypatch, tmp_path):
+def test_figure_from_scratch(rgb, monkeypatch, tmp_path):
     """Phantom, reference, recorded run, errors and figure work from scratch.
 
     The second time nothing is rendered.

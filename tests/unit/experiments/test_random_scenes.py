@@ -84,7 +84,7 @@ def test_the_optical_depth_is_that_of_mitsuba_s_medium(drawn, tmp_path):
         assert longest * 2 * SIDE == pytest.approx(case.depth, rel=2e-2), case.describe()
 
 
-def test_cameras_and_lamps_are_where_they_are_said_to_be(drawn, tmp_path):
+def test_cameras_and_emitters_are_placed_as_described(drawn, tmp_path):
     """Cameras and emitters are inside or outside of the boundary as described.
 
     A ray from the centre to the object crosses the boundary, or does not.
@@ -174,7 +174,7 @@ def test_a_wrong_block_is_found_where_it_is():
     assert row["block"]["error"] == pytest.approx(0.06, abs=4 * row["block"]["noise"])
 
 
-def test_an_error_that_another_cache_has_not_is_noise():
+def test_error_absent_from_another_cache_is_noise():
     random = np.random.default_rng(3)
     a, b, x, y = (1 + 0.01 * random.normal(size=(32, 32, 3)) for _ in range(4))
     row = run.compare(a, b, np.zeros_like(a), x + 0.03, y - 0.03) | {"solver": "sweep"}
@@ -185,7 +185,7 @@ def test_what_the_reference_does_not_resolve_is_undecided():
     assert run.verdict(rendered(0.0, noise=0.3)) == "undecided"
 
 
-def test_rows_are_computed_again_when_they_have_to_be(drawn):
+def test_outdated_rows_are_computed_again(drawn):
     case = drawn[3]
     row = rendered(0.0, noise=0.3)
     row |= {"drawn": json.loads(json.dumps(case.as_dict())), "seconds_granted": 5}
@@ -196,7 +196,7 @@ def test_rows_are_computed_again_when_they_have_to_be(drawn):
     assert not run.is_outdated(row | rendered(0.0), case, 6)
 
 
-def test_images_that_are_not_finite_and_failures_are_told():
+def test_nonfinite_images_and_failures_are_reported():
     row = rendered(np.where(np.arange(32) == 3, np.nan, 0.0)[:, None, None])
     assert run.verdict(row) == "NOT FINITE"
     assert run.verdict({"failed": "no", "refused": True}) == "refused"

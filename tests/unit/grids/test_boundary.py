@@ -29,7 +29,7 @@ def rays(count: int = 2048) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("kind", ["cube", "sphere"])
 @pytest.mark.parametrize("placement", PLACEMENTS)
-def test_hits_are_mitsubas(scenes, kind, placement):
+def test_intersections_equal_mitsubas(scenes, kind, placement):
     """Entry and exit distances equal those of ray tracing against the shape."""
     if kind == "sphere":
         placement = {k: v for k, v in placement.items() if k == "center"}
@@ -52,7 +52,7 @@ def test_hits_are_mitsubas(scenes, kind, placement):
 
 
 @pytest.mark.parametrize("kind", ["box", "sphere"])
-def test_from_within(kind):
+def test_intersections_from_inside(kind):
     """From inside, the entry lies behind and the exit ahead."""
     boundary = Boundary(kind, np.eye(4))
     ray = mi.Ray3f(mi.Point3f(0.25, 0, 0), mi.Vector3f(1, 0, 0))

@@ -18,7 +18,7 @@ PLACES = {
 
 
 @pytest.mark.parametrize("kind", PLACES)
-def test_surrounds_what_the_shape_does(scenes, kind):
+def test_containment_equals_mitsubas_shape(scenes, kind):
     """Points are inside if rays along three oblique directions leave the shape through back
     faces.
 

@@ -148,7 +148,7 @@ def looked_up(lookups: Lookups, p: mi.Point3f) -> list:
     [("1", 1), ("3", 1), ("1r", 1), ("1rc", 1), ("1r1", 1), ("1R", 1), ("1ra", 1), ("1Ra", 1),
      ("3Ra", 2)],
 )  # fmt: skip
-def test_packets_hold_what_fields_hold(scenes, shape, kinds, groups):
+def test_packed_fields_equal_the_originals(scenes, shape, kinds, groups):
     """Packed fields equal the originals to 16 bits (11 of them mantissa) in every layout."""
     grid = Grid(shape, scenes.placement(turn=30.0, edges=(1.0, 2.0, 3.0)))
     fields = fields_of(grid, list(kinds))
@@ -164,7 +164,7 @@ def test_packets_hold_what_fields_hold(scenes, shape, kinds, groups):
 
 
 @pytest.mark.parametrize("value", [0.7, 1.0, 3e-5, 1e30, 1e-30])
-def test_packets_are_right_on_average(value):
+def test_packed_fields_are_unbiased(value):
     """Rounding to 16 bits is unbiased.
 
     A thousand voxels determine their mean ten times better, whether they are equal or of many
@@ -182,7 +182,7 @@ def test_packets_are_right_on_average(value):
         assert found[1:].mean() == pytest.approx(value, rel=2.0**-11 / 10)
 
 
-def test_packets_tell_nothing_from_little():
+def test_packed_fields_distinguish_zero_from_small():
     """Packed zeros are exact, and values rounded to zero are below 2^-30 of the maximum."""
     grid = Grid((1, 1, 6), np.eye(4))
     values = np.float32([0, 1, 2.0**-29, 2.0**-31, 0, 1e-38])
@@ -193,7 +193,7 @@ def test_packets_tell_nothing_from_little():
     np.testing.assert_array_equal(looked_up(Lookups([empty]), p)[0], 0)
 
 
-def test_packets_keep_to_limits():
+def test_packed_fields_are_precise_beside_opaque_voxels():
     """The precision does not degrade because of single opaque voxels."""
     grid = Grid((1, 1, 2), np.eye(4))
     field = GridField(grid, mi.Float([1e30, 1.0]), 1)
@@ -202,7 +202,7 @@ def test_packets_keep_to_limits():
     np.testing.assert_allclose(found, [4096, 1], rtol=2.0**-11)
 
 
-def test_packets_keep_other_grids_apart():
+def test_packed_fields_of_other_grids_are_separate():
     """Fields of different grids are not packed together."""
     fine, coarse = (Grid((n, n, n), np.eye(4)) for n in (6, 3))
     lookups = Lookups([*fields_of(fine, ["1"]), *fields_of(coarse, ["1"])])

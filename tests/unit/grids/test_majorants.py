@@ -62,7 +62,7 @@ def test_bounds_are_tight():
 
 @given(st.integers(0, 2**31))
 @settings(max_examples=20, deadline=None)
-def test_walk_visits_the_cell_of_every_point(seed):
+def test_traversal_visits_the_cell_of_every_point(seed):
     """Each point of a ray lies in the cell that the traversal visits between its entry and exit."""
     mi.set_variant("llvm_ad_rgb")
     _, cells = cells_of((9, 13, 11), 1, 5)

@@ -22,7 +22,7 @@ def test_replaces_the_old_file(tmp_path):
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
-def test_nothing_is_left_after_an_error(tmp_path, error):
+def test_no_file_remains_after_an_error(tmp_path, error):
     with pytest.raises(error), atomic_write(tmp_path / "a.bin") as file:
         file.write(b"half")
         raise error

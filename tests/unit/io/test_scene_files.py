@@ -80,14 +80,14 @@ def test_scene_as_it_is(file):
     assert tuple(scene.sensors()[0].film().size()) == (5, 5)
 
 
-def test_integrator_takes_over_what_is_shared(file):
+def test_integrator_receives_shared_properties(file):
     text = str(load_scene(file, integrator="irrcache{step=0.5}").integrator())
     assert "max_depth = 3" in text and "rr_depth = 7" in text and "step = 0.5" in text
     assert "max_depth = 9" in str(load_scene(file, integrator="irrcache{max_depth=9}").integrator())
 
 
 @pytest.mark.parametrize("integrator", ["direct", "depth", "aov{aovs=d:depth}", "volpath"])
-def test_what_a_plugin_does_not_know_is_not_taken_over(file, integrator):
+def test_unknown_properties_are_not_passed_on(file, integrator):
     """Properties that a plugin lacks are not passed on, unless the user gives them, which is an
     error.
 

@@ -29,7 +29,7 @@ def value(found: InverseSquareFactor, p: np.ndarray) -> np.ndarray:
     return np.array(found.at(mi.Point3f(np.float32(p))))
 
 
-def test_is_that_of_the_distance():
+def test_factor_depends_on_the_distance():
     """The factor is 1 + (16 h / r)^2, whatever the intensity."""
     p = np.random.default_rng(1).random((3, 50))
     squares = np.sum((p - LAMP[:, None]) ** 2, axis=0)
@@ -57,7 +57,7 @@ def test_means_along_a_ray(aside, a, b):
         assert mean[0] == pytest.approx(weighted, rel=2e-3)
 
 
-def test_spread_over_voxels():
+def test_means_over_voxels():
     """Means over voxels agree with a fine sum to 1.5 %, 0.5 % and 0.1 %.
 
     The bounds are for the emitter's own voxel, its neighbours, and farther ones.
@@ -74,7 +74,7 @@ def test_spread_over_voxels():
         assert mean == pytest.approx(expected, rel=tolerance)
 
 
-def test_only_what_is_near_and_small_counts():
+def test_only_near_and_small_emitters_have_a_factor():
     """Only near and small emitters get a factor; others vary smoothly between voxels."""
     assert falloff([0.5, 0.5, 1 + 0.9 * REACH / 8]) is not None
     assert falloff([0.5, 0.5, 1 + 1.1 * REACH / 8]) is None
@@ -87,7 +87,7 @@ def test_only_what_is_near_and_small_counts():
     assert InverseSquareFactor.of(scene, grid_of()) is None
 
 
-def test_a_small_lamp_is_a_point_from_afar():
+def test_small_sphere_equals_a_point_at_a_distance():
     """A sphere's factor is that of a point from a distance of five radii on, within 8 %."""
     ball = {"type": "sphere", "center": LAMP.tolist(), "radius": 0.02, "emitter": {"type": "area"}}
     found = InverseSquareFactor.of(mi.load_dict({"type": "scene", "ball": ball}), grid_of())
@@ -96,7 +96,7 @@ def test_a_small_lamp_is_a_point_from_afar():
     np.testing.assert_allclose(value(found, p)[far], value(falloff(), p)[far], rtol=0.12)
 
 
-def test_grid_of_one_voxel_and_a_lamp_in_its_middle():
+def test_emitter_in_the_middle_of_a_single_voxel():
     """The factor is finite everywhere, also at the emitter, in a grid of one voxel."""
     found = falloff([0.5, 0.5, 0.5], n=1)
     assert np.isfinite(value(found, np.full((3, 1), 0.5))).all()

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 @pytest.mark.parametrize("aside", [0.0, 1e-3, 0.03, 0.2, 0.6])
-def test_places_keep_away_from_lamps(scenes, aside):
+def test_sample_points_are_moved_away_from_lights(scenes, aside):
     """Sample points are moved away from the light up to a quarter of the shortest edge.
 
     The light lies ``aside`` of the centre of an oblong voxel; points of other voxels are unchanged.

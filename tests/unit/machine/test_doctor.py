@@ -112,7 +112,7 @@ def test_missing_package_is_named_with_the_command(monkeypatch, no_trials, capsy
     assert 'pip install --upgrade "tqdm' in text
 
 
-def test_kernel_cache_folder_is_the_one_that_dr_jit_is_told(monkeypatch, tmp_path):
+def test_kernel_cache_folder_is_that_of_dr_jit(monkeypatch, tmp_path):
     (tmp_path / "0123.llvm.v6.bin").write_bytes(bytes(100))
     monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path))
     cache = doctor.examine_kernel_cache()

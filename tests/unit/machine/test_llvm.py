@@ -84,14 +84,14 @@ def test_newest_usable_library_is_chosen(folder_of_libraries):
 
 
 @linux_only
-def test_nothing_is_chosen_where_nothing_is_usable(folder_of_libraries):
+def test_no_library_is_chosen_if_none_is_usable(folder_of_libraries):
     put(folder_of_libraries, "libLLVM-14.so.1", "libLLVM-15.so.1")
     llvm.prepare_llvm()
     assert os.environ[llvm.LLVM_VARIABLE] == ""
     assert llvm.usable_llvm() is None
 
 
-def test_the_choice_of_the_user_stands(monkeypatch):
+def test_choice_of_the_user_is_respected(monkeypatch):
     monkeypatch.setenv(llvm.LLVM_VARIABLE, "/my/own/libLLVM.so")
     llvm.prepare_llvm()
     assert os.environ[llvm.LLVM_VARIABLE] == "/my/own/libLLVM.so"
@@ -134,7 +134,7 @@ def test_preparing_starts_no_process_and_loads_no_library():
     assert "subprocess.Popen" in started
 
 
-def test_files_that_are_no_library_are_named_as_such(tmp_path):
+def test_files_that_are_no_libraries_are_refused(tmp_path):
     text = tmp_path / "libLLVM.so.19.1"
     text.write_text("LLVM")
     assert "not a shared library" in llvm.inspect_llvm(text).problem

@@ -43,7 +43,7 @@ print(full - resident())
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc needs it")
-def test_freed_arrays_are_the_systems_at_once():
+def test_freed_arrays_are_returned_to_the_system():
     """Arrays of ended threads, and arrays between others, are returned at once; in MiB."""
     program = [sys.executable, "-c", PROGRAM]
     done = subprocess.run(program, capture_output=True, text=True, check=True)

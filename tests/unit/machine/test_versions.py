@@ -8,7 +8,7 @@ from packaging.requirements import Requirement
 from mitsuba_irrcache.machine import versions
 
 
-def test_everything_that_is_needed_is_installed():
+def test_requirements_are_installed():
     versions.check_versions()
 
 

@@ -64,7 +64,7 @@ def test_homogeneous(scenes, values):
     assert grid.macrocells.count == 1
 
 
-def test_extent_is_the_worlds_box_of_the_grid(scenes):
+def test_extent_is_the_world_bounding_box_of_the_grid(scenes):
     """A grid smaller than the boundary limits the medium; a larger one does not."""
     inner = baked(scenes, scenes.medium(np.ones((2, 2, 2)), 0.5, scenes.placement((1.0, 1.2, 1.4))))
     np.testing.assert_allclose(np.abs(inner.bbox), [[0.5, 0.6, 0.7]] * 2, rtol=1e-6)

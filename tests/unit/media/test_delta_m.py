@@ -23,7 +23,7 @@ def moments(g: float) -> Phase:
 
 
 @pytest.mark.parametrize("g", [0.6, 0.75, 0.77, 0.85])
-def test_moments_without_the_peak(g):
+def test_scaled_phase_function_plus_peak_has_the_original_moments(g):
     """A forward delta function plus the scaled phase function has the original moments.
 
     They agree up to the order of truncation.
@@ -37,7 +37,7 @@ def test_moments_without_the_peak(g):
     assert rest.forward <= PEAK or rest.order == 6
 
 
-def test_only_forward_peaks_are_taken_away():
+def test_only_forward_peaks_are_scaled():
     for g in (0.5, -0.8, 0.9, 0.0):
         assert not moments(g).has_peak
 
@@ -66,7 +66,7 @@ FIELDS = {
 
 
 @pytest.mark.parametrize(("sigma_t", "albedo"), FIELDS.values(), ids=FIELDS)
-def test_what_is_absorbed_stays(scenes, sigma_t, albedo):
+def test_absorption_is_preserved(scenes, sigma_t, albedo):
     """Scaling preserves the absorption at voxel centres, and reduces sigma_s by the peak."""
     medium = {"type": "heterogeneous" if np.ndim(sigma_t) > 1 else "homogeneous", "phase": hg(0.8)}
     for name, value in (("sigma_t", sigma_t), ("albedo", albedo)):
@@ -123,7 +123,7 @@ def prepared(scenes, ball: dict) -> mi.Scene:
     return scene
 
 
-def test_sharp_media_around_surfaces_are_refused(scenes):
+def test_forward_scattering_media_with_surfaces_are_refused(scenes):
     """Forward scattering media with surfaces are refused if paths would scale the peak.
 
     Media without surfaces in them are accepted.
@@ -135,7 +135,7 @@ def test_sharp_media_around_surfaces_are_refused(scenes):
     assert aside.integrator().cache.samples == 128
 
 
-def test_other_media_keep_their_peaks(scenes):
+def test_other_media_are_not_scaled(scenes):
     """Paths through several media scale one of them; the others are unscaled."""
     place = scenes.placement((1, 1, 1), center=(3, 0, 0))
     other = scenes.boundary(scenes.medium(2.0, 0.5) | {"phase": hg(0.7)}, place)

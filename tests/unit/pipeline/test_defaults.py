@@ -38,14 +38,14 @@ def in_air(count: int, sigma_t: float) -> np.ndarray:
     return values
 
 
-def test_thin_data_keep_their_voxels():
+def test_thin_media_use_the_resolution_of_the_data():
     assert chosen(in_air(40, 2.0)) == (40, 40, 40)  # optical depth per voxel
     assert chosen(np.zeros((40, 48, 56))) == (40, 48, 56)
     assert chosen(np.full((40, 48, 56), 1.0)) == (40, 48, 56)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (4, 6, 8)])
-def test_few_data_get_more_voxels(shape):
+def test_small_grids_get_more_voxels(shape):
     """Small grids get more voxels: irradiance has more detail than the data, at a negligible
     cost.
     """
@@ -53,7 +53,7 @@ def test_few_data_get_more_voxels(shape):
     assert chosen(np.full(shape, 1.0), (1.0, 0.5, 0.25)) == (max(8, shape[0]), 16, 32)
 
 
-def test_dense_data_get_finer_voxels_where_it_counts():
+def test_dense_grids_are_refined_by_optical_depth():
     """Dense grids are refined per axis by the optical depth, by a factor of six at most.
 
     For ``path`` they are not, since its noise exceeds the discretisation error.
@@ -70,7 +70,7 @@ def test_dense_data_get_finer_voxels_where_it_counts():
     assert chosen(np.full((1, 1, 1), 1.0), solver="path") == (16, 16, 16)
 
 
-def test_contrast_and_a_cut_boundary_ask_for_voxels():
+def test_contrast_and_a_cut_boundary_need_more_voxels():
     """High contrast requires five voxels per mean free path, up to 64; a cut boundary up to 128."""
     speck = np.zeros((4, 4, 4))
     speck[1:3, 1:3, 1:3] = 8.0
@@ -80,7 +80,7 @@ def test_contrast_and_a_cut_boundary_ask_for_voxels():
     assert chosen(np.full((4, 4, 4), 500.0)) == (128, 128, 128)
 
 
-def test_homogeneous_media_get_what_their_data_would():
+def test_homogeneous_media_get_the_resolution_of_an_equal_grid():
     """A homogeneous medium gets the resolution of the same medium on a grid."""
     for sigma_t in (0.5, 10.0, 1000.0):
         grid = medium(np.full((4, 4, 4), sigma_t))
@@ -88,7 +88,7 @@ def test_homogeneous_media_get_what_their_data_would():
         assert choose_grid(same, 0, "sweep")[0].shape == choose_grid(grid, 0, "sweep")[0].shape
 
 
-def test_a_little_bone_in_much_air():
+def test_resolution_depends_on_where_collisions_happen():
     """The resolution depends on the extinction where collisions happen, not on the volume's
     mean.
     """

@@ -70,7 +70,7 @@ def test_a_list_of_images_keeps_its_order_and_names():
         ("light:colour,light:noise", '"light" twice'),
     ],
 )
-def test_wrong_lists_are_refused_by_name(text, named):
+def test_invalid_lists_are_refused(text, named):
     """Invalid lists are refused; the message names the entry and, for a wrong type, the valid
     ones.
     """
@@ -84,7 +84,7 @@ def test_wrong_lists_are_refused_by_name(text, named):
 
 
 @pytest.mark.parametrize("probes", [0, 4])
-def test_channels_come_back_as_they_went(variant, probes):
+def test_layers_survive_a_round_trip_through_channels(variant, probes):
     """Layers written to channels and read again are identical; all values are distinct."""
     layers = random_layers(probes)
     channels = layers.channels()
@@ -140,7 +140,7 @@ def test_another_illumination_replaces_its_own_only(variant):
     np.testing.assert_allclose(doubled, np.where(dark, 1, 2) * light + background, rtol=3e-7)
 
 
-def test_illumination_needs_a_colour(rgb):
+def test_illumination_is_zero_without_colour(rgb):
     """The illumination is 0 where the colour is not safely positive, channel by channel.
 
     Reconstruction filters with negative lobes give colours that are tiny, 0 or negative.
@@ -159,7 +159,7 @@ def test_illumination_needs_a_colour(rgb):
     np.testing.assert_allclose(illumination[1], expected, rtol=3e-7)
 
 
-def test_depth_is_the_mean_over_what_is_seen(variant):
+def test_depth_is_weighted_by_opacity(variant):
     """Depth is int (-dT/dt) t dt divided by the opacity 1 - T, and 0 where the opacity is 0.
 
     A half transparent object at 3 has depth 3, not 1.5.

@@ -75,7 +75,7 @@ def blotches(rng, size: int, block: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_noise_on_a_constant_goes(rgb, channels):
+def test_noise_on_a_constant_is_removed(rgb, channels):
     """Independent noise of 10 % on a constant decreases below a quarter.
 
     A Gaussian of the same radius gives 11 %.
@@ -89,7 +89,7 @@ def test_noise_on_a_constant_goes(rgb, channels):
     assert abs(result.mean() - image.mean()) < 0.003
 
 
-def test_nothing_is_done_where_there_is_no_noise(rgb):
+def test_noiseless_images_are_unchanged(rgb):
     """Without noise the image is unchanged bit by bit, for errors of 0 and of 1e-4 of the
     radiance.
     """
@@ -98,7 +98,7 @@ def test_nothing_is_done_where_there_is_no_noise(rgb):
         np.testing.assert_array_equal(denoise(image, np.full((9, 13), error)), image)
 
 
-def test_pure_structure_is_left_alone(rgb):
+def test_structure_is_preserved(rgb):
     """On structure 20 times the noise, the filter adds at most a fifth of the noise.
 
     Stein's unbiased risk estimate may select a weak filter or none.
@@ -110,7 +110,7 @@ def test_pure_structure_is_left_alone(rgb):
     assert rms(result - truth) < 1.2 * rms(image - truth)
 
 
-def test_an_edge_stays(rgb):
+def test_edges_are_preserved(rgb):
     """A step of 20 standard errors preserves its height to 5 %, with a third of the noise.
 
     A Gaussian of the same radius removes 84 % of the step between two pixels.
@@ -141,7 +141,7 @@ def test_small_images(rgb, shape):
 
 
 @pytest.mark.parametrize("kind", ["bilateral", "fixed"])
-def test_pixels_without_illumination_neither_receive_nor_give(rgb, kind):
+def test_invalid_pixels_are_ignored(rgb, kind):
     """Invalid pixels are not filtered and do not affect others, bit by bit."""
     rng = np.random.default_rng(6)
     hole = np.zeros((SIZE, SIZE), bool)
@@ -187,7 +187,7 @@ def test_channels_without_albedo_do_not_darken_others(rgb, kind):
 
 
 @pytest.mark.parametrize("kind", ["bilateral", "fixed"])
-def test_nothing_to_filter(rgb, kind):
+def test_filter_without_valid_pixels_returns_none(rgb, kind):
     """Without valid pixels, or without a known error, the result is None."""
     shape = (5, 6)
     light, probes = np.ones(shape), np.full((4, *shape), 0.1)
@@ -292,7 +292,7 @@ def test_more_noise_is_filtered_more(mono):
     assert left[2] < 0.35
 
 
-def test_fading(mono):
+def test_bilateral_filter_fades_out(mono):
     """The change by ``bilateral`` is less than the noise, so it vanishes; that by ``fixed`` does
     not.
     """
@@ -321,7 +321,7 @@ def test_the_scale_of_the_light_does_not_matter(rgb):
         np.testing.assert_allclose(scaled / scale, plain, rtol=2e-4)
 
 
-def test_larger_images_are_judged_by_a_sample(rgb, monkeypatch):
+def test_choice_from_a_sample_of_pixels(rgb, monkeypatch):
     """The choice from 500 of 2304 pixels equals that from all of them, for one image."""
     rng = np.random.default_rng(9)
     image = np.float32(1 + 0.1 * rng.normal(size=(SIZE, SIZE, 1)))

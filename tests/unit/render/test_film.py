@@ -53,7 +53,7 @@ def expected_colour(image: list[np.ndarray], pixel_format: str) -> list[np.ndarr
 
 @pytest.mark.parametrize("pixel_format", ["rgb", "rgba", "luminance", "luminance_alpha"])
 @pytest.mark.parametrize("crop", [{}, CROP], ids=["whole", "crop"])
-def test_a_film_gives_back_what_was_put_on_it(rgb, pixel_format, crop):
+def test_film_round_trip(rgb, pixel_format, crop):
     """Images read from a film equal those written bit by bit, for every reconstruction filter.
 
     This covers colour, alpha and further channels: a misplaced weight channel, a transposition or a
@@ -111,7 +111,7 @@ def test_filling_replaces_an_image_and_its_channels(rgb):
     assert [field.name for field in film.bitmap().struct_()] == ["R", "G", "B", *NAMES]
 
 
-def test_numbers_that_do_not_vary_fill_the_image(rgb):
+def test_literals_fill_the_image(rgb):
     """A literal, such as the alpha of a scene under a sky, is broadcast to all pixels."""
     film = film_of("rgba")
     rendering().fill_film(film, mi.Color3f(0.5), mi.Float(1), {"noise.Y": mi.Float(0.25)})

@@ -28,7 +28,7 @@ class Errors:
 
 @pytest.mark.parametrize("offset", [1.0, 0.5])
 @pytest.mark.parametrize("quadrature", ["trapezoid", "exponential"])
-def test_errors_weigh_as_the_light_of_their_place(quadrature, offset):
+def test_errors_are_weighted_by_radiance(quadrature, offset):
     """Projected errors are int T sigma_s Phi / (4 pi) e dt within 1 %.
 
     The medium is homogeneous and the steps are few; errors of one end of a segment would be off by

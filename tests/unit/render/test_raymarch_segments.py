@@ -51,7 +51,7 @@ def blobs(scenes) -> MediumGrid:
 
 @pytest.mark.parametrize("quadrature", ["riemann", "exponential"])
 @pytest.mark.parametrize("elsewhere", [0.0, 0.3])
-def test_light_of_voxels_without_matter_does_not_count(scenes, quadrature, elsewhere):
+def test_empty_voxels_do_not_contribute(scenes, quadrature, elsewhere):
     """Cache values at empty voxels do not contribute.
 
     With albedo 1 in a constant radiance field, the image is the opacity 1 - T, although the cache
@@ -91,7 +91,7 @@ class Along:
 
 
 @pytest.mark.parametrize("offset", [1.0, 0.37])
-def test_waves_behind_what_hides_them(offset):
+def test_long_steps_resolve_variation_behind_opaque_parts(offset):
     """Longer steps behind an opaque part are still shorter than the variation of the medium.
 
     Behind a transmittance of 1.5 %, extinction and irradiance are waves of 24 steps, which

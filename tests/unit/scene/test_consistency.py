@@ -144,7 +144,7 @@ ACCEPTED = {
 
 
 @pytest.mark.parametrize("build", ACCEPTED.values(), ids=ACCEPTED)
-def test_sound_scenes_are_accepted(build):
+def test_consistent_scenes_are_accepted(build):
     check_media_agree(load(**build()))
 
 

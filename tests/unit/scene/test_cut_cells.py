@@ -37,7 +37,7 @@ def points(count: int = 4096) -> tuple[mi.Point3f, np.ndarray]:
     return mi.Point3f(p), NORMAL @ p - DISTANCE
 
 
-def test_light_does_not_pass_a_wall(unit):
+def test_lookups_do_not_cross_a_wall(unit):
     """Lookups beside a wall use values of their own side only.
 
     The field is 1 on one side and 4 on the other; without cut cells, lookups near the wall would
@@ -57,7 +57,7 @@ def test_light_does_not_pass_a_wall(unit):
     assert np.abs(np.array(plain) - expected)[inner].max() > 0.5
 
 
-def test_colours_and_uncut_cells(unit):
+def test_uncut_cells_are_unchanged(unit):
     """Lookups in uncut cells do not change by a bit, in any channel."""
     rng = np.random.default_rng(2)
     roots = rng.uniform(0.5, 1.5, unit.voxel_count * 3).astype(np.float32)
@@ -76,7 +76,7 @@ def test_empty_space_has_no_edges(unit):
     assert CutCells(mi.load_dict({"type": "scene", "a": ball, "b": null}), unit).count == 0
 
 
-def test_neighbourhood():
+def test_means_over_valid_neighbours():
     """Means over valid neighbours are weighted by the squared distance."""
     rng = np.random.default_rng(3)
     values, valid = rng.uniform(0, 1, (4, 5, 6)).astype(np.float32), rng.random((4, 5, 6)) < 0.5
@@ -93,7 +93,7 @@ def test_neighbourhood():
     np.testing.assert_allclose(np.array(weights).reshape(4, 5, 6), expected[1], rtol=1e-5)
 
 
-def test_survey(scenes):
+def test_voxels_are_classified(scenes):
     """Voxels of a cube, in part another medium in a null sphere or an opaque ball, are
     classified.
     """

@@ -321,7 +321,7 @@ def test_the_same_scene_has_the_same_digests(folder, group):
         assert first == second, plugin
 
 
-def test_names_and_order_are_no_part_of_a_digest():
+def test_digests_ignore_names_and_order():
     objects = [
         {"type": "cube", "to_world": mi.ScalarTransform4f().translate([4, 0, 0])},
         {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": RED}},
@@ -375,7 +375,7 @@ def test_cache_files_of_other_scenes_are_refused(scenes, tmp_path_factory, chang
 
 
 @pytest.mark.parametrize("position", [[0, 0, 4], [0, 3, 0]], ids=str)
-def test_cache_files_know_where_a_point_light_is(scenes, tmp_path, position):
+def test_digests_include_the_position_of_a_point_light(scenes, tmp_path, position):
     """The digest depends on the position of a point light.
 
     Mitsuba's points have an attribute ``matrix``, a swizzle that is zero for all positions.

@@ -27,7 +27,7 @@ def test_h_function(albedo):
     np.testing.assert_allclose(found, PUBLISHED[albedo], atol=6e-6)
 
 
-def test_h_of_albedo_1_conserves_energy():
+def test_h_function_of_albedo_1_conserves_energy():
     """Half of the integral of H is 1 for albedo 1: a white half-space reflects everything."""
     x, w = np.polynomial.legendre.leggauss(200)
     mu = (0.5 * (x + 1)) ** 2
@@ -128,13 +128,13 @@ def test_three_orders_lie_between(scenes):
     assert np.diff(images).min() > 0.004
 
 
-def test_a_resolution_asks_for_a_cache(scenes):
+def test_explicit_resolution_selects_the_cache(scenes):
     scene = opaque(scenes, "sphere", 0.8, {"resolution": 16, "max_depth": 2}, size=4)
     mi.render(scene, spp=1)
     assert scene.integrator().cache is not None
 
 
-def test_a_sensor_inside_of_the_medium_gets_a_cache_or_an_error(scenes):
+def test_sensor_inside_the_medium_selects_the_cache_or_is_refused(scenes):
     scene = opaque(scenes, "sphere", 0.8, {"max_depth": 2}, size=4)
     inside = mi.load_dict(
         {
@@ -147,14 +147,14 @@ def test_a_sensor_inside_of_the_medium_gets_a_cache_or_an_error(scenes):
         scene.integrator().render(scene, inside, spp=1)
 
 
-def test_a_light_inside_of_the_medium_gets_a_cache(scenes):
+def test_emitter_inside_the_medium_selects_the_cache(scenes):
     light = {"type": "point", "position": [0.1, 0.2, 0.3], "intensity": 1.0}
     scene = opaque(scenes, "sphere", 0.8, {"max_depth": 2, "cache_spp": 1}, size=4, lamp=light)
     mi.render(scene, spp=1)
     assert scene.integrator().cache is not None
 
 
-def test_layers_and_progressive_images(scenes):
+def test_aovs_and_progressive_images(scenes):
     """Colour times illumination plus background is the image, and no cache samples are
     requested.
     """

@@ -53,7 +53,7 @@ def segments(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("contrast", [10.0, 1e8])
 @pytest.mark.parametrize("shape", [(1, 1, 1), (4, 4, 4), (1, 1, 9), (5, 1, 3), (23, 17, 20)])
-def test_against_many_small_steps(shape, contrast, channels):
+def test_optical_depth_agrees_with_many_small_steps(shape, contrast, channels):
     """The midpoint rule with 2000 steps agrees; its error is about 1e-5 of the largest value
     here.
     """
@@ -71,7 +71,7 @@ def test_against_many_small_steps(shape, contrast, channels):
     np.testing.assert_allclose(depth, expected, rtol=5e-5, atol=5e-5 * expected.max())
 
 
-def test_parts_add_up_and_opaque_matter_ends_the_march():
+def test_parts_add_up_and_opaque_media_end_the_march():
     found = medium((6, 5, 4), 1, 1e4)
     rng = np.random.default_rng(2)
     origin = mi.Point3f(found.sigma_t.grid.to_world[:3, 3:] - 5 * rng.random((3, 64)))

@@ -60,7 +60,7 @@ def test_furnace(scenes, extinction):
     assert ((scattered > 0.1) == (np.array(extinction) > 0)).all()
 
 
-def test_walls_that_reflect(scenes):
+def test_reflections_form_a_geometric_series(scenes):
     """In a nearly empty medium, reflections between walls form a geometric series.
 
     max_depth truncates it; emission is order 0, of depth 1 at the voxel.
@@ -72,7 +72,7 @@ def test_walls_that_reflect(scenes):
         assert (np.abs(straight + scattered - 4 * np.pi * total) < 4 * error + 2e-3).all()
 
 
-def test_a_disc_overhead(scenes):
+def test_disk_emitter_above(scenes):
     """A disk of solid angle 2 pi (1 - cos) is sampled correctly by both strategies."""
     place = mi.ScalarTransform4f().translate([0, 2, 0]).rotate([1, 0, 0], 90)
     disc = {"type": "disk", "to_world": place, "emitter": {"type": "area", "radiance": 3.0}}

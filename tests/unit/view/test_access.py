@@ -88,7 +88,7 @@ def test_a_token_is_needed_where_other_machines_can_connect(served):
         assert not connects(port, Cookie=forged)
 
 
-def test_names_that_another_site_may_have_given_to_this_machine_are_refused(served):
+def test_rebound_host_names_are_refused(served):
     """Host names that resolve to this machine (DNS rebinding) are refused, even with the token."""
     access, port = served
     for host in ("evil.example.org", "127.0.0.1.example.org", "localhost.example.org", "["):
@@ -162,7 +162,7 @@ def moving(monkeypatch):
     return session, window, waited
 
 
-def test_a_camera_that_comes_to_rest_during_a_step_is_waited_for(moving, monkeypatch):
+def test_thread_wakes_when_a_camera_comes_to_rest(moving, monkeypatch):
     """The thread wakes when a camera comes to rest after it was last checked.
 
     Otherwise the image would remain as coarse as that of a moving camera.
@@ -180,7 +180,7 @@ def test_a_camera_that_comes_to_rest_during_a_step_is_waited_for(moving, monkeyp
 
 
 @pytest.mark.parametrize("looks", range(1, 5))
-def test_a_camera_that_comes_to_rest_while_the_solver_waits(moving, monkeypatch, looks):
+def test_solver_pause_ends_when_a_camera_comes_to_rest(moving, monkeypatch, looks):
     """The solver's wait ends when a camera comes to rest between launches, after any number of
     checks.
     """

@@ -34,7 +34,7 @@ def test_rays_are_mitsubas(fov_axis, up):
     assert dr.all(dr.norm(dr.cross(expected.o - found.o, found.d)) < 1e-4)
 
 
-def test_it_orbits_about_the_point_of_its_sight_next_to_the_centre():
+def test_orbit_centre_is_on_the_optical_axis():
     camera = camera_of(sensor(), np.array([0.5, 0.2, -0.1]))
     np.testing.assert_allclose(camera.target, [0.5, 0.2, -0.1], atol=1e-5)
     assert camera.up == (0, 0, 1)
@@ -46,7 +46,7 @@ def test_a_camera_that_looks_straight_down_has_axes():
     np.testing.assert_allclose(axes[2], [0, 0, -1])
 
 
-def test_placement_is_undone():
+def test_placement_is_inverted():
     place = Placement(np.array([1.0, 2, 3]), 40.0)
     point = np.array([5.0, -6, 7])
     np.testing.assert_allclose(place.to_scene(place.to_browser(point)), point)

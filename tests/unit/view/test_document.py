@@ -59,7 +59,7 @@ def values(scene: mi.Scene) -> dict[str, np.ndarray]:
     }
 
 
-def test_the_text_is_the_scene(path):
+def test_document_equals_its_scene(path):
     """A document equals its scene in every number, with transforms bit by bit and parameters
     resolved.
     """
@@ -95,7 +95,7 @@ def test_edits(path):
     assert document.density == 1 and document.settings.max_depth == 3
 
 
-def test_a_sun_comes_and_goes(path):
+def test_sun_is_added_and_removed(path):
     document = Document.load(path, {}, "irrcache")
     count = len(document.scene().emitters())
     document.set_lighting(Lighting(sun=0))
@@ -113,7 +113,7 @@ SUNS = {
 
 @pytest.mark.parametrize("given", SUNS)
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, -1, 0), (0.3, 0.2, 1)])
-def test_the_sun_stays_where_it_is(path, given, up):
+def test_angles_of_the_sun_are_preserved(path, given, up):
     """The angles of the scene's sun are right for every up axis and definition of its direction.
 
     A larger elevation moves the sun towards the upward axis.
@@ -148,7 +148,7 @@ def test_impossible_values_are_refused(path, change):
         change(Document.load(path, {}, "irrcache"))
 
 
-def test_saved_scenes_load_from_elsewhere(path, tmp_path_factory):
+def test_saved_scenes_load_from_another_folder(path, tmp_path_factory):
     """Saved scenes load from another folder, with the camera and all files.
 
     Existing files are referred to; the others are written beside the scene.

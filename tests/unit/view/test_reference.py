@@ -64,7 +64,7 @@ def squares(image: np.ndarray) -> np.ndarray:
     ],
     indirect=["document"],
 )
-def test_it_is_volpaths_image_of_the_saved_scene(document, tmp_path, position):
+def test_reference_equals_volpath_of_the_saved_scene(document, tmp_path, position):
     """The reference agrees with volpath for cameras outside and inside of the medium."""
     camera = Camera(position, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
     inside = position[1] > -1
@@ -83,7 +83,7 @@ def test_it_is_volpaths_image_of_the_saved_scene(document, tmp_path, position):
     assert np.abs(found.mean() / np.mean(several) - 1) < 0.02
 
 
-def test_errors_are_told_without_its_own_noise(document):
+def test_reported_error_excludes_the_reference_noise(document):
     """The reported error excludes the noise of the reference.
 
     An image with a known error is compared with few samples.
@@ -101,7 +101,7 @@ def test_errors_are_told_without_its_own_noise(document):
     assert resolved < 0.5 * noise
 
 
-def test_it_is_beside_the_picture_until_something_changes(document):
+def test_reference_is_displayed_until_something_changes(document):
     """The reference is displayed beside the image until camera or scene change.
 
     The same image on both sides is reported with its error; while a camera moves there is no
@@ -141,7 +141,7 @@ def test_it_is_beside_the_picture_until_something_changes(document):
 
 
 @pytest.mark.parametrize("document", list(SCENES), indirect=True)
-def test_light_that_is_not_seen_any_more_is_freed(document, uncollected):
+def test_previous_caches_are_freed(document, uncollected):
     """Previous caches are freed with their medium after an edit, also in windows with a
     reference.
     """

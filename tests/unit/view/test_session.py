@@ -104,7 +104,7 @@ def test_no_solver_works_while_a_camera_moves(session):
     assert session.status.samples > before
 
 
-def test_a_picture_at_rest_gives_way_to_a_camera_that_moves(session, monkeypatch):
+def test_moving_camera_interrupts_an_image_at_rest(session, monkeypatch):
     """An image at rest is rendered in bands and aborted when a camera moves; it is completed
     later.
     """
@@ -158,7 +158,7 @@ def test_no_kernel_is_compiled_for_another_camera_or_size(session, kernels):
     assert used and all(k["cache_hit"] for k in used)
 
 
-def test_an_edit_shows_new_light_and_never_black(session):
+def test_edits_display_no_black_images(session):
     """After an edit, every image is as bright as the old or the new scene."""
     screen = Screen()
     window = session.open(screen.show)
@@ -173,7 +173,7 @@ def test_an_edit_shows_new_light_and_never_black(session):
     assert min(means) > low - 1 and max(means) < high + 1
 
 
-def test_light_that_is_put_out_is_out(path):
+def test_removed_emitters_give_a_black_image(path):
     """Without emitters the session has nothing to refine, and displays a black image."""
     sky = '<emitter type="constant"> <rgb name="radiance" value="0.3, 0.4, 0.5"/> </emitter>'
     assert sky in SCENE
@@ -237,7 +237,7 @@ def test_a_closed_window_holds_nothing(session):
     assert samples() is None
 
 
-def test_all_that_can_be_shown(session):
+def test_all_kinds_of_images(session):
     """Every kind of displayed image is nonempty and differs from the others."""
     screen = Screen()
     window = session.open(screen.show)
@@ -252,12 +252,12 @@ def test_all_that_can_be_shown(session):
 
 
 @pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "", "a" * 100, "/etc/passwd", "a\n"])
-def test_names_that_lead_elsewhere_are_refused(session, tmp_path, name):
+def test_file_names_outside_the_folder_are_refused(session, tmp_path, name):
     with pytest.raises(IrrcacheError, match="no name"):
         keep(session, View(front(session), SIZE), tmp_path, name)
 
 
-def test_what_cannot_be_viewed_is_said(path, tmp_path):
+def test_unsupported_scenes_raise_errors(path, tmp_path):
     text = path.read_text().replace('<ref name="interior" id="cloud"/>', "")
     (tmp_path / "empty.xml").write_text(text)
     session = Session(Document.load(tmp_path / "empty.xml"))

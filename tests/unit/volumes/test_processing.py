@@ -33,7 +33,7 @@ def linear_in_world(shape=(8, 9, 10)) -> VolumeData:
     return volume((world @ (1.0, -2.0, 3.0, 7.0)).astype(np.float64))
 
 
-def test_crop_does_not_move_what_it_keeps():
+def test_crop_preserves_world_positions():
     whole = linear_in_world()
     part = processing.crop(whole, [(2, 7), (None, 4), (3, None)])
     assert part.size == (5, 4, 5)
@@ -65,7 +65,7 @@ def test_rescale():
 
 
 @pytest.mark.parametrize("size", [(5, 5, 4), (20, 27, 8), (7, 18, 3), (10, 9, 8)])
-def test_resampling_keeps_an_affine_function_in_place(size):
+def test_resampling_preserves_an_affine_function(size):
     """Resampling preserves an affine function, except at the border, where it is clamped."""
     resampled = processing.resample(linear_in_world((24, 27, 30)), size)
     x, y, z = (n // 2 for n in size)
@@ -107,7 +107,7 @@ def test_sizes_give_near_cubic_voxels():
             call(source, 0)
 
 
-def test_isolation_removes_the_table_and_keeps_the_lungs():
+def test_isolation_removes_the_table_and_preserves_the_lungs():
     chest = np.full((12, 40, 40), -1000, dtype=np.int16)
     chest[:, 5:25, 5:35] = 40
     chest[:, 10:20, 10:18] = -850
@@ -127,7 +127,7 @@ def test_flip_mirrors_in_place():
     np.testing.assert_array_equal(flipped.to_world, source.to_world)
 
 
-def test_supersampling_a_linear_mapping_keeps_its_mean():
+def test_supersampling_a_linear_mapping_preserves_its_mean():
     source = VolumeData(noise((6, 6, 6)))
     plain = processing.bake(source, DensityMapping(), source.size)[1]
     fine = processing.bake(source, DensityMapping(), source.size, supersample=4)[1]
@@ -157,7 +157,7 @@ def test_averaged_albedo_is_weighted_by_extinction():
     assert albedo[1, 1, 7, 0] > STEP.albedo(np.array([100.0]))[0, 0]
 
 
-def test_bake_returns_the_grid_it_is_for():
+def test_bake_returns_the_resampled_grid():
     source = volume(noise())
     for size in [source.size, (5, 5, 4), (20, 20, 20)]:
         resampled, sigma_t, albedo = processing.bake(source, DensityMapping(), size, 2)
@@ -168,7 +168,7 @@ def test_bake_returns_the_grid_it_is_for():
 
 
 @pytest.mark.parametrize("supersample", [1, 10**20])
-def test_more_voxels_than_memory_holds_are_refused(supersample):
+def test_grids_larger_than_memory_are_refused(supersample):
     """More voxels than fit in memory are refused before allocation, in bytes and with the
     remedy.
 
@@ -181,7 +181,7 @@ def test_more_voxels_than_memory_holds_are_refused(supersample):
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf, 5e-324])
-def test_voxels_of_no_size_are_refused(size):
+def test_invalid_voxel_sizes_are_refused(size):
     volume = VolumeData(np.ones((4, 4, 4), np.float32), (1.0, 1.0, 1.0))
     with pytest.raises(IrrcacheError, match="give a positive length"):
         processing.size_for_voxel(volume, size)

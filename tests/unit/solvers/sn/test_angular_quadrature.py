@@ -44,7 +44,7 @@ def test_every_direction_is_uniform():
 
 
 @pytest.mark.parametrize(("sets", "count"), [(2, 8), (4, 8), (16, 8), (4, 32)])
-def test_sets_are_even_together(sets, count):
+def test_sets_of_several_passes_are_stratified(sets, count):
     """Sets of several passes together have a smaller quadrature error than independent sets.
 
     Each set has exact low moments; together they integrate (d . e)^6 and (d . e)^8 over directions
@@ -79,7 +79,7 @@ def lights(scenes, batches: int, **emitters) -> list[list[tuple]]:
     return rows
 
 
-def test_a_constant_sky_and_a_sun_have_no_noise(scenes):
+def test_constant_environment_and_sun_have_no_noise(scenes):
     """A constant environment and a sun are integrated exactly in every pass.
 
     The weights sum to 4 pi; the sun's irradiance is in one direction.

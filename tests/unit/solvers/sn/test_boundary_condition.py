@@ -48,7 +48,7 @@ def alone(monkeypatch):
 @pytest.mark.parametrize("way", [0, 1])
 @pytest.mark.parametrize("cells", [1 << 14, 30], ids=["lines", "blocks"])
 @pytest.mark.parametrize("coarse", [False, True])
-def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way, cells, coarse):
+def test_tracks_carry_the_radiance_of_their_entry(scenes, monkeypatch, alone, way, cells, coarse):
     """Radiance at a track's entry reaches all voxels on it.
 
     A quantity that is constant along tracks is given at the entry points and compared at the
@@ -89,7 +89,7 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
         assert abs((brought - (centres @ across + 10)).mean()) < 0.5 * edge * share
 
 
-def test_what_returns_is_linear_in_phi(scenes):
+def test_reflected_radiance_is_linear_in_phi(scenes):
     """Radiance reflected by surfaces is linear in phi.
 
     With white walls around a medium and no emitters, the incoming radiance is what left the medium:

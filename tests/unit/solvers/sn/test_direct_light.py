@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 20])
-def test_lamps_add_up(scenes, count):
+def test_sampled_emitters_add_up(scenes, count):
     """Many emitters sampled one at a time give the sum of all.
 
     Emissive spheres of different radiance, without extinction: 2 pi (1 - cos) times the radiance of

@@ -48,7 +48,7 @@ def harmonics(moments: Moments, towards: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda w: ",".join(f"{x:.1f}" for x in w))
 @pytest.mark.parametrize("back", [False, True])
-def test_moments_of_light_through_nothing(way, back):
+def test_moments_without_extinction(way, back):
     """Moments refer to the direction from which radiance comes, opposite to that of propagation.
 
     This holds for either direction of a pair and any sign of its largest component.
@@ -75,7 +75,7 @@ def centred(level: AnisotropicMultigridLevel, ways: np.ndarray) -> np.ndarray:
     return np.array(offsets)
 
 
-def test_light_that_a_voxel_scatters_goes_on_forward():
+def test_scattering_voxel_radiates_forward():
     """A voxel with g = 0.5, irradiated from one direction, scatters forward along all tracks.
 
     Reversing the irradiation mirrors the result; the voxels ahead receive 4 pi p of the angle, and
@@ -113,7 +113,7 @@ class Nothing:
     shines, directional = False, None
 
 
-def test_paths_begin_on_their_lines(scenes, monkeypatch):
+def test_paths_continue_their_tracks(scenes, monkeypatch):
     """A path that continues a track passes the centres of all slices at points of the lattice.
 
     These are a whole number of voxels from the first track.

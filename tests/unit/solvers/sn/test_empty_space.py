@@ -35,7 +35,7 @@ def found(occupied: np.ndarray, lower, upper) -> np.ndarray | None:
     return np.array(emptiness.slices).reshape(shape)
 
 
-def test_lines_skip_what_is_empty_and_no_more():
+def test_tracks_skip_only_empty_slices():
     """Slices that tracks may skip contain no occupied voxel and no side of the box.
 
     The first cell that prevents a longer skip is nearer than two cells behind them.
@@ -61,14 +61,14 @@ def test_lines_skip_what_is_empty_and_no_more():
     assert longest > 2 * CELL
 
 
-def test_nothing_is_skipped_where_it_gains_too_little():
+def test_skipping_is_disabled_where_it_saves_little():
     assert found(np.ones(SHAPE, bool), (0, 0, 0), SIDES) is None
     assert found(sparse(), (0, 0, 0), SIDES) is not None
 
 
 @pytest.mark.parametrize("box", [((0, 0, 0), (32, 21, 26)), ((3, 1, 2), (32, 20, 25))])
 @pytest.mark.parametrize("detailed", [False, True])
-def test_light_is_the_same(monkeypatch, box, detailed):
+def test_skipping_does_not_change_the_radiance(monkeypatch, box, detailed):
     """Skipping does not change the result, for all directions and entry points.
 
     Both incoming and scattered radiance are compared, with voxels of the medium and its detail.

@@ -70,7 +70,7 @@ def rows(pairs: int, light: float = 0.0, seed: int = 1) -> tuple[np.ndarray, ...
     return directions, entering, weights, rng.random((pairs, 2))
 
 
-def test_light_of_one_direction():
+def test_moments_of_one_direction():
     """Moments of a single direction are its irradiance times the spherical harmonics."""
     moments, of_matter = moments_of(0.5, 4), lines(matter())
     way = np.array([[0.3, -0.5, 0.6]]) / np.sqrt(0.7)
@@ -85,7 +85,7 @@ def test_light_of_one_direction():
         np.testing.assert_allclose(found, basis[:, None] * irradiance, atol=2e-6)
 
 
-def test_isotropic_scattering_is_that_of_levels():
+def test_isotropic_scattering_equals_the_multigrid_level():
     """Without higher moments, scattering is that of `MultigridLevel`."""
     sigma_t, none = matter(empty=0.3), moments_of(0.0, 1)
     isotropic, directional = level(sigma_t, 0.8, None), level(sigma_t, 0.8, none)
@@ -118,7 +118,7 @@ def test_furnace(order, scale):
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-def test_white_matter_is_no_source(order):
+def test_scattering_without_absorption_decays(order):
     """With albedo 1 and many empty voxels, repeatedly scattered radiance decays.
 
     Tracks without medium in a voxel in which others have some must not contribute to it.
@@ -134,7 +134,7 @@ def test_white_matter_is_no_source(order):
     assert sizes[-1] / sizes[-2] < 0.97
 
 
-def test_solution():
+def test_multigrid_solves_the_equation():
     """The multigrid solution satisfies phi = A phi + b."""
     rng = np.random.default_rng(7)
     grid = Grid((24, 24, 24), np.diag([1.0, 1, 1, 1]))

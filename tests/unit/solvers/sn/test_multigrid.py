@@ -60,7 +60,7 @@ def stacked(values: mi.Float) -> np.ndarray:
     return np.array(values).reshape(VOXELS, -1).T
 
 
-def test_channels_that_are_swept_together_do_not_mix(random):
+def test_channels_of_a_sweep_do_not_mix(random):
     """Channels that share a sweep do not mix, also with incoming radiance."""
     of, of_rows = level(random, False), rows(random)
     phi = random.uniform(0, 3, (3, VOXELS))
@@ -92,7 +92,7 @@ class Arriving(BoundarySource):
 
 
 @pytest.mark.parametrize("evenly", [False, True])
-def test_channels_are_solved_together_as_alone(random, evenly):
+def test_channels_solved_together_equal_separate_solutions(random, evenly):
     """Three channels solved together equal separate solutions within the tolerance of each.
 
     One channel is nearly dark, and one is zero.
@@ -108,7 +108,7 @@ def test_channels_are_solved_together_as_alone(random, evenly):
         assert alone.sum() >= 1.2 * b[c].sum()
 
 
-def test_light_without_voxels_sending_is_carried_in_all_channels(random):
+def test_unscattered_radiance_is_carried_in_all_channels(random):
     """Unscattered radiance is carried in all channels as in each alone, including sharpening."""
     of, (directions, dark, _, offsets) = level(random, False), rows(random)
     light = random.uniform(0, 1, (3, 2 * PAIRS))
@@ -130,7 +130,7 @@ def test_light_without_voxels_sending_is_carried_in_all_channels(random):
 
 
 @pytest.mark.parametrize("evenly", [False, True])
-def test_voxels_without_matter_need_not_be_known(random, evenly):
+def test_solution_needs_occupied_voxels_only(random, evenly):
     """In a mostly empty grid, the solution on occupied voxels equals that on the whole grid.
 
     All orders of scattering agree within the tolerance of each.
@@ -163,7 +163,7 @@ def test_voxels_without_matter_need_not_be_known(random, evenly):
     assert found[1][0].mean() > b.mean()
 
 
-def test_mixing_goes_where_a_slow_error_leads():
+def test_anderson_acceleration_removes_a_slow_error():
     """Anderson acceleration removes a slowly decaying error.
 
     Two channels whose errors decay by 0.9 and by 0.3 per step are solved by the third step.

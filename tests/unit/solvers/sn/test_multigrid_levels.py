@@ -38,7 +38,7 @@ def centres(level: MultigridLevel) -> np.ndarray:
 
 @pytest.mark.parametrize("evenly", [False, True])
 @pytest.mark.parametrize(("shape", "edges"), GRIDS.values(), ids=GRIDS)
-def test_matter_stays_where_it_is(scenes, shape, edges, evenly):
+def test_coarse_levels_conserve_mass_and_position(scenes, shape, edges, evenly):
     """Each coarse voxel has the mass of the fine voxels whose centres lie in it.
 
     Mass is extinction times volume; world positions are compared, also beyond the end of odd sides.
@@ -59,7 +59,7 @@ def test_matter_stays_where_it_is(scenes, shape, edges, evenly):
 
 @pytest.mark.parametrize("evenly", [False, True])
 @pytest.mark.parametrize(("shape", "edges"), GRIDS.values(), ids=GRIDS)
-def test_what_changes_evenly_comes_back(scenes, shape, edges, evenly):
+def test_transfer_between_levels_preserves_linear_functions(scenes, shape, edges, evenly):
     """Restriction followed by interpolation preserves linear functions, except at the border."""
     level = level_of(scenes, shape, edges, np.ones(shape), evenly)
     values = centres(level) @ np.array([0.5, -0.3, 0.8])

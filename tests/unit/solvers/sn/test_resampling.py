@@ -46,7 +46,7 @@ def test_albedo_is_that_of_collisions(scenes):
 
 
 @pytest.mark.parametrize("sides", [3, 16])
-def test_albedo_that_is_one_value_stays_so(scenes, sides):
+def test_constant_albedo_is_unchanged(scenes, sides):
     """A constant albedo, also as a grid of one value, is unchanged for any extinction."""
     density = scenes.texture((8, 8, 8), 0.0, 3.0, 2)
     assert (at_voxels(scenes, density, 0.7, sides) == np.float32(0.7)).all()

@@ -34,7 +34,7 @@ def test_blocks_are_means_of_their_voxels(scenes, block):
 
 @pytest.mark.parametrize("shape", [(12, 12, 12), (15, 8, 21), (9, 25, 7), (3, 3, 30)], ids=str)
 @pytest.mark.parametrize("cache", [(2, 2, 2), (4, 3, 5), (3, 1, 2)], ids=str)
-def test_lines_see_whole_voxels_of_the_data(scenes, shape, cache):
+def test_track_voxels_are_aligned_with_the_data(scenes, shape, cache):
     """Track voxels are those of the cache or whole divisions of the data, and conserve the mean."""
     density = scenes.texture(shape, 0.0, 3.0, 9)
     medium = medium_of(scenes, density)

@@ -91,7 +91,7 @@ def lengths(grid: Grid, at: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_each_voxel_once_per_way(shape):
+def test_each_voxel_is_crossed_once_per_direction(shape):
     """Each voxel is crossed exactly once per direction.
 
     Each direction carries its own power of two without extinction, so that the sum identifies
@@ -105,7 +105,7 @@ def test_each_voxel_once_per_way(shape):
         np.testing.assert_array_equal(found, light.sum())
 
 
-def test_each_voxel_of_a_box_once_per_way(scenes):
+def test_each_voxel_of_a_box_is_crossed_once_per_direction(scenes):
     """In a rotated, stretched, mirrored grid, each voxel of the box is crossed once per
     direction.
 
@@ -120,7 +120,7 @@ def test_each_voxel_of_a_box_once_per_way(scenes):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_batch_of_launches_is_the_work(mode, kernels):
+def test_launches_per_batch(mode, kernels):
     """The number of launches per batch is bounded.
 
     Eight pairs at once take a launch per axis and one to add up; otherwise one per pair, and one
@@ -140,7 +140,7 @@ def test_a_batch_of_launches_is_the_work(mode, kernels):
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("depth", [0.05, 0.31, 1.25])
-def test_homogeneous_matter_is_exact_along_each_line(scenes, shape, depth):
+def test_homogeneous_medium_is_exact_along_each_track(scenes, shape, depth):
     """In a homogeneous medium, transmittance is exp(-sigma_t d) from the exact point of entry.
 
     It is compared for each direction and voxel; ``depth`` is the optical depth of a voxel. A track
@@ -170,7 +170,7 @@ def smooth(p: np.ndarray) -> np.ndarray:
     return 5 * (1 + 0.5 * np.sin(4 * x + 1) * np.cos(3 * y) + 0.4 * z * np.sin(5 * z + x))
 
 
-def test_heterogeneous_matter_is_of_order_two():
+def test_heterogeneous_medium_is_of_order_two():
     """In a smooth medium, the error decreases with the square of the voxel size.
 
     The reference is a fine march through the smooth medium along the tracks; mean and RMS error
@@ -256,7 +256,7 @@ def test_both_modes_agree(monkeypatch):
 # Quantised extinction
 
 
-def test_zero_is_zero_and_the_maximum_exact():
+def test_quantisation_is_exact_at_zero_and_maximum():
     """Quantisation represents zero and the maximum exactly.
 
     Half of a grid is empty, the other half has the largest extinction: the irradiance has full
@@ -274,7 +274,7 @@ def test_zero_is_zero_and_the_maximum_exact():
     )
 
 
-def test_fog_beside_an_opaque_voxel():
+def test_quantisation_preserves_fog_beside_an_opaque_voxel():
     """Quantisation preserves thin fog in a grid with an opaque voxel.
 
     The fog has an optical depth of 1e-3, the voxel of 1e6 lies beside the tracks: transmittance is
@@ -296,7 +296,7 @@ def test_fog_beside_an_opaque_voxel():
 
 @pytest.mark.parametrize("detail", [(5, 12, 6), (10, 3, 12), (5, 4, 3), (4, 7, 9)], ids=str)
 @pytest.mark.parametrize("axis", range(3))
-def test_detail_of_the_medium_is_kept(detail, axis):
+def test_tracks_integrate_the_detail_of_the_medium(detail, axis):
     """Tracks on a coarse grid integrate the medium's own interpolation.
 
     On a grid of (5, 6, 6) voxels, the attenuation along an axis is that of the medium, whether its
@@ -329,7 +329,7 @@ def laid(values: np.ndarray, axis: int) -> mi.Float:
     return mi.Float((np.moveaxis(values, 2, 0) if axis == 0 else values).ravel())
 
 
-def test_sharpening_takes_back_a_mean(monkeypatch):
+def test_sharpening_recovers_values_from_means(monkeypatch):
     """Sharpening converts means of a quadratic over voxels to its values at their centres.
 
     Values outside of the box do not matter; a constant is unchanged, at the borders too.

@@ -43,7 +43,7 @@ def behind_the_entry(grid: Grid, way: np.ndarray, offset: np.ndarray) -> np.ndar
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda w: ",".join(f"{x:.1f}" for x in w))
 @pytest.mark.parametrize("back", [0, 1])
-def test_light_that_enters_is_less_by_what_it_has_passed(way, back):
+def test_incoming_radiance_is_attenuated(way, back):
     """Incoming radiance is attenuated by e^-tau, and collisions are proportional to it.
 
     Tracks may enter between two slices; sigma_t is 0.5 to 1 per voxel.

@@ -23,7 +23,7 @@ DEPTH = 10.0
     [((165, 120, 190), 0.05), ((96, 72, 112), 0.1)],
     ids=["make demo", "coarse"],
 )
-def test_the_optical_depth_of_the_skin_is_even(shape, bound):
+def test_optical_depth_of_the_skin_is_uniform(shape, bound):
     """The optical depth of the skin along x at the flank varies little between neighbouring
     rays.
 

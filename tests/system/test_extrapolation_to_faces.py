@@ -32,7 +32,7 @@ def cube(sigma_t: float, integrator: dict) -> mi.Scene:
 
 
 @pytest.mark.parametrize(("depth", "mean_error", "rmse"), [(0.16, 0.01, 0.06), (0.62, 0.05, 0.11)])
-def test_light_is_extrapolated_to_the_faces(depth, mean_error, rmse):
+def test_irradiance_is_extrapolated_to_the_faces(depth, mean_error, rmse):
     """The irradiance is extrapolated from the outermost voxel centres to the faces.
 
     ``depth`` is the optical depth of a cache voxel. When the irradiance was clamped there, the

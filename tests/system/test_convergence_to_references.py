@@ -67,7 +67,7 @@ def error(case: Case, expected: float, **integrator) -> float:
 
 
 @pytest.mark.parametrize("case", POINTS, ids=lambda case: case.name)
-def test_sweep_of_point_like_lights(case):
+def test_sweep_of_delta_lights(case):
     """With delta lights, the error of ``sweep`` decreases with the square of the voxel size.
 
     Both the extrapolation of two resolutions and the finer one are compared with the reference.

@@ -43,7 +43,7 @@ def of_passes(sky: DistantIllumination, count: int, pairs: int, value) -> np.nda
     return np.array(found)
 
 
-def test_a_bright_side_is_as_bright_as_it_is(scenes):
+def test_flux_from_a_bright_side_is_unbiased(scenes):
     """The flux from one side of an environment is unbiased.
 
     Half of it comes from a broad lobe above, the other half from all sides: the share from above,
@@ -66,7 +66,7 @@ def test_a_bright_side_is_as_bright_as_it_is(scenes):
     assert (np.abs(found.mean(axis=0) - expected) < 4 * error + 2e-3 * expected[0]).all()
 
 
-def test_an_even_part_of_a_sky_favours_no_side(scenes):
+def test_uniform_part_of_an_environment_is_balanced(scenes):
     """The uniform part of an environment is balanced between opposite sides in each pass.
 
     Almost all importance sampled directions go to a small spot; the rest is balanced to 2.5 % in

@@ -24,7 +24,7 @@ def sky() -> dict:
 
 @pytest.mark.parametrize("density", [1.2, DENSITY], ids=["constant", "grid"])
 @pytest.mark.parametrize("albedo", [1.0, 0.6])
-def test_transmittance_with_and_without_the_peak(scenes, density, albedo):
+def test_exponent_recovers_the_original_transmittance(scenes, density, albedo):
     """The exponent converts the transmittance of the scaled medium to that of the original one.
 
     This is exact for a constant albedo.
@@ -43,7 +43,7 @@ def test_transmittance_with_and_without_the_peak(scenes, density, albedo):
     assert np.exp(-less) ** found.unscattered_exponent == pytest.approx(np.exp(-whole), rel=1e-4)
 
 
-def test_a_bright_spot_of_the_sky_through_a_medium(scenes):
+def test_bright_spot_of_the_sky_is_attenuated_by_the_original_extinction(scenes):
     """The spot of a sky seen through a medium is attenuated by e^-tau of the original
     extinction.
     """
@@ -66,7 +66,7 @@ def test_a_bright_spot_of_the_sky_through_a_medium(scenes):
     assert seen[1] / seen[0] == pytest.approx(np.exp(-2 * 0.9), rel=2e-3)
 
 
-def test_light_scattered_once_from_narrow_lights(scenes):
+def test_single_scattering_of_narrow_emitters(scenes):
     """Single scattering of the scaled medium is extinction times albedo times Henyey-Greenstein.
 
     It equals that of the original medium.

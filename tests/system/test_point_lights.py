@@ -94,7 +94,7 @@ def test_single_scattering(scenes, lamp, rmse, mean, solver, g):
 ORDERS = {1.0: 1.54237649, 2.0: 0.76483116, 3.0: 0.37801463}
 
 
-def test_all_orders_in_infinite_matter(scenes):
+def test_all_orders_in_an_infinite_medium(scenes):
     """The fluence of a point light agrees with that of an infinite medium in spherical shells.
 
     The medium is 16 mean free paths wide, with voxels of a quarter of one. Shells around the

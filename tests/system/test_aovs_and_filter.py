@@ -69,7 +69,7 @@ def noisy(scenes, settings: dict, **objects) -> mi.Scene:
 
 
 @pytest.mark.parametrize("pixel_format", ["rgba", "luminance"])
-def test_layers_do_not_change_the_image(scenes, pixel_format):
+def test_aovs_do_not_change_the_image(scenes, pixel_format):
     """AOVs leave the image unchanged to float32 rounding, including its format and alpha.
 
     It would change if AOVs consumed random numbers of the ray march, or were added to the film
@@ -133,7 +133,7 @@ def test_colour_times_illumination_plus_background_is_the_image(scenes, rfilter)
     assert (found["colour"] * light)[inner].mean() > 1.2 * product[inner].mean()
 
 
-def test_names_on_the_film(scenes):
+def test_aov_channel_names(scenes):
     """AOV channels follow the film's own ones in the requested order, with the user's names."""
     sensor = scenes.description({}, None, 6)["sensor"]
     sensor["film"] = film_of(scenes, 6, pixel_format="rgba")
@@ -289,7 +289,7 @@ def test_bias_is_what_a_finer_cache_changes(scenes):
 # Filter
 
 
-def test_the_filter_does_no_harm(scenes, tmp_path):
+def test_filter_does_not_increase_the_error(scenes, tmp_path):
     """The filter does not increase the error of images with 16, 64 and 256 samples per voxel.
 
     The error against an image of 1024 samples a voxel is at most 8 % above the unfiltered one's,
@@ -364,7 +364,7 @@ def edge(profile: np.ndarray) -> tuple[float, float]:
     return crossings[1], crossings[2] - crossings[0]
 
 
-def test_a_bone_keeps_its_edge(scenes, monkeypatch):
+def test_filter_preserves_an_edge(scenes, monkeypatch):
     """Filtered images preserve the position and width of an edge.
 
     At 16 samples a voxel, with automatic and given strengths, the edge of the rod is within half a
@@ -417,7 +417,7 @@ BARE = {
 
 @pytest.mark.parametrize("kind", ["none", "bilateral", "fixed"])
 @pytest.mark.parametrize(("settings", "shape", "objects"), BARE.values(), ids=BARE)
-def test_no_nan_where_there_is_little(scenes, kind, settings, shape, objects):
+def test_no_nan_beside_the_medium(scenes, kind, settings, shape, objects):
     """All layers are finite if all pixels lie beside the medium; the image is unchanged."""
     settings = {"max_depth": 2, "resolution": 6, "cache_spp": 16} | settings
     sensor = scenes.description({}, None, 8)["sensor"]
@@ -465,7 +465,7 @@ def test_a_second_filtered_picture_compiles_nothing(scenes, kernels):
         assert history and {k["hash"] for k in history} <= first
 
 
-def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
+def test_no_work_for_unused_filter_and_aovs(scenes, monkeypatch):
     """Without filter and AOVs, no errors and layers are computed and no film is developed for
     them.
     """
@@ -484,7 +484,7 @@ def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
     assert scene.integrator()._sight.projection.channel_count == 0
 
 
-def test_layers_without_errors_project_none(scenes, monkeypatch):
+def test_aovs_without_errors_compute_none(scenes, monkeypatch):
     """Colour alone requires no error estimate of the cache, and no second batch."""
     from mitsuba_irrcache.render import camera
 
@@ -513,7 +513,7 @@ def test_mono(mono, scenes):
 
 
 @pytest.mark.parametrize("settings", [{"max_depth": 1}, {"albedo": 0.0}])
-def test_opacity_needs_no_light(scenes, settings):
+def test_opacity_without_radiance(scenes, settings):
     """With hidden emitters and no scattering, alpha and transmittance are those of the medium."""
     albedo = settings.get("albedo", 0.9)
     settings = {"max_depth": 2} | {k: v for k, v in settings.items() if k != "albedo"}
@@ -528,7 +528,7 @@ def test_opacity_needs_no_light(scenes, settings):
     np.testing.assert_allclose(found["image"][..., 3], 1 - np.exp(-1.5), rtol=1e-3)
 
 
-def test_the_dimmest_light_is_not_nan(scenes):
+def test_smallest_radiance_is_not_nan(scenes):
     """The smallest radiance, 1e-38 behind an optically thick box, gives no NaN."""
     sun = {"type": "directional", "direction": [0.0, 0.0, -1.0], "irradiance": 3.0}
     shape = scenes.boundary(scenes.medium(60.0, 0.9), scenes.placement())

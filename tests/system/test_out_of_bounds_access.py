@@ -39,7 +39,7 @@ def reported(capfd):
     return run
 
 
-def test_the_check_finds_one(reported):
+def test_debug_mode_detects_an_access(reported):
     """Debug mode detects a gather and a scatter beyond the end of an array."""
     values = mi.Float([1, 2, 3, 4])
     assert reported(lambda: dr.eval(dr.gather(mi.Float, values, mi.UInt32([1, 4]))))
@@ -66,7 +66,7 @@ def test_lookups(reported, shape):
     assert not reported(action)
 
 
-def test_lookups_beside_surfaces(reported):
+def test_lookups_in_cut_cells(reported):
     """Lookups in cut cells stay in bounds, up to the last corner of the grid and beyond."""
     grid, rng = Grid((3, 4, 5), np.eye(4)), np.random.default_rng(2)
     ball = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.6}

@@ -25,13 +25,13 @@ def kept(light: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_mirrored_light_has_mirrored_roots(axis):
+def test_mirrored_field_has_mirrored_roots(axis):
     """Mirrored fields have mirrored roots."""
     mirrored = kept(np.flip(LIGHT, axis), np.flip(KNOWN, axis))
     np.testing.assert_allclose(mirrored, np.flip(kept(LIGHT, KNOWN), axis), rtol=1e-5)
 
 
-def test_values_that_are_not_known_do_not_matter():
+def test_unknown_values_do_not_affect_known_ones():
     """Values at unknown voxels do not affect the roots at others."""
     results = [kept(np.where(KNOWN, LIGHT, other), KNOWN)[KNOWN] for other in (0.0, 1.0, 1e4)]
     np.testing.assert_array_equal(results[0], results[1])
@@ -40,7 +40,7 @@ def test_values_that_are_not_known_do_not_matter():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("count", "lit"), [(3, 1), (5, 1), (5, 3), (4, 2)])
-def test_one_lit_voxel_of_a_row_keeps_its_light(axis, count, lit):
+def test_single_voxel_of_a_row_is_conserved(axis, count, lit):
     """The integral of a single nonzero voxel in a row is conserved.
 
     Interpolated roots rise and fall linearly between this voxel and its zero neighbours, so their

@@ -69,7 +69,7 @@ def test_sharpening(reports, grid, axis, channels, box):
 
 
 @pytest.mark.parametrize("box", BOXES.values(), ids=BOXES)
-def test_light_that_enters(reports, grid, box):
+def test_incoming_radiance_stays_in_bounds(reports, grid, box):
     """Carrying incoming radiance through the box stays in bounds, inside and outside of it."""
     directions = np.array([[0.2, 0.5, 1.0], [1.0, -0.7, 0.4], [-0.3, -1.0, 0.6]])
     directions /= np.linalg.norm(directions, axis=1)[:, None]

@@ -181,7 +181,7 @@ def test_white_furnace(scenes, around, tolerance):
 
 
 @pytest.mark.parametrize("size", [0.4, 2.4])
-def test_small_and_large_lamps_are_as_bright_as_paths(scenes, size):
+def test_small_and_large_emitters_agree_with_path(scenes, size):
     """Both layers of the cache agree with ``path`` for small and large area lights.
 
     Small ones are sampled from voxels, large ones are hit by tracks. Means over all voxels reveal
@@ -194,7 +194,7 @@ def test_small_and_large_lamps_are_as_bright_as_paths(scenes, size):
     np.testing.assert_allclose(*found, rtol=0.02)
 
 
-def test_lights_nearby_and_several_media(scenes):
+def test_point_light_and_several_media(scenes):
     """A point light behind an occluder, seen through another medium, agrees with ``path`` per
     channel.
     """

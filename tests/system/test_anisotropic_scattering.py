@@ -93,13 +93,13 @@ AMONG_SURFACES = {
 
 
 @pytest.mark.parametrize(("build", "depth", "bounds"), AMONG_SURFACES.values(), ids=AMONG_SURFACES)
-def test_among_surfaces(scenes, build, depth, bounds):
+def test_with_surfaces(scenes, build, depth, bounds):
     """``sweep`` agrees with volpath if the ground and another medium scatter radiance back."""
     depths, ours = {"max_depth": depth, "rr_depth": 50}, {"cache_spp": 128, "solver": "sweep"}
     check(*images(scenes, build(scenes), ours, depths, (64, 512)), **bounds)
 
 
-def test_furnace_among_surfaces(scenes):
+def test_furnace_with_surfaces(scenes):
     """With an albedo of 1 everywhere, a forward scattering medium on the ground is invisible."""
     medium = scenes.medium(3.0, 1.0) | {"phase": hg(0.8)}
     objects = {"emitter": {"type": "constant", "radiance": 1.0}, "sun": None}

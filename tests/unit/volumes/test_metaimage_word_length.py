@@ -61,7 +61,7 @@ def test_tabs_are_refused(tmp_path):
         read_volume(written(tmp_path, "s%d.raw\t0 1 1"))
 
 
-def test_the_longest_word_is_read_within_its_memory(tmp_path):
+def test_longest_word_is_read_without_overflow(tmp_path):
     """The longest word is read without memory errors, in a process of its own."""
     path = written(tmp_path, f"{FITS} 0 1 1", FITS)
     program = (
@@ -75,7 +75,7 @@ def test_the_longest_word_is_read_within_its_memory(tmp_path):
     assert done.stdout.strip() == str(list(range(24)))
 
 
-def test_long_names_without_such_a_limit(tmp_path):
+def test_single_and_listed_names_have_no_limit(tmp_path):
     """Single names, and names in the lines of a list, have no such limit."""
     below = tmp_path / ("d" * 120)
     below.mkdir()

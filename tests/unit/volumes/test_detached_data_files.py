@@ -132,7 +132,7 @@ def test_data_files_of_slices(folders, case):
 
 
 @pytest.mark.parametrize("case", ["nhdr", "mhd"])
-def test_decoys(folders, case):
+def test_names_in_comments_do_not_hide_data_files(folders, case):
     """A harmless name before the actual one, in a comment or far behind the start, is no bypass."""
     own, other = folders
     header, line = ONE[case]
@@ -166,7 +166,7 @@ def test_patterns_that_name_no_files(folders, pattern):
 
 
 @pytest.mark.parametrize("extension", ["nrrd", "mha", "nii", "nii.gz"])
-def test_contents_do_not_choose_another_format(folders, extension):
+def test_format_is_that_of_the_extension(folders, extension):
     """The extension determines the format: a header of another format is refused."""
     own, other = folders
     path = own / f"ct.{extension}"
@@ -177,14 +177,14 @@ def test_contents_do_not_choose_another_format(folders, extension):
 
 
 @pytest.mark.parametrize("extension", ["nrrd", "nhdr", "mha", "mhd"])
-def test_files_as_others_write_them(tmp_path, extension):
+def test_attached_and_detached_files_are_read(tmp_path, extension):
     """Files with the voxels after the header, and detached files by SimpleITK, are read."""
     path = tmp_path / f"ct.{extension}"
     SimpleITK.WriteImage(SimpleITK.GetImageFromArray(VALUES), str(path))
     np.testing.assert_array_equal(read_volume(path).values, VALUES)
 
 
-def test_the_command(folders, capsys, monkeypatch):
+def test_import_command_refuses_and_allows_folders(folders, capsys, monkeypatch):
     """The command refuses such a file with the name of the option, and imports it with the
     option.
     """

@@ -123,7 +123,7 @@ def test_cameras(scenes):
     assert both[0].integrator().cache.samples == 64
 
 
-def test_meters(scenes):
+def test_radiance_and_irradiance_meters(scenes):
     """Radiance and irradiance meters agree with volpath.
 
     A radiance meter has the noise of few voxels, since it measures along a single ray.
@@ -273,7 +273,7 @@ def test_seeds_and_samples(scenes):
     assert scene.sensors()[0].sampler().sample_count() == 6
 
 
-def test_develop_and_evaluate(scenes):
+def test_develop_and_evaluate_arguments(scenes):
     scene = scenes.load(ours(), cloud(scenes), SIZE, default_solver="path")
     integrator = scene.integrator()
     expected = scenes.image(scene, spp=4)
@@ -284,7 +284,7 @@ def test_develop_and_evaluate(scenes):
     np.testing.assert_array_equal(np.array(lazy), expected)
 
 
-def test_an_integrator_and_a_sensor_of_their_own(scenes):
+def test_separately_loaded_integrator_and_sensor(scenes):
     scene = scenes.load(STOCK, cloud(scenes), SIZE)
     integrator, sensor = mi.load_dict(ours()), mi.load_dict(camera(scenes))
     found = scenes.image(scene, sensor=sensor, integrator=integrator, spp=4)

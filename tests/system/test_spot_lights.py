@@ -91,7 +91,7 @@ def _all_orders(scenes, solver: str) -> mi.Scene:
     )
 
 
-def test_a_beam_past_an_object(scenes):
+def test_spot_light_with_an_occluder(scenes):
     """An object in the cone of a spot light casts the same shadow in the medium as with
     ``path``.
     """
@@ -107,7 +107,7 @@ def test_a_beam_past_an_object(scenes):
     assert dark < 0.75 * clear
 
 
-def test_the_cache_of_a_file_shows_the_beam(scenes, tmp_path):
+def test_loaded_cache_renders_the_spot_light(scenes, tmp_path):
     """A cache loaded from a file renders the same spot light as the cache that was saved."""
     file = str(tmp_path / "cache.irr")
     cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO))
@@ -121,7 +121,7 @@ def test_the_cache_of_a_file_shows_the_beam(scenes, tmp_path):
     np.testing.assert_array_equal(*images)
 
 
-def test_irradiance_of_the_cache_holds_the_mean_of_the_beam(scenes):
+def test_cached_irradiance_conserves_the_spot_light(scenes):
     """The integral of ``cache.uncollided`` equals that of points sampled in the whole volume."""
     scene = fog(scenes, 10.0, 12)
     scene.integrator().prepare(scene)

@@ -210,7 +210,7 @@ def own_keys(scenes, world: str, solver: str) -> list[str]:
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("world", WORLDS)
-def test_every_parameter_that_is_assigned_shows(scenes, world, solver):
+def test_every_assigned_parameter_changes_the_image(scenes, world, solver):
     """Every assigned parameter changes the image, and its previous value restores it.
 
     Parameters are changed one by one and all at once. Each image equals, bit by bit, that of an
@@ -245,7 +245,7 @@ def test_every_parameter_that_is_assigned_shows(scenes, world, solver):
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_arrays_that_are_edited_in_place_show(scenes, world):
+def test_arrays_edited_in_place_change_the_image(scenes, world):
     """Edits in place by ``dr.scatter``, as documented by Mitsuba, change the image."""
     scene = loaded(scenes, world, "path")
     params, old = mi.traverse(scene), image(scene)
@@ -266,7 +266,7 @@ def test_arrays_that_are_edited_in_place_show(scenes, world):
             old = found
 
 
-def test_writing_through_a_view_shows(scenes):
+def test_writing_through_a_view_changes_the_image(scenes):
     """Edits through a NumPy view change the image.
 
     Such memory still belongs to the same variable, which a snapshot of the scene may hold, too.
@@ -310,7 +310,7 @@ CAMERA_EDITS = {
 
 
 @pytest.mark.parametrize("world", ["lights", "surfaces"])
-def test_a_moved_camera_makes_no_cache(scenes, world, kernels):
+def test_moved_camera_rebuilds_no_cache(scenes, world, kernels):
     """Moving the camera rebuilds no cache, and launches no kernel to inspect parameters."""
     scene = loaded(scenes, world, "path")
     image(scene)
@@ -324,7 +324,7 @@ def test_a_moved_camera_makes_no_cache(scenes, world, kernels):
     assert integrator._builder.revision == revision
 
 
-def test_the_value_of_before_makes_no_cache(scenes):
+def test_equal_value_rebuilds_no_cache(scenes):
     """Assigning an equal value in a new array rebuilds no cache."""
     scene = loaded(scenes, "lights", "path")
     image(scene)
@@ -362,7 +362,7 @@ def test_emission_of_the_integrator_is_a_parameter_too(scenes):
     np.testing.assert_array_equal(image(fresh), old)
 
 
-def test_another_bsdf_shows(scenes):
+def test_replaced_bsdf_is_detected(scenes):
     """Replacing an object is detected, although no parameter of the old one was edited."""
     scene = loaded(scenes, "surfaces", "path")
     old = image(scene)

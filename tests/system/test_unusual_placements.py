@@ -42,7 +42,7 @@ SPHERES = {
 
 
 @pytest.mark.parametrize("place", SPHERES.values(), ids=SPHERES)
-def test_spheres_are_round_whatever_their_placement(scenes, place):
+def test_spheres_are_round_for_every_placement(scenes, place):
     """Spheres with any accepted placement are rendered as spheres.
 
     As ellipsoids they would cover more or less of the sky, by 2 to 30 %.
@@ -93,7 +93,7 @@ def test_scaled_emitters_far_away_are_refused(scenes, kind, place, solver):
 
 
 @pytest.mark.parametrize("place", [np.diag([0.2, 0.5, 1, 1]), SHEAR], ids=["uneven", "sheared"])
-def test_cylinders_that_shine_are_round(scenes, place):
+def test_emissive_cylinders_are_round(scenes, place):
     """Emissive cylinders that are not round are refused.
 
     Mitsuba's emitter sampling of them gives two thirds of the radiance that rays find.
@@ -130,13 +130,13 @@ ALONE = {"box without a face": lambda scenes: box_without_a_face(), "rectangle":
 
 
 @pytest.mark.parametrize("build", ALONE.values(), ids=ALONE)
-def test_open_boundaries_that_are_alone_are_refused(scenes, build):
+def test_open_boundaries_are_refused(scenes, build):
     scene = scenes.load({"type": "irrcache", "solver": "auto"}, build(scenes), 4)
     with pytest.raises(RuntimeError, match="not closed"):
         mi.render(scene, spp=1)
 
 
-def test_a_null_shape_at_the_centre_is_no_face_of_the_boundary(scenes):
+def test_null_shape_at_the_centre_is_not_part_of_the_boundary(scenes):
     """A null sphere in the middle of a cube does not change which boundaries are accepted.
 
     The cube is accepted, and refused if it is mirrored.
@@ -151,7 +151,7 @@ def test_a_null_shape_at_the_centre_is_no_face_of_the_boundary(scenes):
 
 
 @pytest.mark.parametrize("depth", [2, -1])
-def test_a_hole_in_a_medium_is_not_swept_as_if_it_was_full(scenes, depth):
+def test_medium_with_a_hole_is_not_solved_by_sweep(scenes, depth):
     """A medium with a hole is not solved by ``sweep`` as if it had none.
 
     The hole is a null shape that has the medium only as its exterior. By ``sweep`` the mean would
@@ -177,7 +177,7 @@ def test_a_hole_in_a_medium_is_not_swept_as_if_it_was_full(scenes, depth):
     assert images[0] / images[1] == pytest.approx(1, abs=0.002)
 
 
-def test_media_that_reach_to_infinity_are_refused(scenes):
+def test_unbounded_media_are_refused(scenes):
     """A grid medium that is only the exterior of a shape is refused.
 
     volpath shows no radiance that leaves such a medium.
@@ -192,7 +192,7 @@ def test_media_that_reach_to_infinity_are_refused(scenes):
 
 
 @pytest.mark.parametrize("wrapper", [None, "aov", "moment"])
-def test_errors_say_what_went_wrong(scenes, wrapper):
+def test_messages_contain_the_cause(scenes, wrapper):
     """The message of mi.render's exception is the cause itself."""
     shape = scenes.boundary(scenes.medium(1.0, 0.8)) | {"flip_normals": True}
     integrator = {"type": "irrcache"}
@@ -206,7 +206,7 @@ def test_errors_say_what_went_wrong(scenes, wrapper):
     assert "see above" not in str(caught.value)
 
 
-def test_the_exterior_of_walls_needs_a_shape_to_fill(scenes):
+def test_exterior_media_of_walls_need_a_shape_to_fill(scenes):
     """An opaque shape's exterior medium that fills no shape is refused with the remedy."""
     walls, fog = {"fog": {"type": "homogeneous"}}, {"type": "ref", "id": "fog"}
     for name, turn in (("floor", -90), ("ceiling", 90)):
@@ -285,7 +285,7 @@ STOCK = {
 
 
 @pytest.mark.parametrize(("extinction", "expected"), STOCK.values(), ids=STOCK)
-def test_the_cheaper_stock_integrator_stands_in(scenes, tmp_path, extinction, expected):
+def test_cheapest_stock_integrator_replaces_the_cache(scenes, tmp_path, extinction, expected):
     """If no cache is useful, the image is bit by bit that of the cheapest stock integrator.
 
     The log says so once per scene.
