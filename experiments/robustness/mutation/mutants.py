@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 CLOSED_FORMS = "tests/correctness/test_closed_forms.py"
 SWEEP = "tests/system/test_sweep.py"
-UNBIASED = "tests/system/test_unbiased.py"
+UNBIASED = "tests/system/test_path_is_unbiased.py"
 PROJECTION = "tests/unit/render/test_raymarch.py"
 CACHE = "tests/unit/cache/test_volume.py"
 MOMENTS = "tests/unit/solvers/sn/test_moments.py"
-PHASE = "tests/system/test_phase.py"
+PHASE = "tests/system/test_anisotropic_scattering.py"
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ MUTANTS = (
         "media/phase.py",
         "found.p, found.wi = p, -direction",
         "found.p, found.wi = p, direction",
-        ("tests/system/test_phase.py",),
+        ("tests/system/test_anisotropic_scattering.py",),
     ),
     Mutant(
         "standard errors of samples, not of batches",
@@ -249,7 +249,7 @@ MUTANTS = (
         "solvers/sn/solver.py",
         "else irradiance[channel] * self._spread",
         "else irradiance[channel]",
-        ("tests/system/test_lamps.py",),
+        ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "light from the opposite side (moments)",
@@ -326,7 +326,7 @@ MUTANTS = (
         "cache/volume.py",
         "values = conserving(self.grid, values, marked(self.grid, self.active), channels)",
         "values = values + 0",
-        ("tests/system/test_lamps.py",),
+        ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "interpolated roots keep half of the light that bends",

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from experiments.robustness.mutation.mutants import Mutant
 
-NEIGHBOURS = "tests/unit/cache/test_conservative_at_every_voxel.py"
+NEIGHBOURS = "tests/unit/cache/test_conservative_symmetry_and_borders.py"
 FILTER = "tests/unit/render/test_denoise_symmetry_and_rejection.py"
 ERRORS = "tests/unit/cache/test_uncertainty_of_lookups.py"
-SIMILARITY = "tests/unit/media/test_delta_m_narrow_lights.py"
+SIMILARITY = "tests/unit/media/test_delta_m_narrow_emitters.py"
 SEGMENTS = "tests/unit/render/test_raymarch_segments.py"
 
 OUTSIDE = (
