@@ -1,6 +1,4 @@
-"""Faults as they are made: each a line of the library that is wrong in one place, with the tests
-that should say so.
-"""
+"""Typical faults: each changes one line of the library, and lists the tests that should fail."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ PHASE = "tests/system/test_anisotropic_scattering.py"
 
 @dataclass(frozen=True)
 class Mutant:
-    """``old``, which occurs once in ``file`` (of mitsuba_irrcache), is replaced by ``new``."""
+    """Replace ``old``, which occurs once in ``file`` (of mitsuba_irrcache), by ``new``."""
 
     name: str
     file: str

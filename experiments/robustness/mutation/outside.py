@@ -1,4 +1,4 @@
-"""Mutants that people made who had not seen the tests, and that no test of the time detected."""
+"""Mutants by people who had not seen the tests, and that no test detected at that time."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Mutants that an ordinary slip makes, spread over all modules: an index off by one, a wrong sign,
-a wrong neighbour, a missing factor, exchanged axes, a normalisation for cubic voxels only.
+"""Mutants by ordinary mistakes in all modules: an index off by one, a wrong sign, a wrong
+neighbour, a missing factor, exchanged axes, a normalisation for cubic voxels only.
 """
 
 from __future__ import annotations
