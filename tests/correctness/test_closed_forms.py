@@ -1,5 +1,7 @@
 """Cache and image against closed forms and published tables; no reference was rendered."""
 
+from __future__ import annotations
+
 import math
 
 import drjit as dr
