@@ -1,14 +1,14 @@
-"""What the solver ``sweep`` costs as volumes and images grow, beside what memory allows.
+"""Cost of the solver ``sweep`` as volumes and images grow, compared with the memory bandwidth.
 
     python -m experiments.performance.scaling.run [--full] [--force]
 
 Single scattering in grey, 256 directions, on procedural clouds up to 128^3 voxels (``--full``: up
 to 256^3, and the paper's 512 x 150 x 350 thorax), each in a process of its own: seconds, voxels
-times directions per second, peak memory. Two floors are measured in the same process. Stream, a
-kernel y = a x: a step of a line would take as long if it moved 12 bytes and did nothing else.
-Loads, a kernel of the loads and stores of a step alone: two words of the extinction, and the light
-of a voxel before and after. Then images of up to 512^2 (``--full``: 1024^2) pixels, and the kernels
-of a pass. Writes output/scaling/results.json.
+times directions per second, peak memory. Two bounds are measured in the same process. Stream, a
+kernel y = a x: the time of a track's step if it only moved 12 bytes. Loads, a kernel with only the
+loads and stores of a step: two words of the extinction, and the irradiance of a voxel before and
+after. Then images of up to 512^2 (``--full``: 1024^2) pixels, and the kernels of a pass. Writes
+output/scaling/results.json.
 """
 
 from __future__ import annotations

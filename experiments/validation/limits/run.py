@@ -1,17 +1,17 @@
-"""Whether images converge to the exact ones as resolution and cache_spp grow and step falls.
+"""Convergence of images to exact references as resolution and cache_spp grow and step decreases.
 
     python -m experiments.validation.limits.run [--only TEXT] [--solver sweep|path] [--budget 280]
         [--force]
 
 Coarse grids of high contrast, every emitter and phase function, both solvers (see cases.py). For
 max_depth 2 the reference is a quadrature without noise; for others Monte Carlo with a standard
-error of about 0.05 % (see reference.py). Printed is the error of the mean of the image in % of it,
-and the RMSE of its pixels where the reference has no noise, for one setting after the other; of the
-last two resolutions what errors of order 2 would leave in the limit; and the standard error of all
-this by caches of other seeds. A case *converges* where the last error, or the limit, is within
-0.1 % or three standard errors.
+error of about 0.05 % (see reference.py). The table has the relative error of the mean of the image,
+and the RMSE of its pixels if the reference has no noise, for one setting after the other; the limit
+that the last two resolutions imply if the error is of order 2; and the standard error of all this
+from caches of other seeds. A case *converges* if the last error, or the limit, is within 0.1 % or
+three standard errors.
 
-Rows are kept in output/limits/results.json; no case is begun after ``--budget`` seconds.
+Rows are saved in output/limits/results.json; no case is started after ``--budget`` seconds.
 """
 
 from __future__ import annotations

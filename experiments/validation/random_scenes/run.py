@@ -4,23 +4,23 @@
         [--seconds 12]
         [--budget 480] [--force]
 
-Each scene (see generate.py) is loaded by `mi.load_dict`, its integrator ``irrcache`` with nothing
-set but ``max_depth`` and ``hide_emitters``, and rendered twice, with another ``cache_seed`` the
-second time, which separates the noise of the cache from its bias. The reference is rendered by
-volpath (volpathmis where it is cheaper) in two independent halves. A pilot chooses its samples: the
-noise of a pixel is to be 4 % of the mean radiance in each half, which makes that of the mean much
-less than a third of a percent; all of the reference gets about ``--seconds``. A scene whose mean is
-not known to a third of a percent by then counts as undecided; where that of the volume alone is
-not, it says so.
+Each scene (see generate.py) is loaded by `mi.load_dict`, with the integrator ``irrcache`` at
+default settings except ``max_depth`` and ``hide_emitters``, and rendered with two values of
+``cache_seed``, which separates the noise of the cache from its bias. The reference is rendered by
+volpath (volpathmis if it is cheaper) in two independent halves. A pilot run selects the samples for
+a noise of 4 % of the mean radiance per pixel in each half, with which that of the mean is much less
+than a third of a percent, within about ``--seconds`` for the whole reference. A scene whose mean is
+not known to a third of a percent then counts as undecided; the table marks scenes for which only
+the mean of the volume alone is uncertain.
 
-Printed are the difference of the means; the RMSE, the noise of the reference removed by
-mean((x - a)(x - b)); what of it is bias, by mean((x - a)(y - b)), with a bound that it exceeds by
-three standard errors; the worst block of 4 x 4 pixels. All in % of the mean radiance of the image
-and, in brackets, of that of the volume alone: of the image without the light that reaches the
-camera without being scattered (volpath at depth 1). A scene *disagrees* where one of these, in both
+The table has the difference of the means; the RMSE, net of the reference's noise, by
+mean((x - a)(x - b)); its bias, by mean((x - a)(y - b)), with a lower bound of three standard
+errors; the largest error of a block of 4 x 4 pixels. All in % of the mean radiance of the image
+and, in brackets, of that of the volume alone: of the image without the
+unscattered radiance (volpath at depth 1). A scene *disagrees* if one of these, in both
 renderings, is beyond three standard errors (4.5 for the worst of 64 blocks) and beyond LIMITS.
 
-Rows are kept in output/random_scenes/<seed>.json, images beside them as .npz; no scene is begun
+Rows are saved in output/random_scenes/<seed>.json, images as .npz files; no scene is started
 after ``--budget`` seconds: run it again for the others, and with more ``--seconds`` for those that
 are undecided.
 """

@@ -20,7 +20,7 @@ def grid(rgb) -> Grid:
     return Grid((SIDE,) * 3, np.diag([SIDE, SIDE, SIDE, 1.0]))
 
 
-def kept(grid: Grid, phi: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+def conservative_roots(grid: Grid, phi: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
     """Return the conservative roots of ``phi`` (z, y, x, channel) at ``known`` (z, y, x) voxels."""
     roots = mi.Float(np.sqrt(phi).ravel().astype(np.float32))
     known = np.ones(phi.shape[:3], bool) if known is None else known
@@ -57,7 +57,7 @@ def test_fields_with_a_sharp_end_are_conserved(grid, radius, dim):
     """
     phi, lit = dim + ball(radius) * (1 - dim), (SIDE - 3) ** 3
     total, left = phi.sum() - dim * SIDE**3, dim * lit
-    found = mean_lookup(grid, kept(grid, phi)) * lit - left
+    found = mean_lookup(grid, conservative_roots(grid, phi)) * lit - left
     plain = mean_lookup(grid, np.sqrt(phi)) * lit - left
     assert plain < 0.97 * total
     assert abs(found - total) < 0.125 * (total - plain)
@@ -76,7 +76,7 @@ def test_exponential_decay_is_conserved(grid, k, error, before):
     u[2] = SIDE / 2 + 0.5 + (np.arange(64) + 0.5) / 64
     exact = phi[SIDE // 2] * (1 - np.exp(-k)) / k
     for roots, low, high in (
-        (kept(grid, layers(phi)), -error, error), (np.sqrt(layers(phi)), before, 1),
+        (conservative_roots(grid, layers(phi)), -error, error), (np.sqrt(layers(phi)), before, 1),
     ):  # fmt: skip
         field = RootField(grid, mi.Float(roots.ravel()), 1)
         found = np.array(field.at(mi.Point3f(np.float32(u)))).mean()
@@ -96,7 +96,10 @@ def test_smooth_field_is_conserved_per_cell(grid):
     u = np.full((3, 12, 32), SIDE / 2)
     u[2] = place[:, None] + (np.arange(32) + 0.5) / 32
     errors = []
-    for roots in (np.sqrt(layers(2 + np.cos(w * x))), kept(grid, layers(2 + np.cos(w * x)))):
+    for roots in (
+        np.sqrt(layers(2 + np.cos(w * x))),
+        conservative_roots(grid, layers(2 + np.cos(w * x))),
+    ):
         field = RootField(grid, mi.Float(roots.ravel()), 1)
         found = np.array(field.at(mi.Point3f(np.float32(u.reshape(3, -1))))).reshape(12, 32)
         errors.append(np.abs(found.mean(axis=1) / exact - 1).max())
@@ -106,9 +109,9 @@ def test_smooth_field_is_conserved_per_cell(grid):
 def test_channels_are_independent(grid):
     one = ball(4.0)
     other = np.roll(one, 3, axis=0) * 0.5
-    both = kept(grid, np.concatenate([one, other, one], axis=-1))
+    both = conservative_roots(grid, np.concatenate([one, other, one], axis=-1))
     for c, alone in enumerate((one, other, one)):
-        np.testing.assert_allclose(both[..., c : c + 1], kept(grid, alone), rtol=1e-5)
+        np.testing.assert_allclose(both[..., c : c + 1], conservative_roots(grid, alone), rtol=1e-5)
 
 
 def test_unknown_neighbours_are_ignored(grid):
@@ -119,6 +122,6 @@ def test_unknown_neighbours_are_ignored(grid):
     phi, known = layers((1 + np.arange(SIDE)) ** 2.0), np.ones((SIDE,) * 3, bool)
     known[:, :10] = False
     phi[:, :10] = 0
-    np.testing.assert_allclose(kept(grid, phi, known=known), np.sqrt(phi), rtol=1e-5)
-    assert np.abs(kept(grid, phi) - np.sqrt(phi)).max() > 0.5
-    np.testing.assert_array_equal(kept(grid, np.zeros_like(phi)), 0)
+    np.testing.assert_allclose(conservative_roots(grid, phi, known=known), np.sqrt(phi), rtol=1e-5)
+    assert np.abs(conservative_roots(grid, phi) - np.sqrt(phi)).max() > 0.5
+    np.testing.assert_array_equal(conservative_roots(grid, np.zeros_like(phi)), 0)

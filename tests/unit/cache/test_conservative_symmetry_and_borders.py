@@ -17,7 +17,7 @@ LIGHT = RNG.uniform(0.1, 4.0, SHAPE)
 KNOWN = RNG.random(SHAPE) < 0.8
 
 
-def kept(light: np.ndarray, known: np.ndarray) -> np.ndarray:
+def conservative_roots(light: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return the roots of ``light``, both (z, y, x)."""
     roots = mi.Float(np.float32(np.sqrt(light)).ravel())
     found = conserving(Grid(light.shape, np.eye(4)), roots, mi.Bool(known.ravel()))
@@ -27,13 +27,15 @@ def kept(light: np.ndarray, known: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("axis", range(3))
 def test_mirrored_field_has_mirrored_roots(axis):
     """Mirrored fields have mirrored roots."""
-    mirrored = kept(np.flip(LIGHT, axis), np.flip(KNOWN, axis))
-    np.testing.assert_allclose(mirrored, np.flip(kept(LIGHT, KNOWN), axis), rtol=1e-5)
+    mirrored = conservative_roots(np.flip(LIGHT, axis), np.flip(KNOWN, axis))
+    np.testing.assert_allclose(mirrored, np.flip(conservative_roots(LIGHT, KNOWN), axis), rtol=1e-5)
 
 
 def test_unknown_values_do_not_affect_known_ones():
     """Values at unknown voxels do not affect the roots at others."""
-    results = [kept(np.where(KNOWN, LIGHT, other), KNOWN)[KNOWN] for other in (0.0, 1.0, 1e4)]
+    results = [
+        conservative_roots(np.where(KNOWN, LIGHT, other), KNOWN)[KNOWN] for other in (0.0, 1.0, 1e4)
+    ]
     np.testing.assert_array_equal(results[0], results[1])
     np.testing.assert_array_equal(results[0], results[2])
 
@@ -51,6 +53,6 @@ def test_single_voxel_of_a_row_is_conserved(axis, count, lit):
     shape[2 - axis] = count
     light = np.zeros(count)
     light[lit] = 2.5
-    roots = kept(light.reshape(shape), np.ones(shape, bool)).ravel()
+    roots = conservative_roots(light.reshape(shape), np.ones(shape, bool)).ravel()
     assert np.flatnonzero(roots).tolist() == [lit]
     assert 2 / 3 * roots[lit] ** 2 == pytest.approx(2.5, rel=1e-5)
