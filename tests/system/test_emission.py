@@ -81,9 +81,8 @@ def test_emission_in_empty_voxels(scenes):
     found, _ = rendered(scenes, shape, scenes.volume(np.full((2, 2, 2), 3.0), flame), spp=64)
     np.testing.assert_allclose(found.mean(), 3.0 * 0.5, rtol=5e-3)
     np.testing.assert_allclose(found, 3.0 * 0.5, rtol=0.03)  # the block's faces cut steps
-    behind = scenes.placement(
-        (2.0, 2.0, 0.2), center=(0, 0, 1.0)
-    )  # inside of the medium, half outside
+    # Where the emission lies inside of the grid, the medium is there; half of it lies outside.
+    behind = scenes.placement((2.0, 2.0, 0.2), center=(0, 0, 1.0))
     light = scenes.volume(np.full((2, 2, 2), 3.0), behind)
     found, _ = rendered(scenes, shape, light, spp=64, step=0.2)
     t = np.linspace(0.9, 1.0, 2001)

@@ -192,9 +192,8 @@ def edited_keys(scene: mi.Scene) -> dict[str, tuple]:
     kinds = {}
     for key, entry in params.properties.items():
         plugin, (root, _, name) = entry[2].class_name(), key.partition(".")
-        if plugin not in CAMERA_SIDE and not key.endswith(
-            ".faces"
-        ):  # the other faces bound no medium
+        # Meshes with other faces would not bound the medium.
+        if plugin not in CAMERA_SIDE and not key.endswith(".faces"):
             kinds[key] = (roots.get(root, root), name, plugin)
     return kinds
 

@@ -141,9 +141,8 @@ def test_cameras_and_environment_of_a_scene_with_surfaces(browser, tmp_path, sce
         window.tick("compare with volpath")
         window.wait_for(r"volpath, \d{2,} samples per pixel; RMSE", 90)
         window.page.add_style_tag(content=".mantine-Paper-root {visibility: hidden}")
-        latest = (
-            time.monotonic() + 30
-        )  # the image follows the text; noise is biased by the sRGB curve
+        # The image follows the text, and the sRGB curve biases its noise, so samples are awaited.
+        latest = time.monotonic() + 30
         apart = np.inf
         while not apart < 3 and time.monotonic() < latest:
             ours, theirs = np.split(screen(window, SIZE[0]), 2, axis=1)

@@ -193,9 +193,8 @@ def verdict(row: dict) -> str:
     if not row["finite"]:
         return "NOT FINITE"
     if "x" not in row:
-        return (
-            "agrees" if row["dark_difference"] == 0 else "undecided"
-        )  # no path reached an emitter
+        # No path reached an emitter.
+        return "agrees" if row["dark_difference"] == 0 else "undecided"
     found = []
     volume = row["volume"] / row["mean"]
     for suffix, unit in (("", 1.0), (" of volume", volume)):

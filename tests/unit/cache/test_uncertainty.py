@@ -104,9 +104,8 @@ def test_probes_have_the_variance_of_interpolated_noise(scenes, light):
     phi = light(n)
     relative = np.random.default_rng(3).uniform(0.01, 0.1, (n, 1))
     cache = cache_of(with_error(phi, phi * relative), shape, to_world)
-    points = inside(
-        to_world, 20000, margin=0.04
-    )  # half a voxel: beyond it, values are extrapolated
+    # The margin is half a voxel, beyond which values are extrapolated.
+    points = inside(to_world, 20000, margin=0.04)
     brightness, probes, _ = errors_at(cache, points)
     index, weight = trilinear(points, shape, to_world)
     root = np.sqrt(phi[:, 0])

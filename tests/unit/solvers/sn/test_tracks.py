@@ -367,9 +367,8 @@ def test_dense_voxels_have_two_halves(scale, halves):
     volume = dr.opaque(mi.Float, 0, grid.voxel_count * 4)
     directions = np.array([[0.0, 0.0, 1.0]])
     sweep.scatter(volume, sweep.table(directions, np.zeros((1, 2)), np.ones(1), offsets(1)))
-    depth = np.array(volume).reshape(*grid.shape, 4)[
-        ..., 3
-    ]  # both directions, over the cross section
+    # The sum of both directions, over the cross section.
+    depth = np.array(volume).reshape(*grid.shape, 4)[..., 3]
     beside = np.concatenate([layers[:1], layers, layers[-1:]])
     expected = (beside[:-2] + 6 * layers + beside[2:]) / 8 if halves else layers
     wanted = np.broadcast_to(2 * expected[:, None, None], grid.shape)
