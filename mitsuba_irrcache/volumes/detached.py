@@ -48,9 +48,7 @@ def data_files(path: Path, allowed: Sequence[str | os.PathLike] = ()) -> list[Pa
         path.open("rb") as stream,
         mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as contents,
     ):
-        end = (
-            contents.find(b"\n\n") if kind == "nrrd" else -1
-        )  # an NRRD has voxels after its header
+        end = contents.find(b"\n\n") if kind == "nrrd" else -1  # where an NRRD's voxels begin
         header = contents[:end] if end >= 0 else contents
         for field in _FIELDS[kind].finditer(header):
             if kind == "meta":

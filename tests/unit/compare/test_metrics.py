@@ -63,7 +63,7 @@ def test_mean_error_with_correlated_noise(truth):
 
 
 def test_block_error_measures_blotches(truth, rng):
-    """Of two errors with equal RMSE, the blotched one has a block error 8 times larger."""
+    """A blotched error has a block error 8 times that of pixel noise with equal RMSE."""
     a, b = halves(truth, rng, 1e-6)
     fine = truth + rng.normal(0, 0.05, SHAPE)
     blotches = np.kron(rng.normal(0, 0.05, (16, 12)), np.ones((8, 8)))[..., None]

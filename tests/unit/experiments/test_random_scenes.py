@@ -91,9 +91,8 @@ def test_cameras_and_emitters_are_placed_as_described(drawn, tmp_path):
     """
     for case in drawn:
         scene = mi.load_dict(case.build({"type": "volpath"}, tmp_path))
-        boundary = mi.load_dict(
-            {"type": "scene", "shape": case._boundary(tmp_path)}
-        )  # without an object in between
+        # The boundary alone: no other object obstructs the ray.
+        boundary = mi.load_dict({"type": "scene", "shape": case._boundary(tmp_path)})
 
         def within(point, boundary=boundary):
             start, direction = mi.Point3f(0.0), mi.Vector3f(*map(float, point))
