@@ -38,11 +38,15 @@ FULL = Size(longest=512, pixels=1024, horizon=300, others=100, reference=3600)
 
 @dataclass(frozen=True)
 class Options:
-    """Size, output folder, and whether to recompute existing results."""
+    """Size, output folder, whether to recompute existing results, and a Markdown file.
+
+    The marked tables of the Markdown file are replaced.
+    """
 
     size: Size = QUICK
     output: Path = Path("output")
     force: bool = False
+    document: Path | None = None
 
     def folder(self, experiment: str) -> Path:
         """Return the folder of an experiment; the full size has its own."""
@@ -61,6 +65,13 @@ def parser_of(description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
+def add_document(parser: argparse.ArgumentParser) -> None:
+    """Declare the option of experiments whose tables are part of the documentation."""
+    parser.add_argument(
+        "--document", type=Path, help="Markdown file whose marked tables are replaced"
+    )
+
+
 def begin() -> None:
     """Set Mitsuba's variant."""
     require_llvm()
@@ -68,10 +79,13 @@ def begin() -> None:
     mi.set_log_level(mi.LogLevel.Error)
 
 
-def parse(description: str | None) -> Options:
-    """Parse the command line and set Mitsuba's variant."""
+def parse(description: str | None, documented: bool = False) -> Options:
+    """Parse the command line, with ``--document`` if ``documented``; set Mitsuba's variant."""
     parser = parser_of(description)
+    if documented:
+        add_document(parser)
     parser.add_argument("--full", action="store_true", help="the paper's sizes: hours")
     args = parser.parse_args()
     begin()
-    return Options(FULL if args.full else QUICK, args.output, args.force)
+    document = args.document if documented else None
+    return Options(FULL if args.full else QUICK, args.output, args.force, document)

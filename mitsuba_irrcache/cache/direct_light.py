@@ -97,6 +97,7 @@ class DirectLight:
 
     def depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """The optical depth of the medium between world positions and the emitter."""
+        # docs/primer, eq. (2.5)
         return self.extinction.at_world(p, active) * self.length(p)
 
     def length(self, p: mi.Point3f) -> mi.Float:
@@ -256,6 +257,7 @@ class DirectLightAlongRays:
         depth s0 to s0 + S, int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), however
         opaque that part is.
         """
+        # docs/primer, eq. (2.6)
         light, (a, b) = self._light, ends
         near, far = (extinction * (b - a) for extinction in sigma)
         at = self._parts(ray, a, b, 0.5 * (near + far))

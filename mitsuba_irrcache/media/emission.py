@@ -1,9 +1,8 @@
-"""Light that media send out themselves: flames, plasma, glowing gas. Mitsuba's media have none.
+"""Volumetric emission (flames, plasma, glowing gas), which Mitsuba's media do not support.
 
-The emission coefficient j is the radiance that is emitted along each unit of length [W m^-3 sr^-1,
-or the scene's unit of radiance per unit of length], the same in all directions. It is the sigma_a
-L_e of the paper's eq. 1, told as a whole: nothing multiplies it, so that matter without extinction
-can shine too.
+The emission coefficient j is the isotropic radiance emitted per unit length [W m^-3 sr^-1, or the
+scene's unit of radiance per unit of length]. It equals the product sigma_a L_e in eq. 1 of the
+paper, but is specified directly, so that media without extinction can be emissive.
 """
 
 from __future__ import annotations
@@ -23,23 +22,21 @@ from mitsuba_irrcache.grids.occupancy import active_voxels, marked
 from mitsuba_irrcache.media.bake import baked_field, volume_error
 from mitsuba_irrcache.media.medium import MediumGrid
 
-#: How far baked values may be from Mitsuba's own, relative to their maximum.
+#: Tolerated deviation from Mitsuba's own values, relative to the maximum.
 TOLERANCE = 0.02
-#: Voxels around a grid that still count as in it: rays end on the very faces of media.
+#: Tolerance in voxels of the test whether a point is inside a grid: rays end exactly on its faces.
 SLACK = 1e-3
 
 
 class Emission:
-    """The emission coefficient at all places in media: that of ``field``, and 0 outside of its
-    grid.
-    """
+    """Emission coefficient: the value of ``field``, and 0 outside of its grid."""
 
     def __init__(self, field: Field) -> None:
         self.field, self.grid = field, field.grid
         self.channels, self.maximum = field.channels, field.maximum
 
     def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """Its value at the world position ``p``: a Float for one channel, else a Color3f."""
+        """Evaluate at the world position ``p``: a Float for one channel, else a Color3f."""
         if self.grid is None:
             return self.field.value
         u = self.grid.coordinates.point(p)
@@ -48,9 +45,7 @@ class Emission:
         return dr.select(inside, self.field.at(u, active & inside), 0)
 
     def interval(self, ray: mi.Ray3f, near: mi.Float, far: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """The part of a ray between ``near`` and ``far`` on which there can be light; none where it
-        does not end behind its start.
-        """
+        """Clip a ray between ``near`` and ``far`` to the emissive grid; empty if end <= start."""
         if self.grid is None:
             return near, far
         origin = self.grid.coordinates.point(ray.o)
@@ -63,8 +58,9 @@ class Emission:
     def between(
         self, ray: mi.Ray3f, begin: mi.Float, end: mi.Float, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.PCG32]:
-        """An unbiased estimate of int j dt from one random place, and the random generator; 0 where
-        not ``active``.
+        """Estimate int j dt, unbiased, from one random position; 0 where not ``active``.
+
+        Also returns the advanced random number generator.
         """
         if self.grid is None:
             return dr.select(active, mi.Spectrum(self.field.value) * (end - begin), 0), rng
@@ -73,7 +69,7 @@ class Emission:
         return dr.select(active, light, 0), rng
 
     def reaches(self, cells: Macrocells) -> mi.Bool:
-        """For each of a medium's macrocells whether there may be light in it."""
+        """Whether each macrocell of a medium may contain emission."""
         if self.grid is None or cells.count == 1:
             return dr.full(mi.Bool, True, cells.count)
         own = SimpleNamespace(
@@ -86,9 +82,9 @@ class Emission:
 
 
 def bake_emission(value: object, scale: float) -> Emission | None:
-    """The emission that the integrator was given: a number, a colour, or a ``constvolume`` or
-    ``gridvolume`` in world space, times ``scale``. None where it is 0 everywhere.
+    """Convert the integrator's ``emission`` property times ``scale``; None if it is 0 everywhere.
 
+    The property is a number, a colour, or a ``constvolume`` or ``gridvolume`` in world space.
     Raises IrrcacheError for anything else, and for values that are negative or not finite.
     """
     if not np.isfinite(scale) or scale < 0:
@@ -104,19 +100,19 @@ def bake_emission(value: object, scale: float) -> Emission | None:
 
 
 def place_emission(emission: Emission | None, media: list[MediumGrid]) -> None:
-    """Lets ``media`` shine. Raises IrrcacheError where the light would be in none of them."""
+    """Assign the emission to all ``media``; raise IrrcacheError if it overlaps none of them."""
     if emission is None:
         return
     if not media:
         raise IrrcacheError(
-            "irrcache: there is emission, but no medium, and only media shine. Put a medium around "
+            "irrcache: there is emission, but no medium, and only media emit. Put a medium around "
             "it; its sigma_t may be 0."
         )
     if emission.grid is not None and not any(_overlap(emission.grid, m.frame) for m in media):
         lower, upper = _box(emission.grid.to_world)
         raise IrrcacheError(
             f"irrcache: the emission fills {lower} to {upper}, where there is no medium, and only "
-            "media shine. Place it by its to_world in world space, or put a medium around it; its "
+            "media emit. Place it by its to_world in world space, or put a medium around it; its "
             "sigma_t may be 0."
         )
     for medium in media:
@@ -124,7 +120,7 @@ def place_emission(emission: Emission | None, media: list[MediumGrid]) -> None:
 
 
 def _numbers(value: object, scale: float) -> np.ndarray:
-    """One value, or three of a colour; times ``scale`` they are numbers in single precision."""
+    """Convert a number or colour to one or three values; times ``scale`` they must be finite."""
     try:
         values = np.array(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
@@ -147,27 +143,27 @@ def _numbers(value: object, scale: float) -> np.ndarray:
 
 
 def _verify(volume: mi.Volume, field: Field, scale: float) -> None:
-    """Compares baked values with Mitsuba's own inside of the volume."""
+    """Compare the converted values with Mitsuba's own at random points inside the volume."""
     if field.grid is None or not field.maximum > 0:
         return
     rng = mi.PCG32(512)
     u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
     interaction = dr.zeros(mi.Interaction3f, 512)
     interaction.p = Grid((1, 1, 1), field.grid.to_world).world.point(u)
-    theirs = mi.Spectrum(volume.eval(interaction)) * scale
-    apart = dr.abs(theirs - mi.Spectrum(field.at_world(interaction.p)))
-    if dr.max(dr.max(apart))[0] > TOLERANCE * field.maximum:
+    expected = mi.Spectrum(volume.eval(interaction)) * scale
+    deviation = dr.abs(expected - mi.Spectrum(field.at_world(interaction.p)))
+    if dr.max(dr.max(deviation))[0] > TOLERANCE * field.maximum:
         raise volume_error("emission of the integrator")
 
 
 def _box(to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The world box around a unit cube that is placed by ``to_world``."""
+    """Return the world bounding box of the unit cube under ``to_world``."""
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
     world = to_world[:3, :3] @ corners + to_world[:3, 3:]
     return world.min(axis=1), world.max(axis=1)
 
 
 def _overlap(grid: Grid, frame: np.ndarray) -> bool:
-    """Whether the world boxes of both meet."""
+    """Whether the world bounding boxes overlap."""
     (a, b), (c, d) = _box(grid.to_world), _box(frame)
     return bool((np.maximum(a, c) < np.minimum(b, d)).all())

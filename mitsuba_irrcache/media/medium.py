@@ -1,4 +1,4 @@
-"""A participating medium baked on grids: extinction, albedo, extent, occupancy and majorants."""
+"""A participating medium on grids: extinction, albedo, extent, and majorants."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from mitsuba_irrcache.media.phase import Phase
 
 
 class MediumGrid:
-    """``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and the world box ``bbox``
-    (None: unbounded).
+    """A medium with ``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and ``bbox``.
+
+    ``bbox`` is a world box, or None if the medium is not clipped.
     """
 
     def __init__(
@@ -31,23 +32,23 @@ class MediumGrid:
         self.albedo = albedo
         self.boundary = boundary
         self.bbox = bbox
-        #: what it sends out itself; None where it does not (see `emission`)
+        #: volumetric emission, or None (see `emission`)
         self.emission: object | None = None
-        #: whether there is no more to its bounds than ``boundary``; others are larger than it
+        #: whether ``boundary`` is the exact shape of the medium, not a bounding shape
         self.has_exact_boundary = True
-        #: None where it is isotropic
+        #: None for isotropic scattering
         self.phase: Phase | None = None
-        #: the power of transmittance that is left of light if what is scattered into a forward peak
-        #: is taken from it, too (see `delta_m`)
+        #: exponent that converts the transmittance of the truncated medium to the original one
+        #: (see `delta_m`)
         self.unscattered_exponent = 1.0
         self._with_peak: MediumGrid | None = None
-        #: what it is called among others
+        #: identifier of the medium
         self.name = ""
-        #: Mitsuba's medium, as rays carry it, and what else there is in the scene; None where
-        #: this medium in its boundary is all, and it is isotropic
+        #: pointer to Mitsuba's medium, and the other objects of the scene; None if the medium is
+        #: isolated and isotropic
         self.pointer: mi.MediumPtr | None = None
         self.surroundings: object | None = None
-        #: whether this medium in its boundary is all, and the light around it
+        #: whether the scene has no other medium, no surface and no area emitter
         self.is_isolated = True
         self.macrocells = Macrocells.build(sigma_t, boundary)
         if bbox is not None:
@@ -56,9 +57,7 @@ class MediumGrid:
 
     @property
     def frame(self) -> np.ndarray:
-        """``to_world`` of the smallest known unit cube that encloses the medium: where a cache
-        goes.
-        """
+        """``to_world`` of the smallest known unit cube around the medium: extent of its cache."""
         frames = [self.boundary.frame]
         if self.bbox is not None:
             frames.append(axis_aligned(*self.bbox))
@@ -66,7 +65,7 @@ class MediumGrid:
 
     @property
     def channels(self) -> int:
-        """3 where extinction or albedo is coloured, else 1."""
+        """3 for coloured extinction or albedo, else 1."""
         return max(self.sigma_t.channels, self.albedo.channels)
 
     @property
@@ -75,30 +74,30 @@ class MediumGrid:
 
     @property
     def shortest_edge(self) -> float:
-        """Of a voxel of the extinction [scene units]; infinite where nothing varies."""
+        """Shortest edge of an extinction voxel [scene units]; infinite for a homogeneous medium."""
         return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
 
     @property
     def with_peak(self) -> MediumGrid:
-        """The medium before a forward peak was taken away from it."""
+        """The medium before truncation of its forward peak."""
         return self._with_peak or self
 
-    def keep_peak(self) -> None:
-        """Remembers the medium as it is."""
+    def store_untruncated(self) -> None:
+        """Store a copy of the untruncated medium."""
         self._with_peak = copy(self)
 
     def contains(self, p: mi.Point3f) -> mi.Bool:
-        """Whether a point is in the medium."""
+        """Whether points lie in the medium."""
         inside = self.boundary.surrounds(p)
         return inside if self.bbox is None else inside & self._clip.contains(p)
 
     def fills(self, grid: Grid) -> bool:
-        """Whether the medium is all of the box that ``grid`` covers."""
+        """Whether the medium fills the whole box covered by ``grid``."""
         same = np.abs(self.boundary.frame - grid.to_world).max() <= 1e-6 * grid.side_lengths.max()
         return self.boundary.kind == "box" and self.bbox is None and bool(same)
 
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Whether the ray's line meets the medium, and its distances of entry and exit."""
+        """Whether the line of a ray intersects the medium, and its distances of entry and exit."""
         hit, near, far = self.boundary.intersect(ray)
         if self.bbox is not None:
             _, box_near, box_far = self._clip.ray_intersect(ray)
@@ -107,7 +106,7 @@ class MediumGrid:
 
 
 def axis_aligned(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """``to_world`` of the unit cube over a world box."""
+    """Return ``to_world`` of the unit cube for an axis-aligned world box."""
     frame = np.diag([*(upper - lower), 1.0])
     frame[:3, 3] = lower
     return frame

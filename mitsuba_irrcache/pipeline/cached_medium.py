@@ -233,7 +233,7 @@ class CachedMedium:
             _check_like(cache, stored, file)
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
-            stored.lie_like(cache)
+            stored.copy_scene_attributes(cache)
             return stored
         if edited:
             mi.Log(
@@ -278,7 +278,7 @@ class CachedMedium:
                 batch=size,
                 moments=cache.moments,
             )
-            self._preview.lie_like(cache)
+            self._preview.copy_scene_attributes(cache)
             self._opening.fill(self._preview)
         return True
 

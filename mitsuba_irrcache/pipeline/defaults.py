@@ -258,6 +258,7 @@ def _estimated_grid(medium: MediumGrid, solver: str, voxels: int) -> tuple[Grid,
     """The grid whose estimated error is `TARGET_ERROR`, with no more than so many ``voxels``, and
     the reason for its size.
     """
+    # docs/primer, eq. (7.2)
     data, frame = medium.sigma_t.grid, medium.frame
     lengths = np.linalg.norm(frame[:3, :3], axis=0)
     mean, border = _colliding_extinction(medium), _border_extinction(medium)
@@ -337,6 +338,7 @@ def border_error(medium: MediumGrid, grid: Grid) -> float:
     """The estimated error of the pixels at the boundary of a medium that cuts through matter [%],
     where irradiance is interpolated between the voxels of ``grid``.
     """
+    # docs/primer, eq. (7.1)
     return BORDER_ERROR * (_border_extinction(medium) * grid.voxel_size.max()) ** BORDER_ORDER
 
 

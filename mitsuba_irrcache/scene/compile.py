@@ -16,7 +16,7 @@ from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary, boundary_of, rays_through
 from mitsuba_irrcache.lights.emitters import check_placement
 from mitsuba_irrcache.media.bake import bake, children
-from mitsuba_irrcache.media.delta_m import take_away_peak
+from mitsuba_irrcache.media.delta_m import truncate_forward_peak
 from mitsuba_irrcache.media.emission import Emission, place_emission
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.media.phase import refuse_sharp
@@ -164,7 +164,7 @@ def bake_general(
     place_emission(emission, grids)
     for grid in seen:
         if grid.phase is not None and grid.phase.has_peak:
-            take_away_peak(grid)
+            truncate_forward_peak(grid)
     if not seen and emission is not None:
         _refuse("all media are behind surfaces, and the emission in them is unknown to volpath")
     if not seen:

@@ -141,7 +141,7 @@ class Samples:
         scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in self.size))
         ray = self.camera.rays(at * scale, width / height)
         medium = seen.medium_at(np.array(self.camera.position))
-        view = seen.sight.look(seen.scene, sampler, ray, medium, mi.Bool(True))
+        view = seen.sight.sample(seen.scene, sampler, ray, medium, mi.Bool(True))
         if seen.layered:
             parts = view.scattered, view.transmittance, view.gathered, view.background
             values = seen.sight.projection.layers(*parts, mi.Spectrum(1)).channels()

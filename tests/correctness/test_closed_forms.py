@@ -1,4 +1,7 @@
-"""Cache and image against closed forms and published tables; no reference was rendered."""
+"""Cache and image against closed forms and published tables; no reference was rendered.
+
+`correctness.md` is docs/correctness.md.
+"""
 
 from __future__ import annotations
 

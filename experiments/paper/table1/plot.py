@@ -1,10 +1,11 @@
 """Writes table 1 from what run.py left: output/table1/table1.txt.
 
-python -m experiments.paper.table1.plot [--full]
+python -m experiments.paper.table1.plot [--full] [--document docs/validation.md]
 """
 
 from __future__ import annotations
 
+from experiments.support.documents import replace_tables
 from experiments.support.options import Options, parse
 from experiments.support.store import read_json
 from mitsuba_irrcache.compare.report import Section
@@ -19,6 +20,8 @@ def plot(options: Options) -> Section:
     text = "\n\n".join(f"{table.as_text()}\n  {table.note}" for table in tables)
     (folder / "table1.txt").write_text(text + "\n")
     print(text)
+    if options.document:
+        replace_tables(options.document, {"paper-table-1": tables[0]})
     return Section("Table 1: time to convergence", tables)
 
 
@@ -72,4 +75,4 @@ def _times(ratio: float | None, how: str = "") -> str:
 
 
 if __name__ == "__main__":
-    plot(parse(__doc__))
+    plot(parse(__doc__, documented=True))

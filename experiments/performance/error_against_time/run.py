@@ -39,7 +39,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from experiments.support.documents import replace_tables
 from experiments.support.methods import specify
+from experiments.support.options import add_document
 from experiments.support.scenes import available, scene_file
 from experiments.support.store import Store
 from mitsuba_irrcache.compare import metrics
@@ -138,6 +140,7 @@ def main() -> None:
     parser.add_argument("--steps", nargs="+", type=float, default=STEPS, help="likewise")
     parser.add_argument("-o", "--output", type=Path, default=Path("output"))
     parser.add_argument("--force", action="store_true", help="measure irrcache again")
+    add_document(parser)
     args = parser.parse_args()
 
     require_llvm()
@@ -161,6 +164,9 @@ def main() -> None:
             print(table(cases[-1:]).as_text(), flush=True)
     whole = table(cases)
     print(f"\n{whole.as_text()}\n  {whole.note}\n\n{defaults(cases).as_text()}")
+    if args.document:
+        tables = {"error-against-time": whole, "defaults": defaults(cases)}
+        replace_tables(args.document, tables)
 
 
 def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -> dict:

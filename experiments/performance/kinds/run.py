@@ -26,7 +26,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from experiments.support.options import begin, parser_of
+from experiments.support.documents import replace_tables
+from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import IrrcacheError
@@ -322,6 +323,7 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--budget", type=float, default=240, help="no row is begun later")
     parser.add_argument("--seconds", type=float, default=12, help="of half a reference")
+    add_document(parser)
     args = parser.parse_args()
     begin()
     folder = args.output / "kinds"
@@ -333,7 +335,10 @@ def main() -> None:
             continue
         store.row(name, partial(compute, build, args.seconds))
         print(table({name: store.rows[name]}).as_text(), flush=True)
-    print(table({name: store.rows[name] for name in KINDS if name in store.rows}).as_text())
+    whole = table({name: store.rows[name] for name in KINDS if name in store.rows})
+    print(whole.as_text())
+    if args.document:
+        replace_tables(args.document, {"kinds": whole})
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ MUTANTS = (
     Mutant(
         "a factor 4 pi dropped (projection)",
         "render/raymarch.py",
-        "albedo * phi * dr.inv_four_pi, known",
-        "albedo * phi, known",
+        "albedo * phi * dr.inv_four_pi, extras",
+        "albedo * phi, extras",
         (CLOSED_FORMS,),
     ),
     Mutant(
@@ -154,7 +154,7 @@ MUTANTS = (
     Mutant(
         "the background in front of the medium",
         "render/camera.py",
-        "background = self._left_of(transmittance, ray.d) * background + emitted",
+        "background = self._attenuation(transmittance, ray.d) * background + emitted",
         "background = background + emitted",
         (CLOSED_FORMS,),
     ),
@@ -203,8 +203,8 @@ MUTANTS = (
     Mutant(
         "emitters counted twice: sampled and met (surfaces)",
         "transport/path.py",
-        "share = dr.select(sampled, power_heuristic(pdf, density), 1)",
-        "share = mi.Float(1)",
+        "mis_weight = dr.select(sampled, power_heuristic(pdf, density), 1)",
+        "mis_weight = mi.Float(1)",
         ("tests/system/test_surfaces.py",),
     ),
     Mutant(
@@ -266,8 +266,8 @@ MUTANTS = (
     Mutant(
         "light of narrow lights twice (moments)",
         "cache/angular.py",
-        "light = light - own",
-        "light = light - 0 * own",
+        "radiance = radiance - own",
+        "radiance = radiance - 0 * own",
         (PHASE,),
     ),
     Mutant(
@@ -280,8 +280,8 @@ MUTANTS = (
     Mutant(
         "wide lamps as narrow as points (directional)",
         "cache/angular.py",
-        "left *= ratio",
-        "left *= 1",
+        "attenuation *= ratio",
+        "attenuation *= 1",
         ("tests/unit/cache/test_angular.py",),
     ),
     Mutant(
@@ -322,15 +322,15 @@ MUTANTS = (
     Mutant(
         "interpolated roots do not keep the light",
         "cache/volume.py",
-        "values = conserving(self.grid, values, marked(self.grid, self.active), channels)",
+        "values = conserving(self.grid, values, known, channels, share)",
         "values = values + 0",
         ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "interpolated roots keep half of the light that bends",
         "cache/conservative.py",
-        "bend(spread) / 6",
-        "bend(spread) / 12",
+        "second_difference(smoothed) / 6",
+        "second_difference(smoothed) / 12",
         ("tests/unit/cache/test_conservative.py",),
     ),
     Mutant(

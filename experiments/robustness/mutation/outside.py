@@ -84,8 +84,8 @@ OUTSIDE = (
     Mutant(
         "steps of 64 where little light is left",
         "render/raymarch.py",
-        "dr.select(left > COARSEST * sofar, stride, 4)",
-        "dr.select(left > COARSEST * sofar, stride, 64)",
+        "dr.select(remaining > COARSEST * accumulated, stride, 4)",
+        "dr.select(remaining > COARSEST * accumulated, stride, 64)",
         (SEGMENTS,),
     ),
     Mutant(

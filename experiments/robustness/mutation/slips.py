@@ -253,8 +253,8 @@ SLIPS = (
     Mutant(
         "emission beyond the wall of a macrocell (tracking)",
         "transport/tracking.py",
-        "end = dr.minimum(dr.select(leaves, wall, candidate), shines_to)",
-        "end = dr.minimum(candidate, shines_to)",
+        "end = dr.minimum(dr.select(exits_cell, cell_exit, candidate), emission_far)",
+        "end = dr.minimum(candidate, emission_far)",
         (EMISSION,),
     ),
     Mutant(

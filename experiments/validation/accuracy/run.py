@@ -17,9 +17,12 @@ from pathlib import Path
 import mitsuba as mi
 
 from experiments.support.cached import measure
+from experiments.support.documents import replace_tables
+from experiments.support.options import add_document
 from experiments.support.scenes import SOURCES, scene_file
 from experiments.support.store import Store
 from mitsuba_irrcache.compare.reference import reference
+from mitsuba_irrcache.compare.tables import Table, percent
 from mitsuba_irrcache.machine.llvm import require_llvm
 
 SCENES = ["phantom", "cloud", "head"]
@@ -37,12 +40,13 @@ def main() -> None:
     parser.add_argument("--reference-spp", type=int, default=256, help="per half")
     parser.add_argument("--output", type=Path, default=Path("output/accuracy"))
     parser.add_argument("--force", action="store_true", help="compute all rows again")
+    add_document(parser)
     args = parser.parse_args()
 
     require_llvm()
     mi.set_variant("llvm_ad_rgb")
     args.output.mkdir(parents=True, exist_ok=True)
-    store = Store(args.output / "results.json", args.force)
+    store, rows = Store(args.output / "results.json", args.force), []
     for name in args.scenes:
         path = scene_file(name, args.output)
         if path is None:
@@ -54,6 +58,21 @@ def main() -> None:
                 )
                 row = store.row(key, partial(compute, path, depth, resolution, args))
                 print_row(name, depth, resolution, row)
+                rows.append((name, depth, resolution, row))
+    if args.document:
+        replace_tables(args.document, {"accuracy": table(rows)})
+
+
+def table(rows: list[tuple[str, int, int, dict[str, float]]]) -> Table:
+    """All rows: the scene, its depth, voxels of the cache (0: chosen), and errors."""
+    head = ["scene", "depth", "cache voxels", "mean error", "RMSE", "of it noise"]
+    head += ["of it discretisation"]
+    cells = [
+        [name, str(depth), str(resolution or "chosen"), f"{row['mean_error']:+.2%}"]
+        + [percent(row[key]) for key in ("net_rmse", "noise", "discretisation")]
+        for name, depth, resolution, row in rows
+    ]
+    return Table("Errors in units of the mean radiance", head, cells)
 
 
 def compute(path: Path, depth: int, resolution: int, args: argparse.Namespace) -> dict[str, float]:

@@ -20,9 +20,10 @@ and, in brackets, of that of the volume alone: of the image without the
 unscattered radiance (volpath at depth 1). A scene *disagrees* if one of these, in both
 renderings, is beyond three standard errors (4.5 for the worst of 64 blocks) and beyond LIMITS.
 
-Rows are saved in output/random_scenes/<seed>.json, images as .npz files; no scene is started
-after ``--budget`` seconds: run it again for the others, and with more ``--seconds`` for those that
-are undecided.
+Rows are stored in output/random_scenes/<seed>.json, images and references as .npz files;
+``--force`` discards the rows and renders with irrcache again, against the stored references. No
+scene is started after ``--budget`` seconds: run it again for the others, and with more
+``--seconds`` for those that are undecided.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def compute(case: RandomScene, seconds: float, folder: Path) -> dict:
     ours = ours_of(case, folder)
     if "failed" in ours:
         return row | ours
-    reference = reference_of(case, seconds, folder)
+    reference = stored_reference(case, seconds, folder)
     images = {name: reference.pop(name) for name in ("a", "b", "unscattered")}
     images |= {name: ours.pop(name) for name in ("x", "y")}
     np.savez_compressed(folder / f"{case.seed}-{case.index}.npz", **images)
@@ -120,6 +121,19 @@ def reference_of(case: RandomScene, seconds: float, folder: Path) -> dict:
     )
     unscattered = picture(load(case, judge, folder, max_depth=1), 256, 7)
     return {"a": a, "b": b, "unscattered": unscattered, "judge": judge, "spp": 2 * spp * count}
+
+
+def stored_reference(case: RandomScene, seconds: float, folder: Path) -> dict:
+    """Return `reference_of`, from its file if that is of the same scene and ``seconds``."""
+    file, drawn = folder / f"{case.seed}-{case.index}-reference.npz", json.dumps(case.as_dict())
+    if file.exists():
+        with np.load(file) as stored:
+            if str(stored["drawn"]) == drawn and stored["seconds"] >= seconds:
+                found = {name: stored[name] for name in ("a", "b", "unscattered")}
+                return found | {"judge": str(stored["judge"]), "spp": int(stored["spp"])}
+    found = reference_of(case, seconds, folder)
+    np.savez_compressed(file, drawn=drawn, seconds=seconds, **found)
+    return found
 
 
 def pilot(scene: mi.Scene) -> tuple[float, float, float]:

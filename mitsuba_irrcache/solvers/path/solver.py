@@ -283,6 +283,7 @@ def _estimate(
     """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over
     directions.
     """
+    # docs/primer, eq. (3.1)
     rng, spread = _random_numbers(batch, within, voxel, seed)
     always = mi.Bool(True)
     uncollided, rng = direct_light(

@@ -66,7 +66,7 @@ class SurfaceBoundary:
     @property
     def shines(self) -> bool:
         """Whether lines meet light by chance."""
-        return bool(self.lamps) or self.others.shines
+        return bool(self.lamps) or self.others.is_emissive
 
 
 class IncomingRadiance:
@@ -287,6 +287,7 @@ class ReflectedBoundarySource(BoundarySource):
 
     def receive(self, phi: mi.Float | None) -> None:
         """Where the mean irradiance of collisions is ``phi`` (None: 0)."""
+        # docs/primer, eq. (4.13)
         light = dr.zeros(mi.Float, dr.width(self._source))
         if phi is not None:
             light = self._returned * self._level.seen(phi, self._source, self._heading)

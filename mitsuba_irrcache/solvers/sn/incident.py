@@ -134,6 +134,7 @@ class DistantIllumination:
         environment that varies, and the light along all. One may come from either, and as the
         opposite of one: what it stands for is one over the density of all ways to get it.
         """
+        # docs/primer, eq. (4.2)
         rows = []
         chosen = self._bright(len(even), count, rng)
         for (plain, weights), bright in zip(even, chosen, strict=True):

@@ -261,6 +261,7 @@ def _passed(since, before, here, scale) -> mi.Float:
     """Transmittance from the slice before: half of it and half of this one, or what of this one
     lies behind the entry.
     """
+    # docs/primer, eq. (4.4)
     return decay(dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
 
 
@@ -270,6 +271,7 @@ def _crossed(L: list, source: list, first, second, since, count, area) -> tuple[
 
     A line stands for an ``area`` across it that is the less the longer it stays in a voxel.
     """
+    # docs/primer, eqs. (4.6), (4.7)
     to_middle = dr.select(since < 1, since, 0.5) * first
     tau = dr.fma(second, 0.5, to_middle)
     passed = decay(tau)

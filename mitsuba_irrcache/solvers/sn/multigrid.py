@@ -152,6 +152,7 @@ class MultigridLevel:
 
         ``phi``, such a mean, may be None for 0.
         """
+        # docs/primer, eq. (4.8)
         lattice = self.lattice
         place, channel = voxels_of(lattice.count, self.channels)
         slot = dr.gather(mi.UInt32, lattice.wanted, place) * self.channels + channel
@@ -223,6 +224,7 @@ class MultigridLevel:
         """Solves phi = A phi + b for ``rows`` and ``returning`` as of `tables`, ``tolerance`` times
         as exactly as is promised.
         """
+        # docs/primer, eq. (4.9)
         tables = self.tables(rows, returning)
         phi = self._guess(b, tables)
         change, light = np.inf, self._sums(dr.abs(b)).max() > 0
@@ -270,6 +272,7 @@ class MultigridLevel:
         """What a sweep has made of ``phi``, the errors that are left of which are found on the
         coarser level, with tables of it and those below; there is none under the coarsest.
         """
+        # docs/primer, eq. (4.10)
         if self.coarsest:
             return swept
         _, again = self.coarser.scatter(self.restrict(swept - phi), coarse[0])

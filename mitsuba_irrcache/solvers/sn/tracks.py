@@ -128,6 +128,7 @@ class Tracks:
             offsets: (n, 2), in [0, 1), random.
             by_slice: whether the volume that lines leave light in is laid out by their slices.
         """
+        # docs/primer, eq. (4.3)
         count = len(directions)
         integers = np.zeros((count, INTEGERS), np.int64)
         numbers = np.zeros((count, NUMBERS), np.float64)
@@ -320,6 +321,7 @@ def sharpened(
     smoothed. Never negative. A voxel may have values of several ``channels``, of which one is
     taken.
     """
+    # docs/primer, eq. (4.5)
     places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
     place = flat(places, strides) + begin
 

@@ -111,8 +111,8 @@ def test_altered_descriptions_are_refused(file, lie):
         ({"batch": 10**6, "correlated": True}, "type|batches"),
         ({"streams": {"0": 10**12}}, "samples"),
         ({"streams": {"-1": 16}}, "samples"),
-        ({"streams": {"0": 8}}, "more light than 1 batch"),
-        ({"streams": {}}, "more light than 0 batch"),
+        ({"streams": {"0": 8}}, "non-zero sums, but only 1 batch"),
+        ({"streams": {}}, "non-zero sums, but only 0 batch"),
     ],
     ids=str,
 )

@@ -293,7 +293,7 @@ def test_vol_is_placed_by_its_bounding_box(tmp_path):
         (lambda b: b[:-1], "truncated"),
         (lambda b: b[:20], "truncated"),
         (lambda b: b + b"0", "too long"),
-        (lambda b: b"VOX" + b[3:], "no Mitsuba volume"),
+        (lambda b: b"VOX" + b[3:], "not a Mitsuba volume"),
         (lambda b: b[:3] + b"\x04" + b[4:], "version 4"),
         (lambda b: b[:4] + struct.pack("<i", 2) + b[8:], "encoding 2"),
         (lambda b: b[:20] + struct.pack("<i", 2) + b[24:], "2 channels"),
