@@ -13,7 +13,7 @@ from mitsuba_irrcache.compare.tables import Table, seconds
 
 
 def plot(options: Options) -> Section:
-    """Two tables: the paper's criterion, and equal error."""
+    """Write two tables: the paper's criterion, and equal error."""
     folder = options.folder("table1")
     results = read_json(folder / "results.json")
     tables = [converged(results), equal_error(results)]
@@ -26,7 +26,7 @@ def plot(options: Options) -> Section:
 
 
 def converged(results: dict) -> Table:
-    """Seconds until the image is that of the horizon, beside the paper's."""
+    """Tabulate the seconds until the image equals that of the horizon, and those of the paper."""
     rows = [
         [label, _time(row), _times(row["speed_up"], row["how"]),
          f"{row['paper_seconds']:.2f} s" if row["paper_seconds"] else "—",
@@ -46,7 +46,7 @@ def converged(results: dict) -> Table:
 
 
 def equal_error(results: dict) -> Table:
-    """Seconds to errors against the independent reference, with speed-ups."""
+    """Tabulate seconds to errors against the independent reference, with speed-ups."""
     labels = list(results["converged"])
     rows = [
         [level, *(_with_speed_up(row[label]) for label in labels)]

@@ -1,6 +1,4 @@
-"""Faults as they are made: each a line of the library that is wrong in one place, with the tests
-that should say so.
-"""
+"""Typical faults: each changes one line of the library, and lists the tests that should fail."""
 
 from __future__ import annotations
 
@@ -8,16 +6,16 @@ from dataclasses import dataclass
 
 CLOSED_FORMS = "tests/correctness/test_closed_forms.py"
 SWEEP = "tests/system/test_sweep.py"
-UNBIASED = "tests/system/test_unbiased.py"
+UNBIASED = "tests/system/test_path_is_unbiased.py"
 PROJECTION = "tests/unit/render/test_raymarch.py"
 CACHE = "tests/unit/cache/test_volume.py"
 MOMENTS = "tests/unit/solvers/sn/test_moments.py"
-PHASE = "tests/system/test_phase.py"
+PHASE = "tests/system/test_anisotropic_scattering.py"
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """``old``, which occurs once in ``file`` (of mitsuba_irrcache), is replaced by ``new``."""
+    """Replace ``old``, which occurs once in ``file`` (of mitsuba_irrcache), by ``new``."""
 
     name: str
     file: str
@@ -214,7 +212,7 @@ MUTANTS = (
         "media/phase.py",
         "found.p, found.wi = p, -direction",
         "found.p, found.wi = p, direction",
-        ("tests/system/test_phase.py",),
+        ("tests/system/test_anisotropic_scattering.py",),
     ),
     Mutant(
         "standard errors of samples, not of batches",
@@ -249,7 +247,7 @@ MUTANTS = (
         "solvers/sn/solver.py",
         "else irradiance[channel] * self._spread",
         "else irradiance[channel]",
-        ("tests/system/test_lamps.py",),
+        ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "light from the opposite side (moments)",
@@ -327,7 +325,7 @@ MUTANTS = (
         "cache/volume.py",
         "values = conserving(self.grid, values, known, channels, share)",
         "values = values + 0",
-        ("tests/system/test_lamps.py",),
+        ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "interpolated roots keep half of the light that bends",

@@ -1,13 +1,13 @@
-"""Mutants that people made who had not seen the tests, and that no test of the time detected."""
+"""Mutants by people who had not seen the tests, and that no test detected at that time."""
 
 from __future__ import annotations
 
 from experiments.robustness.mutation.mutants import Mutant
 
-NEIGHBOURS = "tests/unit/cache/test_conservative_at_every_voxel.py"
+NEIGHBOURS = "tests/unit/cache/test_conservative_symmetry_and_borders.py"
 FILTER = "tests/unit/render/test_denoise_symmetry_and_rejection.py"
 ERRORS = "tests/unit/cache/test_uncertainty_of_lookups.py"
-SIMILARITY = "tests/unit/media/test_delta_m_narrow_lights.py"
+SIMILARITY = "tests/unit/media/test_delta_m_narrow_emitters.py"
 SEGMENTS = "tests/unit/render/test_raymarch_segments.py"
 
 OUTSIDE = (

@@ -1,12 +1,11 @@
-"""How far ``irrcache`` is from volpath: bias, RMSE, and what of it is noise and what
-discretisation.
+"""Errors of ``irrcache`` against volpath: bias and RMSE, split into noise and discretisation.
 
     python -m experiments.validation.accuracy.run [--scenes phantom cloud head] [--depths 2 -1]
         [--force]
 
-For every scene, depth and cache resolution two caches of different seeds are built: what their
-images share is discretisation, what they do not is noise. Prints a table and writes
-output/accuracy/results.json; finished rows are kept.
+For every scene, depth and cache resolution two caches of different seeds are built: the common part
+of their images' errors is discretisation, the rest is noise. Prints a table and writes
+output/accuracy/results.json; finished rows are saved.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ REFERENCE = {2: "volpath{rr_depth=1000}", -1: "volpath{rr_depth=20}"}
 
 
 def main() -> None:
-    """Computes the rows that are missing and prints all."""
+    """Compute missing rows and print all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="+", default=SCENES, choices=list(SOURCES))
     parser.add_argument("--depths", nargs="+", type=int, default=[2, -1])
@@ -77,7 +76,7 @@ def table(rows: list[tuple[str, int, int, dict[str, float]]]) -> Table:
 
 
 def compute(path: Path, depth: int, resolution: int, args: argparse.Namespace) -> dict[str, float]:
-    """One row, with the reference that it needs."""
+    """Compute one row, with the reference that it needs."""
     parameters = {"max_depth": str(depth), "width": str(args.size), "height": str(args.size)}
     truth = reference(
         path, parameters, REFERENCE[depth], args.output / "references", args.reference_spp
@@ -86,7 +85,7 @@ def compute(path: Path, depth: int, resolution: int, args: argparse.Namespace) -
 
 
 def print_row(name: str, depth: int, resolution: int, row: dict[str, float]) -> None:
-    """One line of the table; the heading goes with it, so that every line can be read alone."""
+    """Print one row of the table, with its headings, so that every line is self-contained."""
     print(
         f"{name:8} depth {depth:2} cache {resolution:3}: mean error {row['mean_error']:+.2%}  "
         f"RMSE {row['net_rmse']:.2%} (noise {row['noise']:.2%}, discretisation "

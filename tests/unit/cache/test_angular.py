@@ -1,4 +1,4 @@
-"""Phase functions by their moments, and light by its direction."""
+"""Phase functions and their angular moments, and radiance by direction."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_moments(scenes, phase, moments, order):
 
 
 @pytest.mark.parametrize("phase", [{"type": "isotropic"}, hg(0.0)])
-def test_isotropic_ones_have_none(scenes, phase):
+def test_isotropic_phase_functions_have_no_moments(scenes, phase):
     assert compile_scene(scene_of(scenes, phase)).visible[0].phase.is_isotropic
 
 
@@ -57,7 +57,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("phase", "message"), REFUSED.values(), ids=REFUSED)
-def test_others_are_refused(scenes, phase, message):
+def test_unsupported_phase_functions_are_refused(scenes, phase, message):
     if "S" in phase:
         values = np.tile(np.float32([0.1, 0.1, 1, 0, 0, 0]), (2, 2, 2, 1))
         phase["S"] = {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True}
@@ -83,9 +83,10 @@ LIGHTS = {
 
 @pytest.mark.parametrize(("objects", "tolerance"), LIGHTS.values(), ids=LIGHTS)
 @pytest.mark.parametrize("g", [0.5, -0.3])
-def test_scattered_light_of_one_place(scenes, objects, tolerance, g):
-    """From the moments, and from all directions one by one: relative to the mean, 4 pi p weighted
-    with the same samples.
+def test_scattered_radiance_from_moments_and_from_directions(scenes, objects, tolerance, g):
+    """Scattered radiance from moments agrees with the sum over directions.
+
+    The sum weights the same samples by 4 pi p; the difference is relative to the mean.
     """
     if isinstance(objects.get("emitter"), float):
         objects = objects | {"emitter": lamp(objects["emitter"])}

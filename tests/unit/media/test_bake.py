@@ -1,4 +1,4 @@
-"""Baking: the medium's own values and extent, exactly, and refusal of what cannot be right."""
+"""Baking a medium: exact coefficients and extent, and refusal of invalid media."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ def mitsubas(medium: dict, p: mi.Point3f) -> tuple[np.ndarray, np.ndarray]:
 )
 @pytest.mark.parametrize("channels", [1, 3])
 def test_coefficients_are_mitsubas(scenes, placement, channels):
-    """sigma_t and sigma_s inside, with a scale, in grids of different sizes; the placement of a
-    turned grid is known to 1e-6 of its size.
+    """Baked sigma_t and sigma_s equal Mitsuba's, for scaled media and grids of different sizes.
+
+    The placement of a rotated grid is known to 1e-6 of its size.
     """
     to_world = scenes.placement(**placement)
     sigma_t = scenes.texture((4, 5, 6, channels), 0, 3, 1)
@@ -49,7 +50,7 @@ def test_coefficients_are_mitsubas(scenes, placement, channels):
 
 
 def test_data_are_not_copied(scenes):
-    """The baked field reads the medium's own array: no second copy of a large volume."""
+    """The baked field shares the array of the medium, without a copy of a large volume."""
     medium = scenes.medium(scenes.texture((4, 5, 6), 0, 3, 1), 0.5, scenes.placement(), scale=2.0)
     scene = scenes.load({"type": "volpath"}, scenes.boundary(medium))
     params = mi.traverse(scene)
@@ -65,8 +66,8 @@ def test_homogeneous(scenes, values):
     assert grid.macrocells.count == 1
 
 
-def test_extent_is_the_worlds_box_of_the_grid(scenes):
-    """A grid inside its boundary ends the medium; one around it does not."""
+def test_extent_is_the_world_bounding_box_of_the_grid(scenes):
+    """A grid smaller than the boundary limits the medium; a larger one does not."""
     inner = baked(scenes, scenes.medium(np.ones((2, 2, 2)), 0.5, scenes.placement((1.0, 1.2, 1.4))))
     np.testing.assert_allclose(np.abs(inner.bbox), [[0.5, 0.6, 0.7]] * 2, rtol=1e-6)
     ray = mi.Ray3f(mi.Point3f(-5, 0, 0), mi.Vector3f(1, 0, 0))
@@ -89,7 +90,7 @@ BAD = {
 
 @pytest.mark.parametrize(("change", "message"), BAD.values(), ids=BAD)
 def test_impossible_values_are_refused(scenes, change, message):
-    """The message names the medium's parameter, where the value is, and what it is."""
+    """Invalid values are refused with the parameter, the position and the value."""
     fields = {name: np.full((2, 3, 2), 0.5, np.float32) for name in ("sigma_t", "albedo")}
     for name in fields.keys() & change.keys():
         fields[name][1, 0, 1] = change[name]
@@ -119,7 +120,7 @@ def test_other_media_are_refused(scenes, kind, message):
 
 
 def test_mono_takes_the_luminance(mono, scenes):
-    """As Mitsuba does for RGB data in a mono variant."""
+    """In a mono variant the luminance of RGB data is used, as in Mitsuba."""
     sigma_t = scenes.texture((3, 3, 3, 3), 0, 2, 4)
     medium = scenes.medium(sigma_t, 0.5, scenes.placement())
     grid = baked(scenes, medium)

@@ -1,4 +1,4 @@
-"""Defaults of the cache: voxels, and directions."""
+"""Defaults for parameters that the user left unset: resolution of the cache, and directions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def medium(values: np.ndarray, edges=(1.0, 1.0, 1.0)) -> MediumGrid:
-    """A medium of these extinctions (z, y, x) in a box of these edges (x, y, z)."""
+    """Return a medium of these extinctions (z, y, x) in a box of these edges (x, y, z)."""
     frame = np.diag([*edges, 1.0])
     field = GridField(Grid(values.shape, frame), mi.Float(values.astype(np.float32).ravel()), 1)
     unit = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]])
@@ -32,33 +32,36 @@ def chosen(values: np.ndarray, edges=(1.0, 1.0, 1.0), solver="sweep") -> tuple[i
 
 
 def in_air(count: int, sigma_t: float) -> np.ndarray:
-    """A cube of matter with some empty voxels around it, which the boundary does not cut."""
+    """Return a cube of medium surrounded by empty voxels, so that the boundary does not cut it."""
     values = np.zeros((count, count, count))
     inner = slice(count // 8, -(count // 8))
     values[inner, inner, inner] = sigma_t
     return values
 
 
-def test_thin_data_keep_their_voxels():
-    assert chosen(in_air(40, 2.0)) == (40, 40, 40)  # 0.05 per voxel
+def test_thin_media_use_the_resolution_of_the_data():
+    assert chosen(in_air(40, 2.0)) == (40, 40, 40)  # optical depth per voxel
     assert chosen(np.zeros((40, 48, 56))) == (40, 48, 56)
     assert chosen(np.full((40, 48, 56), 1.0)) == (40, 48, 56)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (4, 6, 8)])
-def test_few_data_get_more_voxels(shape):
-    """Light has detail that few data lack; so many voxels cost next to nothing."""
+def test_small_grids_get_more_voxels(shape):
+    """Small grids get more voxels: irradiance has more detail than the data, at a negligible
+    cost.
+    """
     assert chosen(np.full(shape, 1.0)) == (32, 32, 32)
     assert chosen(np.full(shape, 1.0), (1.0, 0.5, 0.25)) == (max(8, shape[0]), 16, 32)
 
 
-def test_dense_data_get_finer_voxels_where_it_counts():
-    """Along each axis as far as its optical depth asks for, at most six times; ``path``, whose
-    noise is larger than that error, does not.
+def test_dense_grids_are_refined_by_optical_depth():
+    """Dense grids are refined per axis by the optical depth, by a factor of six at most.
+
+    For ``path`` they are not, since its noise exceeds the discretisation error.
     """
     thin, dense, opaque = (chosen(in_air(40, 40 * depth)) for depth in (0.1, 1.0, 1000.0))
     assert thin == (40, 40, 40)
-    assert dense == (64, 64, 64)  # 1 / 0.7 for each of the data would be 57
+    assert dense == (64, 64, 64)  # 1 / 0.7 for each data voxel would be 57
     assert chosen(in_air(40, 48.0)) == (68, 68, 68)
     assert chosen(in_air(40, 40.0 * 1.2 * 4)) == (127, 127, 127)  # 4^0.45 times as many
     assert opaque == (200, 200, 200)
@@ -68,8 +71,8 @@ def test_dense_data_get_finer_voxels_where_it_counts():
     assert chosen(np.full((1, 1, 1), 1.0), solver="path") == (16, 16, 16)
 
 
-def test_contrast_and_a_cut_boundary_ask_for_voxels():
-    """Five per mean free path where light collides, up to 64; up to 128 at the boundary."""
+def test_contrast_and_a_cut_boundary_need_more_voxels():
+    """High contrast requires five voxels per mean free path, up to 64; a cut boundary up to 128."""
     speck = np.zeros((4, 4, 4))
     speck[1:3, 1:3, 1:3] = 8.0
     assert chosen(speck) == (40, 40, 40)
@@ -78,8 +81,8 @@ def test_contrast_and_a_cut_boundary_ask_for_voxels():
     assert chosen(np.full((4, 4, 4), 500.0)) == (128, 128, 128)
 
 
-def test_homogeneous_media_get_what_their_data_would():
-    """A homogeneous medium, and the same matter on a grid."""
+def test_homogeneous_media_get_the_resolution_of_an_equal_grid():
+    """A homogeneous medium gets the resolution of the same medium on a grid."""
     rule = solver_named("sweep").size_rule
     for sigma_t in (0.5, 10.0, 1000.0):
         grid = medium(np.full((4, 4, 4), sigma_t))
@@ -88,8 +91,10 @@ def test_homogeneous_media_get_what_their_data_would():
         assert shapes[0] == shapes[1]
 
 
-def test_a_little_bone_in_much_air():
-    """What counts is the matter where light collides, not the mean of the volume."""
+def test_resolution_depends_on_where_collisions_happen():
+    """The resolution depends on the extinction where collisions happen, not on the volume's
+    mean.
+    """
     values = np.full((40, 40, 40), 0.01)
     values[16:24, 16:24, 16:24] = 40.0
     assert chosen(values) == (64, 64, 64)
@@ -107,13 +112,14 @@ def test_finer_voxels_have_a_limit(monkeypatch):
     [(1, 32), (32, 32), (33, 64), (96, 96), (128, 128), (256, 256), (257, 160), (1000, 256)],
 )
 def test_size_of_batches(samples, batch):
-    """All that is wanted, or equal parts of up to 256 directions."""
+    """A batch holds all directions, or equal parts of up to 256."""
     assert sn_solver.batch_of(samples, sn_solver.BATCH) == batch
 
 
 def test_directions_by_default(scenes):
-    """128 in one batch, twice as many for single scattering; in two where an error is wanted; those
-    asked for later count.
+    """The default is 128 directions in one batch, twice as many for single scattering.
+
+    If an error estimate is required, there are two batches; directions requested later count.
     """
     shape = scenes.boundary(scenes.medium(scenes.texture((4, 4, 4), 0.5, 3.0, 1), 0.9))
     for wanted, asked, expected in (

@@ -1,4 +1,4 @@
-"""What passes between two places in one medium: matter behind the second is not in the way."""
+"""Transmittance between two points in one medium; the medium behind the second is ignored."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.mark.parametrize("varies", [False, True])
 def test_transmittance_between_two_places(scenes, varies):
-    """e^-tau of the way between them, in a box that goes on behind both; of a grid on average over
-    estimates, to 4 standard errors.
+    """The transmittance is e^-tau of the segment between the points.
+
+    The medium continues behind both; for a grid the mean of estimates agrees to 4 standard errors.
     """
     count, place = 1 << 14, scenes.placement()
     density = 1.5 * np.ones((4, 4, 8), np.float32)
-    density[..., 4:] = 0.5  # beyond x = 0, linear in between over a quarter
+    density[..., 4:] = 0.5  # for x > 0, linear in between over a quarter
     shape = scenes.boundary(scenes.medium(density if varies else 1.1, 0.5, place), place)
     beside = {"type": "sphere", "center": [0, 4, 0]}
     scene = scenes.load({"type": "volpath"}, shape, 2, beside=beside)

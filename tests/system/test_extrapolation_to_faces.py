@@ -1,4 +1,4 @@
-"""Dense matter that the boundary cuts: its light falls off within less than a voxel."""
+"""Dense media cut by their boundary: the irradiance decays within less than a voxel."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.usefixtures("mono")
 
 
 def cube(sigma_t: float, integrator: dict) -> mi.Scene:
-    """A homogeneous cube of edge 1 seen from a corner under a white sky that is hidden."""
+    """Return a homogeneous cube of edge 1 seen from a corner, under a hidden white sky."""
     view = mi.ScalarTransform4f().look_at([2, 1.7, 2.2], [0.5, 0.5, 0.5], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 32, "height": 32, "pixel_format": "luminance"}
     return mi.load_dict(
@@ -32,9 +32,11 @@ def cube(sigma_t: float, integrator: dict) -> mi.Scene:
 
 
 @pytest.mark.parametrize(("depth", "mean_error", "rmse"), [(0.16, 0.01, 0.06), (0.62, 0.05, 0.11)])
-def test_light_is_extrapolated_to_the_faces(depth, mean_error, rmse):
-    """``depth`` is the optical depth of a cache voxel. Clamped beyond the outermost voxel centres,
-    as it once was, the image was 2 and 20 % too dark, with an RMSE of 5 and 30 %.
+def test_irradiance_is_extrapolated_to_the_faces(depth, mean_error, rmse):
+    """The irradiance is extrapolated from the outermost voxel centres to the faces.
+
+    ``depth`` is the optical depth of a cache voxel. When the irradiance was clamped there, the
+    image was 2 and 20 % too dark, with an RMSE of 5 and 30 %.
     """
     sigma_t = 32 * depth
     a, b = (

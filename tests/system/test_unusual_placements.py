@@ -1,4 +1,4 @@
-"""Odd placements of boundaries and emitters against ``volpath``, and what is said of refusals."""
+"""Unusual placements of boundaries and emitters against ``volpath``, and the errors for others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHEAR = np.eye(4) + 0.5 * np.eye(4)[:, [0]] @ np.eye(4)[[1]]
 
 
 def difference(scenes, shape: dict, solver: str = "sweep", **objects) -> float:
-    """Difference of the mean radiance from volpath's, relative; single scattering."""
+    """Return the relative difference of the mean radiance from volpath's; single scattering."""
     ours = {"type": "irrcache", "solver": solver, "resolution": 20, "cache_spp": 256} | ONCE
     mine = scenes.image(
         scenes.load(ours, shape, 16, **objects, default_solver="path"), spp=64
@@ -27,7 +27,7 @@ def difference(scenes, shape: dict, solver: str = "sweep", **objects) -> float:
 
 
 def dark(place: np.ndarray, scenes, **more) -> dict:
-    """A dark sphere: what it hides of the sky tells its size."""
+    """Return an absorbing sphere: the share of the sky that it covers depends on its size."""
     shape = scenes.boundary(scenes.medium(1.5, 0.3))
     place = mi.ScalarTransform4f(place)
     return shape | {"type": "sphere", "to_world": place} | more
@@ -42,8 +42,11 @@ SPHERES = {
 
 
 @pytest.mark.parametrize("place", SPHERES.values(), ids=SPHERES)
-def test_spheres_are_round_whatever_their_placement(scenes, place):
-    """Taken for ellipsoids, they would hide more or less of the sky: by 2 to 30 %."""
+def test_spheres_are_round_for_every_placement(scenes, place):
+    """Spheres with any accepted placement are rendered as spheres.
+
+    As ellipsoids they would cover more or less of the sky, by 2 to 30 %.
+    """
     assert abs(difference(scenes, dark(place, scenes))) < 0.004
 
 
@@ -52,7 +55,7 @@ MIRRORS = {"x": (-1, 1, 1), "y": (1, -1, 1), "all": (-1, -1, -1)}
 
 @pytest.mark.parametrize("mirror", MIRRORS.values(), ids=MIRRORS)
 def test_mirrored_environments(scenes, mirror):
-    """With a bright texel, whose wrong place would be seen."""
+    """Mirrored environment maps have their bright texel in the right direction."""
     texels = np.random.default_rng(1).uniform(0.2, 1.0, (5, 7, 3)).astype(np.float32)
     texels[1, 2] = 20.0
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], 40).scale(list(mirror))
@@ -90,8 +93,11 @@ def test_scaled_emitters_far_away_are_refused(scenes, kind, place, solver):
 
 
 @pytest.mark.parametrize("place", [np.diag([0.2, 0.5, 1, 1]), SHEAR], ids=["uneven", "sheared"])
-def test_cylinders_that_shine_are_round(scenes, place):
-    """Mitsuba's samples of others have two thirds of the light that rays find."""
+def test_emissive_cylinders_are_round(scenes, place):
+    """Emissive cylinders that are not round are refused.
+
+    Mitsuba's emitter sampling of them gives two thirds of the radiance that rays find.
+    """
     lamp = {"type": "cylinder", "to_world": mi.ScalarTransform4f().translate([0, 3, 0])}
     lamp["emitter"] = {"type": "area", "radiance": 2.0}
     shape = scenes.boundary(scenes.medium(1.0, 0.8))
@@ -103,7 +109,7 @@ def test_cylinders_that_shine_are_round(scenes, place):
 
 
 def box_without_a_face() -> mi.Mesh:
-    """With all eight corners."""
+    """Return a box that lacks a face but has all eight corners."""
     params = mi.traverse(mi.load_dict({"type": "cube"}))
     vertices, faces = (np.array(params[k]) for k in ("vertex_positions", "faces"))
     properties = mi.Properties()
@@ -124,14 +130,17 @@ ALONE = {"box without a face": lambda scenes: box_without_a_face(), "rectangle":
 
 
 @pytest.mark.parametrize("build", ALONE.values(), ids=ALONE)
-def test_open_boundaries_that_are_alone_are_refused(scenes, build):
+def test_open_boundaries_are_refused(scenes, build):
     scene = scenes.load({"type": "irrcache", "solver": "auto"}, build(scenes), 4)
     with pytest.raises(RuntimeError, match="not closed"):
         mi.render(scene, spp=1)
 
 
-def test_a_null_shape_at_the_centre_is_no_face_of_the_boundary(scenes):
-    """A cube with a null sphere in its middle is accepted, and refused if it is mirrored."""
+def test_null_shape_at_the_centre_is_not_part_of_the_boundary(scenes):
+    """A null sphere in the middle of a cube does not change which boundaries are accepted.
+
+    The cube is accepted, and refused if it is mirrored.
+    """
     ball = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "null"}}
     shape = scenes.boundary(scenes.medium(1.0, 0.8))
     settings = {"type": "irrcache", "solver": "auto", "resolution": 8, "cache_spp": 32}
@@ -142,9 +151,11 @@ def test_a_null_shape_at_the_centre_is_no_face_of_the_boundary(scenes):
 
 
 @pytest.mark.parametrize("depth", [2, -1])
-def test_a_hole_in_a_medium_is_not_swept_as_if_it_was_full(scenes, depth):
-    """A null shape that has the medium as its exterior only: within, there is none. Swept, the mean
-    is 0.3 to 1 % too small.
+def test_medium_with_a_hole_is_not_solved_by_sweep(scenes, depth):
+    """A medium with a hole is not solved by ``sweep`` as if it had none.
+
+    The hole is a null shape that has the medium only as its exterior. By ``sweep`` the mean would
+    be 0.3 to 1 % too small.
     """
     fog = {"type": "ref", "id": "fog"}
     hole = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "null"}, "exterior": fog}
@@ -167,8 +178,11 @@ def test_a_hole_in_a_medium_is_not_swept_as_if_it_was_full(scenes, depth):
     assert images[0] / images[1] == pytest.approx(1, abs=0.002)
 
 
-def test_media_that_reach_to_infinity_are_refused(scenes):
-    """A grid that is the exterior of a shape only: volpath shows no light that leaves it so."""
+def test_unbounded_media_are_refused(scenes):
+    """A grid medium that is only the exterior of a shape is refused.
+
+    volpath shows no radiance that leaves such a medium.
+    """
     smoke = scenes.medium(scenes.texture((4, 4, 4), 0.5, 1.0, 1), 0.8, scenes.placement())
     fog = {"type": "ref", "id": "smoke"}
     hole = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "null"}, "exterior": fog}
@@ -179,8 +193,8 @@ def test_media_that_reach_to_infinity_are_refused(scenes):
 
 
 @pytest.mark.parametrize("wrapper", [None, "aov", "moment"])
-def test_errors_say_what_went_wrong(scenes, wrapper):
-    """The message of what ``mi.render`` raises is the cause, and not that there is one above."""
+def test_messages_contain_the_cause(scenes, wrapper):
+    """The message of mi.render's exception is the cause itself."""
     shape = scenes.boundary(scenes.medium(1.0, 0.8)) | {"flip_normals": True}
     integrator = {"type": "irrcache"}
     if wrapper:
@@ -193,8 +207,8 @@ def test_errors_say_what_went_wrong(scenes, wrapper):
     assert "see above" not in str(caught.value)
 
 
-def test_the_exterior_of_walls_needs_a_shape_to_fill(scenes):
-    """The medium, a wall and the remedy are named."""
+def test_exterior_media_of_walls_need_a_shape_to_fill(scenes):
+    """An opaque shape's exterior medium that fills no shape is refused with the remedy."""
     walls, fog = {"fog": {"type": "homogeneous"}}, {"type": "ref", "id": "fog"}
     for name, turn in (("floor", -90), ("ceiling", 90)):
         place = mi.ScalarTransform4f().rotate([1, 0, 0], turn).translate([0, 0, -2])
@@ -237,7 +251,10 @@ OUTSIDE = {
 
 @pytest.mark.parametrize("build", OUTSIDE.values(), ids=OUTSIDE)
 def test_sensors_that_are_not_in_their_medium_are_refused(scenes, build):
-    """Also one that was moved out of it since; within it, and on its face, they are accepted."""
+    """A sensor with a medium that does not contain it is refused.
+
+    This includes a sensor that was moved out since; inside and on a face it is accepted.
+    """
     medium, more = build(scenes)
     fog = {"type": "ref", "id": "fog"}
     shape = scenes.boundary(medium) | {"interior": fog}
@@ -269,8 +286,11 @@ STOCK = {
 
 
 @pytest.mark.parametrize(("extinction", "expected"), STOCK.values(), ids=STOCK)
-def test_the_cheaper_stock_integrator_stands_in(scenes, tmp_path, extinction, expected):
-    """Its own image, to the bit; and that no cache is used is logged once per scene."""
+def test_cheapest_stock_integrator_replaces_the_cache(scenes, tmp_path, extinction, expected):
+    """If no cache is useful, the image is bit by bit that of the cheapest stock integrator.
+
+    The log says so once per scene.
+    """
     ball = {} if extinction is None else {"ball": glass(extinction)}
     depth = {"max_depth": 4, "rr_depth": 5}
     ours = scenes.load({"type": "irrcache", "solver": "path"} | depth, None, 8, **ball)

@@ -1,6 +1,9 @@
-"""Images converge to the exact ones: coarse grids of high contrast, each kind of emitter and phase
-function, both solvers. The references are those of experiments/validation/limits: quadrature of
-single scattering, and paths of all orders, without any code of irrcache.
+"""Images converge to exact references, for each kind of emitter and phase function and both
+solvers.
+
+The media are coarse grids of high contrast. The references are those of
+experiments/validation/limits: quadrature of single scattering, and paths of all orders, which share
+no code with irrcache.
 """
 
 from __future__ import annotations
@@ -17,15 +20,15 @@ from experiments.validation.limits.reference import orders, single
 pytestmark = pytest.mark.usefixtures("mono")
 
 SPP = 64
-#: Point-like lights, whose light has hardly any noise with ``sweep``.
+#: Delta lights, for which ``sweep`` has hardly any noise.
 POINTS = [
     Case(emitter, phase)
     for phase in ("isotropic", "hg 0.58", "rayleigh")
     for emitter in ("point outside", "point beside", "point inside", "spot wide", "spot narrow")
 ]
 POINTS += [Case("point outside", phase) for phase in ("hg 0.3", "hg -0.4")]
-#: Resolution, samples per voxel, and the largest relative error of the mean: 0.1 % where so many
-#: voxels leave no more, and where the noise of the directions is small enough.
+#: Resolution, samples per voxel, and the largest relative error of the mean: 0.1 % where the
+#: discretisation and the noise of the directions are small enough.
 SWEEP = {
     Case("directional"): (128, 256, 0.001),
     Case("directional", "rayleigh"): (96, 128, 0.003),
@@ -53,20 +56,21 @@ ORDERS = {
 
 @lru_cache
 def exact(case: Case) -> float:
-    """The mean of the image of single scattering."""
+    """Return the mean of the image of single scattering."""
     return single(case, 4, 1 if case.has_direction else 32, 64).mean()
 
 
 def error(case: Case, expected: float, **integrator) -> float:
-    """The relative error of the mean of the image."""
+    """Return the relative error of the mean of the image."""
     image = mi.render(case.scene(**integrator), spp=SPP)
     return float(np.mean(np.array(image)[..., 0], dtype=np.float64) / expected - 1)
 
 
 @pytest.mark.parametrize("case", POINTS, ids=lambda case: case.name)
-def test_sweep_of_point_like_lights(case):
-    """Errors fall with the square of the resolution: what those of two leave in the limit, and at
-    the finer one.
+def test_sweep_of_delta_lights(case):
+    """With delta lights, the error of ``sweep`` decreases with the square of the voxel size.
+
+    Both the extrapolation of two resolutions and the finer one are compared with the reference.
     """
     settings = {"solver": "sweep", "cache_spp": 32}
     coarse, fine = (error(case, exact(case), resolution=n, **settings) for n in (32, 64))
@@ -101,7 +105,7 @@ def test_all_orders(case):
     "case", [Case("directional", "hg 0.58"), Case("constant", "rayleigh", "3x5x2")]
 )
 def test_the_references_agree(case):
-    """Quadrature, and paths that end after their first collision."""
+    """The two references agree: quadrature, and paths that end after their first collision."""
     expected, noise = orders(case, 1 << 20, with_control=False)
     assert noise < 2e-3 * expected, "too noisy to say"
     assert abs(expected - exact(case)) < 3 * noise

@@ -1,4 +1,4 @@
-"""How the light of passes is spread over the directions of a sky, beside how much there is."""
+"""Distribution of directions over an environment map."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def sky_of(scenes, pixels: np.ndarray) -> tuple[DistantIllumination, np.ndarray, np.ndarray]:
-    """A grey sky (row, column), and directions (n, 3) all over the sphere with the radiance that
-    Mitsuba has there.
+    """Return a grey environment (row, column), and directions (n, 3) with Mitsuba's radiance
+    there.
     """
     bitmap = mi.Bitmap(np.repeat(np.float32(pixels)[..., None], 3, axis=2))
     emitter = {"type": "envmap", "bitmap": bitmap}
@@ -32,7 +32,9 @@ def sky_of(scenes, pixels: np.ndarray) -> tuple[DistantIllumination, np.ndarray,
 
 
 def of_passes(sky: DistantIllumination, count: int, pairs: int, value) -> np.ndarray:
-    """Integrals of radiance times ``value`` of where it comes from, of ``count`` single passes."""
+    """Return the integrals of radiance times ``value`` of its direction, of ``count`` single
+    passes.
+    """
     rng, found = np.random.default_rng(12), []
     for _ in range(count):
         directions, light, *_ = sky.rows(1, pairs, rng)[0]
@@ -41,10 +43,13 @@ def of_passes(sky: DistantIllumination, count: int, pairs: int, value) -> np.nda
     return np.array(found)
 
 
-def test_a_bright_side_is_as_bright_as_it_is(scenes):
-    """Half of the light from a broad lobe above, the other half from all sides: the share from
-    above, by two smooth weights, within 4 standard errors, these below 1 %. Directions that may be
-    drawn as an opposite, too, and are not divided by both densities, weigh up to twice as much.
+def test_flux_from_a_bright_side_is_unbiased(scenes):
+    """The flux from one side of an environment is unbiased.
+
+    Half of it comes from a broad lobe above, the other half from all sides: the share from above,
+    by two smooth weights, agrees within 4 standard errors, these below 1 %. Directions that can
+    also be sampled as an opposite one, but are not divided by both densities, would count up to
+    twice.
     """
 
     def value(towards: np.ndarray) -> np.ndarray:
@@ -61,10 +66,11 @@ def test_a_bright_side_is_as_bright_as_it_is(scenes):
     assert (np.abs(found.mean(axis=0) - expected) < 4 * error + 2e-3 * expected[0]).all()
 
 
-def test_an_even_part_of_a_sky_favours_no_side(scenes):
-    """Beside a spot, to which almost all bright directions go, the sky is even: in each pass as
-    much light comes from all sides about it, to 2.5 % in the root mean square, as the weights of
-    the directions have it. Alike weights leave 4 % and more.
+def test_uniform_part_of_an_environment_is_balanced(scenes):
+    """The uniform part of an environment is balanced between opposite sides in each pass.
+
+    Almost all importance sampled directions go to a small spot; the rest is balanced to 2.5 % in
+    the root mean square, as the weights of the directions imply. Equal weights give 4 % and more.
     """
     pixels = np.ones((32, 64))
     pixels[15:17, 31:33] = 3e4

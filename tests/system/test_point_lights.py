@@ -1,5 +1,5 @@
-"""Point-like lights in media and right beside them: pictures against quadrature, the cache against
-the solution for infinite matter.
+"""Point and spot lights in and near media: images against quadrature, the cache against the
+solution for an infinite medium.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import pytest
 pytestmark = pytest.mark.usefixtures("mono")
 
 SIGMA_T, ALBEDO, SIZE = 1.0, 0.9, 32
-#: Where the lamp is; the error allowed in pixels by root mean square, relative to their mean, and
-#: in this mean, with 32 voxels along the box. With light interpolated as it is, it was 260 and 9 %
-#: for the lamp in the box, and 7 % for the one above.
+#: Position of the light; allowed relative RMSE of the pixels, and relative error of the mean, with
+#: 32 voxels along the box. When the irradiance was interpolated directly, they were 260 and 9 % for
+#: the light in the box, and 7 % for the one above it.
 LAMPS = {
     "in the box": ((0.13, 0.22, -0.3), 0.01, 0.005),
     "in a corner": ((0.97, 0.96, -0.98), 0.01, 0.005),
@@ -32,8 +32,9 @@ def point(position) -> dict:
 
 
 def single(scene: mi.Scene, lamp: np.ndarray, count: int, g: float) -> np.ndarray:
-    """Radiance of single scattering in the cube [-1, 1]^3 by equiangular quadrature in float64:
-    means over ``count``^2 points of a pixel, NaN where some see past the cube's silhouette.
+    """Return the single scattering in the cube [-1, 1]^3 by equiangular quadrature in float64.
+
+    Means over ``count``^2 points of a pixel; NaN for pixels that the cube's silhouette crosses.
     """
     points = (np.arange(400) + 0.5) / 400
     fine = (np.arange(count) + 0.5) / count
@@ -66,8 +67,10 @@ def single(scene: mi.Scene, lamp: np.ndarray, count: int, g: float) -> np.ndarra
 @pytest.mark.parametrize(("solver", "g"), [("sweep", 0.0), ("path", 0.0), ("path", 0.4)])
 @pytest.mark.parametrize(("lamp", "rmse", "mean"), LAMPS.values(), ids=LAMPS)
 def test_single_scattering(scenes, lamp, rmse, mean, solver, g):
-    """Pixels next to the lamp, whose radiance grows like one over the distance, are left out: there
-    both sides depend on where in the pixel they look.
+    """Single scattering of point lights agrees with quadrature.
+
+    Pixels next to the light are excluded: their radiance is inversely proportional to the distance,
+    so that both results depend on the sampling positions within the pixel.
     """
     phase = {"type": "hg", "g": g} if g else {"type": "isotropic"}
     cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO) | {"phase": phase})
@@ -86,15 +89,17 @@ def test_single_scattering(scenes, lamp, rmse, mean, solver, g):
 
 
 #: int_0^inf k sin(k r) c A^2 / (1 - c A) dk with A = atan(k) / k and c = 0.8, by quadrature, in two
-#: ways that agree to 1e-6: over 2 pi^2 r, it is Phi of all orders but the first at r mean free
-#: paths from a source of unit power in infinite matter of albedo c.
+#: ways that agree to 1e-6: divided by 2 pi^2 r, it is Phi of all orders but the first at r mean
+#: free paths from a source of unit power in an infinite medium of albedo c.
 ORDERS = {1.0: 1.54237649, 2.0: 0.76483116, 3.0: 0.37801463}
 
 
-def test_all_orders_in_infinite_matter(scenes):
-    """16 mean free paths across, a quarter of one per voxel. Shells around the distances hold 200
-    to 2500 voxels; 2.5 %, of which such voxels leave 1.6. ``path`` has a noise without bounds here,
-    like all paths that meet a lamp without a size.
+def test_all_orders_in_an_infinite_medium(scenes):
+    """The fluence of a point light agrees with that of an infinite medium in spherical shells.
+
+    The medium is 16 mean free paths wide, with voxels of a quarter of one. Shells around the
+    distances hold 200 to 2500 voxels; the bound is 2.5 %, of which their discretisation is 1.6.
+    ``path`` has unbounded variance here, as its paths can pass arbitrarily close to the emitter.
     """
     to_world = scenes.placement((16.0, 16.0, 16.0))
     lamp = np.array([0.05, 0.11, -0.07])
@@ -111,14 +116,15 @@ def test_all_orders_in_infinite_matter(scenes):
     for r, value in ORDERS.items():
         shell = np.abs(distance - r) < 0.25
         expected = value * 2 / np.pi / r
-        # e^-kr / r is what it is like, so that the shell's width does not matter.
+        # The result varies like e^-kr / r; dividing by it makes the shell's width irrelevant.
         like = np.exp(-0.71 * (distance[shell] - r)) * r / distance[shell]
         assert (phi[shell] / like).mean() == pytest.approx(expected, rel=0.025)
 
 
 def test_beside_a_spot_light(scenes):
-    """A narrow beam from right above: the mean of the picture, of which what interpolation loses at
-    the beam's edge is 2 %.
+    """The image mean of a narrow spot light right above the medium agrees with volpath.
+
+    Of the bound, 2 % are the interpolation error at the cone's edge.
     """
     look = mi.ScalarTransform4f().look_at([0.1, 1.6, 0.2], [0, 0, 0], [1, 0, 0])
     spot = {"type": "spot", "to_world": look, "intensity": 1.0, "cutoff_angle": 30.0}

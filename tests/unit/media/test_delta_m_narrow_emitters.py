@@ -1,4 +1,4 @@
-"""Narrow lights seen through a medium that scatters sharply forwards: Beer's law."""
+"""Narrow emitters seen through a delta-M scaled medium: Beer's law."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DENSITY = np.random.default_rng(3).uniform(0.2, 1.5, (4, 5, 6)).astype(np.float3
 
 
 def sky() -> dict:
-    """Dark but for one spot ahead of a camera that looks along z, and one behind it."""
+    """Return a dark sky with one spot ahead of a camera that looks along z, and one behind it."""
     pixels = np.full((32, 64, 3), 0.05, np.float32)
     pixels[15:17, [31, 32, 63, 0]] = 60.0
     return {"type": "envmap", "bitmap": mi.Bitmap(pixels)}
@@ -24,9 +24,10 @@ def sky() -> dict:
 
 @pytest.mark.parametrize("density", [1.2, DENSITY], ids=["constant", "grid"])
 @pytest.mark.parametrize("albedo", [1.0, 0.6])
-def test_transmittance_with_and_without_the_peak(scenes, density, albedo):
-    """The power that turns the transmittance of the medium without its forward peak into that of
-    the medium as it is: exact where the albedo does not vary.
+def test_exponent_recovers_the_original_transmittance(scenes, density, albedo):
+    """The exponent converts the transmittance of the scaled medium to that of the original one.
+
+    This is exact for a constant albedo.
     """
     place = scenes.placement((2.0, 1.0, 1.5))
     medium = scenes.medium(density, albedo, place) | {"phase": PHASE}
@@ -42,9 +43,9 @@ def test_transmittance_with_and_without_the_peak(scenes, density, albedo):
     assert np.exp(-less) ** found.unscattered_exponent == pytest.approx(np.exp(-whole), rel=1e-4)
 
 
-def test_a_bright_spot_of_the_sky_through_a_medium(scenes):
-    """In the layer of what is behind the medium: e^-tau of the spot, for the extinction that the
-    scene names.
+def test_bright_spot_of_the_sky_is_attenuated_by_the_original_extinction(scenes):
+    """The spot of a sky seen through a medium is attenuated by e^-tau of the original
+    extinction.
     """
     look = mi.ScalarTransform4f().look_at([0, 0, -5], [0, 0, 0], [0, 1, 0])
     film = scenes.description({}, None, 2)["sensor"]["film"]
@@ -65,9 +66,10 @@ def test_a_bright_spot_of_the_sky_through_a_medium(scenes):
     assert seen[1] / seen[0] == pytest.approx(np.exp(-2 * 0.9), rel=2e-3)
 
 
-def test_light_scattered_once_from_narrow_lights(scenes):
-    """Extinction times albedo times the phase function of the medium without its peak is that of
-    the medium as the scene has it: Henyey and Greenstein's formula.
+def test_single_scattering_of_narrow_emitters(scenes):
+    """Single scattering of the scaled medium is extinction times albedo times Henyey-Greenstein.
+
+    It equals that of the original medium.
     """
     medium = scenes.medium(1.3, 0.7) | {"phase": PHASE}
     scene = scenes.load({"type": "irrcache", "solver": "auto"}, scenes.boundary(medium), 8)
@@ -75,7 +77,8 @@ def test_light_scattered_once_from_narrow_lights(scenes):
     assert found.phase.forward > 0.1
     cosine = np.linspace(-0.99, 0.99, 50)
     towards = mi.Vector3f(np.float32([np.sqrt(1 - cosine**2), 0 * cosine, cosine]))
-    # Light that comes from ``towards`` and is seen along a ray there goes on by the angle between.
+    # Radiance from ``towards`` that reaches the camera along a ray was scattered by the angle
+    # between.
     gain = np.array(found.phase.gain(mi.Point3f(0), mi.Vector3f(0, 0, 1), towards), np.float64)
     scattered = float(found.sigma_t.value[0] * found.albedo.value[0]) * gain
     g = PHASE["g"]

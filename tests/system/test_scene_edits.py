@@ -1,5 +1,6 @@
-"""Scenes that are edited between renderings show what they hold now, and nothing else: every
-parameter that Mitsuba exposes, assigned several times in one process, with both solvers.
+"""Images after scene edits equal those of freshly loaded scenes, for every exposed parameter.
+
+Each parameter is assigned several times in one process, with both solvers.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ import pytest
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
-#: Values that a parameter is given one after the other, in units of its first one.
+#: Values assigned to a parameter one after the other, in units of its initial value.
 FACTORS = (0.8, 1)
-#: Parameters that may be without effect on the image of a scene here.
+#: Parameters that may have no effect on the image of these scenes.
 UNSEEN = (
     "allow_thread_reordering",
     "emitter.bsdf.reflectance.value",
@@ -35,7 +36,7 @@ def bitmap(scenes) -> dict:
 
 
 def cloud(scenes, **properties) -> dict:
-    """A cube of 3^3 voxels, in colour."""
+    """Return a cube of 3^3 coloured voxels."""
     sigma_t = scenes.texture((3, 3, 3, 3), 0.2, 1.0, 1)
     medium = scenes.medium(sigma_t, [0.9, 0.8, 0.5], scenes.placement(), **properties)
     return scenes.boundary(medium)
@@ -47,12 +48,12 @@ def fog(scenes, **properties) -> dict:
 
 
 def worlds(scenes) -> dict[str, dict]:
-    """Shape of the medium and other objects; together all plugins that irrcache supports."""
+    """Return the medium's shape and other objects; together they use all supported plugins."""
     sphere = {"type": "sphere", "bsdf": {"type": "null"}}
     lamp = {
         "type": "rectangle",
         "to_world": placed(0, 3, 0).rotate([1, 0, 0], 90),
-        "bsdf": {"type": "diffuse"},  # by default Mitsuba makes lamps black
+        "bsdf": {"type": "diffuse"},  # by default Mitsuba's area lights have a black BSDF
         "emitter": {"type": "area", "radiance": RED},
     }
     albedo = scenes.volume(scenes.texture((3, 3, 3), 0.2, 0.9, 2), scenes.placement())
@@ -115,7 +116,7 @@ def worlds(scenes) -> dict[str, dict]:
 
 
 WORLDS = ("lights", "envmap", "sunsky", "phases", "table", "ball", "surfaces")
-#: Swept for single scattering, which is faster.
+#: Rendered by `sweep` with single scattering, which is faster.
 SWEPT_ONCE = ("lights", "envmap", "sunsky", "phases", "table", "surfaces")
 SOLVERS = ("sweep", "path")
 
@@ -136,17 +137,15 @@ def image(scene: mi.Scene, **options) -> np.ndarray:
 
 
 def image_without_past(scene: mi.Scene) -> np.ndarray:
-    """By an integrator of the same settings that has rendered nothing before."""
+    """Render with a new integrator of the same settings."""
     same = scene.integrator()._settings
     return image(scene, integrator=mi.load_dict(settings(same.solver, max_depth=same.max_depth)))
 
 
 def plain(value):
-    """A copy of a parameter's value in the form that a script has it: numbers, lists, arrays of
-    NumPy, and transformations.
-    """
+    """Copy a parameter's value to plain numbers, lists, NumPy arrays and transformations."""
     if is_transform(value):
-        return type(value)(value)  # what a traversal gives changes with the scene
+        return type(value)(value)  # traversed values are references into the scene
     if not dr.is_array_v(value):
         return value
     values = np.array(value)
@@ -158,18 +157,18 @@ def is_transform(value) -> bool:
 
 
 def edited(value, factor: float, plugin: mi.Object):
-    """A plain ``value`` that is another one for each ``factor``, and itself for 1."""
+    """Return a plain value that differs for each ``factor``, and equals ``value`` for 1."""
     if factor == 1:
         return value
     if isinstance(value, bool):
         return not value
     if is_transform(value):
         kind = type(value)
-        if isinstance(plugin, mi.Emitter):  # one infinitely far away has no scale
+        if isinstance(plugin, mi.Emitter):  # an infinitely distant emitter has no scale
             return value @ kind().rotate([0.48, 0.64, 0.6], 40 * (1 - factor))
         return value @ kind().scale(factor)
     if isinstance(plugin, mi.PhaseFunction) and isinstance(value, np.ndarray):
-        return value**factor  # a table is normalised
+        return value**factor  # a tabulated phase function is normalised
     return value * factor
 
 
@@ -183,22 +182,24 @@ def assign(params, key: str, value) -> None:
 
 
 def edited_keys(scene: mi.Scene) -> dict[str, tuple]:
-    """All parameters but those of the camera's side. Each with what tells it from others: the
-    classes of the plugin that has it and of the object in the scene that this belongs to, and its
-    name in there.
+    """Return all parameters except those of the sensor, with a key for each kind.
+
+    The key consists of the classes of the plugin and of its top-level object, and of the name in
+    it.
     """
     params = mi.traverse(scene)
     roots = {o.id(): o.class_name() for o in (*scene.emitters(), *scene.shapes())}
     kinds = {}
     for key, entry in params.properties.items():
         plugin, (root, _, name) = entry[2].class_name(), key.partition(".")
-        if plugin not in CAMERA_SIDE and not key.endswith(".faces"):  # other faces bound no medium
+        # Meshes with other faces would not bound the medium.
+        if plugin not in CAMERA_SIDE and not key.endswith(".faces"):
             kinds[key] = (roots.get(root, root), name, plugin)
     return kinds
 
 
 def own_keys(scenes, world: str, solver: str) -> list[str]:
-    """Parameters that no world before this one has."""
+    """Return parameters that occur in no earlier scene."""
     known = set()
     for name in WORLDS[: WORLDS.index(world)]:
         known |= {*edited_keys(loaded(scenes, name, solver)).values()}
@@ -208,10 +209,11 @@ def own_keys(scenes, world: str, solver: str) -> list[str]:
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("world", WORLDS)
-def test_every_parameter_that_is_assigned_shows(scenes, world, solver):
-    """One after the other, each another value and its value of before; then all at once. Each image
-    is that of an integrator which has not rendered before, to the last bit, and the last one that
-    of another scene.
+def test_every_assigned_parameter_changes_the_image(scenes, world, solver):
+    """Every assigned parameter changes the image, and its previous value restores it.
+
+    Parameters are changed one by one and all at once. Each image equals, bit by bit, that of an
+    integrator that has not rendered before; the last one also equals that of a newly loaded scene.
     """
     scene = loaded(scenes, world, solver)
     builder = scene.integrator()._builder
@@ -242,8 +244,8 @@ def test_every_parameter_that_is_assigned_shows(scenes, world, solver):
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_arrays_that_are_edited_in_place_show(scenes, world):
-    """By ``dr.scatter``, as Mitsuba's documentation has it."""
+def test_arrays_edited_in_place_change_the_image(scenes, world):
+    """Edits in place by ``dr.scatter``, as documented by Mitsuba, change the image."""
     scene = loaded(scenes, world, "path")
     params, old = mi.traverse(scene), image(scene)
     for key in own_keys(scenes, world, "path"):
@@ -263,16 +265,17 @@ def test_arrays_that_are_edited_in_place_show(scenes, world):
             old = found
 
 
-def test_writing_through_a_view_shows(scenes):
-    """Memory that NumPy writes to belongs to the same variable as before, also to what a snapshot
-    holds.
+def test_writing_through_a_view_changes_the_image(scenes):
+    """Edits through a NumPy view change the image.
+
+    Such memory still belongs to the same variable, which a snapshot of the scene may hold, too.
     """
     scene = loaded(scenes, "lights", "path")
     params, old = mi.traverse(scene), image(scene)
     for key in ("point.intensity.value", "shape.interior_medium.sigma_t.data"):
         value = params[key]
         (value.array if dr.is_tensor_v(value) else value.x).numpy()[:] *= 0.7
-        if dr.is_tensor_v(value):  # Mitsuba has another copy, for lookups
+        if dr.is_tensor_v(value):  # Mitsuba copies the data for its lookups
             params.set_dirty(key)
             params.update()
         found = image(scene)
@@ -282,7 +285,10 @@ def test_writing_through_a_view_shows(scenes):
 
 
 def test_data_written_without_set_dirty_are_refused(scenes):
-    """Mitsuba looks up a copy of the data, which it makes anew in ``params.update``."""
+    """Data that were written without ``set_dirty`` are refused.
+
+    Mitsuba copies the data for its lookups, and updates the copy only in ``params.update``.
+    """
     scene = loaded(scenes, "lights", "path")
     image(scene)
     params, key = mi.traverse(scene), "shape.interior_medium.sigma_t.data"
@@ -303,8 +309,8 @@ CAMERA_EDITS = {
 
 
 @pytest.mark.parametrize("world", ["lights", "surfaces"])
-def test_a_moved_camera_makes_no_cache(scenes, world, kernels):
-    """And none of Mitsuba's parameters is looked at by a kernel."""
+def test_moved_camera_rebuilds_no_cache(scenes, world, kernels):
+    """Moving the camera rebuilds no cache, and launches no kernel to inspect parameters."""
     scene = loaded(scenes, world, "path")
     image(scene)
     integrator, params = scene.integrator(), mi.traverse(scene)
@@ -317,8 +323,8 @@ def test_a_moved_camera_makes_no_cache(scenes, world, kernels):
     assert integrator._builder.revision == revision
 
 
-def test_the_value_of_before_makes_no_cache(scenes):
-    """Assigned as an array of its own."""
+def test_equal_value_rebuilds_no_cache(scenes):
+    """Assigning an equal value in a new array rebuilds no cache."""
     scene = loaded(scenes, "lights", "path")
     image(scene)
     builder = scene.integrator()._builder
@@ -355,8 +361,8 @@ def test_emission_of_the_integrator_is_a_parameter_too(scenes):
     np.testing.assert_array_equal(image(fresh), old)
 
 
-def test_another_bsdf_shows(scenes):
-    """Objects can be exchanged, without any parameter of the old ones being edited."""
+def test_replaced_bsdf_is_detected(scenes):
+    """Replacing an object is detected, although no parameter of the old one was edited."""
     scene = loaded(scenes, "surfaces", "path")
     old = image(scene)
     (ball,) = [s for s in scene.shapes() if s.class_name() == "Sphere"]

@@ -1,4 +1,4 @@
-"""Layers, errors and filter of whole images, through the door of the plugin."""
+"""AOVs, error estimates and the filter of whole images, rendered through the plugin."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 ALL = ",".join(AOVS)
 SKY = {"type": "constant", "radiance": 1.0}
-#: What a bright window in a dark sky lights is noisy.
+#: A dark sky with a small bright window, whose irradiance is noisy in the cache.
 WINDOW = np.full((8, 16, 3), 0.02, np.float32)
 WINDOW[2:4, 5:7] = 12.0
 
 
 def layered(scene: mi.Scene, **options) -> dict[str, np.ndarray]:
-    """The image, and the layers that its film carries, by name; float64."""
+    """Return the image and its AOVs by name; float64."""
     values = np.array(mi.render(scene, **options), dtype=np.float64)
     names = [field.name for field in scene.sensors()[0].film().bitmap().struct_()]
     assert len(names) == values.shape[2]
@@ -45,7 +45,7 @@ def film_of(scenes, size: int, **properties) -> dict:
 
 
 def facing(scenes, size: int = 16, half: float = 0.8, **properties) -> dict:
-    """An orthographic sensor that looks along +z at the square |x|, |y| < ``half``."""
+    """Return an orthographic sensor that looks along +z at the square |x|, |y| < ``half``."""
     look = mi.ScalarTransform4f().look_at([0, 0, -3], [0, 0, 0], [0, 1, 0])
     film = film_of(scenes, size, **properties)
     return {"type": "orthographic", "to_world": look.scale(half), "film": film}
@@ -58,20 +58,22 @@ def cloud(scenes, albedo=0.9, **properties) -> dict:
 
 
 def noisy(scenes, settings: dict, **objects) -> mi.Scene:
-    """A cloud lit through a window: some 30 % of noise in a voxel at 16 samples."""
+    """Return a cloud under a small bright window: some 30 % of noise in a voxel at 16 samples."""
     integrator = {"type": "irrcache", "max_depth": 3, "resolution": 16} | settings
     emitter = {"type": "envmap", "bitmap": mi.Bitmap(WINDOW)}
     objects = {"emitter": emitter, "size": 24} | objects
     return scenes.load(integrator, cloud(scenes), **objects, default_solver="path")
 
 
-# The image and its layers
+# Image and AOVs
 
 
 @pytest.mark.parametrize("pixel_format", ["rgba", "luminance"])
-def test_layers_do_not_change_the_image(scenes, pixel_format):
-    """The same picture to float32 rounding, in the film's format, alpha included; layers that cost
-    the march a random number, or a film filled twice, change it.
+def test_aovs_do_not_change_the_image(scenes, pixel_format):
+    """AOVs leave the image unchanged to float32 rounding, including its format and alpha.
+
+    It would change if AOVs consumed random numbers of the ray march, or were added to the film
+    twice.
     """
     sensor = scenes.description({}, None, 12)["sensor"]
     sensor["film"] = film_of(
@@ -91,7 +93,9 @@ def test_layers_do_not_change_the_image(scenes, pixel_format):
 
 
 def sorted_slab(scenes, albedo, **film) -> mi.Scene:
-    """A slab lit from the front, so that light falls with depth; seen from there."""
+    """Return a slab and a sensor on the side of the emitter, where the irradiance decays with
+    depth.
+    """
     to_world = scenes.placement((2.0, 2.0, 1.0))
     sigma_t = scenes.texture((8, 6, 6), 1.0, 3.0, 3)
     settings = {"max_depth": 2, "resolution": 16, "cache_spp": 16, "aovs": ALL}
@@ -106,12 +110,14 @@ def sorted_slab(scenes, albedo, **film) -> mi.Scene:
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
 def test_colour_times_illumination_plus_background_is_the_image(scenes, rfilter):
-    """To float32 rounding, whatever the film's filter, where the albedo rises along the ray while
-    the light falls. A product of averages, of the colour and of the light where it is seen, is more
-    than 20 % too bright there.
+    """Colour times illumination plus background is the image to float32 rounding, for any film
+    filter.
 
-    Only where negative lobes leave no colour (some pixels of Lanczos around the medium), there is
-    no illumination, and the scattered light is in the image alone.
+    The albedo increases along the ray while the irradiance decreases, so that a product of separate
+    averages of both would be more than 20 % too bright.
+
+    Only where negative lobes cancel the colour (some pixels of Lanczos around the medium), there is
+    no illumination, and the scattered radiance is in the image alone.
     """
     rising = np.linspace(0.05, 0.95, 8)[:, None, None, None] * np.ones((8, 6, 6, 3)) * [1, 0.7, 0.4]
     film = {"rfilter": {"type": rfilter}}
@@ -127,8 +133,8 @@ def test_colour_times_illumination_plus_background_is_the_image(scenes, rfilter)
     assert (found["colour"] * light)[inner].mean() > 1.2 * product[inner].mean()
 
 
-def test_names_on_the_film(scenes):
-    """In the order in which they were asked for, after the film's own, with the user's names."""
+def test_aov_channel_names(scenes):
+    """AOV channels follow the film's own ones in the requested order, with the user's names."""
     sensor = scenes.description({}, None, 6)["sensor"]
     sensor["film"] = film_of(scenes, 6, pixel_format="rgba")
     settings = {"resolution": 4, "cache_spp": 16, "aovs": "far:depth, light:illumination, noise"}
@@ -143,8 +149,9 @@ def test_names_on_the_film(scenes):
 
 
 def test_wrapped_like_a_stock_integrator(scenes):
-    """Inside ``aov``: the channels that it has around volpath, with ours after the inner image's;
-    and what they hold is what they hold outside.
+    """Nested in ``aov``, the AOVs and their values are the same as without the wrapper.
+
+    As with a nested volpath, the channels follow those of the inner image.
     """
     names, values = {}, {}
     ours = {"type": "irrcache", "solver": "path", "resolution": 8, "cache_spp": 16}
@@ -170,8 +177,10 @@ def test_wrapped_like_a_stock_integrator(scenes):
 
 
 def test_depth_of_a_thin_dense_slab(scenes):
-    """A sheet 0.1 thick that lies 3.45 in front of the sensor, optical depth 5: depth is that of
-    its front side to half a voxel, wherever something is seen of it, and 0 beside it.
+    """The depth of a thin dense sheet is that of its front side, to half a voxel; beside it it
+    is 0.
+
+    The sheet is 0.1 thick, lies 3.45 in front of the sensor and has an optical depth of 5.
     """
     to_world = scenes.placement((2.0, 2.0, 2.0))
     sigma_t = np.zeros((20, 4, 4), np.float32)
@@ -188,7 +197,10 @@ def test_depth_of_a_thin_dense_slab(scenes):
 
 @pytest.mark.parametrize("kind", ["homogeneous", "heterogeneous"])
 def test_transmittance_is_beer_lambert(scenes, kind):
-    """exp(-sigma_t d) of each colour, and colour albedo (1 - T); 1 and 0 beside the medium."""
+    """Transmittance is exp(-sigma_t d) per channel and colour is albedo (1 - T).
+
+    Beside the medium they are 1 and 0.
+    """
     sigma_t, albedo = np.array([0.3, 1.0, 4.0]), np.array([0.9, 0.5, 0.2])
     values = sigma_t if kind == "homogeneous" else sigma_t * np.ones((4, 4, 4, 3))
     to_world = scenes.placement((2.0, 2.0, 1.5))
@@ -211,13 +223,15 @@ def test_transmittance_is_beer_lambert(scenes, kind):
 
 @pytest.mark.parametrize("border", ["soft", "hard"])
 def test_noise_is_the_scatter_of_caches(scenes, border):
-    """Images of 24 cache seeds that share their camera samples: the root of their mean variance is
-    that of the mean square of ``noise``, within 10 % (each known to some 2 %) with the medium in
-    the middle of its grid; within 15 % where its faces cut it, as the noise of what is extrapolated
-    there is known roughly.
+    """``noise`` is the standard deviation over images of 24 cache seeds with equal camera
+    samples.
 
-    One probe for all, or signs that are not independent, change it by 17 % and more; errors of
-    layers or channels added wrongly by 20 % and more.
+    The root mean squares of both agree within 10 % (each known to some 2 %) with the medium in the
+    middle of its grid; within 15 % if its faces cut the grid, since the noise of extrapolated
+    values is an approximation.
+
+    A single probe for all voxels, or signs that are not independent, would change it by 17 % and
+    more; errors of layers or channels added wrongly by 20 % and more.
     """
     to_world = scenes.placement(turn=20)
     sigma_t = scenes.texture((9, 9, 9), 1.0, 3.0, 1)
@@ -240,13 +254,13 @@ def test_noise_is_the_scatter_of_caches(scenes, border):
 
 
 def soft_ball(scenes, resolution: int, samples: int) -> dict[str, np.ndarray]:
-    """A Gaussian ball in the sun, whose light varies smoothly: the cache's noise is 0.03 %."""
+    """Return a Gaussian sphere in the sun, with smooth irradiance: the cache's noise is 0.03 %."""
     c = np.linspace(-1, 1, 24)
     z, y, x = np.meshgrid(c, c, c, indexing="ij")
     to_world = scenes.placement()
     medium = scenes.medium(3 * np.exp(-4 * (x**2 + y**2 + z**2)), 0.9, to_world)
     settings = {"max_depth": 2, "resolution": resolution, "cache_spp": samples, "aovs": "bias"}
-    settings["step"] = resolution / 36  # the same length
+    settings["step"] = resolution / 36  # of equal length
     sun = {"type": "directional", "direction": [0.2, -1.0, 0.1], "irradiance": 4.0}
     shape = scenes.boundary(medium, to_world)
     return layered(
@@ -256,8 +270,10 @@ def soft_ball(scenes, resolution: int, samples: int) -> dict[str, np.ndarray]:
 
 
 def test_bias_is_what_a_finer_cache_changes(scenes):
-    """The image's mean error at 8 and at 12 voxels an edge, against 36: predicted with its sign and
-    within a factor of 2 (measured: 0.64 and 1.1), and pixel by pixel in the right places.
+    """``bias`` predicts how a finer cache changes the image.
+
+    Its mean at 8 and at 12 voxels an edge, against 36, is predicted with its sign and within a
+    factor of 2 (measured: 0.64 and 1.1), and its pixels correlate.
     """
     exact = soft_ball(scenes, 36, 64)
     errors = []
@@ -273,11 +289,12 @@ def test_bias_is_what_a_finer_cache_changes(scenes):
 # Filter
 
 
-def test_the_filter_does_no_harm(scenes, tmp_path):
-    """Error of the image against one of 1024 samples a voxel, at 16, 64 and 256: above the
-    unfiltered one's by at most 8 %; and below it at 16, on average over three caches, where there
-    is something to gain (measured: 0.95). ``fixed`` doubles it at 256. A cache is computed once,
-    and read by the others.
+def test_filter_does_not_increase_the_error(scenes, tmp_path):
+    """The filter does not increase the error of images with 16, 64 and 256 samples per voxel.
+
+    The error against an image of 1024 samples a voxel is at most 8 % above the unfiltered one's,
+    and below it at 16 samples on average over three caches (measured: 0.95). ``fixed`` doubles it
+    at 256. Each cache is computed once and shared.
     """
     settings = {"cache_spp": 1024, "cache_seed": 9}
     truth = luminance(scenes.image(noisy(scenes, settings, size=48), spp=8))
@@ -299,8 +316,9 @@ def test_the_filter_does_no_harm(scenes, tmp_path):
 
 
 def test_a_cache_without_noise_is_not_filtered(scenes):
-    """A sun on a homogeneous medium: ``bilateral`` is ``none`` to float32 rounding; ``fixed`` is
-    not.
+    """``bilateral`` leaves images of a noiseless cache unchanged; ``fixed`` does not.
+
+    The cache of a sun in a homogeneous medium has no noise.
     """
     sun = {"type": "directional", "direction": [0.3, -1.0, 0.4], "irradiance": 4.0}
     shape = scenes.boundary(scenes.medium(2.0, 0.9), scenes.placement())
@@ -316,7 +334,7 @@ def test_a_cache_without_noise_is_not_filtered(scenes):
 
 
 def bone(scenes, settings: dict) -> np.ndarray:
-    """Luminance of a bright dense rod along y in dim soft matter."""
+    """Return the luminance of a bright dense rod along y in a dim soft medium."""
     to_world = scenes.placement()
     density, albedo = np.full((20, 4, 20), 0.1), np.full((20, 4, 20), 0.5)
     density[4:16, :, 8:12], albedo[4:16, :, 8:12] = 20.0, 0.95
@@ -336,7 +354,7 @@ def bone(scenes, settings: dict) -> np.ndarray:
 
 
 def edge(profile: np.ndarray) -> tuple[float, float]:
-    """Place of the half height and the 10 to 90 % width of the rod's flank, in pixels."""
+    """Return position and 10 to 90 % width of the rod's edge in pixels."""
     low, high = np.median(profile[8:16]), np.median(profile[28:36])
     crossings = []
     for share in (0.1, 0.5, 0.9):
@@ -346,10 +364,12 @@ def edge(profile: np.ndarray) -> tuple[float, float]:
     return crossings[1], crossings[2] - crossings[0]
 
 
-def test_a_bone_keeps_its_edge(scenes, monkeypatch):
-    """The flank of the rod at 16 samples a voxel, filtered as chosen and with given strengths,
-    against that of the converged image: in place to half a pixel and no wider than by one. A
-    Gaussian of the same reach adds 2.7.
+def test_filter_preserves_an_edge(scenes, monkeypatch):
+    """Filtered images preserve the position and width of an edge.
+
+    At 16 samples a voxel, with automatic and given strengths, the edge of the rod is within half a
+    pixel of the converged image's, and at most one pixel wider. A Gaussian of the same radius adds
+    2.7.
     """
     exact = bone(scenes, {"cache_spp": 256}).mean(axis=0)
     place, width = edge(exact)
@@ -367,13 +387,15 @@ def test_a_bone_keeps_its_edge(scenes, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["bilateral", "fixed"])
 def test_few_samples_are_enough_for_an_error(scenes, refine_calls, kind):
-    """8 samples are one batch, which tells no error: 16 are taken where it is needed."""
+    """A cache of 8 samples is one batch without an error estimate: 16 are taken if one is
+    needed.
+    """
     scenes.image(noisy(scenes, {"cache_spp": 8, "filter": kind}, size=6), spp=1)
     scenes.image(noisy(scenes, {"cache_spp": 8, "aovs": "noise"}, size=6), spp=1)
     assert refine_calls == [16 if kind == "bilateral" else 8, 16]
 
 
-# Where there is little
+# Images with few valid pixels
 
 
 def empty(scenes) -> dict:
@@ -395,8 +417,8 @@ BARE = {
 
 @pytest.mark.parametrize("kind", ["none", "bilateral", "fixed"])
 @pytest.mark.parametrize(("settings", "shape", "objects"), BARE.values(), ids=BARE)
-def test_no_nan_where_there_is_little(scenes, kind, settings, shape, objects):
-    """Pixels beside the medium in all; every layer finite; the image is the one without layers."""
+def test_no_nan_beside_the_medium(scenes, kind, settings, shape, objects):
+    """All layers are finite if all pixels lie beside the medium; the image is unchanged."""
     settings = {"max_depth": 2, "resolution": 6, "cache_spp": 16} | settings
     sensor = scenes.description({}, None, 8)["sensor"]
     sensor["film"] = film_of(scenes, 8, pixel_format="rgba")
@@ -420,17 +442,19 @@ def test_no_nan_where_there_is_little(scenes, kind, settings, shape, objects):
         np.testing.assert_allclose(product, found["image"][..., :3], rtol=1e-4, atol=1e-6)
 
 
-# Work
+# Amount of work
 
 
 def test_a_second_filtered_picture_compiles_nothing(scenes, kernels):
-    """Another seed, another camera with another number of pixels that see the medium: the kernels
-    of the first pictures: of one that is filtered and of one whose filter of least risk is none.
-    (dr.mean writes the number of pixels into a kernel.)
+    """A second filtered image reuses all kernels.
+
+    It has another seed and camera, and another number of pixels with the medium. Both the kernels
+    of an image that is filtered and those of one without a gain by the filter are covered. (dr.mean
+    embeds the number of pixels in a kernel.)
     """
     second = scenes.description({}, None, 24)["sensor"] | {"fov": 21.0}
     scene = noisy(scenes, {"cache_spp": 16, "filter": "bilateral", "aovs": ALL}, second=second)
-    # By hash: whether a kernel is found on disk depends on what ran before.
+    # By hash: whether a kernel is found on disk depends on earlier runs.
     first = {
         k["hash"]
         for seed in (0, 1)
@@ -441,8 +465,10 @@ def test_a_second_filtered_picture_compiles_nothing(scenes, kernels):
         assert history and {k["hash"] for k in history} <= first
 
 
-def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
-    """No errors, no layers, no developed film."""
+def test_no_work_for_unused_filter_and_aovs(scenes, monkeypatch):
+    """Without filter and AOVs, no errors and layers are computed and no film is developed for
+    them.
+    """
     from mitsuba_irrcache.integrators import irrcache
 
     from mitsuba_irrcache.render import camera
@@ -458,8 +484,8 @@ def test_without_filter_and_layers_nothing_of_them_is_done(scenes, monkeypatch):
     assert scene.integrator()._sight.projection.channel_count == 0
 
 
-def test_layers_without_errors_project_none(scenes, monkeypatch):
-    """Colour alone needs no error of the cache, and no second batch."""
+def test_aovs_without_errors_compute_none(scenes, monkeypatch):
+    """Colour alone requires no error estimate of the cache, and no second batch."""
     from mitsuba_irrcache.render import camera
 
     monkeypatch.setattr(camera, "uncertainty_of", None)
@@ -470,7 +496,7 @@ def test_layers_without_errors_project_none(scenes, monkeypatch):
 
 
 def test_mono(mono, scenes):
-    """Filter and all layers in a monochromatic variant, recombined to the image."""
+    """In a monochromatic variant, filter and AOVs are consistent with the image."""
     scene = noisy(scenes, {"cache_spp": 16, "aovs": ALL}, size=8)
     found = layered(scene, spp=4)
     assert {name: v.shape[2] for name, v in found.items() if name != "image"} == {
@@ -483,12 +509,12 @@ def test_mono(mono, scenes):
     assert filtered.mean() == pytest.approx(found["image"][..., :1].mean(), rel=0.05)
 
 
-# What once went wrong
+# Regression tests
 
 
 @pytest.mark.parametrize("settings", [{"max_depth": 1}, {"albedo": 0.0}])
-def test_opacity_needs_no_light(scenes, settings):
-    """Hidden emitters and no scattering: alpha and transmittance are still those of the medium."""
+def test_opacity_without_radiance(scenes, settings):
+    """With hidden emitters and no scattering, alpha and transmittance are those of the medium."""
     albedo = settings.get("albedo", 0.9)
     settings = {"max_depth": 2} | {k: v for k, v in settings.items() if k != "albedo"}
     to_world = scenes.placement((2.0, 2.0, 1.5))
@@ -502,8 +528,8 @@ def test_opacity_needs_no_light(scenes, settings):
     np.testing.assert_allclose(found["image"][..., 3], 1 - np.exp(-1.5), rtol=1e-3)
 
 
-def test_the_dimmest_light_is_not_nan(scenes):
-    """The far side of an optically thick box, in the dark to 1e-38 of the light."""
+def test_smallest_radiance_is_not_nan(scenes):
+    """The smallest radiance, 1e-38 behind an optically thick box, gives no NaN."""
     sun = {"type": "directional", "direction": [0.0, 0.0, -1.0], "irradiance": 3.0}
     shape = scenes.boundary(scenes.medium(60.0, 0.9), scenes.placement())
     settings = {"type": "irrcache", "max_depth": 2, "resolution": 32, "cache_spp": 16}
@@ -512,7 +538,7 @@ def test_the_dimmest_light_is_not_nan(scenes):
 
 
 def test_alpha_with_other_sample_counts_compiles_nothing(scenes, kernels):
-    """As without alpha: the projection's kernel is that of the first picture."""
+    """Rendering alpha with other sample counts reuses the kernels of the image without alpha."""
     sensor = scenes.description({}, None, 8)["sensor"]
     sensor["film"] = film_of(scenes, 8, pixel_format="rgba")
     settings = {"type": "irrcache", "resolution": 8, "cache_spp": 8, "hide_emitters": True}
@@ -525,8 +551,9 @@ def test_alpha_with_other_sample_counts_compiles_nothing(scenes, kernels):
 
 
 def test_depth_in_one_step(scenes):
-    """max_depth 1 through a homogeneous box, optical depth 20: its front, a mean free path in; the
-    exponential rule weights the ends of so long a step to 0.03.
+    """Depth is correct in one step through a homogeneous box of optical depth 20.
+
+    The front is one mean free path deep; the exponential rule weights the ends of the step to 0.03.
     """
     shape = scenes.boundary(scenes.medium(10.0, 0.9), scenes.placement())
     settings = {"type": "irrcache", "max_depth": 1, "aovs": "depth"}

@@ -1,6 +1,6 @@
-"""No kernel reads or writes outside of its arrays: Dr.Jit checks every access in its debug mode.
+"""No kernel accesses memory outside of its arrays, as checked by Dr.Jit's debug mode.
 
-What is read there is arbitrary: with a weight of 0 it changes nothing, unless it is NaN.
+Values from there are arbitrary: with a weight of 0 they change nothing, unless they are NaN.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.fixture
 def reported(capfd):
-    """Runs an action in debug mode: what Dr.Jit reports."""
+    """Run an action in debug mode and return Dr.Jit's messages."""
 
     def run(action) -> str:
         level = dr.log_level()
@@ -39,8 +39,8 @@ def reported(capfd):
     return run
 
 
-def test_the_check_finds_one(reported):
-    """A read behind the end, and a write."""
+def test_debug_mode_detects_an_access(reported):
+    """Debug mode detects a gather and a scatter beyond the end of an array."""
     values = mi.Float([1, 2, 3, 4])
     assert reported(lambda: dr.eval(dr.gather(mi.Float, values, mi.UInt32([1, 4]))))
     assert reported(lambda: dr.scatter(values, mi.Float(1), mi.UInt32([1, 9])) or dr.eval(values))
@@ -48,7 +48,9 @@ def test_the_check_finds_one(reported):
 
 @pytest.mark.parametrize("shape", [(4, 5, 6), (1, 7, 1), (1, 1, 1)], ids=str)
 def test_lookups(reported, shape):
-    """Lookups of one and of two fields inside, on the border and outside of the grid."""
+    """Lookups of one and two fields stay in bounds inside, on the border and outside of the
+    grid.
+    """
     grid, rng = Grid(shape, np.eye(4)), np.random.default_rng(1)
     count = grid.voxel_count
     grey = GridField(grid, mi.Float(np.float32(rng.random(count))), 1)
@@ -64,8 +66,8 @@ def test_lookups(reported, shape):
     assert not reported(action)
 
 
-def test_lookups_beside_surfaces(reported):
-    """In cells that a surface cuts, up to the far corner of the grid, and beyond."""
+def test_lookups_in_cut_cells(reported):
+    """Lookups in cut cells stay in bounds, up to the last corner of the grid and beyond."""
     grid, rng = Grid((3, 4, 5), np.eye(4)), np.random.default_rng(2)
     ball = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.6}
     edges = CutCells(mi.load_dict({"type": "scene", "ball": ball}), grid)
@@ -90,7 +92,9 @@ SCENES = {
 
 @pytest.mark.parametrize(("settings", "medium", "objects"), SCENES.values(), ids=SCENES)
 def test_images(scenes, reported, settings, medium, objects):
-    """Small caches of odd sides over a cloud with empty parts, turned, of oblong voxels."""
+    """Rendering stays in bounds for odd grid sizes, with a rotated sparse cloud of oblong
+    voxels.
+    """
     density = scenes.texture((7, 5, 9), 0.0, 4.0, 3)
     density[:3, :3] = 0
     place = scenes.placement((2.0, 1.5, 1.0), turn=20)

@@ -1,7 +1,7 @@
-"""A sweep over a box that is smaller than its grid reads nothing outside of its arrays.
+"""A sweep over a box smaller than its grid accesses no memory out of bounds.
 
-Dr.Jit reports such accesses in its debug mode. Elsewhere they return whatever lies there, or end
-the process where no memory does.
+Dr.Jit reports such accesses in its debug mode. Otherwise they return arbitrary values or crash the
+process.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mitsuba_irrcache.solvers.sn.tracks import Tracks, sharpened
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
-#: Boxes (x, y, z) with space on all sides, on some, on none; and of too few voxels to sharpen.
+#: Boxes (x, y, z) with margins on all sides, on some, on none; and with too few voxels to sharpen.
 BOXES = {
     "inside": ((1, 1, 1), (6, 4, 5)),
     "at the lower corner": ((0, 0, 0), (4, 4, 4)),
@@ -33,7 +33,7 @@ def grid():
 
 @pytest.fixture
 def reports(capfd):
-    """A function: what Dr.Jit says about accesses out of bounds while ``action`` runs."""
+    """Return a function that lists Dr.Jit's messages about out-of-bounds accesses of ``action``."""
 
     def during(action) -> list[str]:
         level = dr.log_level()
@@ -54,7 +54,7 @@ def reports(capfd):
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("axis", range(3))
 def test_sharpening(reports, grid, axis, channels, box):
-    """At all voxels, also at those beside the box."""
+    """Sharpening stays in bounds at all voxels, including those outside of the box."""
     count = grid.voxel_count
     rng = np.random.default_rng(axis)
     values = mi.Float((rng.random(count * channels) + 1).astype(np.float32).tolist())
@@ -69,8 +69,8 @@ def test_sharpening(reports, grid, axis, channels, box):
 
 
 @pytest.mark.parametrize("box", BOXES.values(), ids=BOXES)
-def test_light_that_enters(reports, grid, box):
-    """Light carried through the box, to voxels in it and beside it."""
+def test_incoming_radiance_stays_in_bounds(reports, grid, box):
+    """Carrying incoming radiance through the box stays in bounds, inside and outside of it."""
     directions = np.array([[0.2, 0.5, 1.0], [1.0, -0.7, 0.4], [-0.3, -1.0, 0.6]])
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     sigma_t = dr.opaque(mi.Float, 0.5, grid.voxel_count)

@@ -1,4 +1,4 @@
-"""Media that do not scatter alike to all sides, against ``volpath`` and closed forms."""
+"""Anisotropically scattering media against ``volpath`` and closed forms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def hg(g: float) -> dict:
 
 
 def envmap(sun: float) -> dict:
-    """A sky brighter above, with a bright texel."""
+    """Return an environment that is brighter above, with a bright texel."""
     texels = np.float32(np.ones((32, 64, 3)) * [0.5, 0.6, 0.8])
     texels[:16] *= 3
     texels[10, 52] = sun
@@ -67,7 +67,7 @@ def test_two_media_of_two_kinds(scenes, solver):
 
 
 def sharp_beside(scenes) -> dict:
-    """A sharp medium beside another one, over the ground."""
+    """Return a strongly forward scattering medium beside another one, over the ground."""
     thin = fog() | {"phase": hg(0.7)}
     beside = scenes.boundary(thin, scenes.placement((0.9, 1.6, 1.6), center=(0.8, 0, 0)))
     place = scenes.placement((1.0, 1.6, 1.6), center=(-0.5, 0, 0))
@@ -76,7 +76,7 @@ def sharp_beside(scenes) -> dict:
 
 
 def lamps(scenes) -> dict:
-    """Two lamps over a medium, one close to it and wide, the other small; a point light."""
+    """Return two area lights, one large and close, one small, and a point light above a medium."""
     return {
         "cloud": scenes.boundary(scenes.medium((1.0, 1.2, 1.4), 0.9) | {"phase": hg(0.5)}),
         "wide": lamp((0.2, 1.6, 0.1), (0, 0, 0), 0.6, (3, 3, 3)),
@@ -93,14 +93,14 @@ AMONG_SURFACES = {
 
 
 @pytest.mark.parametrize(("build", "depth", "bounds"), AMONG_SURFACES.values(), ids=AMONG_SURFACES)
-def test_among_surfaces(scenes, build, depth, bounds):
-    """By lines, whose light comes back from the ground and from the other medium."""
+def test_with_surfaces(scenes, build, depth, bounds):
+    """``sweep`` agrees with volpath if the ground and another medium scatter radiance back."""
     depths, ours = {"max_depth": depth, "rr_depth": 50}, {"cache_spp": 128, "solver": "sweep"}
     check(*images(scenes, build(scenes), ours, depths, (64, 512)), **bounds)
 
 
-def test_furnace_among_surfaces(scenes):
-    """Nothing absorbs, neither the ground nor a medium that scatters sharply: all pixels are 1."""
+def test_furnace_with_surfaces(scenes):
+    """With an albedo of 1 everywhere, a forward scattering medium on the ground is invisible."""
     medium = scenes.medium(3.0, 1.0) | {"phase": hg(0.8)}
     objects = {"emitter": {"type": "constant", "radiance": 1.0}, "sun": None}
     objects["ground"] = ground(bsdf=diffuse(1.0, 1.0, 1.0))
@@ -112,7 +112,7 @@ def test_furnace_among_surfaces(scenes):
 
 @pytest.mark.parametrize("g", [0.5, -0.4])
 def test_thin_slab(scenes, g):
-    """Of so little matter every path is single: sigma_s p(cos) E t, to 1 %."""
+    """A thin slab scatters once: its radiance is sigma_s p(cos) E t, to 1 %."""
     sun = scenes.sun | {"irradiance": 2.0, "direction": [1.0, 0.0, 1.0]}
     medium = scenes.medium(1e-3, 0.8) | {"phase": hg(g)}
     shape = scenes.boundary(medium, scenes.placement((4.0, 4.0, 0.5)))
@@ -123,14 +123,14 @@ def test_thin_slab(scenes, g):
         {"type": "irrcache", "solver": "path", "resolution": 8, "cache_spp": 16}, shape, 4,
         emitter=sun, sun=None, sensor=sensor,
     )  # fmt: skip
-    cosine = -(0.5**0.5)  # of the light's way and the way to the camera
+    cosine = -(0.5**0.5)  # of both path segments
     p = (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cosine) ** 1.5)
     expected = 0.8e-3 * p * 2.0 * 0.5
     np.testing.assert_allclose(scenes.image(scene, spp=16), expected, rtol=0.01)
 
 
 def test_furnace(scenes):
-    """Nothing absorbs under a white sky: all pixels are 1."""
+    """With albedo 1 under a white sky, all pixels are 1."""
     medium = scenes.medium(1.0, 1.0) | {"phase": hg(0.5)}
     sky = {"type": "constant", "radiance": 1.0}
     integrator = {"type": "irrcache", "resolution": 10, "cache_spp": 512, "rr_depth": 100000}
@@ -148,7 +148,7 @@ def loaded(scenes, phase: dict, **settings) -> mi.Scene:
 
 
 def test_files(scenes, tmp_path):
-    """Moments are saved, loaded and merged; another phase function has other light."""
+    """Angular moments are saved, loaded and merged; a file of another phase function is refused."""
     file = str(tmp_path / "light.npz")
     first = loaded(scenes, hg(0.4), cache_file=file)
     before = scenes.image(first, spp=2)
@@ -167,7 +167,7 @@ def test_files(scenes, tmp_path):
 
 @pytest.mark.parametrize("g", [0.4, 0.75])
 def test_equilibrium(scenes, g):
-    """Matter that emits what it absorbs, under a sky of 1: all is 1."""
+    """With emission equal to absorption and a sky of 1, all radiance is 1."""
     medium = scenes.medium(2.0, 0.6) | {"phase": hg(g)}
     integrator = {"type": "irrcache", "solver": "auto", "emission": 0.8, "resolution": 10}
     sky = {"type": "constant", "radiance": 1.0}

@@ -1,8 +1,8 @@
 """Words of a MetaImage's header that are too long for SimpleITK's reader are refused.
 
-MetaIO has 80 bytes for each word of the list or pattern that names the data files, and does not
-look whether they are enough. Longer words are written over other memory of the process, which then
-ends at any time later, or calculates with other numbers.
+MetaIO has buffers of 80 bytes for the words of the list or pattern that names the data files, and
+does not check their length. Longer words overwrite other memory of the process, which crashes later
+or computes wrong values.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ElementDataFile = {}
 FITS = "s" * 73 + "%d.raw"  # 79 bytes
 assert len(FITS) == 79
 
-#: What a header may not say, and the length of the word for which it is refused.
+#: Invalid values, and the length of the word for which they are refused.
 TOO_LONG = {
     "pattern": (f"s{FITS} 0 1 1", 80),
     "pattern in a folder": ("./" * 60 + "s%d.raw 0 1 1", 127),
@@ -40,7 +40,7 @@ TOO_LONG = {
 
 
 def written(folder, value: str, slices: str = "s%d.raw"):
-    """A header that names its data files by ``value``, with one file for each slice beside it."""
+    """Write a header that names its data files by ``value``, with one file per slice beside it."""
     for k in range(2):
         (folder / (slices % k)).write_bytes(VALUES[k].tobytes())
     path = folder / "ct.mhd"
@@ -50,19 +50,19 @@ def written(folder, value: str, slices: str = "s%d.raw"):
 
 @pytest.mark.parametrize(("value", "length"), TOO_LONG.values(), ids=TOO_LONG)
 def test_words_that_are_too_long_are_refused(tmp_path, value, length):
-    """Before SimpleITK sees them, with their length and the remedy."""
+    """Too long words are refused with their length and the remedy before SimpleITK reads them."""
     with pytest.raises(IrrcacheError, match=f"has {length} bytes.*beside the header"):
         read_volume(written(tmp_path, value))
 
 
 def test_tabs_are_refused(tmp_path):
-    """MetaIO takes them for a part of a word, and then divides by a step of 0."""
+    """Tabs are refused: MetaIO takes them for a part of a word, and then divides by a step of 0."""
     with pytest.raises(IrrcacheError, match="with a tab"):
         read_volume(written(tmp_path, "s%d.raw\t0 1 1"))
 
 
-def test_the_longest_word_is_read_within_its_memory(tmp_path):
-    """In a process of its own, which ends normally."""
+def test_longest_word_is_read_without_overflow(tmp_path):
+    """The longest word is read without memory errors, in a process of its own."""
     path = written(tmp_path, f"{FITS} 0 1 1", FITS)
     program = (
         "import sys; from mitsuba_irrcache.volumes.readers import read_volume\n"
@@ -75,8 +75,8 @@ def test_the_longest_word_is_read_within_its_memory(tmp_path):
     assert done.stdout.strip() == str(list(range(24)))
 
 
-def test_long_names_without_such_a_limit(tmp_path):
-    """Of a single file, and in the lines of a list."""
+def test_single_and_listed_names_have_no_limit(tmp_path):
+    """Single names, and names in the lines of a list, have no such limit."""
     below = tmp_path / ("d" * 120)
     below.mkdir()
     (below / "voxels.raw").write_bytes(VALUES.tobytes())

@@ -1,4 +1,4 @@
-"""A header may name data files of its own folder and of those that the user allows, no others."""
+"""A header may name data files in its own folder and in those that the user allows, no others."""
 
 from __future__ import annotations
 
@@ -51,15 +51,16 @@ SLICES = {
 
 @pytest.fixture
 def folders():
-    """A folder for a header, and one beside it, with data in both and in a folder below. Not in
-    ``tmp_path``, whose full names are too long for patterns in a MetaImage.
+    """Return a folder for a header, and one beside it, with data in both and in a subfolder.
+
+    They are not in ``tmp_path``, whose full names are too long for patterns in a MetaImage.
     """
     with tempfile.TemporaryDirectory() as short:
         yield filled(Path(short).resolve())
 
 
 def filled(top: Path) -> tuple[Path, Path]:
-    """The folders that `folders` makes in ``top``."""
+    """Create the folders of `folders` in ``top``."""
     own, other = top / "own", top / "other"
     for folder in (own, own / "below", other):
         folder.mkdir()
@@ -74,7 +75,7 @@ def filled(top: Path) -> tuple[Path, Path]:
 
 
 def written(own, case: str, names: list[str], cases=ONE):
-    """The file of a header that names these."""
+    """Write a header that names these files."""
     header, lines = cases[case]
     path = own / f"ct.{case.partition(',')[0]}"
     pattern = names[0].replace("0.raw", "%d.raw")
@@ -83,7 +84,7 @@ def written(own, case: str, names: list[str], cases=ONE):
 
 
 def elsewhere(other) -> dict[str, str]:
-    """Names of the same file in another folder."""
+    """Return names of the same file in another folder."""
     return {
         "absolute": str(other / "voxels.raw"),
         "upwards": "../other/voxels.raw",
@@ -112,7 +113,7 @@ def test_one_data_file(folders, case):
 
 @pytest.mark.parametrize("case", SLICES)
 def test_data_files_of_slices(folders, case):
-    """In a list, or by a pattern: the second one is looked at, too."""
+    """All files of a list or a pattern are checked."""
     own, other = folders
     good = written(own, case, ["slice0.raw", "slice1.raw"], SLICES)
     np.testing.assert_array_equal(read_volume(good).values, VALUES)
@@ -131,8 +132,8 @@ def test_data_files_of_slices(folders, case):
 
 
 @pytest.mark.parametrize("case", ["nhdr", "mhd"])
-def test_decoys(folders, case):
-    """A harmless name before the real one, in a comment or long after the start."""
+def test_names_in_comments_do_not_hide_data_files(folders, case):
+    """A harmless name before the actual one, in a comment or far behind the start, is no bypass."""
     own, other = folders
     header, line = ONE[case]
     real = line.format(other / "voxels.raw")
@@ -165,8 +166,8 @@ def test_patterns_that_name_no_files(folders, pattern):
 
 
 @pytest.mark.parametrize("extension", ["nrrd", "mha", "nii", "nii.gz"])
-def test_contents_do_not_choose_another_format(folders, extension):
-    """A header of one format under the extension of another names no file."""
+def test_format_is_that_of_the_extension(folders, extension):
+    """The extension determines the format: a header of another format is refused."""
     own, other = folders
     path = own / f"ct.{extension}"
     for header, line in (ONE["nhdr"], ONE["mhd"]):
@@ -176,15 +177,17 @@ def test_contents_do_not_choose_another_format(folders, extension):
 
 
 @pytest.mark.parametrize("extension", ["nrrd", "nhdr", "mha", "mhd"])
-def test_files_as_others_write_them(tmp_path, extension):
-    """Voxels after the header, and the data file beside it that SimpleITK writes."""
+def test_attached_and_detached_files_are_read(tmp_path, extension):
+    """Files with the voxels after the header, and detached files by SimpleITK, are read."""
     path = tmp_path / f"ct.{extension}"
     SimpleITK.WriteImage(SimpleITK.GetImageFromArray(VALUES), str(path))
     np.testing.assert_array_equal(read_volume(path).values, VALUES)
 
 
-def test_the_command(folders, capsys, monkeypatch):
-    """Refused with the option that allows it; and with that option, imported."""
+def test_import_command_refuses_and_allows_folders(folders, capsys, monkeypatch):
+    """The command refuses such a file with the name of the option, and imports it with the
+    option.
+    """
     own, _ = folders
     monkeypatch.chdir(own)
     written(own, "nhdr", ["../other/voxels.raw"])

@@ -1,4 +1,4 @@
-"""The solver ``sweep`` where there are surfaces and area lights around the medium."""
+"""The solver ``sweep`` with surfaces and area emitters around the medium."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DIM = {"type": "constant", "radiance": 0.1}
 
 @pytest.fixture(autouse=True)
 def small_batches(monkeypatch):
-    """Enough batches for a standard error, of few directions."""
+    """Return settings with enough batches for a standard error, of few directions each."""
     monkeypatch.setattr(sweep, "LARGEST_BATCH", 64)
 
 
@@ -33,7 +33,7 @@ def red() -> dict:
 
 
 def square(center, towards, size: float, **more) -> dict:
-    """A square that faces ``towards`` a point."""
+    """Return a square that faces ``towards`` a point."""
     place = mi.ScalarTransform4f().look_at(list(center), list(towards), [0.1, 1, 0.2])
     return {"type": "rectangle", "to_world": place.scale([size, size, 1])} | more
 
@@ -43,7 +43,7 @@ def ground(bsdf: dict | None = None) -> dict:
 
 
 def room(bsdf: dict, overlap: float = 1.5) -> dict:
-    """Six walls, which overlap at their edges, or else meet there."""
+    """Return six walls, which overlap at their edges or meet exactly."""
     size, walls = 2.5, {}
     for i, axis in enumerate(np.vstack([np.eye(3), -np.eye(3)])):
         up = np.roll(np.abs(axis), 1)
@@ -54,8 +54,10 @@ def room(bsdf: dict, overlap: float = 1.5) -> dict:
 
 
 def open_room(bsdf: dict) -> dict:
-    """Four walls. They meet exactly: where walls overlap, volpath and path find light of 1.04 in a
-    room of 1, even if there is no medium.
+    """Return four walls that meet exactly.
+
+    With overlapping walls, volpath and path find a radiance of 1.04 instead of 1, even without a
+    medium.
     """
     walls = room(bsdf, 1.0)
     return {name: walls[name] for name in ("wall0", "wall2", "wall3", "wall4")}
@@ -67,7 +69,9 @@ def lamp(size: float = 0.5) -> dict:
 
 
 def cloud(scenes, depth: float, albedo=0.97) -> dict:
-    """A dense ball with structure, its borders empty; ``depth`` is the extinction at its core."""
+    """Return a dense structured ball with empty borders; ``depth`` is the extinction at its
+    core.
+    """
     c = (np.arange(VOXELS) + 0.5) / VOXELS * 2 - 1
     z, y, x = np.meshgrid(c, c, c, indexing="ij")
     density = np.clip(1.1 - 1.4 * np.sqrt(x**2 + y**2 + z**2), 0, None)
@@ -91,13 +95,13 @@ def scene_sun(scenes) -> dict:
 
 
 def scene_occluder(scenes) -> dict:
-    """A ball between the sun and one half of the cloud."""
+    """Return a scene with a sphere between the sun and one half of the cloud."""
     ball = {"type": "sphere", "center": [-1.2, 2.6, -1.2], "radius": 0.8, "bsdf": grey(0.5)}
     return scene_sun(scenes) | {"shape": cloud(scenes, 4), "ball": ball}
 
 
 def scene_room(scenes) -> dict:
-    """Smoke in a closed room, under a lamp."""
+    """Return a medium in a closed room under an area light."""
     inside = {"emitter": None, "sensor": camera(scenes, (1.5, 1.0, -2.3)), "lamp": lamp()}
     walls = room(grey(0.7))
     walls["wall0"] = walls["wall0"] | {"bsdf": red()}
@@ -119,13 +123,13 @@ def load(scenes, objects: dict) -> mi.Scene:
 
 
 def image(scene: mi.Scene, name: str, spp: int, seed: int, **settings) -> np.ndarray:
-    """By an integrator of its own: kernels of a scene are compiled once."""
+    """Render with a new integrator; the kernels of a scene are compiled once."""
     integrator = mi.load_dict({"type": name, "rr_depth": 10} | settings)
     return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed), np.float64)
 
 
 def filled(scene: mi.Scene, solver: str = "sweep", **settings):
-    """The integrator with its caches."""
+    """Return the integrator with its caches."""
     integrator = {"type": "irrcache", "solver": solver, "rr_depth": 10} | settings
     integrator = mi.load_dict(integrator)
     integrator.prepare(scene)
@@ -139,9 +143,10 @@ def blocks(image: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("build", "max_depth", "spp"), SCENES.values(), ids=SCENES)
 def test_volpath(scenes, build, max_depth, spp):
-    """Cloud, its shadow on the ground, and what the ground sends back: block means of the image
-    within 1 % of the mean (root mean square, without noise: independent halves of both), and the
-    mean of all within 0.5 %.
+    """A cloud, its shadow, and the radiance that the ground reflects to it agree with volpath.
+
+    The RMSE of block means of the image is within 1 % of the mean (noise is excluded by independent
+    halves of both), and the mean of all within 0.5 %.
     """
     scene, depth = load(scenes, build(scenes)), {"max_depth": max_depth}
     sweep = {"solver": "sweep"} | depth
@@ -159,9 +164,10 @@ def test_volpath(scenes, build, max_depth, spp):
     ("around", "tolerance"), [(lambda bsdf: {"ground": ground(bsdf)}, 0.01), (open_room, 0.02)]
 )
 def test_white_furnace(scenes, around, tolerance):
-    """Nothing absorbs, the sky is 1: so is all light, seen in the image and known at the voxels,
-    where 128 directions leave a noise of some percent. Walls of the room are path traced; in this
-    room volpath is 1.3 % too bright on average.
+    """Without absorption under a sky of 1, image and cache are 1.
+
+    The noise of 128 directions is some percent per voxel. Walls of the room are path traced; in
+    this room volpath is 1.3 % too bright on average.
     """
     objects = {"shape": cloud(scenes, 8, 1.0), "emitter": SKY} | around(grey(1.0))
     scene = load(scenes, objects)
@@ -175,9 +181,11 @@ def test_white_furnace(scenes, around, tolerance):
 
 
 @pytest.mark.parametrize("size", [0.4, 2.4])
-def test_small_and_large_lamps_are_as_bright_as_paths(scenes, size):
-    """Lamps that are sampled from voxels, and those that lines meet: both layers of the cache as
-    ``path`` finds them, on average over all voxels. Light that is counted twice or left out shows.
+def test_small_and_large_emitters_agree_with_path(scenes, size):
+    """Both layers of the cache agree with ``path`` for small and large area lights.
+
+    Small ones are sampled from voxels, large ones are hit by tracks. Means over all voxels reveal
+    radiance that is counted twice or left out.
     """
     scene, found = load(scenes, scene_room(scenes) | {"lamp": lamp(size)}), []
     for solver, spp in (("sweep", 192), ("path", 64)):
@@ -186,9 +194,9 @@ def test_small_and_large_lamps_are_as_bright_as_paths(scenes, size):
     np.testing.assert_allclose(*found, rtol=0.02)
 
 
-def test_lights_nearby_and_several_media(scenes):
-    """A point light behind a post, and another medium beside the cloud, through which its light
-    comes: as ``path`` finds it, channel by channel.
+def test_point_light_and_several_media(scenes):
+    """A point light behind an occluder, seen through another medium, agrees with ``path`` per
+    channel.
     """
     fog = scenes.medium([1.5, 1.0, 0.5], [0.9, 0.8, 0.7])
     objects = {
@@ -207,7 +215,10 @@ def test_lights_nearby_and_several_media(scenes):
 
 
 def test_the_choice_of_solver(scenes):
-    """auto: sweep unless something is in the medium, or depths are few; and why not."""
+    """``auto`` selects sweep unless an object reaches into the medium or max_depth is small.
+
+    A request for ``sweep`` in these cases is refused with the reason.
+    """
     ball = {"type": "sphere", "center": [0, 0, 0], "radius": 0.2, "bsdf": grey(0.5)}
     veil = square((0, 0, 0), (0, 0, 1), 3, bsdf=grey(0.5))
     shape = cloud(scenes, 8)
@@ -233,8 +244,9 @@ def test_the_choice_of_solver(scenes):
 
 
 def test_standard_error_is_the_scatter(scenes):
-    """Batches are independent, paths between surfaces included: over 8 seeds the error that is told
-    is the scatter, within 30 %.
+    """The standard error agrees with the scatter over 8 seeds within 30 %.
+
+    Batches are independent, including the paths between surfaces.
     """
     scene = load(scenes, scene_sky(scenes) | {"ground": ground(grey(0.5))})
     settings = {"cache_spp": 96, "resolution": 8}
@@ -245,7 +257,7 @@ def test_standard_error_is_the_scatter(scenes):
 
 
 def test_more_batches_compile_nothing(scenes, kernels):
-    """More batches: the kernels of the first ones, but for one by accident."""
+    """More batches use the kernels of the first ones, with one accidental exception."""
     scene = load(scenes, scene_room(scenes))
     integrator = mi.load_dict({"type": "irrcache", "cache_spp": 128, "resolution": 12})
     known = {k["hash"] for k in kernels(lambda: integrator.prepare(scene))}

@@ -1,4 +1,4 @@
-"""What the integrator prints of itself, the record in reports and images, is complete."""
+"""to_string of the integrator, the record in reports and images, is complete."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
-#: A value of each property that is not its default.
+#: A value of each property that differs from its default.
 GIVEN = {
     "max_depth": 7,
     "rr_depth": 11,
@@ -36,12 +36,12 @@ def printed(integrator: mi.Integrator) -> dict[str, str]:
 
 
 def documented(integrator: mi.Integrator) -> set[str]:
-    """The properties in the plugin's documentation."""
+    """Return the properties in the plugin's documentation."""
     return set(re.findall(r"^\s+\* - (\w+)$", type(integrator).__doc__, re.MULTILINE))
 
 
 def test_every_documented_property_is_printed():
-    """By default, too; and nothing is read that is not documented."""
+    """Every documented property is printed, and no other property is read."""
     integrator = mi.load_dict({"type": "irrcache"})
     assert documented(integrator) == set(GIVEN)
     assert set(printed(integrator)) == set(GIVEN)
@@ -58,13 +58,15 @@ def test_values_are_printed_as_given():
 
 @pytest.mark.parametrize("name", GIVEN)
 def test_each_property_changes_the_record(name):
-    """Two integrators that differ differ in print."""
+    """Each property changes the printed record."""
     plain = str(mi.load_dict({"type": "irrcache"}))
     assert str(mi.load_dict({"type": "irrcache", name: GIVEN[name]})) != plain
 
 
 def test_volumes_and_later_changes_are_printed():
-    """An emitting volume, in the braces that Mitsuba's plugins use; samples raised later."""
+    """An emission volume is printed in Mitsuba's format, and so is a number of samples raised
+    later.
+    """
     volume = {"type": "constvolume", "value": 0.625}
     integrator = mi.load_dict({"type": "irrcache", "emission": volume})
     assert "0.625" in str(integrator)

@@ -1,5 +1,7 @@
-"""``irrcache`` through the doors that Mitsuba's users know: films, sensors, wrappers, ``cancel``,
-time-outs, seeds, parameters and gradients. What is seen is compared with ``volpath``.
+"""``irrcache`` through Mitsuba's interfaces: films, sensors, wrappers, cancellation, seeds,
+gradients.
+
+Images are compared with those of ``volpath``.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 SIZE = 12
 DEPTH = {"max_depth": 3, "rr_depth": 1000}
-#: Difference allowed beside 4.5 standard errors, relative to the mean: what a coarse cache errs.
+#: Difference allowed relative to the mean, in addition to 4.5 standard errors: the bias of a coarse
+#: cache.
 TOLERANCE = 0.015
 
 
@@ -29,7 +32,7 @@ STOCK = {"type": "volpath", **DEPTH}
 
 
 def cloud(scenes) -> dict:
-    """Smooth enough for a coarse cache."""
+    """Return a cloud that is smooth enough for a coarse cache."""
     to_world = scenes.placement(turn=20)
     return scenes.boundary(
         scenes.medium(scenes.texture((5, 6, 7), 0.6, 1.4, 4), 0.9, to_world), to_world
@@ -37,7 +40,7 @@ def cloud(scenes) -> dict:
 
 
 def pair(scenes, wrap=lambda inner: inner, settings=None, **objects) -> list[mi.Scene]:
-    """The same scene with both integrators."""
+    """Return the same scene with both integrators."""
     mine = ours(**(settings or {}))
     return [
         scenes.load(wrap(i), cloud(scenes), SIZE, **objects, default_solver="path")
@@ -46,7 +49,7 @@ def pair(scenes, wrap=lambda inner: inner, settings=None, **objects) -> list[mi.
 
 
 def agree(both: list[mi.Scene], spp=(32, 256), channels=None, **options) -> np.ndarray:
-    """Compares the means of all ``channels``; gives the first image of ours."""
+    """Compare the means of all ``channels``; return the first image by irrcache."""
     images = [
         [np.array(mi.render(s, spp=n, seed=seed, **options), np.float64) for seed in (1, 2)]
         for s, n in zip(both, spp, strict=True)
@@ -73,7 +76,7 @@ def camera(scenes, **film) -> dict:
 
 @pytest.mark.parametrize("layers", [{}, {"filter": "bilateral"}], ids=["plain", "filtered"])
 def test_pixel_formats(scenes, layers):
-    """Every one of hdrfilm's holds what it holds of volpath."""
+    """Each pixel format of hdrfilm has the same channel means as with volpath."""
     formats = ("rgb", "rgba", "xyz", "xyza", "luminance", "luminance_alpha")
     films = {f: camera(scenes, pixel_format=f) for f in formats}
     films["sensor"] = films.pop("rgb")
@@ -87,7 +90,7 @@ def test_pixel_formats(scenes, layers):
 
 @pytest.mark.parametrize("rfilter", ["tent", "gaussian", "lanczos"])
 def test_reconstruction_filters(scenes, rfilter):
-    """On a crop window, with samples beyond its border."""
+    """Reconstruction filters agree with volpath on a crop window with border samples."""
     crop = {"crop_offset_x": 2, "crop_offset_y": 3, "crop_width": 7, "crop_height": 6}
     film = {"rfilter": {"type": rfilter}, "sample_border": True, **crop}
     assert agree(pair(scenes, sensor=camera(scenes, **film))).shape == (6, 7, 3)
@@ -103,9 +106,7 @@ def test_samplers(scenes, sampler):
 
 
 def test_cameras(scenes):
-    """Several in one scene, of one cache: with a lens, without perspective, with a shutter, and two
-    side by side.
-    """
+    """Several sensors share one cache: thin lens, orthographic, with a shutter, and a batch."""
     plain = camera(scenes)
     wide = plain["film"] | {"width": 2 * SIZE}
     zoom = plain["to_world"] @ mi.ScalarTransform4f().scale([1.7, 1.7, 1])
@@ -122,8 +123,11 @@ def test_cameras(scenes):
     assert both[0].integrator().cache.samples == 64
 
 
-def test_meters(scenes):
-    """Along a ray, from a direction, and on a surface. A ray alone sees the noise of few voxels."""
+def test_radiance_and_irradiance_meters(scenes):
+    """Radiance and irradiance meters agree with volpath.
+
+    A radiance meter has the noise of few voxels, since it measures along a single ray.
+    """
     film = camera(scenes, width=4, height=4)["film"]
     target = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(0.4)}
     patch = mi.ScalarTransform4f().look_at([0.3, 0, -3.0], [0, 0, 0], [0, 1, 0])
@@ -150,8 +154,9 @@ def test_meters(scenes):
 
 
 def test_in_aov_and_moment(scenes):
-    """What they show of us and beside us; the second moments are those of our own samples, which
-    have less noise.
+    """Nested in ``aov`` and ``moment``, the channels agree with those of volpath.
+
+    The second moments differ: they are of irrcache's own samples, which have less noise.
     """
 
     def aov(inner):
@@ -165,11 +170,11 @@ def test_in_aov_and_moment(scenes):
     assert (square > 0.999 * mean**2).all()
 
 
-# Ends before the end
+# Cancellation
 
 
 def slow(scenes, **settings) -> mi.Scene:
-    """Half a minute of work."""
+    """Return a scene that renders for half a minute."""
     return scenes.load(
         ours(solver="path", resolution=32, cache_spp=4096) | settings,
         cloud(scenes),
@@ -178,7 +183,10 @@ def slow(scenes, **settings) -> mi.Scene:
 
 
 def test_cancelled_while_the_cache_is_built(scenes):
-    """From another thread: the image shows what there is, and the next one goes on from there."""
+    """``cancel`` from another thread stops the cache build; the next image continues from there.
+
+    The image shows the incomplete cache.
+    """
     scene = slow(scenes)
     integrator, seen = scene.integrator(), []
 
@@ -200,7 +208,9 @@ def test_cancelled_while_the_cache_is_built(scenes):
 
 
 def test_cancelled_while_the_image_is_rendered(scenes, monkeypatch):
-    """After the pass that is in progress, as in volpath; a later rendering is not."""
+    """``cancel`` stops after the current pass, as in volpath, and does not affect later
+    renderings.
+    """
     from mitsuba_irrcache.render import film as rendering
 
     monkeypatch.setattr(rendering, "LANES", SIZE**2 * 4)
@@ -243,8 +253,8 @@ def test_a_progressive_run_is_cancelled(scenes):
 
 
 def test_seeds_and_samples(scenes):
-    """The same seed gives the same image, in whatever form it comes; no samples named, the
-    sampler's; and the scene's own sampler is left alone.
+    """Equal seeds of any type give equal images; spp defaults to the sampler's, which is not
+    changed.
     """
     sampler = {"type": "independent", "sample_count": 6}
     scene = scenes.load(
@@ -263,7 +273,7 @@ def test_seeds_and_samples(scenes):
     assert scene.sensors()[0].sampler().sample_count() == 6
 
 
-def test_develop_and_evaluate(scenes):
+def test_develop_and_evaluate_arguments(scenes):
     scene = scenes.load(ours(), cloud(scenes), SIZE, default_solver="path")
     integrator = scene.integrator()
     expected = scenes.image(scene, spp=4)
@@ -274,7 +284,7 @@ def test_develop_and_evaluate(scenes):
     np.testing.assert_array_equal(np.array(lazy), expected)
 
 
-def test_an_integrator_and_a_sensor_of_their_own(scenes):
+def test_separately_loaded_integrator_and_sensor(scenes):
     scene = scenes.load(STOCK, cloud(scenes), SIZE)
     integrator, sensor = mi.load_dict(ours()), mi.load_dict(camera(scenes))
     found = scenes.image(scene, sensor=sensor, integrator=integrator, spp=4)
@@ -282,7 +292,9 @@ def test_an_integrator_and_a_sensor_of_their_own(scenes):
 
 
 def test_to_string(scenes):
-    """Says what was asked for, in Mitsuba's form; the scene's own text has it."""
+    """to_string lists the user's settings in Mitsuba's format, also as part of the scene's
+    string.
+    """
     text = str(mi.load_dict(ours(aovs="far:depth,noise", step=0.5)))
     assert text.startswith("IrradianceCachingIntegrator[\n  max_depth = 3,") and text.endswith("]")
     assert "aovs = far:depth, noise:noise," in text and "step = 0.5," in text
@@ -307,7 +319,9 @@ KEYS = ("sigma_t.data", "albedo.value.value", "sun.irradiance.value", "reflectan
 
 @pytest.mark.parametrize("wrapped", [False, True], ids=["simple", "surfaces, in aov"])
 def test_gradients_are_refused(scenes, wrapped):
-    """Images are rendered all the same; a derivative of them names prbvolpath."""
+    """Scenes with gradients render, but differentiating the image raises an error that names
+    prbvolpath.
+    """
     ball = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "diffuse"}} if wrapped else None
     integrator = ours(solver="path", resolution=8, cache_spp=16)
     if wrapped:

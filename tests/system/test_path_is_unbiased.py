@@ -1,8 +1,8 @@
-"""The cache against a delta tracker that shares no code with it.
+"""The solver ``path`` against an independent delta tracker.
 
 The reference is written in NumPy: float64, its own trilinear interpolation, one global majorant,
-analog collisions, binary transmittance towards the sun, and each colour channel traced by itself.
-Only the radiance of an escaping ray is asked of Mitsuba.
+analog collisions, binary transmittance towards the sun, and each colour channel traced separately.
+Only the radiance of escaping rays comes from Mitsuba.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ SAMPLES = 2048
 
 
 class DeltaTracker:
-    """Irradiance by analog paths in a grey medium that fills the image of the unit cube, for each
-    channel of the light.
+    """Compute the fluence of analog paths in a grey medium that fills the transformed unit cube.
+
+    Each channel of the emitters is computed separately.
     """
 
     def __init__(self, sigma_t, albedo, to_world, sky, sun: np.ndarray, seed: int) -> None:
@@ -32,8 +33,9 @@ class DeltaTracker:
         self.rng = np.random.default_rng(seed)
 
     def irradiance(self, positions: np.ndarray) -> np.ndarray:
-        """Light of scattering order 0, order 1, and all above, (3, n, channel), one path per
-        position (n, 3).
+        """Return the fluence of order 0, of order 1, and of all higher orders, (3, n, channel).
+
+        One path is traced per position (n, 3).
         """
         result = np.zeros((3, len(positions), len(self.sun)))
         alive, where = np.arange(len(positions)), positions
@@ -45,7 +47,7 @@ class DeltaTracker:
             escaped, where = self._fly(where, direction)
             light = escaped[:, None] * 4 * np.pi * self.sky(direction) + sunlit[:, None] * self.sun
             result[min(order, 2), alive] += light
-            # Absorption by chance, so every path has the weight 1.
+            # Absorption is sampled, so every path has the weight 1.
             survives = ~escaped
             survives[survives] &= self.rng.random(survives.sum()) < self._lookup(
                 self.albedo, where[survives]
@@ -55,7 +57,7 @@ class DeltaTracker:
         return result
 
     def _fly(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whether each ray leaves the medium without a collision, and where it collides."""
+        """Return whether each ray leaves the medium without a collision, and where it collides."""
         majorant = self.sigma_t.max()
         position, flying = origin.copy(), np.ones(len(origin), bool)
         escaped = np.zeros(len(origin), bool)
@@ -86,7 +88,7 @@ class DeltaTracker:
 
 
 def voxel_centers(cache) -> np.ndarray:
-    """World positions (n, 3) of the cached voxels."""
+    """Return the world positions (n, 3) of the cached voxels."""
     nz, ny, nx = cache.grid.shape
     z, y, x = np.unravel_index(np.array(cache.active), (nz, ny, nx))
     local = (np.stack([x, y, z], axis=1) + 0.5) / [nx, ny, nz]
@@ -94,15 +96,18 @@ def voxel_centers(cache) -> np.ndarray:
 
 
 def sky_image() -> np.ndarray:
-    """An environment that is ten times brighter on one side than on the other, (8, 16, 3)."""
+    """Return an environment that is ten times brighter on one side than on the other, (8, 16,
+    3).
+    """
     v, u = np.meshgrid(np.linspace(0, np.pi, 8), np.linspace(0, 2 * np.pi, 16), indexing="ij")
     brightness = 0.1 + 0.5 * (1 + np.sin(v) * np.cos(u - 1)) ** 2 / 2
     return np.float32(brightness[..., None] * [1.0, 0.7, 0.4])
 
 
 def coloured_medium(scenes, coloured: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Extinction from 0.1 to 3 (optical depth 2 to 5 across) and albedo from 0.4 to 0.98, (z, y, x,
-    channel).
+    """Return extinction from 0.1 to 3 and albedo from 0.4 to 0.98, (z, y, x, channel).
+
+    The optical depth is 2 to 5 across.
     """
     channels = 3 if coloured else 1
     sigma_t = scenes.texture((*SHAPE, channels), 0.1, 3.0, 1)
@@ -112,16 +117,14 @@ def coloured_medium(scenes, coloured: bool) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def measured():
-    """Reference samples, kept from one max_depth to the next: coloured -> per-channel mean and
-    error of orders.
+    """Cache reference samples across max_depth: coloured -> per-channel mean and error of
+    orders.
     """
     return {}
 
 
 def reference(store, coloured, sigma_t, albedo, to_world, positions, environment):
-    """Means and standard errors (3, n, channel) of the light up to scattering order 0, 1, and of
-    all orders.
-    """
+    """Return means and standard errors (3, n, channel) up to order 0, up to order 1, and of all."""
     if coloured not in store:
         parts = []
         for k, channels in enumerate([[0], [1], [2]] if coloured else [[0, 1, 2]]):
@@ -143,12 +146,12 @@ def reference(store, coloured, sigma_t, albedo, to_world, positions, environment
 @pytest.mark.parametrize("max_depth", [2, 3, -1])
 @pytest.mark.parametrize("coloured", [False, True], ids=["grey", "rgb"])
 def test_voxel_irradiance_is_unbiased(scenes, measured, coloured, max_depth):
-    """Z-tests at every voxel (about 250), for each colour channel (fixed seeds; 6 cases x 3
-    channels).
+    """The fluence at every voxel (about 250) passes Z-tests for each colour channel.
 
-    Each statistic would fail by chance with probability below 1e-4 per channel: |mean of Z| sqrt(n)
-    < 4, the variance of Z within 4 deviations of 1, |Z| < 5.2 everywhere, and the pooled mean
-    within 4 standard errors, which are about 0.2 %: a bias of 1 % of the light fails.
+    The seeds are fixed; there are 6 cases x 3 channels. Each statistic would fail by chance with
+    probability below 1e-4 per channel: |mean of Z| sqrt(n) < 4, the variance of Z within 4
+    deviations of 1, |Z| < 5.2 everywhere, and the pooled mean within 4 standard errors, which are
+    about 0.2 %: a bias of 1 % of the fluence fails.
     """
     sigma_t, albedo = coloured_medium(scenes, coloured)
     to_world = scenes.placement((2.4, 1.4, 1.8), turn=35, mirror=True)

@@ -1,4 +1,4 @@
-"""Spot lights in media: beams narrower than the voxels of a cache, against quadrature."""
+"""Spot lights in media: cones narrower than a voxel of the cache, against quadrature."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ def fog(scenes, cutoff: float, resolution: int, solver: str = "sweep", **objects
 
 
 def single(scene: mi.Scene) -> np.ndarray:
-    """Radiance of single scattering in the cube [-1, 1]^3: means over `PER_SIDE`^2 places of each
-    pixel, by the midpoint rule along each ray, between its ends in the cube.
+    """Return the radiance of single scattering in the cube [-1, 1]^3.
+
+    Means over `PER_SIDE`^2 points of each pixel, by the midpoint rule along the ray inside the
+    cube.
     """
     at = (np.arange(SIZE * PER_SIDE) + 0.5) / (SIZE * PER_SIDE)
     x, y = (np.float32(c.ravel()) for c in np.meshgrid(at, at))
@@ -56,9 +58,11 @@ def single(scene: mi.Scene) -> np.ndarray:
 
 @pytest.mark.parametrize(("cutoff", "rmse"), [(7.0, 0.04), (30.0, 0.015)])
 def test_single_scattering(scenes, cutoff, rmse):
-    """With 16 voxels along the cube, of which a beam of 7 degrees has one or two across; what is
-    left is the noise of both where rays cross the beam next to the light: 45 times as bright as the
-    image's mean. As an irradiance interpolated between voxels, the beam was 7 % too dark.
+    """Single scattering of a spot light of 7 degrees agrees with quadrature.
+
+    With 16 voxels along the cube, the cone is one or two voxels wide. The remaining error is the
+    noise of both images where rays cross the cone next to the emitter, at 45 times the mean
+    radiance. When the irradiance was interpolated between voxels, the cone was 7 % too dark.
     """
     scene = fog(scenes, cutoff, 16)
     expected, image = single(scene), scenes.image(scene, spp=4096)[..., 0]
@@ -68,8 +72,9 @@ def test_single_scattering(scenes, cutoff, rmse):
 
 
 def test_all_orders_agree_with_path(scenes):
-    """The sum over the image, whose noise is 0.5 % with ``path`` here; sweep scatters the means
-    over voxels.
+    """The image means of both solvers agree with all orders of scattering.
+
+    The noise of ``path`` is 0.5 % here; sweep scatters the means over voxels.
     """
     images = [
         scenes.image(_all_orders(scenes, solver), spp=64).mean() for solver in ("sweep", "path")
@@ -86,8 +91,10 @@ def _all_orders(scenes, solver: str) -> mi.Scene:
     )
 
 
-def test_a_beam_past_an_object(scenes):
-    """A ball in the beam shadows the fog behind it, as with ``path``."""
+def test_spot_light_with_an_occluder(scenes):
+    """An object in the cone of a spot light casts the same shadow in the medium as with
+    ``path``.
+    """
     ball = {
         "type": "sphere",
         "center": [0.16, 1.15, 0.05],
@@ -100,8 +107,8 @@ def test_a_beam_past_an_object(scenes):
     assert dark < 0.75 * clear
 
 
-def test_the_cache_of_a_file_shows_the_beam(scenes, tmp_path):
-    """A stored cache, which is not refined, is rendered like the one that was computed."""
+def test_loaded_cache_renders_the_spot_light(scenes, tmp_path):
+    """A cache loaded from a file renders the same spot light as the cache that was saved."""
     file = str(tmp_path / "cache.irr")
     cube = scenes.boundary(scenes.medium(SIGMA_T, ALBEDO))
     settings = {"resolution": 12, "solver": "sweep", "cache_spp": 32, "cache_file": file}
@@ -114,8 +121,8 @@ def test_the_cache_of_a_file_shows_the_beam(scenes, tmp_path):
     np.testing.assert_array_equal(*images)
 
 
-def test_irradiance_of_the_cache_holds_the_mean_of_the_beam(scenes):
-    """The integral of ``cache.uncollided`` over the volume against points all over it."""
+def test_cached_irradiance_conserves_the_spot_light(scenes):
+    """The integral of ``cache.uncollided`` equals that of points sampled in the whole volume."""
     scene = fog(scenes, 10.0, 12)
     scene.integrator().prepare(scene)
     mean = np.array(scene.integrator().cache.uncollided).mean()

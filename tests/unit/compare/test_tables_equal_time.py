@@ -1,4 +1,4 @@
-"""The table of errors after equal time shows images that came late or early, with their time."""
+"""The table of errors after equal time includes early and late images, with their time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def table(budgets, *curves):
 
 @pytest.mark.parametrize("late", [TOLERANCE * 1.001, 1.2, 3.0, 40.0])
 def test_a_late_snapshot_is_shown_with_its_time(late):
-    """However late; it is not among those of which one is best."""
+    """A late snapshot is shown with its time, and is not a candidate for the best value."""
     slow = curve("slow", [late, 10 * late], [0.25, 0.01])
     fast = curve("fast", [1.0, 10.0], [0.3, 0.1])
     other = curve("other", [1.0, 10.0], [0.4, 0.2])
