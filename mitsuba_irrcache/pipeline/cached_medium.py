@@ -32,11 +32,11 @@ from mitsuba_irrcache.pipeline.defaults import (
     warn_of_dense_border,
 )
 from mitsuba_irrcache.scene.fingerprint import differing, digests
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
+from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, least_batch
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.solvers.path import solver as path_solver
-from mitsuba_irrcache.solvers.sn import solver as sn_solver
-from mitsuba_irrcache.solvers.sn.anisotropic import AnisotropicSweep, least_batch
-from mitsuba_irrcache.solvers.sn.solver import Sweep
 
 #: Held by the thread that writes a cache file.
 _SAVING = Lock()

@@ -18,7 +18,7 @@ from mitsuba_irrcache.scene.compile import media_of
 from mitsuba_irrcache.scene.consistency import described
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, obstacle
 from mitsuba_irrcache.solvers import half_space
-from mitsuba_irrcache.solvers.sn import solver as sn_solver
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 from mitsuba_irrcache.transport.path import is_null
 
 #: Why something is as a property says.

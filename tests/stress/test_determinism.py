@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from experiments.robustness.stability.worlds import WHITE_SKY, Camera, Matter, World, blob, scene
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import SMALL
 from mitsuba_irrcache.solvers.path import solver as path_solver
-from mitsuba_irrcache.solvers.sn.tracks import SMALL
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -13,8 +13,8 @@ import pytest
 from experiments.performance.kinds.run import box, smoke
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import bake_media
-from mitsuba_irrcache.solvers.sn import multigrid, tracks
-from mitsuba_irrcache.solvers.sn import solver as sn_solver
+from mitsuba_irrcache.solvers.discrete_ordinates import multigrid, tracks
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -12,7 +12,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline import defaults
 from mitsuba_irrcache.pipeline.defaults import choose_grid
-from mitsuba_irrcache.solvers.sn import solver as sn_solver
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

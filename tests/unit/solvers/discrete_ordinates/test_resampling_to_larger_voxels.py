@@ -7,7 +7,7 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.scene.compile import bake_scene
-from mitsuba_irrcache.solvers.sn.resampling import baked, detail_of
+from mitsuba_irrcache.solvers.discrete_ordinates.resampling import baked, detail_of
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

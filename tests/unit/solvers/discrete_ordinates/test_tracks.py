@@ -9,9 +9,9 @@ import pytest
 
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn import tracks
-from mitsuba_irrcache.solvers.sn.kernel import ONE
-from mitsuba_irrcache.solvers.sn.tracks import Tracks, sharpened
+from mitsuba_irrcache.solvers.discrete_ordinates import tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.kernel import ONE
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, sharpened
 
 SHAPES = [(8, 8, 8), (7, 12, 5), (1, 6, 9), (5, 1, 1), (9, 4, 1)]
 #: Along axes, edges and diagonals, almost along them, and between.

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.core.fast_math import absorbed, clipped, decay, least
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.solvers.sn.empty_space import CELL
+from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import CELL
 
 #: Positions within a voxel are integers below this: lines can be followed back without rounding.
 ONE = 1 << 24

@@ -27,10 +27,17 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn.empty_space import EmptySpace
-from mitsuba_irrcache.solvers.sn.extinction import Extinction
-from mitsuba_irrcache.solvers.sn.kernel import DIRECTION, INTEGERS, NUMBERS, ONE, add_copies, follow
-from mitsuba_irrcache.solvers.sn.layout import (
+from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import EmptySpace
+from mitsuba_irrcache.solvers.discrete_ordinates.extinction import Extinction
+from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
+    DIRECTION,
+    INTEGERS,
+    NUMBERS,
+    ONE,
+    add_copies,
+    follow,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     STANDARD,
     flat,
     joined,
@@ -38,7 +45,7 @@ from mitsuba_irrcache.solvers.sn.layout import (
     slicewise,
     strides_of,
 )
-from mitsuba_irrcache.solvers.sn.track_table import Group, Rows, TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import Group, Rows, TrackTable
 
 #: What lines leave in a voxel is a mean over its cross section: smoothing of variance 1/12 along
 #: both axes across, half of which is to be taken back (`sharpened`).

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn import multigrid, tracks
-from mitsuba_irrcache.solvers.sn.anderson import AndersonAcceleration
-from mitsuba_irrcache.solvers.sn.angular_quadrature import spread
-from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.track_table import BoundarySource
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates import multigrid, tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.anderson import AndersonAcceleration
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import spread
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.solvers.sn.kernel import DIRECTION, NUMBERS, ONE, WEIGHT
+from mitsuba_irrcache.solvers.discrete_ordinates.kernel import DIRECTION, NUMBERS, ONE, WEIGHT
 
 
 class TrackTable:

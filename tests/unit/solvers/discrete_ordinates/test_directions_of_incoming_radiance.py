@@ -10,10 +10,10 @@ import pytest
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
-from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance
-from mitsuba_irrcache.solvers.sn.kernel import ONE
-from mitsuba_irrcache.solvers.sn.moments import AnisotropicMultigridLevel, Moments
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import IncomingRadiance
+from mitsuba_irrcache.solvers.discrete_ordinates.kernel import ONE
+from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -115,7 +115,7 @@ def test_paths_begin_on_their_lines(scenes, monkeypatch):
     places of the lattice: a whole number of voxels from the first line.
     """
     monkeypatch.setattr(
-        "mitsuba_irrcache.solvers.sn.boundary_condition._follow",
+        "mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition._follow",
         lambda *args: (None, None, None, mi.UInt32(0), None),
     )
     grid = Grid((12, 10, 8), scenes.placement((1.0, 3.0, 2.0), turn=35))

@@ -10,12 +10,15 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.solvers.sn.angular_quadrature import spread, spread_together
-from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance, SurfaceBoundary
-from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
-from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.track_table import TrackTable
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import spread, spread_together
+from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import (
+    IncomingRadiance,
+    SurfaceBoundary,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 #: Directions and what belongs to them, as `Tracks.table` wants it.
 Rows = Sequence[np.ndarray]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn.tracks import Tracks, sharpened
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, sharpened
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.scene.compile import bake_scene
-from mitsuba_irrcache.solvers.sn.resampling import albedo_of_collisions
+from mitsuba_irrcache.solvers.discrete_ordinates.resampling import albedo_of_collisions
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -9,7 +9,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn.layout import flat, places_of, slicewise, strides_of
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
+    flat,
+    places_of,
+    slicewise,
+    strides_of,
+)
 
 #: Extinction is kept in 16 bits, rounded at random, between 0 and the largest there is, at most
 #: this optical depth of a voxel.

@@ -17,7 +17,11 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import spots_of
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.solvers.sn.angular_quadrature import STEP, spread_together, strata
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
+    STEP,
+    spread_together,
+    strata,
+)
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn import tracks
-from mitsuba_irrcache.solvers.sn.kernel import ONE
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates import tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.kernel import ONE
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -20,15 +20,24 @@ from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.solvers.sn.boundary_condition import SurfaceBoundary
-from mitsuba_irrcache.solvers.sn.direct_emission import emitted_light
-from mitsuba_irrcache.solvers.sn.direct_light import Lamps, is_lamp, split
-from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
-from mitsuba_irrcache.solvers.sn.layout import side_by_side
-from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.ordinates import BoundaryOrdinateSet, OrdinateSet, arriving, merged
-from mitsuba_irrcache.solvers.sn.resampling import albedo_of_collisions, baked, detail_of
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
+from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emitted_light
+from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import Lamps, is_lamp, split
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import side_by_side
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
+    BoundaryOrdinateSet,
+    OrdinateSet,
+    arriving,
+    merged,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
+    albedo_of_collisions,
+    baked,
+    detail_of,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 #: Directions per voxel of a batch, pairs of opposite ones, at least and at most. Spread evenly
 #: together, 32 leave half the noise of two sets of 16, and 64 four fifths of that of two of 32.

@@ -18,10 +18,10 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid, stencil
-from mitsuba_irrcache.solvers.sn.anderson import TINY, AndersonAcceleration, mixed
-from mitsuba_irrcache.solvers.sn.layout import voxels_of
-from mitsuba_irrcache.solvers.sn.track_table import TrackTable
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.anderson import TINY, AndersonAcceleration, mixed
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxels_of
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 #: Voxels along the longest side of the coarsest grid, at most.
 COARSEST = 20

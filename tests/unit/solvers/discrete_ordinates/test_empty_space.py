@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn import empty_space, tracks
-from mitsuba_irrcache.solvers.sn.empty_space import CELL, EmptySpace
-from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates import empty_space, tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import CELL, EmptySpace
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

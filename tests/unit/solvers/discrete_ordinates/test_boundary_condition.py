@@ -9,10 +9,13 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.scene.compile import bake_media
-from mitsuba_irrcache.solvers.sn import boundary_condition
-from mitsuba_irrcache.solvers.sn.boundary_condition import IncomingRadiance, SurfaceBoundary
-from mitsuba_irrcache.solvers.sn.track_table import BoundarySource
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates import boundary_condition
+from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import (
+    IncomingRadiance,
+    SurfaceBoundary,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.scene.compile import bake_media
-from mitsuba_irrcache.solvers.sn.direct_light import Lamps, is_lamp
+from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import Lamps, is_lamp
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

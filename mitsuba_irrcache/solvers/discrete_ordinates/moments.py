@@ -16,11 +16,11 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.solvers.sn.layout import joined, layers_of
-from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.ordinates import BoundaryOrdinateSet, OrdinateSet
-from mitsuba_irrcache.solvers.sn.track_table import Group, TrackTable
-from mitsuba_irrcache.solvers.sn.tracks import Tracks, sharpened
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import joined, layers_of
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import BoundaryOrdinateSet, OrdinateSet
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import Group, TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, sharpened
 
 #: Highest degree of what is corrected on coarser grids.
 SMOOTH = 1

@@ -10,11 +10,11 @@ import pytest
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
-from mitsuba_irrcache.solvers.sn import tracks
-from mitsuba_irrcache.solvers.sn.angular_quadrature import spread
-from mitsuba_irrcache.solvers.sn.moments import AnisotropicMultigridLevel, Moments
-from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates import tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import spread
+from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

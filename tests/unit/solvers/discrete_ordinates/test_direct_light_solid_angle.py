@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.sn import direct_light
+from mitsuba_irrcache.solvers.discrete_ordinates import direct_light
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.solvers.sn.angular_quadrature import spread, spread_together
-from mitsuba_irrcache.solvers.sn.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import spread, spread_together
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

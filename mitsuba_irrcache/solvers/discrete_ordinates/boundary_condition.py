@@ -24,10 +24,10 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.context import probe
-from mitsuba_irrcache.solvers.sn.layout import joined
-from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.track_table import BoundarySource, TrackTable
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import joined
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 from mitsuba_irrcache.transport.path import Start, trace, trace_to_infinity
 
 #: Cells of a direction, at most about: a path is followed for one line in each, and rays that only

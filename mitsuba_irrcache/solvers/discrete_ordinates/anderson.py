@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.solvers.sn.layout import voxels_of
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxels_of
 
 #: Below all light.
 TINY = 1e-300

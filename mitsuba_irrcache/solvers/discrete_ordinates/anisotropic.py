@@ -9,11 +9,11 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.solvers.sn.layout import joined
-from mitsuba_irrcache.solvers.sn.moments import AnisotropicMultigridLevel, Moments
-from mitsuba_irrcache.solvers.sn.multigrid import MultigridLevel
-from mitsuba_irrcache.solvers.sn.ordinates import OrdinateSet
-from mitsuba_irrcache.solvers.sn.solver import Sweep
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import joined
+from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 
 #: Directions of a pass for moments up to order 4, and beyond. They have to integrate products of
 #: these: under a sun, with g = 0.5 and 0.85, half as many left twice and five times the error.
