@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.sequences import GOLDEN_STEP, lattice_points
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
@@ -38,7 +39,7 @@ WHOLE_SPOT = 0.97
 #: Half the angle of spots that are as good as points.
 POINT_LIKE = float(np.deg2rad(1))
 #: Directions that are drawn to find these, and the step from one to the next.
-SPOT_SAMPLES, GOLDEN = 1 << 16, (5**0.5 - 1) / 2
+SPOT_SAMPLES = 1 << 16
 #: Lamps that are told apart, and points of each that tell how it lies.
 MOST_LAMPS, POINTS = 8, 1024
 #: Terms of a series of Legendre polynomials that are left out beyond the last one larger than this.
@@ -336,8 +337,7 @@ def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
     (1 + n, channels) that comes from beside all of them, and from each.
     """
     rng = np.random.default_rng(3)
-    number = np.arange(SPOT_SAMPLES)
-    even = np.stack([(number + 0.5) / SPOT_SAMPLES, number * GOLDEN % 1])
+    even = lattice_points(SPOT_SAMPLES, GOLDEN_STEP)
     samples = mi.Point2f(np.float32((even + rng.random((2, 1))) % 1))
     record, colours = environment.sample_direction(
         dr.zeros(mi.Interaction3f, SPOT_SAMPLES), samples

@@ -8,12 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.polynomial.legendre import legval
 
-_GOLDEN = (1 + 5**0.5) / 2
-
-
-#: One over the root of x^3 = x + 1: steps of it are spread evenly.
-STEP = 0.7548776662466927
-
+from mitsuba_irrcache.core.sequences import GENERALISED_GOLDEN_RATIOS, fibonacci_hemisphere
 
 #: What a set, of several that share their directions, is to integrate, and how much it matters:
 #: spherical harmonics by their degree.
@@ -43,11 +38,8 @@ def spread_together(
 @lru_cache(maxsize=32)
 def _shared_out(sets: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions of one hemisphere on a Fibonacci spiral, and which of them each set has."""
-    number = np.arange(sets * count)
-    z, turn = 1 - (number + 0.5) / len(number), number / _GOLDEN % 1
-    radius, angle = np.sqrt(1 - z * z), 2 * np.pi * turn
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-    members = strata(sets, turn, 1 / _GOLDEN)
+    points, turn = fibonacci_hemisphere(sets * count)
+    members = strata(sets, turn, 1 / GENERALISED_GOLDEN_RATIOS[1])
     # The squared error of a set's integrals is the sum of this over all pairs of its points, by the
     # addition theorem. Two sets exchange those two points that lower it most.
     factors = np.zeros(max(DEGREES) + 1)

@@ -21,6 +21,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import Divisor, symbolic
+from mitsuba_irrcache.core.sequences import hashed_seed, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.context import probe
@@ -202,9 +203,9 @@ class IncomingRadiance:
         back, cell = (within & 1) == 1, within >> 1
         cell_c = cell // dr.maximum(wide, 1)
         cell_b = cell - cell_c * wide
-        first, batch, use = (dr.opaque(mi.UInt32, s) for s in seed)
-        state = mi.sample_tea_32(lanes, mi.sample_tea_32(first, batch)[0] + use)
-        rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
+        *batch, use = seed
+        stream = hashed_seed(batch)[0] + dr.opaque(mi.UInt32, use)
+        rng = random_stream(mi.sample_tea_32(lanes, stream))
         lines = least_b, least_c, slope_b, slope_c, nb, nc, na
         b, c, near, far, rng = _one_of(edge, mi.Float(cell_b), mi.Float(cell_c), *lines, rng)
         hit = near < far

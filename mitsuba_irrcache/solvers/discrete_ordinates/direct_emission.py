@@ -7,11 +7,9 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import hashed_seed, kronecker_words, random_stream, unit_floats
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.tracking import free_flight
-
-#: 2^32 over the root of x^3 = x + 1, and over its square: points that are spread evenly.
-STEPS = (3242174889, 2447445414)
 
 
 @symbolic
@@ -27,9 +25,7 @@ def emitted_light(
     at each position. ``seed`` ends with the number of the batch.
     """
     place = dr.arange(mi.UInt32, dr.width(position))
-    stream = mi.sample_tea_32(*(dr.opaque(mi.UInt32, s) for s in seed))[0]
-    state = mi.sample_tea_32(place, stream)
-    rng = mi.PCG32(initstate=mi.UInt64(state[0]) << 32 | mi.UInt64(state[1]), initseq=1)
+    rng = random_stream(mi.sample_tea_32(place, hashed_seed(seed)[0]), 1)
     shift = [rng.next_uint32(), rng.next_uint32()]
     total, weight = nothing(directional), dr.opaque(mi.Float, 4 * dr.pi / count)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, count)
@@ -48,5 +44,4 @@ def emitted_light(
 
 def _direction(shift: list[mi.UInt32], k: mi.UInt32) -> mi.Vector3f:
     """Direction ``k`` of the set with this random shift."""
-    u = [mi.Float((s + k * n) >> 8) * 2.0**-24 for s, n in zip(shift, STEPS, strict=True)]
-    return mi.warp.square_to_uniform_sphere(mi.Point2f(u))
+    return mi.warp.square_to_uniform_sphere(mi.Point2f(unit_floats(kronecker_words(k, shift))))

@@ -15,6 +15,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import visibility
@@ -99,9 +100,7 @@ class Lamps:
             return self._lights
         samples = min(max(SAMPLES, self._small), MOST_SAMPLES)
         lane = dr.arange(mi.UInt32, dr.width(self._p))
-        seeds = mi.sample_tea_32(*(dr.opaque(mi.UInt32, s) for s in seed))
-        state = mi.sample_tea_32(lane, seeds[1])
-        rng = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
+        rng = random_stream(mi.sample_tea_32(lane, hashed_seed(seed)[1]))
         light = _sampled(
             self._scene, self._medium, self._others, self._emitters, self._p,
             dr.opaque(mi.UInt32, self._small), dr.opaque(mi.UInt32, samples), rng,
@@ -146,9 +145,7 @@ def _sampled(scene, medium, others, emitters, p, count, samples, rng, directiona
         # The same number on each lamp, as far as it goes; evenly spread over it.
         which = mi.UInt32((mi.Float(k) + shift.z) / mi.Float(samples) * mi.Float(count))
         emitter = dr.gather(mi.EmitterPtr, emitters, dr.minimum(which, count - 1))
-        u = mi.Float(k) * 0.7548776662466927 + shift.x
-        v = mi.Float(k) * 0.5698402909980532 + shift.y
-        sample = mi.Point2f(u - dr.floor(u), v - dr.floor(v))
+        sample = mi.Point2f(kronecker(k, 2, (shift.x, shift.y)))
         light, towards, rng = _shone(scene, medium, others, emitter, p, sample, rng)
         total = added(total, p, towards, light * weight, mi.Spectrum(0), directional)
         k += 1

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.sequences import golden_words, unit_floats
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     flat,
@@ -110,7 +111,7 @@ def _level(words: mi.UInt32, index: mi.UInt32) -> mi.UInt32:
 def _rounded(values: mi.Float, shift: float = 0.0) -> mi.UInt32:
     """Integers, up or down by the golden ratio: right on average over any few neighbours."""
     place = dr.arange(mi.UInt32, dr.width(values))
-    dither = mi.Float((place * 2654435769 + int(shift * 2**32)) >> 8) * 2**-24
+    (dither,) = unit_floats([golden_words(place, int(shift * 2**32))])
     return mi.UInt32(dr.minimum(values + dither, LEVELS))
 
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import spots_of
 from mitsuba_irrcache.cache.direct_light import DirectLight
+from mitsuba_irrcache.core.sequences import kronecker_steps, lattice_points
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
-    STEP,
     spread_together,
     strata,
 )
@@ -38,6 +38,8 @@ def _values(spectrum: mi.Spectrum, count: int) -> np.ndarray:
     return np.stack(channels, axis=1)
 
 
+#: What the second coordinate of lattices of points advances by.
+STEP = kronecker_steps(2)[0]
 #: Pairs of directions of a pass for each line of light from a sun, and for each direction of an
 #: environment's bright parts.
 SUN_SHARE, BRIGHT_SHARE = 8, 2
@@ -121,7 +123,7 @@ class DistantIllumination:
         for k in range(len(self._suns)):
             # The last rows: lines of one direction lie evenly in the voxels.
             end = len(offsets) - k * lines
-            offsets[end - lines : end] = (offsets[end - 1] + _even(lines)) % 1
+            offsets[end - lines : end] = (offsets[end - 1] + lattice_points(lines, STEP).T) % 1
         return *joined, offsets
 
     def sun_rows(self, pairs: int) -> int:
@@ -181,9 +183,9 @@ class DistantIllumination:
         """Sets of directions (n, 3) of light from the environment, by its own density, all of them
         together evenly.
         """
-        points = _even(sets * count)
-        members = strata(sets, points[:, 1], STEP)
-        samples = ((points.T + rng.random((2, 1))) % 1).astype(np.float32)
+        points = lattice_points(sets * count, STEP)
+        members = strata(sets, points[1], STEP)
+        samples = ((points + rng.random((2, 1))) % 1).astype(np.float32)
         record, _ = self._environment.sample_direction(
             dr.zeros(mi.Interaction3f, sets * count), mi.Point2f(samples)
         )
@@ -210,12 +212,6 @@ class DistantIllumination:
         return [
             means[id(e)] if id(e) in means else _from_point(e, medium, position) for e in self.near
         ]
-
-
-def _even(count: int) -> np.ndarray:
-    """Points (n, 2) that lie evenly in the unit square."""
-    i = np.arange(count)
-    return np.stack([(i + 0.5) / count, i * STEP % 1], axis=1)
 
 
 def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -> mi.Spectrum:
