@@ -370,7 +370,7 @@ def test_seeds_and_batches_differ(scenes):
 @pytest.mark.parametrize("small", [0, 40**3])
 def test_more_batches_compile_nothing(scenes, kernels, monkeypatch, max_depth, small):
     """More batches, another seed, other densities of one shape: the kernels of another one."""
-    monkeypatch.setattr(tracks, "SMALL", small)
+    monkeypatch.setattr(tracks, "SMALL_GRID", small)
     to_world = scenes.placement()
 
     def fill(seed, count):
@@ -389,7 +389,7 @@ def test_launches_of_a_batch(scenes, kernels, monkeypatch):
     """Single scattering of a large grid: for each batch a launch for each of 16 pairs, and three
     per axis: what they read, a volume for what they leave, and its sharpening.
     """
-    monkeypatch.setattr(tracks, "SMALL", 0)
+    monkeypatch.setattr(tracks, "SMALL_GRID", 0)
     counts = []
     for count in (2, 6):
         history = kernels(

@@ -72,15 +72,15 @@ MUTANTS = (
     Mutant(
         "extinction of coarse caches shifted by half a voxel (sweep)",
         "solvers/discrete_ordinates/tracks.py",
-        "self.lower[k] * ratio[k] - 0.5, last",
-        "self.lower[k] * ratio[k], last",
+        "self.lower[k] * ratio[k] - 0.5,",
+        "self.lower[k] * ratio[k],",
         (SWEEP,),
     ),
     Mutant(
         "the cosine of the slope forgotten: length of a line in a slice (sweep)",
         "solvers/discrete_ordinates/tracks.py",
-        "[1 / abs(velocity[axis]), weights[i]",
-        "[1 / np.linalg.norm(velocity), weights[i]",
+        "length=1 / np.abs(along)",
+        "length=1 / np.linalg.norm(velocities, axis=1)",
         (SWEEP,),
     ),
     Mutant(
@@ -100,7 +100,7 @@ MUTANTS = (
     Mutant(
         "lines that leave through a side go on with their light (sweep)",
         "solvers/discrete_ordinates/kernel.py",
-        "return voxel, position, dr.select(outside, self.since(position), 1.0)",
+        "return voxel, position, dr.select(outside, self.since_entry(position), 1.0)",
         "return voxel, position, dr.select(outside, mi.Float(1.0), 1.0)",
         (SWEEP,),
     ),

@@ -29,8 +29,8 @@ SLIPS = (
     Mutant(
         "the way back begins a slice too far (lattice)",
         "solvers/discrete_ordinates/tracks.py",
-        "(int(self.sides[axis]) - 1) * slope",
-        "int(self.sides[axis]) * slope",
+        "(size[axis] - 1) * slope",
+        "size[axis] * slope",
         (LATTICE,),
     ),
     Mutant(
@@ -43,22 +43,22 @@ SLIPS = (
     Mutant(
         "directions of lines against their axis not turned (lattice)",
         "solvers/discrete_ordinates/tracks.py",
-        "directions[i] * np.sign(velocity[axis])",
-        "directions[i]",
+        "directions * np.sign(along)[:, None]",
+        "directions",
         (LINE_DIRECTIONS,),
     ),
     Mutant(
         "lines that begin next to a side pass half a slice at least (lines)",
         "solvers/discrete_ordinates/kernel.py",
-        "dr.select(voxel == self.entry, least(near, 0.5), 0.5)",
-        "dr.select(voxel == self.entry, dr.maximum(near, 0.5), 0.5)",
+        "dr.select(voxel == self.entry, least(nearest, 0.5), 0.5)",
+        "dr.select(voxel == self.entry, dr.maximum(nearest, 0.5), 0.5)",
         (LATTICE,),
     ),
     Mutant(
         "lines that enter between slices collide in half a slice (lines)",
         "solvers/discrete_ordinates/kernel.py",
-        "to_middle = dr.select(since < 1, since, 0.5) * first",
-        "to_middle = 0.5 * first",
+        "dr.select(state.since_entry < 1, state.since_entry, 0.5) * first",
+        "0.5 * first",
         ("tests/unit/solvers/discrete_ordinates/test_tracks_in_homogeneous_media.py",),
     ),
     Mutant(

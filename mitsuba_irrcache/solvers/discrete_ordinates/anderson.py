@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxels_of
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 
 #: Below all light.
 TINY = 1e-300
@@ -39,7 +39,7 @@ class AndersonAcceleration:
             share = -along / np.maximum(square, TINY)
         # Squares of very bright light are not finite.
         share = np.clip(np.where(np.isfinite(share), share, 0), -0.5, FARTHEST)
-        channel = voxels_of(dr.width(phi) // len(share), len(share))[1]
+        channel = voxel_and_channel(dr.width(phi) // len(share), len(share))[1]
         # One more, since kernels that read an array of a single value are different ones.
         factor = dr.gather(mi.Float, mi.Float([*share, 0.0]), channel)
         result = dr.fma(image - last[1], factor, image)

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import joined
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
@@ -95,7 +95,7 @@ class AnisotropicSweep(Sweep):
                 found.append(self._moments.of(light, direction))
             else:
                 rest = [moment[channel] * self._spread for moment in more[: count - 1]]
-                found.append(joined([light, *rest]))
+                found.append(concatenated([light, *rest]))
         for emitted in self._emitted:
-            found.append(joined([moment[channel] for moment in emitted[:count]]))
+            found.append(concatenated([moment[channel] for moment in emitted[:count]]))
         return found

@@ -25,7 +25,7 @@ from mitsuba_irrcache.core.sequences import hashed_seed, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.context import probe
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import joined
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
@@ -92,7 +92,7 @@ class IncomingRadiance:
         #: direction, from those that are not narrow, and from each that is
         self.lit = [part.any(axis=(1, 2)) for part in parts]
         self.lit[0] |= (weights > 0) & around.shines
-        self._lines = lattice.table(directions, light[..., 0], weights, offsets).rows
+        self._lines = lattice.table(directions, light[..., 0], weights, offsets).geometry
         self._cells(np.where(weights > 0, CELLS, LIT_CELLS))
         found = _follow(around, self, *self._numbers(directions, parts, weights), paths, seed)
         #: for each channel: straight from emitters, as of `lit`; all of what does not depend on
@@ -112,7 +112,7 @@ class IncomingRadiance:
         """Light straight from emitters, that ``part`` of it, along the lines of a ``table`` of the
         same lattice for these ``rows``.
         """
-        light = joined([self.straight[part][c] for c in channels])
+        light = concatenated([self.straight[part][c] for c in channels])
         return BoundarySource(*self._placed(self.lattice, table, rows), light, len(channels))
 
     def returning(
@@ -135,14 +135,14 @@ class IncomingRadiance:
         cells[:, 0] -= start
         here = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
         values = [
-            joined([dr.gather(mi.Float, kind[c], here) for c in channels])
+            concatenated([dr.gather(mi.Float, kind[c], here) for c in channels])
             for kind in (self.returned, *([self.emitted] if emitted else []))
         ]
         # All matter is in wanted voxels: no light comes from others.
-        at = lattice.places(dr.gather(mi.UInt32, self._voxels[grid.shape], here))
-        first = dr.minimum(at, dr.opaque(mi.UInt32, lattice.count - 1)) * len(channels)
+        at = lattice.active_index(dr.gather(mi.UInt32, self._voxels[grid.shape], here))
+        first = dr.minimum(at, dr.opaque(mi.UInt32, lattice.active_count - 1)) * len(channels)
         dr.eval(first)
-        sources = joined([first + c for c in range(len(channels))])
+        sources = concatenated([first + c for c in range(len(channels))])
         heading = None
         if self._heading is not None:
             heading = mi.Vector3f(*(dr.gather(mi.Float, x, here) for x in self._heading))
@@ -156,11 +156,11 @@ class IncomingRadiance:
         in a direction.
         """
         lines = self._lines
-        length = lines.sides[:, 2:]
+        length = lines.sizes[:, 2:]
         # The first slice passes the middle of the first voxels.
         moved = np.stack([-0.5 * lines.slopes, (length - 0.5) * lines.slopes])
         self._least = np.floor(-lines.starts - moved.max(axis=0))
-        last = np.ceil(lines.sides[:, :2] - lines.starts - moved.min(axis=0))
+        last = np.ceil(lines.sizes[:, :2] - lines.starts - moved.min(axis=0))
         count = last - self._least + 1
         self._edge = np.maximum(1, np.ceil(np.sqrt(count.prod(axis=1) / most)))
         self._sides = np.ceil(count / self._edge[:, None]).astype(np.int64)
@@ -172,10 +172,12 @@ class IncomingRadiance:
     ) -> tuple[tuple[mi.UInt32, mi.Float], list[mi.Float]]:
         """What `_follow` has to know of each row; ``parts`` are those of the light."""
         lines = self._lines
-        integers = np.column_stack([self._first, self._sides[:, 0], lines.axis, lines.across[:, 0]])
+        integers = np.column_stack(
+            [self._first, self._sides[:, 0], lines.axis, lines.transverse[:, 0]]
+        )
         sign = np.where(lines.forward, 1.0, -1.0)
         columns = [sign[:, None] * directions, lines.slopes, lines.starts + self._least]
-        numbers = np.column_stack([*columns, lines.sides, self._edge, weights])
+        numbers = np.column_stack([*columns, lines.sizes, self._edge, weights])
         forward = lines.forward[:, None, None]
         ways = [np.where(forward, light, light[:, ::-1]).ravel().tolist() for light in parts]
         as_list = mi.UInt32([*integers.ravel().tolist(), 0xFFFFFFFF])  # the end, to be searched for
@@ -224,9 +226,9 @@ class IncomingRadiance:
         self, lattice: Tracks, table: TrackTable, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The first arguments of `BoundarySource`."""
-        mine, lines = self.lattice, table.rows
+        mine, lines = self.lattice, table.geometry
         ratio = float(round((lattice.grid.voxel_size / mine.grid.voxel_size)[0]))
-        lower, across, n = mine.lower, lines.across, np.arange(len(rows))
+        lower, across, n = mine.lower, lines.transverse, np.arange(len(rows))
         # Where the lines are that pass the first slice of the finest grid at 0, in the coarser one.
         ahead = (lower[lines.axis] + 0.5) / ratio - lattice.lower[lines.axis] - 0.5
         moves = ratio * (lattice.lower[across] + lines.slopes * ahead[n, None]) - lower[across]

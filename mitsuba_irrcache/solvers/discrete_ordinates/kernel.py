@@ -1,6 +1,17 @@
-"""Lines in a kernel: how they go on from slice to slice, and what they take and leave there."""
+"""The sweep kernel: the transport equation solved along tracks, slice by slice.
+
+Along a track of length s the equation of radiative transfer is ordinary (method of characteristics,
+Askew 1972): dL/ds = sigma_t (S - L). With a source S that is constant in a voxel of optical depth
+tau, L' = L e^-tau + S (1 - e^-tau), the step characteristic scheme (Lewis and Miller,
+*Computational Methods of Neutron Transport*, 1984).
+
+All radiance in this module is multiplied by the solid angle of its ordinate (ordinate weight), so
+that adding it up over ordinates gives irradiance (fluence rate).
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -8,216 +19,68 @@ import mitsuba as mi
 from mitsuba_irrcache.core.fast_math import absorbed, clipped, decay, least
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import CELL
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
+    FIXED_POINT_BITS,
+    FIXED_POINT_ONE,
+    TrackRecord,
+    TransverseFields,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
 
-#: Positions within a voxel are integers below this: lines can be followed back without rounding.
-ONE = 1 << 24
-#: Parameters of a pair of directions.
-INTEGERS, NUMBERS = 22, 12
-#: Of these, the solid angle, and the last three: where light along the axis goes to, world space.
-WEIGHT, DIRECTION = 1, 9
+
+@dataclass(frozen=True)
+class SweptMedium:
+    """What tracks read of the medium.
+
+    ``corners`` and ``words`` are those of `Extinction.corners`; ``empty`` holds the slices that may
+    be skipped (`EmptySpace`), None where none are.
+    """
+
+    corners: mi.UInt32
+    words: int
+    empty: mi.UInt32 | None = None
 
 
-class _Across:
-    """One way along the lines, and one of the axes across: its constants."""
+@dataclass(frozen=True)
+class SweptVolume:
+    """Where a sweep writes, and the source that it reads.
 
-    def __init__(self, sides: mi.Int32, slope: mi.Int32, detail: tuple) -> None:
-        self.sides, self.slope = sides, slope
-        self.stride, self.ratio, self.origin, self.last = detail
-        forward = slope > 0
-        self.entry = dr.select(forward, 0, sides - 1)
-        # Distance to the side of entry, in slices: (zero + sign * position) * scale.
-        self.zero = dr.select(forward, mi.Float(0), mi.Float(1))
-        self.sign = dr.select(forward, mi.Float(1), mi.Float(-1)) * (1 / ONE)
-        self.scale = ONE / mi.Float(dr.abs(slope))
+    Without ``source`` (no voxel emits or scatters), ``values`` has one value for each voxel and
+    channel, to which the irradiance is added. With a source, it has the four values of
+    `Tracks.sweep`; ``source`` is this same volume, or another one where ``values`` is a copy that
+    begins at voxel ``begin``. Channels of a voxel are next to each other.
 
-    def since(self, position: mi.Int32) -> mi.Float:
-        """Slices since the face of entry, in the voxel that adjoins it."""
-        return dr.fma(mi.Float(position), self.sign, self.zero) * self.scale
+    With ``begin_backward`` the two ways of a pair are separate: values of the ordinates against the
+    axis are written from that voxel on and nothing is added; ``source`` has one value for each
+    voxel and way in the same layout; optical depths are not multiplied by solid angles, and the
+    irradiance does not include what the voxel itself emits.
+    """
 
-    def start(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
-        """Slices since entry in the first slice: half of one, or less through a side."""
-        near = self.since(position)
-        return dr.select(voxel == self.entry, least(near, 0.5), 0.5)
-
-    def advance(self, voxel: mi.Int32, position: mi.Int32, slices: mi.Int32 | int = 1) -> tuple:
-        """Voxel and position some ``slices`` on, and the slices since entry: 1 unless it is new."""
-        moved = position + self.slope * slices
-        position = moved & (ONE - 1)
-        voxel = voxel + (moved >> 24)
-        outside = mi.UInt32(voxel) >= mi.UInt32(self.sides)
-        voxel = dr.select(outside, self.entry, voxel)
-        return voxel, position, dr.select(outside, self.since(position), 1.0)
-
-    def lower(self, voxel: mi.Int32, position: mi.Int32, own: bool) -> tuple:
-        """Of the two values of the extinction around the line, where the lower one is, and the
-        weight of the upper one. ``own``: each voxel has its own value.
-        """
-        if own:
-            before = position < ONE // 2
-            weight = dr.fma(mi.Float(position), 1 / ONE, dr.select(before, 0.5, -0.5))
-            lower = dr.maximum(voxel - dr.select(before, 1, 0), 0)
-            return lower * self.stride, dr.select(before & (voxel == 0), 0, weight)
-        place = dr.fma(mi.Float(position), 1 / ONE, mi.Float(voxel))
-        u = clipped(dr.fma(place, self.ratio, self.origin), 0.0, self.last)
-        lower = mi.Int32(u)
-        return lower * self.stride, u - mi.Float(lower)
-
-    def above(self, place: mi.Int32) -> mi.Int32:
-        """From ``place``, of the lower value, to the upper one; there is none at the grid's end."""
-        return dr.select(place < mi.Int32(self.last) * self.stride, self.stride, 0)
+    values: mi.Float
+    source: mi.Float | None
+    begin: mi.UInt32
+    channels: int = 1
+    begin_backward: mi.UInt32 | None = None
 
 
 @symbolic
-def follow(
-    corners: mi.UInt32,
-    words: int,
-    empty: mi.UInt32 | None,
-    volume: mi.Float,
-    source: mi.Float | None,
-    table,
-    which: mi.UInt32,
-    lanes: mi.UInt32,
-    copy: mi.UInt32,
-    channels: int = 1,
-    copy_back: mi.UInt32 | None = None,
+def sweep_tracks(
+    medium: SweptMedium, volume: SweptVolume, table: TrackTable, pair: mi.UInt32, track: mi.UInt32
 ):
-    """Follows pairs of directions. ``corners``: so many ``words`` together, of `Extinction`.
-    ``empty``: the slices that may be skipped, of `EmptySpace`. ``source``: what `Tracks.scatter`
-    calls volume, None if voxels send no light; may be ``volume`` itself, where the light is added,
-    from voxel ``copy`` on. Light of several ``channels`` goes the same way; a voxel has those of
-    all of them next to each other.
-
-    With ``copy_back`` both ways are told apart: the light of opposite directions is left from that
-    voxel on, nothing is added to anything, ``source`` holds what voxels send in both ways at the
-    same places, one value each, depths are not times solid angles, and irradiance is without that
-    of what the voxel sends itself.
+    """Sweep pairs of opposite ordinates: lane by lane the ``track`` of a ``pair`` of the table,
+    both ways at once. Two independent chains of arithmetic hide each other's latency.
     """
-    entering, elsewhere, apart = table.entering, source is not volume, copy_back is not None
-    row = [dr.gather(mi.Int32, table.integers, which * INTEGERS + i) for i in range(INTEGERS)]
-    nb, nc, na, sb, sc, sa, base, tb, tc, ta, shift, mb, fb, eb, gb, mc, fc, ec, gc = row[:19]
-    cells = row[19:]
-    length, weight, quantum, *detail = (
-        dr.gather(mi.Float, table.numbers, which * NUMBERS + i) for i in range(DIRECTION)
-    )
-    light, light_back = (table.entering_along(which, way, channels) for way in range(2))
-    detail_b, detail_c = (tb, *detail[:3]), (tc, *detail[3:])
-    lane = mi.Int32(lanes)
-    jc = lane // dr.maximum(nb, 1)  # 0 where a vector of lanes is not filled
-    jb = lane - jc * nb
-    active = (jc < nc) & (na > 0)
-    there_b, there_c = _Across(nb, mb, detail_b), _Across(nc, mc, detail_c)
-    back_b, back_c = _Across(nb, -mb, detail_b), _Across(nc, -mc, detail_c)
-    # The state of both ways: voxel and position along both axes across, offset of the slice, slices
-    # since entry (1: not new), radiance, and depth and source in the slice before.
-    width = 0 * lane
-    ib, ic, fb, fc, off = mi.Int32(jb), mi.Int32(jc), fb + width, fc + width, base + width
-    since = least(there_b.start(ib, fb), there_c.start(ic, fc))
-    kb, kc, gb, gc, off_back = (
-        jb + eb,
-        jc + ec,
-        gb + width,
-        gc + width,
-        base + sa * (na - 1) + width,
-    )
-    kb, kc = dr.select(kb >= nb, kb - nb, kb), dr.select(kc >= nc, kc - nc, kc)
-    since_back = least(back_b.start(kb, gb), back_c.start(kc, gc))
-    slice_, slice_back = shift + width, shift + ta * (na - 1) + width
-    L, L_back = ([mi.Float(0) for _ in range(channels)] for _ in range(2))
-    s0, s0_back = mi.Float(0), mi.Float(0)
-    scale, area = quantum * length, dr.rcp(length)
-    count = mi.Float(1) if apart else weight  # what depths are times
-    # Slices behind, of both ways; where they skip some, each is in a slice of its own.
-    k, k_back, active_back = mi.Int32(0), mi.Int32(0), mi.Bool(active)
-    ahead, ahead_back = mi.Int32(1), mi.Int32(1)
-    needed, needed_back = mi.Bool(active), mi.Bool(active)
-    if dr.hint(entering is not None, mode="scalar"):
-        pair, arriving = entering.pair(which), entering.layers()
-    while dr.hint(active | active_back, label="slices"):
-        if dr.hint(empty is not None, mode="scalar"):
-            ahead = _slices(empty, cells, ib, ic, k, active)
-            ahead_back = _slices(empty, cells, kb, kc, na - 1 - k_back, active_back)
-            needed, needed_back = active & (ahead == 0), active_back & (ahead_back == 0)
-            ahead, ahead_back = dr.maximum(ahead, 1), dr.maximum(ahead_back, 1)
-        else:
-            active_back = needed = needed_back = active
-            k_back = k
-        index = mi.UInt32(ib * sb + ic * sc + off)
-        index_back = mi.UInt32(kb * sb + kc * sc + off_back)
-        if dr.hint(channels > 1, mode="scalar"):
-            index, index_back = index * channels, index_back * channels
-        place, place_back = index + copy, index_back + (copy_back if apart else copy)
-        # Of the half before the middle of the slice, and of the half behind it.
-        s, s_next = _levels(corners, words, slice_, there_b, there_c, ib, fb, ic, fc, needed)
-        s_next_back, s_back = _levels(
-            corners, words, slice_back, back_b, back_c, kb, gb, kc, gc, needed_back
-        )
-        if dr.hint(entering is not None, mode="scalar"):
-            new, new_back = active & (since < 1), active_back & (since_back < 1)
-            found = entering.at(pair, arriving, 0, k, ib, fb, ic, fc, new)
-            found_back = entering.at(pair, arriving, 1, na - 1 - k_back, kb, gb, kc, gc, new_back)
-            L, L_back = _chosen(new, found, L), _chosen(new_back, found_back, L_back)
-        else:
-            L = _chosen(since < 1, light, L)
-            L_back = _chosen(since_back < 1, light_back, L_back)
-        # In the middle slice both ways are in the same voxel: the first to write writes for both.
-        middle = off == off_back
-        if dr.hint(source is None, mode="scalar"):
-            L = _times(L, _passed(since, s0, s, scale))
-            L_back = _times(L_back, _passed(since_back, s0_back, s_back, scale))
-            if dr.hint(apart, mode="scalar"):
-                _write(volume, L, place, needed)
-                _write(volume, L_back, place_back, needed_back)
-            else:
-                before = _read(mi.Float, volume, place, channels, needed)
-                before_back = _read(mi.Float, volume, place_back, channels, needed_back)
-                both = _sum(_sum(before, L), _chosen(middle, L_back, len(L) * [0]))
-                _write(volume, both, place, needed)
-                _write(volume, _sum(before_back, L_back), place_back, needed_back & ~middle)
-        else:
-            if dr.hint(apart, mode="scalar"):
-                sent = _read(mi.Float, source, place, channels, needed)
-                sent_back = _read(mi.Float, source, place_back, channels, needed_back)
-            else:
-                voxel = _read(mi.Vector4f, volume, place, channels, needed)
-                voxel_back = _read(mi.Vector4f, volume, place_back, channels, needed_back)
-                sent, sent_back = _sent(voxel), _sent(voxel_back)
-                if dr.hint(elsewhere, mode="scalar"):
-                    sent = _sources(source, index, channels, needed)
-                    sent_back = _sources(source, index_back, channels, needed_back)
-            sent, sent_back = _times(sent, weight), _times(sent_back, weight)
-            L, tally = _crossed(L, sent, s * scale, s_next * scale, since, count, area)
-            L_back, tally_back = _crossed(
-                L_back, sent_back, s_back * scale, s_next_back * scale, since_back, count, area
-            )
-            if dr.hint(apart, mode="scalar"):
-                _write(volume, _without(tally, sent), place, needed)
-                _write(volume, _without(tally_back, sent_back), place_back, needed_back)
-            else:
-                tally = _sum(tally, _chosen(middle, tally_back, len(L) * [0]))
-                _write(volume, _sum(voxel, tally), place, needed)
-                _write(volume, _sum(voxel_back, tally_back), place_back, needed_back & ~middle)
-        s0, s0_back = s_next, s_next_back
-        ib, fb, since = there_b.advance(ib, fb, ahead)
-        ic, fc, near = there_c.advance(ic, fc, ahead)
-        since = least(near, since)
-        kb, gb, since_back = back_b.advance(kb, gb, ahead_back)
-        kc, gc, near_back = back_c.advance(kc, gc, ahead_back)
-        since_back = least(near_back, since_back)
-        off += sa * ahead
-        off_back -= sa * ahead_back
-        slice_ += ta * ahead
-        slice_back -= ta * ahead_back
-        k += ahead
-        active &= k < na
-        if dr.hint(empty is not None, mode="scalar"):
-            k_back += ahead_back
-            active_back &= k_back < na
+    sweep = _PairSweep(medium, volume, table, pair)
+    # An array that the loop reads and writes has to be one of its variables.
+    values, (forward, backward) = volume.values, sweep.begin(mi.Int32(track))
+    while dr.hint(forward.active | backward.active, label="slices"):
+        forward, backward = sweep.cross_slice(values, forward, backward)
 
 
 @symbolic
 def add_copies(volume: mi.Float, copies: mi.Float, voxels: int, count: int, kind: type) -> None:
-    """Adds to the ``voxels`` of ``volume``, values of this ``kind``, those of ``count`` copies, one
-    after the other.
+    """Adds ``count`` copies, one after the other, to the ``voxels`` of ``volume``, whose values are
+    of this ``kind``.
     """
     index = dr.arange(mi.UInt32, voxels)
     step, end = dr.opaque(mi.UInt32, voxels), dr.opaque(mi.UInt32, voxels * count)
@@ -228,97 +91,438 @@ def add_copies(volume: mi.Float, copies: mi.Float, voxels: int, count: int, kind
     dr.scatter(volume, total, index)
 
 
-def _slices(empty, strides, b, c, a, active) -> mi.Int32:
-    """Slices that a line may skip from voxel (b, c) of slice ``a``, 0 where it is needed."""
-    cell = sum(n * mi.Int32(mi.UInt32(i) // CELL) for n, i in zip(strides, (b, c, a), strict=True))
-    return mi.Int32(dr.gather(mi.UInt32, empty, mi.UInt32(cell), active))
+# One way of a pair
 
 
-def _levels(corners, words, slice_, across_b, across_c, ib, fb, ic, fc, active) -> tuple:
-    """Extinction of a line in both halves of a slice, bilinear, in units of the quantum."""
-    own = words < 4
-    place_b, weight_b = across_b.lower(ib, fb, own)
-    place_c, weight_c = across_c.lower(ic, fc, own)
+@dataclass
+class _TrackState:
+    """Where the tracks of one way are, and what they carry: the state of the loop over slices."""
 
-    def bilinear(v00, v10, v01, v11):
-        rows = [dr.fma(high - low, weight_b, low) for low, high in ((v00, v10), (v01, v11))]
-        return dr.fma(rows[1] - rows[0], weight_c, rows[0])
+    #: voxels along the transverse axes, and positions within them (fixed point)
+    b: mi.Int32
+    c: mi.Int32
+    position_b: mi.Int32
+    position_c: mi.Int32
+    #: flat indices at which the slice begins: of the volume, of the extinction
+    offset: mi.Int32
+    extinction_offset: mi.Int32
+    #: slices since entry into the box; 1 unless the track has just entered
+    since_entry: mi.Float
+    #: radiance in each channel, times the solid angle
+    radiance: list[mi.Float]
+    #: quantised extinction in the second half of the previous slice
+    previous: mi.Float
+    #: slices crossed, and whether there are more
+    crossed: mi.Int32
+    active: mi.Bool
 
-    place = mi.UInt32(slice_ + place_b + place_c)
-    if words == 1:
-        above = place + mi.UInt32(across_c.above(place_c))
-        rows = [dr.gather(mi.UInt32, corners, p, active) for p in (place, above)]
-    else:
-        rows = dr.gather(mi.Vector2u if words == 2 else mi.Array4u, corners, place, active)
-    if own:
-        value = bilinear(*(mi.Float(v) for w in rows for v in (w & 0xFFFF, w >> 16)))
-        return value, value
-    first, second = ([mi.Float(w & 0xFFFF) for w in rows], [mi.Float(w >> 16) for w in rows])
-    return bilinear(*first), bilinear(*second)
+    @property
+    def at(self) -> tuple:
+        """Voxels and positions, as of `BoundarySource.irradiance`."""
+        return self.b, self.c, self.position_b, self.position_c
 
 
-def _passed(since, before, here, scale) -> mi.Float:
-    """Transmittance from the slice before: half of it and half of this one, or what of this one
-    lies behind the entry.
+class _TransverseMotion:
+    """How tracks of one way move along one of the transverse axes."""
+
+    def __init__(self, fields: TransverseFields, slope: mi.Int32) -> None:
+        self.size, self.slope = fields.size, slope
+        self.extinction_stride = fields.extinction_stride
+        self.ratio, self.origin = fields.extinction_ratio, fields.extinction_origin
+        self.last = fields.extinction_last
+        forward = slope > 0
+        #: voxel at the side through which tracks enter
+        self.entry = dr.select(forward, 0, self.size - 1)
+        # Distance to the side of entry, in slices: (zero + sign * position) * scale.
+        self.zero = dr.select(forward, mi.Float(0), mi.Float(1))
+        self.sign = dr.select(forward, mi.Float(1), mi.Float(-1)) * (1 / FIXED_POINT_ONE)
+        self.scale = FIXED_POINT_ONE / mi.Float(dr.abs(slope))
+
+    def since_entry(self, position: mi.Int32) -> mi.Float:
+        """Slices since the side of entry, for tracks in the voxel next to it."""
+        return dr.fma(mi.Float(position), self.sign, self.zero) * self.scale
+
+    def start(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
+        """Slices since entry in the first slice: half of one, or less through a side."""
+        nearest = self.since_entry(position)
+        return dr.select(voxel == self.entry, least(nearest, 0.5), 0.5)
+
+    def advance(self, voxel: mi.Int32, position: mi.Int32, slices: mi.Int32 | int) -> tuple:
+        """Voxel and position after some ``slices``, and the slices since entry: 1 unless new."""
+        moved = position + self.slope * slices
+        position = moved & (FIXED_POINT_ONE - 1)
+        voxel = voxel + (moved >> FIXED_POINT_BITS)
+        outside = mi.UInt32(voxel) >= mi.UInt32(self.size)
+        voxel = dr.select(outside, self.entry, voxel)
+        return voxel, position, dr.select(outside, self.since_entry(position), 1.0)
+
+    def lower(self, voxel: mi.Int32, position: mi.Int32, per_voxel: bool) -> tuple:
+        """Index of the lower of the two extinction values around the track, and the weight of the
+        upper one. ``per_voxel``: each voxel has exactly one value.
+        """
+        if per_voxel:
+            before = position < FIXED_POINT_ONE // 2
+            weight = dr.fma(mi.Float(position), 1 / FIXED_POINT_ONE, dr.select(before, 0.5, -0.5))
+            lower = dr.maximum(voxel - dr.select(before, 1, 0), 0)
+            return lower * self.extinction_stride, dr.select(before & (voxel == 0), 0, weight)
+        x = dr.fma(mi.Float(position), 1 / FIXED_POINT_ONE, mi.Float(voxel))
+        u = clipped(dr.fma(x, self.ratio, self.origin), 0.0, self.last)
+        lower = mi.Int32(u)
+        return lower * self.extinction_stride, u - mi.Float(lower)
+
+    def to_upper(self, index: mi.Int32) -> mi.Int32:
+        """Step from the ``index`` of the lower value to the upper one; 0 at the grid's end."""
+        last = mi.Int32(self.last) * self.extinction_stride
+        return dr.select(index < last, self.extinction_stride, 0)
+
+
+class _Way:
+    """One of the two opposite ordinates of a pair: ``number`` 0 runs along the axis, 1 against."""
+
+    def __init__(self, record: TrackRecord, number: int) -> None:
+        self.number, self.record = number, record
+        b, c = record.transverse
+        self.b = _TransverseMotion(b, -b.slope if number else b.slope)
+        self.c = _TransverseMotion(c, -c.slope if number else c.slope)
+
+    def begin(self, track: mi.Int32, channels: int) -> _TrackState:
+        """The state before the first slice that this way crosses."""
+        record, (fields_b, fields_c) = self.record, self.record.transverse
+        # The divisor is 0 where a vector of lanes is not filled.
+        c = track // dr.maximum(fields_b.size, 1)
+        b = track - c * fields_b.size
+        active = (c < fields_c.size) & (record.slices > 0)
+        zero = 0 * track  # makes uniform values as wide as the lanes
+        position_b, position_c = fields_b.start + zero, fields_c.start + zero
+        offset, extinction_offset = record.first_voxel + zero, record.first_extinction + zero
+        if self.number:
+            last = record.slices - 1
+            b, c = b + fields_b.last_shift, c + fields_c.last_shift
+            b = dr.select(b >= fields_b.size, b - fields_b.size, b)
+            c = dr.select(c >= fields_c.size, c - fields_c.size, c)
+            position_b, position_c = fields_b.last_position + zero, fields_c.last_position + zero
+            offset = record.first_voxel + record.stride * last + zero
+            extinction_offset = record.first_extinction + record.extinction_stride * last + zero
+        return _TrackState(
+            b=b,
+            c=c,
+            position_b=position_b,
+            position_c=position_c,
+            offset=offset,
+            extinction_offset=extinction_offset,
+            since_entry=least(self.b.start(b, position_b), self.c.start(c, position_c)),
+            radiance=[mi.Float(0) for _ in range(channels)],
+            previous=mi.Float(0),
+            crossed=mi.Int32(0),
+            active=active,
+        )
+
+    def advance(
+        self, state: _TrackState, slices: mi.Int32 | int, radiance: list, previous: mi.Float
+    ) -> _TrackState:
+        """The state some ``slices`` on, with what tracks carry behind this one."""
+        record = self.record
+        b, position_b, since_b = self.b.advance(state.b, state.position_b, slices)
+        c, position_c, since_c = self.c.advance(state.c, state.position_c, slices)
+        step = record.stride * slices
+        extinction_step = record.extinction_stride * slices
+        crossed = state.crossed + slices
+        return _TrackState(
+            b=b,
+            c=c,
+            position_b=position_b,
+            position_c=position_c,
+            offset=state.offset - step if self.number else state.offset + step,
+            extinction_offset=state.extinction_offset - extinction_step
+            if self.number
+            else state.extinction_offset + extinction_step,
+            since_entry=least(since_c, since_b),
+            radiance=radiance,
+            previous=previous,
+            crossed=crossed,
+            active=state.active & (crossed < record.slices),
+        )
+
+    def slice_of(self, state: _TrackState) -> mi.Int32:
+        """Number of the slice along the axis."""
+        return self.record.slices - 1 - state.crossed if self.number else state.crossed
+
+    def voxel(self, state: _TrackState) -> mi.UInt32:
+        """Flat index of the voxel."""
+        b, c = self.record.transverse
+        return mi.UInt32(state.b * b.stride + state.c * c.stride + state.offset)
+
+    def empty_slices(self, empty: mi.UInt32, state: _TrackState) -> mi.Int32:
+        """Slices that may be skipped from here on, 0 where this one is needed."""
+        b, c = self.record.transverse
+        strides = b.empty_stride, c.empty_stride, self.record.empty_stride
+        at = state.b, state.c, self.slice_of(state)
+        cell = sum(n * mi.Int32(mi.UInt32(i) // CELL) for n, i in zip(strides, at, strict=True))
+        return mi.Int32(dr.gather(mi.UInt32, empty, mi.UInt32(cell), state.active))
+
+    def extinction(self, medium: SweptMedium, state: _TrackState, active: mi.Bool) -> tuple:
+        """Quantised extinction in the half of the slice that this way crosses first, and in the
+        other one; bilinear across the track.
+        """
+        lower, upper = self._extinction(medium, state, active)
+        return (upper, lower) if self.number else (lower, upper)
+
+    def _extinction(self, medium: SweptMedium, state: _TrackState, active: mi.Bool) -> tuple:
+        words, per_voxel = medium.words, medium.words < 4
+        index_b, weight_b = self.b.lower(state.b, state.position_b, per_voxel)
+        index_c, weight_c = self.c.lower(state.c, state.position_c, per_voxel)
+
+        def bilinear(v00, v10, v01, v11):
+            rows = [dr.fma(high - low, weight_b, low) for low, high in ((v00, v10), (v01, v11))]
+            return dr.fma(rows[1] - rows[0], weight_c, rows[0])
+
+        index = mi.UInt32(state.extinction_offset + index_b + index_c)
+        if words == 1:
+            above = index + mi.UInt32(self.c.to_upper(index_c))
+            found = [dr.gather(mi.UInt32, medium.corners, i, active) for i in (index, above)]
+        else:
+            kind = mi.Vector2u if words == 2 else mi.Array4u
+            found = dr.gather(kind, medium.corners, index, active)
+        if per_voxel:
+            value = bilinear(*(mi.Float(v) for w in found for v in (w & 0xFFFF, w >> 16)))
+            return value, value
+        first, second = ([mi.Float(w & 0xFFFF) for w in found], [mi.Float(w >> 16) for w in found])
+        return bilinear(*first), bilinear(*second)
+
+
+# Both ways of a pair
+
+
+class _Visit:
+    """The voxels in which the tracks of one way are: their indices, in the whole volume and in the
+    copy that is written, and whether they are needed. Values of all channels of a voxel are next to
+    each other.
     """
-    return decay(dr.select(since < 1, here * since, 0.5 * (before + here)) * scale)
+
+    def __init__(self, voxel: mi.UInt32, copy: mi.UInt32, active: mi.Bool) -> None:
+        self.voxel, self.copy, self.active = voxel, copy, active
+
+    def read(self, kind: type, volume: mi.Float, channels: int) -> list:
+        """The values of the copy."""
+        return [
+            dr.gather(kind, volume, self._at(self.copy, c), self.active) for c in range(channels)
+        ]
+
+    def read_sources(self, volume: mi.Float, channels: int) -> list:
+        """The first of the four values of the voxels of a whole volume."""
+        return [
+            dr.gather(mi.Float, volume, self._at(self.voxel, c) * 4, self.active)
+            for c in range(channels)
+        ]
+
+    def write(self, volume: mi.Float, values: list) -> None:
+        """Replaces the values of the copy."""
+        for c, value in enumerate(values):
+            dr.scatter(volume, value, self._at(self.copy, c), self.active)
+
+    @staticmethod
+    def _at(index: mi.UInt32, channel: int) -> mi.UInt32:
+        return index + channel if channel else index
 
 
-def _crossed(L: list, source: list, first, second, since, count, area) -> tuple[list, list]:
-    """Radiance behind a slice, and what its voxel tallies, for a source that is constant in it.
-    ``first`` and ``second`` are the slice's optical depths, were it all like that half.
+class _PairSweep:
+    """Both ways of pairs of opposite ordinates through a medium and a volume."""
 
-    A line stands for an ``area`` across it that is the less the longer it stays in a voxel.
+    def __init__(
+        self, medium: SweptMedium, volume: SweptVolume, table: TrackTable, pair: mi.UInt32
+    ) -> None:
+        self.medium, self.volume = medium, volume
+        record = table.records.read(pair)
+        self.ways = _Way(record, 0), _Way(record, 1)
+        self.separate = volume.begin_backward is not None
+        self.begins = (
+            volume.begin,
+            volume.begin if volume.begin_backward is None else volume.begin_backward,
+        )
+        self.incoming = [table.incoming(pair, way, volume.channels) for way in range(2)]
+        self.boundary_source = table.boundary_source
+        if self.boundary_source is not None:
+            self._cells = self.boundary_source.read_pair(pair)
+            self._offsets = self.boundary_source.channel_offsets()
+        self._source_elsewhere = volume.source is not volume.values
+        self.weight, self.scale = record.weight, record.quantum * record.length
+        # Cross section of a track over that of a voxel, times voxel length over track length.
+        self.area = dr.rcp(record.length)
+        #: what optical depths are multiplied by
+        self.solid_angle = mi.Float(1) if self.separate else record.weight
+
+    def begin(self, track: mi.Int32) -> tuple[_TrackState, _TrackState]:
+        forward, backward = (way.begin(track, self.volume.channels) for way in self.ways)
+        return forward, backward
+
+    def cross_slice(
+        self, values: mi.Float, forward: _TrackState, backward: _TrackState
+    ) -> tuple[_TrackState, _TrackState]:
+        """Cross a slice, or skip empty ones, both ways; read and write the ``values`` of its voxels
+        in the volume.
+        """
+        states = forward, backward
+        slices, needed = self._needed(states)
+        voxels = [way.voxel(state) for way, state in zip(self.ways, states, strict=True)]
+        if self.volume.channels > 1:
+            voxels = [voxel * self.volume.channels for voxel in voxels]
+        extinction = [
+            way.extinction(self.medium, state, active)
+            for way, state, active in zip(self.ways, states, needed, strict=True)
+        ]
+        radiance = [self._entered(way, state) for way, state in zip(self.ways, states, strict=True)]
+        visits = [
+            _Visit(voxel, voxel + begin, active)
+            for voxel, begin, active in zip(voxels, self.begins, needed, strict=True)
+        ]
+        # In the middle slice both ways are in the same voxel: the first to write writes for both.
+        middle = forward.offset == backward.offset
+        if self.volume.source is None:
+            radiance = self._attenuate(values, states, radiance, extinction, visits, middle)
+        else:
+            radiance = self._collide(values, states, radiance, extinction, visits, middle)
+        forward, backward = (
+            way.advance(state, n, light, second)
+            for way, state, n, light, (_, second) in zip(
+                self.ways, states, slices, radiance, extinction, strict=True
+            )
+        )
+        if self.medium.empty is None:
+            backward = replace(backward, crossed=forward.crossed, active=forward.active)
+        return forward, backward
+
+    def _needed(self, states: tuple) -> tuple[list, list]:
+        """For both ways the slices to advance by, and whether this one is not skipped."""
+        if self.medium.empty is None:
+            return [1, 1], [state.active for state in states]
+        empty = [
+            way.empty_slices(self.medium.empty, state)
+            for way, state in zip(self.ways, states, strict=True)
+        ]
+        needed = [state.active & (n == 0) for state, n in zip(states, empty, strict=True)]
+        return [dr.maximum(n, 1) for n in empty], needed
+
+    def _entered(self, way: _Way, state: _TrackState) -> list[mi.Float]:
+        """Radiance before the slice: that of the boundary for tracks that have just entered."""
+        entered = state.since_entry < 1
+        if self.boundary_source is None:
+            return _select(entered, self.incoming[way.number], state.radiance)
+        entered = state.active & entered
+        found = self.boundary_source.irradiance(
+            self._cells, self._offsets, way.number, way.slice_of(state), state.at, entered
+        )
+        return _select(entered, found, state.radiance)
+
+    def _attenuate(
+        self,
+        values: mi.Float,
+        states: tuple,
+        radiance: list,
+        extinction: list,
+        visits: list[_Visit],
+        middle: mi.Bool,
+    ) -> list[list[mi.Float]]:
+        """Attenuates the radiance up to the middle of the slice and adds it to the voxels."""
+        radiance = [
+            _scale(light, _transmittance(state, first, self.scale))
+            for state, light, (first, _) in zip(states, radiance, extinction, strict=True)
+        ]
+        if self.separate:
+            for light, visit in zip(radiance, visits, strict=True):
+                visit.write(values, light)
+        else:
+            before = [visit.read(mi.Float, values, self.volume.channels) for visit in visits]
+            self._add_both(values, before, radiance, visits, middle)
+        return radiance
+
+    def _collide(
+        self,
+        values: mi.Float,
+        states: tuple,
+        radiance: list,
+        extinction: list,
+        visits: list[_Visit],
+        middle: mi.Bool,
+    ) -> list[list[mi.Float]]:
+        """Carries the radiance through the slice, whose voxels emit, and adds up irradiance and
+        collisions.
+        """
+        source, channels = self.volume.source, self.volume.channels
+        if self.separate:
+            sources = [visit.read(mi.Float, source, channels) for visit in visits]
+        else:
+            before = [visit.read(mi.Vector4f, values, channels) for visit in visits]
+            if self._source_elsewhere:
+                sources = [visit.read_sources(source, channels) for visit in visits]
+            else:
+                sources = [[value.x for value in voxel] for voxel in before]
+        sources = [_scale(sent, self.weight) for sent in sources]
+        crossed = [
+            self._cross_voxel(state, light, sent, halves)
+            for state, light, sent, halves in zip(
+                states, radiance, sources, extinction, strict=True
+            )
+        ]
+        radiance, tallies = ([way[i] for way in crossed] for i in range(2))
+        if self.separate:
+            for visit, tally, sent in zip(visits, tallies, sources, strict=True):
+                own = [t - mi.Vector4f(0, s, 0, 0) for t, s in zip(tally, sent, strict=True)]
+                visit.write(values, own)
+        else:
+            self._add_both(values, before, tallies, visits, middle)
+        return radiance
+
+    def _add_both(
+        self, values: mi.Float, before: list, added: list, visits: list[_Visit], middle: mi.Bool
+    ) -> None:
+        """Writes what both ways add to the values ``before``."""
+        forward, backward = visits
+        both = _add(added[0], _select(middle, added[1], self.volume.channels * [0]))
+        forward.write(values, _add(before[0], both))
+        backward.active = backward.active & ~middle
+        backward.write(values, _add(before[1], added[1]))
+
+    def _cross_voxel(
+        self, state: _TrackState, radiance: list, source: list, extinction: tuple
+    ) -> tuple[list, list]:
+        """Radiance behind a slice, and what its voxel adds up: (0, irradiance in its middle,
+        radiance lost, optical depth), for a source that is constant in it.
+        """
+        # A track stands for a cross section that is the less the longer it stays in a voxel.
+        area, count = self.area, self.solid_angle
+        first, second = (half * self.scale for half in extinction)
+        to_middle = dr.select(state.since_entry < 1, state.since_entry, 0.5) * first
+        tau = dr.fma(second, 0.5, to_middle)
+        transmittance = decay(tau)
+        # Thin voxels lose little, but what they scatter is known from just that.
+        share = absorbed(tau, transmittance)
+        to_centre = decay(to_middle)
+        behind, tally = [], []
+        for x, sent in zip(radiance, source, strict=True):
+            lost, middle = (x - sent) * share, dr.fma(x - sent, to_centre, sent)
+            behind.append(x - lost)
+            tally.append(mi.Vector4f(0, middle, lost * area, count * tau * area))
+        return behind, tally
+
+
+def _transmittance(state: _TrackState, here: mi.Float, scale: mi.Float) -> mi.Float:
+    """Transmittance from the middle of the previous slice to that of this one, or from the point of
+    entry; ``here`` is the extinction in the half of this one that is crossed first.
     """
-    to_middle = dr.select(since < 1, since, 0.5) * first
-    tau = dr.fma(second, 0.5, to_middle)
-    passed = decay(tau)
-    # Thin voxels lose little, but what they scatter is known from just that.
-    share = absorbed(tau, passed)
-    half = dr.sqrt(passed) if first is second else decay(to_middle)
-    left, tally = [], []
-    for x, sent in zip(L, source, strict=True):
-        lost, middle = (x - sent) * share, dr.fma(x - sent, half, sent)
-        left.append(x - lost)
-        tally.append(mi.Vector4f(0, middle, lost * area, count * tau * area))
-    return left, tally
+    since = state.since_entry
+    return decay(dr.select(since < 1, here * since, 0.5 * (state.previous + here)) * scale)
 
 
-# Of all channels
+# All channels of a voxel
 
 
-def _places(place: mi.UInt32, channels: int) -> list[mi.UInt32]:
-    return [place, *(place + c for c in range(1, channels))]
+def _select(condition: mi.Bool, values: list, others: list) -> list:
+    return [dr.select(condition, a, b) for a, b in zip(values, others, strict=True)]
 
 
-def _read(kind: type, volume: mi.Float, place: mi.UInt32, channels: int, active: mi.Bool) -> list:
-    return [dr.gather(kind, volume, p, active) for p in _places(place, channels)]
-
-
-def _write(volume: mi.Float, values: list, place: mi.UInt32, active: mi.Bool) -> None:
-    for value, p in zip(values, _places(place, len(values)), strict=True):
-        dr.scatter(volume, value, p, active)
-
-
-def _chosen(first: mi.Bool, values: list, others: list) -> list:
-    return [dr.select(first, a, b) for a, b in zip(values, others, strict=True)]
-
-
-def _sum(first: list, second: list) -> list:
+def _add(first: list, second: list) -> list:
     return [a + b for a, b in zip(first, second, strict=True)]
 
 
-def _times(values: list, factor: mi.Float) -> list:
+def _scale(values: list, factor: mi.Float) -> list:
     return [value * factor for value in values]
-
-
-def _sources(source: mi.Float, place: mi.UInt32, channels: int, active: mi.Bool) -> list:
-    return [dr.gather(mi.Float, source, p * 4, active) for p in _places(place, channels)]
-
-
-def _without(tally: list[mi.Vector4f], sent: list[mi.Float]) -> list[mi.Vector4f]:
-    return [t - mi.Vector4f(0, s, 0, 0) for t, s in zip(tally, sent, strict=True)]
-
-
-def _sent(voxels: list[mi.Vector4f]) -> list[mi.Float]:
-    return [voxel.x for voxel in voxels]

@@ -1,4 +1,6 @@
-"""Where the values of a volume lie in memory: along x, y, z, or slice by slice across an axis."""
+"""Memory layouts of the arrays of the sweep: x fastest, or slice by slice across an axis; channels
+next to each other; several arrays one after the other.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,13 @@ import numpy as np
 from mitsuba_irrcache.core.jit import Divisor, unravelled
 from mitsuba_irrcache.core.spectrum import interleaved
 
-#: Axes of an array from the fastest to the slowest, unless they are laid out by slices.
+#: Axes of an array from the fastest to the slowest, unless it is laid out by slices.
 STANDARD = (0, 1, 2)
 
 
 def slicewise(axis: int) -> tuple[int, int, int]:
     """The axes from the fastest to the slowest, such that neighbours across ``axis`` are near each
-    other in memory. Slices along y and z are so as they are.
+    other in memory. For y and z the standard layout has this property.
     """
     return (1, 2, 0) if axis == 0 else STANDARD
 
@@ -31,21 +33,21 @@ def strides_of(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> tuple[i
     return tuple(steps)
 
 
-def places_of(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> list[mi.UInt32]:
-    """Places along x, y, z of all values in the order of their memory."""
+def coordinates_of(sides: np.ndarray, layout: tuple[int, ...] = STANDARD) -> list[mi.UInt32]:
+    """Integer coordinates along x, y, z of all values, in the order of their memory."""
     index = dr.arange(mi.UInt32, int(np.prod(sides)))
     places = unravelled(index, [Divisor(int(sides[axis])) for axis in layout[:2]])
     return [place for _, place in sorted(zip(layout, places, strict=True), key=lambda p: p[0])]
 
 
-def flat(places: Sequence[mi.UInt32], strides: tuple[int, ...]) -> mi.UInt32:
-    """Flat indices of places along x, y, z."""
-    x, y, z = (p * dr.opaque(mi.UInt32, n) for p, n in zip(places, strides, strict=True))
+def flat_index(coordinates: Sequence[mi.UInt32], strides: tuple[int, ...]) -> mi.UInt32:
+    """Flat indices of coordinates along x, y, z."""
+    x, y, z = (p * dr.opaque(mi.UInt32, n) for p, n in zip(coordinates, strides, strict=True))
     return x + y + z
 
 
-def joined(parts: Sequence[mi.Float | mi.UInt32]) -> mi.Float | mi.UInt32:
-    """Arrays one after the other, by kernels that do not differ with their widths, as those of
+def concatenated(parts: Sequence[mi.Float | mi.UInt32]) -> mi.Float | mi.UInt32:
+    """Arrays one after the other, by kernels that do not depend on their widths, as those of
     ``dr.concat`` do.
     """
     if len(parts) == 1:
@@ -59,8 +61,8 @@ def joined(parts: Sequence[mi.Float | mi.UInt32]) -> mi.Float | mi.UInt32:
     return result
 
 
-def side_by_side(channels: Sequence[mi.Float]) -> mi.Float:
-    """Channels as one array that has the values of a voxel next to each other."""
+def interleaved_channels(channels: Sequence[mi.Float]) -> mi.Float:
+    """Channels as one array, with the values of a voxel next to each other."""
     if len(channels) == 1:
         return channels[0]
     result = interleaved(list(channels))
@@ -68,9 +70,9 @@ def side_by_side(channels: Sequence[mi.Float]) -> mi.Float:
     return result
 
 
-def voxels_of(count: int, channels: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Of all values of an array that has those of all ``channels`` of a voxel next to each other:
-    voxel and channel.
+def voxel_and_channel(count: int, channels: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """Voxel and channel of each value of an array with ``channels`` interleaved for ``count``
+    voxels.
     """
     index = dr.arange(mi.UInt32, count * channels)
     if channels == 1:
@@ -79,8 +81,8 @@ def voxels_of(count: int, channels: int) -> tuple[mi.UInt32, mi.UInt32]:
     return voxel, index - voxel * channels
 
 
-def layers_of(voxels: int, count: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Of all values of an array that has ``count`` ones for each voxel (or line), one layer after
-    the other: layer and voxel.
+def layer_and_index(width: int, count: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """Layer and index in it of each value of an array of ``count`` layers, one after the other,
+    each with ``width`` values (voxels or tracks).
     """
-    return Divisor(voxels).split(dr.arange(mi.UInt32, voxels * count))
+    return Divisor(width).split(dr.arange(mi.UInt32, width * count))

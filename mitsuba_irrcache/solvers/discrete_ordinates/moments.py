@@ -16,11 +16,11 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import joined, layers_of
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated, layer_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import BoundaryOrdinateSet, OrdinateSet
-from mitsuba_irrcache.solvers.discrete_ordinates.track_table import Group, TrackTable
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, sharpened
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup, TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, values_at_centres
 
 #: Highest degree of what is corrected on coarser grids.
 SMOOTH = 1
@@ -49,7 +49,7 @@ class Moments:
 
     def of(self, light: mi.Float, direction: mi.Vector3f) -> mi.Float:
         """Moments of the irradiance ``light`` from ``direction``, at each place."""
-        return joined([light * y for y in self.basis(direction)])
+        return concatenated([light * y for y in self.basis(direction)])
 
     def part(self, values: mi.Float, number: int) -> mi.Float:
         """One of the moments at all places."""
@@ -67,14 +67,14 @@ class Moments:
     ) -> mi.Float:
         """As `Tracks.carry`: moments of the light that enters."""
         table = lattice.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
-        table.entering = entering(table) if entering is not None else None
-        wanted = lattice.wanted
+        table.boundary_source = entering(table) if entering is not None else None
+        wanted = lattice.active
         sums = self.nothing(dr.width(wanted))
-        box = lattice.lower, lattice.lower + lattice.sides
-        for axis, group, copies in lattice.apart(table):
+        box = lattice.lower, lattice.lower + lattice.size
+        for axis, group, copies in lattice.sweep_separately(table):
             sums = _with_light(self, sums, copies, group, axis, lattice.grid, *box, wanted)
             dr.eval(sums)
-        return joined(sums)
+        return concatenated(sums)
 
     def nothing(self, width: int) -> list[mi.Float]:
         """No light, at so many places."""
@@ -91,7 +91,7 @@ class Moments:
             self.carry(lattice, *rows) if len(rows[0]) else None
             for rows in passes[0].straight(passes, self.directional)
         ]
-        smooth = dr.opaque(mi.Float, 0, self.count * dr.width(lattice.wanted))
+        smooth = dr.opaque(mi.Float, 0, self.count * dr.width(lattice.active))
         return (smooth if found[0] is None else found[0]), found[1:]
 
 
@@ -110,8 +110,8 @@ class AnisotropicMultigridLevel(MultigridLevel):
 
     def restrict(self, values: mi.Float) -> mi.Float:
         coarser = self.coarser
-        moment, place = layers_of(coarser.lattice.count, coarser.moments.count)
-        begin, result = moment * dr.opaque(mi.UInt32, self.lattice.count), mi.Float(0)
+        moment, place = layer_and_index(coarser.lattice.active_count, coarser.moments.count)
+        begin, result = moment * dr.opaque(mi.UInt32, self.lattice.active_count), mi.Float(0)
         for child, weight in self._children:
             voxel = begin + dr.gather(mi.UInt32, child, place)
             result += dr.gather(mi.Float, values, voxel) * dr.gather(mi.Float, weight, place)
@@ -121,28 +121,30 @@ class AnisotropicMultigridLevel(MultigridLevel):
     def prolong(self, values: mi.Float) -> mi.Float:
         """As of `MultigridLevel`; moments that the coarser one does not have are 0."""
         moments = self.coarser.moments
-        moment, place = layers_of(self.lattice.count, self.moments.count)
+        moment, place = layer_and_index(self.lattice.active_count, self.moments.count)
         known = moment < dr.opaque(mi.UInt32, moments.count)
-        begin = dr.select(known, moment, 0) * dr.opaque(mi.UInt32, self.coarser.lattice.count)
+        begin = dr.select(known, moment, 0) * dr.opaque(
+            mi.UInt32, self.coarser.lattice.active_count
+        )
         return dr.select(known, self._interpolated(values, place, 1, begin), 0)
 
     def scatter(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
         """As of `MultigridLevel`, all moments of it."""
-        moments, wanted, voxels = self.moments, self.lattice.wanted, self.grid.voxel_count
-        if phi is not None and table.entering is not None:
-            table.entering.receive(phi)
-        received, lost = (moments.nothing(self.lattice.count) for _ in range(2))
-        depth = dr.opaque(mi.Float, 0, self.lattice.count)
+        moments, wanted, voxels = self.moments, self.lattice.active, self.grid.voxel_count
+        if phi is not None and table.boundary_source is not None:
+            table.boundary_source.receive(phi)
+        received, lost = (moments.nothing(self.lattice.active_count) for _ in range(2))
+        depth = dr.opaque(mi.Float, 0, self.lattice.active_count)
         scattered = None if phi is None else self._scattered(phi)
 
-        def sent(group: Group) -> mi.Float:
+        def sent(group: PairGroup) -> mi.Float:
             source = dr.opaque(mi.Float, 0, 2 * len(group) * voxels)
             if scattered is not None:
                 _send_out(moments, source, scattered, group, wanted, voxels)
                 dr.eval(source)
             return source
 
-        for _, group, copies in self.lattice.apart(table, sent):
+        for _, group, copies in self.lattice.sweep_separately(table, sent):
             found = _with_collisions(moments, received, lost, depth, copies, group, wanted, voxels)
             dr.eval(found)
             received, lost, depth = found
@@ -154,11 +156,14 @@ class AnisotropicMultigridLevel(MultigridLevel):
             collided = [mean + moments.part(scattered, k) for k, mean in enumerate(collided)]
         pairs = zip(collided, received, strict=True)
         collided = [self.known_from(depth, mean, light) for mean, light in pairs]
-        return joined(received), joined(collided)
+        return concatenated(received), concatenated(collided)
 
     def seen(self, phi: mi.Float, place: mi.UInt32, heading: mi.Vector3f | None) -> mi.Float:
         """As of `MultigridLevel`."""
-        step, result = dr.opaque(mi.UInt32, self.lattice.count), dr.gather(mi.Float, phi, place)
+        step, result = (
+            dr.opaque(mi.UInt32, self.lattice.active_count),
+            dr.gather(mi.Float, phi, place),
+        )
         basis = self.moments.directional.basis(heading)
         for factor in basis[: self.moments.count - 1]:
             place = place + step
@@ -167,7 +172,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
 
     def _scattered(self, phi: mi.Float) -> mi.Float:
         """Moments of the light that is sent out, per optical depth."""
-        moment, place = layers_of(self.lattice.count, self.moments.count)
+        moment, place = layer_and_index(self.lattice.active_count, self.moments.count)
         factor = dr.gather(mi.Float, self.moments.factors, moment)
         scattered = phi * factor * dr.gather(mi.Float, self.albedo, place)
         dr.eval(scattered)
@@ -180,8 +185,8 @@ def _with_light(moments, sums: list, copies, group, axis: int, grid, lower, uppe
     voxels = dr.opaque(mi.UInt32, grid.voxel_count)
     k, begin = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(k < group.count, label="light of pairs"):
-        there = sharpened(copies, grid, lower, upper, axis, wanted, begin=begin)
-        back = sharpened(copies, grid, lower, upper, axis, wanted, begin=begin + voxels)
+        there = values_at_centres(copies, grid, lower, upper, axis, wanted, begin=begin)
+        back = values_at_centres(copies, grid, lower, upper, axis, wanted, begin=begin + voxels)
         basis = moments.basis(-group.direction(k))
         sums = _with_both(moments, sums, basis, there, back)
         k += 1

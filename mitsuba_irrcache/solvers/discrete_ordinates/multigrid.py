@@ -19,7 +19,7 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid, stencil
 from mitsuba_irrcache.solvers.discrete_ordinates.anderson import TINY, AndersonAcceleration, mixed
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxels_of
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
@@ -51,7 +51,7 @@ class MultigridLevel:
     ) -> None:
         self.sigma_t, self.albedo, self.lattice = sigma_t, albedo, lattice
         self.grid, self.evenly = lattice.grid, evenly
-        self.channels = dr.width(albedo) // lattice.count
+        self.channels = dr.width(albedo) // lattice.active_count
         # to the next level: x, y, z
         self._ratio = np.array([2, 2, 2]) if evenly else _ratio(self.grid)
         self._coarser: MultigridLevel | None = None
@@ -67,11 +67,11 @@ class MultigridLevel:
         """The level of fewer voxels, made when it is first asked for."""
         if self._coarser is None:
             grid, lines = _reduced(self.grid, self._ratio), self.lattice
-            wanted = None if lines.whole else self._around(grid)
+            wanted = None if lines.all_active else self._around(grid)
             children = []
             for voxel, inside in _children(self.grid, grid, self._ratio):
-                place = lines.places(voxel)
-                inside &= place < dr.opaque(mi.UInt32, lines.count)
+                place = lines.active_index(voxel)
+                inside &= place < dr.opaque(mi.UInt32, lines.active_count)
                 extinction = dr.gather(mi.Float, self.sigma_t, place, inside)
                 children.append((dr.select(inside, place, 0), extinction))
             total = sum(s for _, s in children)
@@ -81,7 +81,7 @@ class MultigridLevel:
             dr.eval(sigma_t, shares)
             box = np.zeros(3, int), grid.resolution
             lattice = Tracks(grid, sigma_t, *box, None, wanted, lines.sparse, lines.pause)
-            wanted = lattice.wanted
+            wanted = lattice.active
             sigma_t = dr.gather(mi.Float, sigma_t, wanted)
             self._children = [
                 (dr.gather(mi.UInt32, i, wanted), dr.gather(mi.Float, w, wanted)) for i, w in shares
@@ -97,7 +97,7 @@ class MultigridLevel:
     def _around(self, coarse: Grid) -> mi.UInt32:
         """The voxels of a ``coarse`` grid that wanted ones lie between."""
         marks = dr.opaque(mi.Bool, False, coarse.voxel_count)
-        axes = [ends for ends, _ in self._stencil(coarse, self.lattice.wanted)]
+        axes = [ends for ends, _ in self._stencil(coarse, self.lattice.active)]
         for at in product(*axes):
             dr.scatter(marks, mi.Bool(True), coarse.index(*at))
         return dr.compress(marks)
@@ -117,7 +117,7 @@ class MultigridLevel:
         return self._restricted(values, self.coarser.lattice)
 
     def _restricted(self, values: mi.Float, coarse: Tracks) -> mi.Float:
-        place, channel = voxels_of(coarse.count, self.channels)
+        place, channel = voxel_and_channel(coarse.active_count, self.channels)
         result = mi.Float(0)
         for i, w in self._children:
             child = dr.gather(mi.UInt32, i, place) * self.channels + channel
@@ -127,7 +127,7 @@ class MultigridLevel:
 
     def prolong(self, values: mi.Float) -> mi.Float:
         """Values of the coarser level at the voxels of this one, trilinear."""
-        place, channel = voxels_of(self.lattice.count, self.channels)
+        place, channel = voxel_and_channel(self.lattice.active_count, self.channels)
         return self._interpolated(values, place, self.channels, channel)
 
     def _interpolated(
@@ -137,11 +137,11 @@ class MultigridLevel:
         one, trilinear.
         """
         coarse = self.coarser.lattice
-        voxel = dr.gather(mi.UInt32, self.lattice.wanted, place)
+        voxel = dr.gather(mi.UInt32, self.lattice.active, place)
         (xs, wx), (ys, wy), (zs, wz) = self._stencil(coarse.grid, voxel)
 
         def along_x(y, z):
-            at = (coarse.places(coarse.grid.index(x, y, z)) for x in xs)
+            at = (coarse.active_index(coarse.grid.index(x, y, z)) for x in xs)
             return dr.lerp(*(dr.gather(mi.Float, values, p * step + begin) for p in at), wx)
 
         return dr.lerp(*(dr.lerp(*(along_x(y, z) for y in ys), wy) for z in zs), wz)
@@ -153,16 +153,16 @@ class MultigridLevel:
         ``phi``, such a mean, may be None for 0.
         """
         lattice = self.lattice
-        place, channel = voxels_of(lattice.count, self.channels)
-        slot = dr.gather(mi.UInt32, lattice.wanted, place) * self.channels + channel
+        place, channel = voxel_and_channel(lattice.active_count, self.channels)
+        slot = dr.gather(mi.UInt32, lattice.active, place) * self.channels + channel
         volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * self.channels * 4)
         if phi is not None:
             sent = phi * self.albedo * dr.inv_four_pi
             dr.scatter(volume, mi.Vector4f(sent, 0, 0, 0), slot)
             dr.eval(volume)
-            if table.entering is not None:
-                table.entering.receive(phi)
-        lattice.scatter(volume, table)
+            if table.boundary_source is not None:
+                table.boundary_source.receive(phi)
+        lattice.sweep(volume, table)
         source, phi, lost, depth = dr.gather(mi.Vector4f, volume, slot)
         # Radiance of collisions times 4 pi, which is what 1 is, integrated over directions.
         collided = 4 * dr.pi * (source + lost / dr.select(depth > 0, depth, 1))
@@ -208,7 +208,7 @@ class MultigridLevel:
         while True:
             tables.append(level.lattice.table(*rows))
             if returning is not None:
-                tables[-1].entering = returning(level, tables[-1])
+                tables[-1].boundary_source = returning(level, tables[-1])
             if level.coarsest:
                 return tables
             level = level.coarser
@@ -251,7 +251,7 @@ class MultigridLevel:
         """Of ``values``, weighted with how much of the light in a voxel is scattered there, for
         each channel.
         """
-        channels, voxels = self.channels, dr.opaque(mi.UInt32, self.lattice.count)
+        channels, voxels = self.channels, dr.opaque(mi.UInt32, self.lattice.active_count)
         place = dr.arange(mi.UInt32, dr.width(values) // channels)
         voxel = place % voxels
         weight, sums = dr.gather(mi.Float, self.sigma_t, voxel), []

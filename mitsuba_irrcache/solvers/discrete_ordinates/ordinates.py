@@ -119,7 +119,7 @@ class BoundaryOrdinateSet:
     def scatter(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         """As `MultigridLevel.scatter`, with the light that arrives."""
         table = self._arriving(level)
-        table.entering.receive(phi)
+        table.boundary_source.receive(phi)
         found = level.scatter(None, table)
         if phi is None:
             return found
@@ -133,7 +133,7 @@ class BoundaryOrdinateSet:
         """The rows, with the light that arrives along them."""
         table = level.lattice.table(*self.rows)
         of_table = self.channels, level, table, self.numbers
-        table.entering = self.arrivals.returning(*of_table, emitted=True)
+        table.boundary_source = self.arrivals.returning(*of_table, emitted=True)
         return table
 
     def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
@@ -160,7 +160,7 @@ class JointOrdinateSet(BoundaryOrdinateSet):
     def scatter(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         table = self._arriving(level)
         if phi is None:
-            table.entering.receive(phi)
+            table.boundary_source.receive(phi)
         return level.scatter(phi, table)
 
 

@@ -24,7 +24,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import Surfa
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emitted_light
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import Lamps, is_lamp, split
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import side_by_side
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import interleaved_channels
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     BoundaryOrdinateSet,
@@ -227,7 +227,7 @@ class Sweep:
             sigma_t, albedo = self._sigma_t, self._albedo
             self._levels[channels] = self._new_level(
                 sigma_t[min(channels[0], len(sigma_t) - 1)],
-                side_by_side([albedo[min(c, len(albedo) - 1)] for c in channels]),
+                interleaved_channels([albedo[min(c, len(albedo) - 1)] for c in channels]),
                 self._lattice(channels),
             )
         return self._levels[channels]
@@ -337,7 +337,7 @@ class Sweep:
         """Irradiance along ``rows`` at the active voxels, in each channel."""
         if not len(rows[0]):
             return [dr.zeros(mi.Float, self.cache.active_count)] * channels
-        return self._apart(lattice.carry(*rows) * share, channels)
+        return self._apart(lattice.uncollided(*rows) * share, channels)
 
     def _of_suns(self, channel: int) -> mi.Float | int:
         """Irradiance of suns that is not interpolated, over the colour of the light."""
@@ -370,7 +370,7 @@ class Sweep:
     def _with_near_light(self, phi: mi.Float, channels: tuple[int, ...]) -> mi.Float:
         near = [sum(self._near_light(c)) for c in channels]
         if self._direct or self._emitted:
-            phi = phi + side_by_side(near)
+            phi = phi + interleaved_channels(near)
             dr.eval(phi)
         return phi
 

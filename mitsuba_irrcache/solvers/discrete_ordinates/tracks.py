@@ -1,21 +1,25 @@
-"""Sweeps along parallel lines that all voxels of a grid share.
+"""Transport sweeps along long characteristics: parallel tracks that all voxels of a grid share.
 
-For one direction, lines lie on the lattice of the voxels of a slice across the direction's dominant
-axis, moved by a random fraction of a voxel, and advance slice by slice. From one slice to the next
-all lines move by the same number of whole voxels: in every slice each voxel has exactly one line.
-So a voxel and direction cost one step, whatever the size of the grid, and no two lines ever write
-to the same voxel. A line that leaves through a side goes on as a new one that enters through the
-opposite side; it begins at the very point of entry, between two slices.
+For one ordinate, tracks lie on the lattice of the voxels of a slice across the ordinate's dominant
+axis, shifted by a random fraction of a voxel, and advance slice by slice. From one slice to the
+next all tracks move by the same number of whole voxels, so in every slice each voxel has exactly
+one track. A voxel and ordinate cost one step, whatever the size of the grid, and no two tracks ever
+write to the same voxel. A track that leaves through a side continues as a new one that enters
+through the opposite side, and begins at the exact point of entry, between two slices.
 
-Along a line the extinction is interpolated between the four values around it in every slice, and
-linear from slice to slice; a source is that of the line's voxel in every slice. On a grid that is
-coarser or finer than the medium's, the values across the lines are still those of the medium, and
-each half of a slice has its own mean. Were they interpolated to the grid, and between its voxels
-again, matter would be wider than it is, and shade more: on a CT head at twice its resolution, 1 %
-of the light in the air and 5 % in the skin.
+Along a track the extinction is interpolated bilinearly in every slice and linearly from slice to
+slice; the source is that of the track's voxel. On a grid that is coarser or finer than the
+medium's, the values across the tracks are still those of the medium, and each half of a slice has
+its own mean. If they were resampled to the grid first and interpolated again, matter would become
+wider and shadows darker: on a CT head at twice its resolution, by 1 % of the irradiance in the air
+and 5 % in the skin.
 
-Each launch takes a direction and its opposite along the same lines: two independent chains of
-arithmetic, and the odd part of what is integrated over directions cancels.
+Each launch sweeps an ordinate and its opposite along the same tracks: two independent chains of
+arithmetic, and odd parts of what is integrated over directions cancel.
+
+Long characteristics: Askew, *A characteristics formulation of the neutron transport equation in
+complicated geometries*, AEEW-M 1108, 1972. The kernel is in `kernel`, the extinction as it reads it
+in `extinction`, and the table of ordinates in `track_table`.
 """
 
 from __future__ import annotations
@@ -30,41 +34,50 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import EmptySpace
 from mitsuba_irrcache.solvers.discrete_ordinates.extinction import Extinction
 from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
-    DIRECTION,
-    INTEGERS,
-    NUMBERS,
-    ONE,
+    SweptMedium,
+    SweptVolume,
     add_copies,
-    follow,
+    sweep_tracks,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     STANDARD,
-    flat,
-    joined,
-    layers_of,
+    concatenated,
+    flat_index,
+    layer_and_index,
     slicewise,
     strides_of,
 )
-from mitsuba_irrcache.solvers.discrete_ordinates.track_table import Group, Rows, TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
+    FIXED_POINT_BITS,
+    FIXED_POINT_ONE,
+    TrackRecord,
+    TransverseFields,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import (
+    TRANSVERSE,
+    PairGroup,
+    TrackTable,
+)
 
-#: What lines leave in a voxel is a mean over its cross section: smoothing of variance 1/12 along
-#: both axes across, half of which is to be taken back (`sharpened`).
-RECEIVED = 1 / 24
-#: Up to so many voxels one launch takes all directions, each into a copy of the volume of its own,
-#: which are added up in a fixed order: atomic sums would be other bits each time.
-SMALL = 40**3
-#: Voxels of all copies together, at most: 64 MB where light is scattered.
-COPIES = 1 << 22
+#: Share of second differences that turns means over cross sections of voxels into values at their
+#: centres: a mean over a unit square smooths with variance 1/12 along both axes, and the Taylor
+#: expansion takes back half of it.
+SECOND_DIFFERENCE = 1 / 24
+#: Up to so many voxels one launch sweeps all ordinates, each into a copy of the volume, and the
+#: copies are added in a fixed order: atomic sums would differ in their last bits each time.
+SMALL_GRID = 40**3
+#: Voxels of all copies together, at most: 64 MB where there is a source.
+MAX_COPIED_VOXELS = 1 << 22
 
 
 class Tracks:
-    """The lines through the voxels of ``grid`` between ``lower`` and ``upper`` (x, y, z; voxels
-    outside of this box are empty and get no light).
+    """Tracks through the voxels of ``grid`` between ``lower`` and ``upper`` (x, y, z).
 
-    ``sigma_t`` holds the extinction [1/scene unit] at all voxels of ``detail``, a grid over the
-    same box (None: the same grid). Light is found at the voxels ``wanted`` (flat indices; None:
-    all). Where these hold all extinction, ``sparse`` lets it skip what is empty between them, if
-    that gains time.
+    ``sigma_t`` holds the extinction [1/scene unit] at all voxels of ``extinction_grid``, a grid
+    over the same box (None: the same grid). Results are found at the voxels ``active`` (flat
+    indices; None: all). Where these contain all matter, ``sparse`` lets sweeps skip the empty space
+    between them, if that saves time. ``pause`` is called after every launch (see
+    `CacheBuilder.pause`).
     """
 
     def __init__(
@@ -73,245 +86,274 @@ class Tracks:
         sigma_t: mi.Float,
         lower: np.ndarray,
         upper: np.ndarray,
-        detail: Grid | None = None,
-        wanted: mi.UInt32 | None = None,
+        extinction_grid: Grid | None = None,
+        active: mi.UInt32 | None = None,
         sparse: bool = False,
         pause: Callable[[], None] = lambda: None,
     ) -> None:
-        self.grid, self.detail = grid, detail or grid
-        #: called after every launch; see `CacheBuilder.pause`
+        self.grid, self.extinction_grid = grid, extinction_grid or grid
         self.pause = pause
-        self.lower, self.sides = np.array(lower), np.array(upper) - np.array(lower)
+        self.lower, self.size = np.array(lower), np.array(upper) - np.array(lower)
         self._to_voxels = grid.coordinates.matrix[:3, :3]
-        self._lines = max(int(np.prod(np.delete(self.sides, axis))) for axis in range(3))
-        self._lanes = dr.arange(mi.UInt32, self._lines)
-        dr.eval(self._lanes)
-        self.together = grid.voxel_count <= SMALL
-        self._extinction = Extinction(grid, self.detail, sigma_t)
-        self.wanted = dr.arange(mi.UInt32, grid.voxel_count) if wanted is None else wanted
-        self.count = dr.width(self.wanted)
-        #: whether all voxels are wanted
-        self.whole = self.count == grid.voxel_count
-        self._places: mi.UInt32 | None = None
+        self._count = max(int(np.prod(np.delete(self.size, axis))) for axis in range(3))
+        self._indices = dr.arange(mi.UInt32, self._count)
+        dr.eval(self._indices)
+        #: whether one launch sweeps many ordinates
+        self.one_launch = grid.voxel_count <= SMALL_GRID
+        self._extinction = Extinction(grid, self.extinction_grid, sigma_t)
+        self.active = dr.arange(mi.UInt32, grid.voxel_count) if active is None else active
+        self.active_count = dr.width(self.active)
+        self.all_active = self.active_count == grid.voxel_count
+        self._active_index: mi.UInt32 | None = None
         self.sparse, self._empty = sparse, None
-        if sparse and not self.together:
-            self._empty = EmptySpace.find(grid, self.wanted, lower, upper)
-        #: where the corners of each axis begin among all that are kept
-        self._first_corner = [0, 0, 0]
-        if self.together:
+        if sparse and not self.one_launch:
+            self._empty = EmptySpace.find(grid, self.active, lower, upper)
+        #: where the extinction of each axis begins in an array for all of them
+        self._first_extinction = [0, 0, 0]
+        if self.one_launch:
             sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
-            self._first_corner = np.cumsum([0, *sizes[:2]]).tolist()
+            self._first_extinction = np.cumsum([0, *sizes[:2]]).tolist()
             self._all_corners: dict[int, mi.UInt32] = {}  # of all axes
 
-    def _own(self, scatters: bool) -> bool:
-        """Whether lines read the extinction that voxels have of their own, one value of each."""
-        return self._extinction.own and not (scatters and self._extinction.dense)
-
-    def places(self, voxels: mi.UInt32) -> mi.UInt32:
-        """Where these voxels are among the wanted ones; of others, the number of these."""
-        if self.whole:
+    def active_index(self, voxels: mi.UInt32) -> mi.UInt32:
+        """Where these voxels are among the active ones; for others, the number of active voxels."""
+        if self.all_active:
             return voxels
-        if self._places is None:
-            self._places = dr.opaque(mi.UInt32, self.count, self.grid.voxel_count)
-            dr.scatter(self._places, dr.arange(mi.UInt32, self.count), self.wanted)
-            dr.eval(self._places)
-        return dr.gather(mi.UInt32, self._places, voxels)
+        if self._active_index is None:
+            self._active_index = dr.opaque(mi.UInt32, self.active_count, self.grid.voxel_count)
+            dr.scatter(self._active_index, dr.arange(mi.UInt32, self.active_count), self.active)
+            dr.eval(self._active_index)
+        return dr.gather(mi.UInt32, self._active_index, voxels)
 
     def table(
         self,
         directions: np.ndarray,
-        light: np.ndarray,
+        incoming: np.ndarray,
         weights: np.ndarray,
         offsets: np.ndarray,
         by_slice: bool = False,
     ) -> TrackTable:
-        """What kernels need to know of pairs of opposite directions.
+        """The table of pairs of opposite ordinates that kernels read.
 
         Args:
-            directions: (n, 3), where the light goes to, world space, unit length.
-            light: (n, 2) or (n, 2, channels), irradiance that enters along a direction and along
-                its opposite: radiance times solid angle.
-            weights: (n), solid angles that each of a pair stands for, for light from the voxels.
-            offsets: (n, 2), in [0, 1), random.
-            by_slice: whether the volume that lines leave light in is laid out by their slices.
+            directions: (n, 3), in which radiance travels, world space, unit length.
+            incoming: (n, 2) or (n, 2, channels), irradiance that enters the box along an ordinate
+                and along its opposite: radiance times solid angle.
+            weights: (n), ordinate weights for radiance that voxels emit or scatter [sr].
+            offsets: (n, 2), in [0, 1), random shifts of the tracks.
+            by_slice: whether the swept volume is laid out by the slices of each dominant axis.
         """
-        count = len(directions)
-        integers = np.zeros((count, INTEGERS), np.int64)
-        numbers = np.zeros((count, NUMBERS), np.float64)
-        light = light if light.ndim == 3 else light[..., None]
+        incoming = incoming if incoming.ndim == 3 else incoming[..., None]
         velocities = directions @ self._to_voxels.T
-        axes = np.abs(velocities).argmax(axis=1)
-        ratio = self.detail.resolution / self.grid.resolution
-        own = self._own(not by_slice)
-        last = self.detail.resolution - 1 - (self.lower if own else 0)
-        for i, (velocity, axis) in enumerate(zip(velocities, axes, strict=True)):
-            across = [k for k in range(3) if k != axis]
-            order = (*across, axis)
-            layout = slicewise(axis)
-            strides = strides_of(self.grid.resolution, layout if by_slice else STANDARD)
-            places = strides_of(self._extinction.sides(axis), layout)
-            row = [*(int(self.sides[k]) for k in order), *(strides[k] for k in order)]
-            row += [int(np.dot(self.lower, strides)), *(places[k] for k in order)]
-            corner = np.dot(self.lower, places) if own else self.lower[axis] * places[axis]
-            row += [int(corner) + self._first_corner[axis]]
-            for k, offset in zip(across, offsets[i], strict=True):
-                slope = round(velocity[k] / velocity[axis] * ONE)
-                slope = slope or 1  # lines never stay in a face
-                start = min(int(offset * ONE), ONE - 1)
-                end = start + (int(self.sides[axis]) - 1) * slope
-                row += [slope, start, (end >> 24) % int(self.sides[k]), end & (ONE - 1)]
-            row += [self._empty.strides[k] for k in order] if self._empty else [0, 0, 0]
-            integers[i] = row
-            numbers[i, :3] = [1 / abs(velocity[axis]), weights[i], self._extinction.quantum]
-            numbers[i, DIRECTION:] = directions[i] * np.sign(velocity[axis])
-            numbers[i, 3:DIRECTION] = [
-                x for k in across for x in (ratio[k], self.lower[k] * ratio[k] - 0.5, last[k])
-            ]
-        forward = velocities[np.arange(count), axes] > 0
-        along = np.where(forward[:, None, None], light, light[:, ::-1])
-        return TrackTable(integers, numbers, along, Rows(axes, forward, integers))
+        axis = np.abs(velocities).argmax(axis=1)
+        pairs = np.arange(len(directions))
+        along = velocities[pairs, axis]
+        strides, extinction_strides = self._strides(axis, by_slice)
+        empty_strides = np.array(self._empty.strides if self._empty else (0, 0, 0))
+        per_voxel = self._per_voxel(has_source=not by_slice)
+        if per_voxel:
+            first_extinction = extinction_strides @ self.lower
+        else:
+            first_extinction = self.lower[axis] * extinction_strides[pairs, axis]
+        ratio = self.extinction_grid.resolution / self.grid.resolution
+        last = self.extinction_grid.resolution - 1 - (self.lower if per_voxel else 0)
 
-    def carry(
+        def transverse(number: int) -> TransverseFields:
+            k, size = TRANSVERSE[axis, number], self.size
+            slope = np.rint(velocities[pairs, k] / along * FIXED_POINT_ONE).astype(np.int64)
+            slope[slope == 0] = 1  # tracks never stay in a face
+            start = (offsets[:, number] * FIXED_POINT_ONE).astype(np.int64)
+            start = np.minimum(start, FIXED_POINT_ONE - 1)
+            end = start + (size[axis] - 1) * slope
+            return TransverseFields(
+                size=size[k],
+                stride=strides[pairs, k],
+                extinction_stride=extinction_strides[pairs, k],
+                empty_stride=empty_strides[k],
+                slope=slope,
+                start=start,
+                last_shift=(end >> FIXED_POINT_BITS) % size[k],
+                last_position=end & (FIXED_POINT_ONE - 1),
+                extinction_ratio=ratio[k],
+                extinction_origin=self.lower[k] * ratio[k] - 0.5,
+                extinction_last=last[k],
+            )
+
+        along_axis = directions * np.sign(along)[:, None]
+        record = TrackRecord(
+            transverse=(transverse(0), transverse(1)),
+            slices=self.size[axis],
+            stride=strides[pairs, axis],
+            extinction_stride=extinction_strides[pairs, axis],
+            empty_stride=empty_strides[axis],
+            first_voxel=strides @ self.lower,
+            first_extinction=first_extinction + np.array(self._first_extinction)[axis],
+            length=1 / np.abs(along),
+            weight=weights,
+            quantum=self._extinction.quantum,
+            direction_x=along_axis[:, 0],
+            direction_y=along_axis[:, 1],
+            direction_z=along_axis[:, 2],
+        )
+        forward = along > 0
+        incoming = np.where(forward[:, None, None], incoming, incoming[:, ::-1])
+        return TrackTable(record, incoming, axis, forward)
+
+    def uncollided(
         self,
         directions: np.ndarray,
-        light: np.ndarray,
+        incoming: np.ndarray,
         offsets: np.ndarray,
-        entering: Callable | None = None,
+        boundary_source: Callable | None = None,
     ) -> mi.Float:
-        """Irradiance at the centres of the wanted voxels: the light that enters along pairs of
-        directions, told as in `track_table`; instead of that ``light``, line by line, if a
-        function of the table is given that makes `BoundarySource`. Of several channels one follows
-        the other.
+        """Uncollided irradiance at the centres of the active voxels, from radiance that enters
+        along pairs of ordinates: ``incoming``, as in `table`, or, track by track, what
+        ``boundary_source`` makes of the table (`BoundarySource`). Channels follow each other.
         """
-        table = self.table(directions, light, np.zeros(len(light)), offsets, by_slice=True)
-        table.entering = entering(table) if entering is not None else None
-        box = self.lower, self.lower + self.sides
-        channels = table.channels if table.entering is None else table.entering.channels
-        wanted = self.count
-        total = dr.opaque(mi.Float, 0, wanted * channels)
+        table = self.table(directions, incoming, np.zeros(len(incoming)), offsets, by_slice=True)
+        table.boundary_source = boundary_source(table) if boundary_source is not None else None
+        box = self.lower, self.lower + self.size
+        channels = (table if table.boundary_source is None else table.boundary_source).channels
+        active = self.active_count
+        total = dr.opaque(mi.Float, 0, active * channels)
         for axis, pairs in table.by_axis:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)
-            self._launch(volume, False, table, axis, pairs)
+            self._sweep_axis(volume, False, table, axis, pairs)
             for c in range(channels):
-                light = sharpened(volume, self.grid, *box, axis, self.wanted, c, channels)
-                place = dr.arange(mi.UInt32, wanted)
-                place = place + dr.opaque(mi.UInt32, wanted * c) if c else place
+                values = values_at_centres(volume, self.grid, *box, axis, self.active, c, channels)
+                index = dr.arange(mi.UInt32, active)
+                index = index + dr.opaque(mi.UInt32, active * c) if c else index
                 # In place: a sum would be a second array.
-                dr.scatter_add(total, light, place)
+                dr.scatter_add(total, values, index)
             dr.eval(total)
-            del volume, light  # before the next axis has its own
+            del volume, values  # before the next axis has its own
         return total
 
-    def scatter(self, volume: mi.Float, table: TrackTable) -> None:
-        """Follows the light that comes from the voxels themselves, and that enters from outside.
+    def sweep(self, volume: mi.Float, table: TrackTable) -> None:
+        """Sweep radiance that voxels emit or scatter, and that enters from outside.
 
-        ``volume`` holds four values for each voxel: the radiance per optical depth that it sends
-        out, S, and three that are added to: its irradiance; what lines lose in it, the integral of
-        L - S over optical depth and directions; and the integral of 1, W. So S plus the mean loss,
-        loss / W, is the mean radiance *of collisions*: what is scattered from it is neither more
-        nor less than what has collided. Of several channels, a voxel has those four
-        values of each in turn.
+        ``volume`` holds four values for each voxel: its source S (radiance per optical depth), and
+        three that are added to: its irradiance; the radiance lost in it, the integral of L - S over
+        optical depth and directions; and the integral of 1, W. S plus the mean loss, loss / W, is
+        the mean radiance *of collisions*: scattering it conserves energy exactly, cell by cell.
+        Of several channels, a voxel has those four values of each in turn.
         """
-        if self.together:
-            self._launch_together(volume, True, table, table.order)
+        if self.one_launch:
+            self._sweep_copies(volume, True, table, table.order)
             return
         for axis, pairs in table.by_axis:
-            self._launch(volume, True, table, axis, pairs)
+            self._sweep_axis(volume, True, table, axis, pairs)
 
-    def apart(
-        self, table: TrackTable, sent: Callable[[Group], mi.Float] | None = None
-    ) -> Iterator[tuple[int, Group, mi.Float]]:
-        """Follows the pairs of ``table``, some at a time, and tells their axis and what their lines
-        leave: volumes one after the other, two for each pair, of light along the axis and against
+    def sweep_separately(
+        self, table: TrackTable, source: Callable[[PairGroup], mi.Float] | None = None
+    ) -> Iterator[tuple[int, PairGroup, mi.Float]]:
+        """Sweep groups of pairs, and yield for each its dominant axis and what its ordinates leave
+        in the voxels: volumes one after the other, two for each pair, along the axis and against
         it.
 
-        Where ``sent`` tells what voxels send out, likewise, of four values for each voxel, those of
-        `scatter`; else of the light that enters, laid out by slices.
+        With ``source``, which makes such volumes of what voxels emit, these have the four values of
+        `sweep` for each voxel; else one, irradiance, laid out by slices.
         """
         voxels = self.grid.voxel_count
-        most = max(1, COPIES // (2 * voxels))
+        most = max(1, MAX_COPIED_VOXELS // (2 * voxels))
         for axis, pairs in table.by_axis:
-            corners, words = self._corners(axis, sent is not None)
+            medium = self._medium(axis, source is not None)
             for start in range(0, len(pairs), most):
-                group = Group(table, pairs[start : start + most])
-                row, lanes = layers_of(self._lines, len(group))
-                copies = dr.opaque(mi.Float, 0, 2 * len(group) * voxels * (4 if sent else 1))
-                begin = row * dr.opaque(mi.UInt32, 2 * voxels)
-                empty = self._empty.slices if self._empty else None
-                follow(
-                    corners, words, empty, copies, sent(group) if sent else None,
-                    table, group.pair(row), lanes, begin,
-                    copy_back=begin + dr.opaque(mi.UInt32, voxels),
-                )  # fmt: skip
+                group = PairGroup(table, pairs[start : start + most])
+                number, track = layer_and_index(self._count, len(group))
+                copies = dr.opaque(mi.Float, 0, 2 * len(group) * voxels * (4 if source else 1))
+                begin = number * dr.opaque(mi.UInt32, 2 * voxels)
+                volume = SweptVolume(
+                    copies,
+                    source(group) if source else None,
+                    begin,
+                    begin_backward=begin + dr.opaque(mi.UInt32, voxels),
+                )
+                sweep_tracks(medium, volume, table, group.pair(number), track)
                 dr.eval(copies)
                 self.pause()
                 yield axis, group, copies
 
-    def _corners(self, axis: int, scatters: bool) -> tuple[mi.UInt32, int]:
-        """Values of the extinction for lines along ``axis``, and the words that are together. By
-        rows, lines that meet little else find the one above in a cache; wide volumes that light is
-        scattered in would have replaced it.
+    def _per_voxel(self, has_source: bool) -> bool:
+        """Whether sweeps read one value of the extinction for each voxel."""
+        return self._extinction.per_voxel and not (has_source and self._extinction.dense)
+
+    def _strides(self, axis: np.ndarray, by_slice: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Strides (n, 3) of the swept volume and of the extinction for each dominant axis."""
+        layouts = [slicewise(k) for k in range(3)]
+        volume = [
+            strides_of(self.grid.resolution, layout if by_slice else STANDARD) for layout in layouts
+        ]
+        extinction = [
+            strides_of(self._extinction.sides(k), layout) for k, layout in enumerate(layouts)
+        ]
+        return np.array(volume)[axis], np.array(extinction)[axis]
+
+    def _medium(self, axis: int, has_source: bool) -> SweptMedium:
+        """The extinction for tracks along ``axis``, and empty space.
+
+        Without a source, a track finds the row above it in a processor's cache, and rows of corners
+        suffice; sweeps with a source would have replaced it there by their wider volumes.
         """
-        by_rows = not scatters and not self.together
-        words = self._extinction.words(self._own(scatters), by_rows)
-        if self.together:
+        by_rows = not has_source and not self.one_launch
+        words = self._extinction.words(self._per_voxel(has_source), by_rows)
+        if self.one_launch:
             if words not in self._all_corners:
                 parts = [self._extinction.corners(k, words) for k in range(3)]
-                self._all_corners[words] = joined(parts)
-            return self._all_corners[words], words
+                self._all_corners[words] = concatenated(parts)
+            return SweptMedium(self._all_corners[words], words)
         corners = self._extinction.corners(axis, words)
         dr.eval(corners)
-        return corners, words
+        return SweptMedium(corners, words, self._empty.slices if self._empty else None)
 
-    def _launch(
-        self, volume: mi.Float, scatters: bool, table: TrackTable, axis: int, pairs: list[int]
+    def _sweep_axis(
+        self, values: mi.Float, has_source: bool, table: TrackTable, axis: int, pairs: list[int]
     ) -> None:
-        """Follows the ``pairs`` of ``table``, all of which have the dominant ``axis``."""
-        if self.together:
-            self._launch_together(volume, scatters, table, pairs)
+        """Sweep the ``pairs`` of ``table``, all of which have the dominant ``axis``."""
+        if self.one_launch:
+            self._sweep_copies(values, has_source, table, pairs)
             return
-        corners, words = self._corners(axis, scatters)  # one set at a time is kept
-        empty = self._empty.slices if self._empty else None
-        source = volume if scatters else None
-        channels = self._channels(volume, scatters)
+        medium = self._medium(axis, has_source)  # one axis at a time is in memory
+        source = values if has_source else None
+        channels = self._channels(values, has_source)
         for i in pairs:
-            follow(
-                corners, words, empty, volume, source, table, table.places[i],
-                self._lanes, dr.opaque(mi.UInt32, 0), channels,
-            )  # fmt: skip
-            dr.eval(volume)
+            volume = SweptVolume(values, source, dr.opaque(mi.UInt32, 0), channels)
+            sweep_tracks(medium, volume, table, table.pair_index[i], self._indices)
+            dr.eval(values)
             self.pause()
 
-    def _launch_together(
-        self, volume: mi.Float, scatters: bool, table: TrackTable, pairs: list[int]
+    def _sweep_copies(
+        self, values: mi.Float, has_source: bool, table: TrackTable, pairs: list[int]
     ) -> None:
-        """The same in one launch, or few; the ``pairs``, of any axes, follow each other in the
-        table's order.
+        """The same in one launch, or few, each pair into a copy; the ``pairs``, of any axes, follow
+        each other in the table's order.
         """
-        kind, size = (mi.Vector4f, 4) if scatters else (mi.Float, 1)
-        voxels = dr.width(volume) // size  # of all channels
-        most, (corners, words) = max(1, COPIES // voxels), self._corners(0, scatters)
+        kind, width = (mi.Vector4f, 4) if has_source else (mi.Float, 1)
+        voxels = dr.width(values) // width  # of all channels
+        most, medium = max(1, MAX_COPIED_VOXELS // voxels), self._medium(0, has_source)
         for start in range(0, len(pairs), most):
-            group = Group(table, pairs[start : start + most])
-            row, lanes = layers_of(self._lines, len(group))
-            copies = dr.opaque(mi.Float, 0, dr.width(volume) * len(group))
-            follow(
-                corners, words, None, copies, volume if scatters else None,
-                table, group.pair(row), lanes, row * dr.opaque(mi.UInt32, voxels),
-                self._channels(volume, scatters),
-            )  # fmt: skip
+            group = PairGroup(table, pairs[start : start + most])
+            number, track = layer_and_index(self._count, len(group))
+            copies = dr.opaque(mi.Float, 0, dr.width(values) * len(group))
+            volume = SweptVolume(
+                copies,
+                values if has_source else None,
+                number * dr.opaque(mi.UInt32, voxels),
+                self._channels(values, has_source),
+            )
+            sweep_tracks(medium, volume, table, group.pair(number), track)
             dr.eval(copies)
-            add_copies(volume, copies, voxels, len(group), kind)
-            dr.eval(volume)
+            add_copies(values, copies, voxels, len(group), kind)
+            dr.eval(values)
             self.pause()
 
-    def _channels(self, volume: mi.Float, scatters: bool) -> int:
-        """How many a volume has."""
-        return dr.width(volume) // (self.grid.voxel_count * (4 if scatters else 1))
+    def _channels(self, values: mi.Float, has_source: bool) -> int:
+        """How many channels a swept volume has."""
+        return dr.width(values) // (self.grid.voxel_count * (4 if has_source else 1))
 
 
-def sharpened(
-    values: mi.Float,
+def values_at_centres(
+    means: mi.Float,
     grid: Grid,
     lower: np.ndarray,
     upper: np.ndarray,
@@ -321,18 +363,19 @@ def sharpened(
     channels: int = 1,
     begin: mi.UInt32 | int = 0,
 ) -> mi.Float:
-    """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z),
-    given means over the cross sections of all voxels across ``axis``, ``values`` from ``begin`` on,
-    laid out by slices: second differences along both other axes take back what the mean has
-    smoothed. Never negative. A voxel may have values of several ``channels``, of which one is
-    taken.
+    """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z), from
+    ``means`` over the cross sections of all voxels across ``axis``.
+
+    Tracks with a random shift sample a voxel's cross section uniformly; second differences along
+    both transverse axes take back the smoothing. Results are never negative. ``means``, laid out by
+    slices from ``begin`` on, have several ``channels``, of which one is taken.
     """
     places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
-    place = flat(places, strides) + begin
+    place = flat_index(places, strides) + begin
 
     def read(i: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:
         i = i if channels == 1 else i * channels + channel
-        return dr.gather(mi.Float, values, i, active)
+        return dr.gather(mi.Float, means, i, active)
 
     value, change = read(place), mi.Float(0)
     for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
@@ -344,6 +387,6 @@ def sharpened(
         # At a border, the second difference of the voxel next to it.
         centre = place + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
         here, below, above = (read(i, inside) for i in (centre, centre - stride, centre + stride))
-        # Where no line has left anything, nothing is known.
+        # Voxels that no radiance has reached have no second difference.
         change += dr.select((below > 0) & (above > 0), 2 * here - below - above, 0)
-    return dr.maximum(dr.fma(change, dr.opaque(mi.Float, RECEIVED), value), 0)
+    return dr.maximum(dr.fma(change, dr.opaque(mi.Float, SECOND_DIFFERENCE), value), 0)

@@ -36,7 +36,7 @@ def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, of
     def entering(table):
         return BoundarySource(*found._placed(lattice, table, rows), values)
 
-    volume = lattice.carry(DIRECTIONS[rows], dark, offset[rows], entering)
+    volume = lattice.uncollided(DIRECTIONS[rows], dark, offset[rows], entering)
     return np.array(volume, dtype=np.float64).reshape(lattice.grid.shape)
 
 

@@ -11,8 +11,8 @@ from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import IncomingRadiance
-from mitsuba_irrcache.solvers.discrete_ordinates.kernel import ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -79,7 +79,10 @@ def test_light_that_a_voxel_scatters_goes_on_forward():
     opposite side, and the voxels ahead receive 4 pi p of the angle, those behind likewise.
     """
     moments, of_matter = moments_of(0.5), lines(0.2)
-    fields = dr.full(mi.Float, 0.2, of_matter.count), dr.full(mi.Float, 1.0, of_matter.count)
+    fields = (
+        dr.full(mi.Float, 0.2, of_matter.active_count),
+        dr.full(mi.Float, 1.0, of_matter.active_count),
+    )
     level = AnisotropicMultigridLevel(*fields, of_matter, moments=moments)
     ways = WAYS[:15]
     table = ways, np.zeros((15, 2)), np.full(15, 2 * np.pi / 15), centred(level, ways)
@@ -133,7 +136,7 @@ def test_paths_begin_on_their_lines(scenes, monkeypatch):
         own = start[row[hit] == i]
         axis = int(np.abs(velocity).argmax())
         for k, offset in zip([k for k in range(3) if k != axis], offsets[i], strict=True):
-            slope = round(velocity[k] / velocity[axis] * ONE) / ONE
+            slope = round(velocity[k] / velocity[axis] * FIXED_POINT_ONE) / FIXED_POINT_ONE
             first = own[:, k] + slope * (lower[axis] + 0.5 - own[:, axis])
             away = (first - offset + 0.5) % 1 - 0.5
             assert np.quantile(np.abs(away), 0.95) < 5e-3

@@ -55,7 +55,7 @@ def test_lines_skip_what_is_empty_and_no_more():
         assert (n == 0) == inside.any()
         if n > 1:  # reached from any voxel of the cell in fewer than n slices
             assert not blocked[tuple(np.s_[a - n + 1 : a + CELL + n - 1] for a in first)].any()
-        if n and n < (empty_space.REACH - 1) * CELL:
+        if n and n < (empty_space.MAX_DISTANCE - 1) * CELL:
             wide = n + 2 * CELL
             assert blocked[tuple(np.s_[a - wide : a + CELL + wide] for a in first)].any()
         longest = max(longest, n)
@@ -73,8 +73,8 @@ def test_light_is_the_same(monkeypatch, box, detailed):
     """Whichever way lines go, and where they enter, with voxels of the medium and its detail: of
     light that enters, and what voxels scatter besides.
     """
-    monkeypatch.setattr(tracks, "SMALL", 0)
-    monkeypatch.setattr(tracks, "RECEIVED", 0.0)
+    monkeypatch.setattr(tracks, "SMALL_GRID", 0)
+    monkeypatch.setattr(tracks, "SECOND_DIFFERENCE", 0.0)
     monkeypatch.setattr(empty_space, "WORTHWHILE", 1.0)
     occupied = sparse()
     lower, upper = (np.array(end) for end in box)
@@ -100,7 +100,7 @@ def test_light_is_the_same(monkeypatch, box, detailed):
     light, offsets = rng.random((12, 2)), rng.random((12, 2))
     sigma_t = mi.Float(density.ravel().tolist())
     lines = [Tracks(grid, sigma_t, lower, upper, medium, wanted, skip) for skip in (False, True)]
-    values = [np.array(each.carry(directions, light, offsets)) for each in lines]
+    values = [np.array(each.uncollided(directions, light, offsets)) for each in lines]
     assert values[0].max() > 2 * values[0].min()
     np.testing.assert_allclose(*values, rtol=1e-6)
     count = dr.width(wanted)

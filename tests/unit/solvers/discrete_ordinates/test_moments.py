@@ -25,8 +25,8 @@ SIDES = (6, 9, 7)
 def mode(request, monkeypatch):
     """All pairs of directions in one launch, or one in each."""
     if request.param == "apart":
-        monkeypatch.setattr(tracks, "SMALL", 0)
-        monkeypatch.setattr(tracks, "COPIES", 1)
+        monkeypatch.setattr(tracks, "SMALL_GRID", 0)
+        monkeypatch.setattr(tracks, "MAX_COPIED_VOXELS", 1)
 
 
 def moments_of(g: float, order: int) -> Moments:
@@ -52,7 +52,7 @@ def lines(sigma_t: np.ndarray) -> Tracks:
 
 def level(sigma_t: np.ndarray, albedo: float, moments: Moments | None) -> MultigridLevel:
     of_matter = lines(sigma_t)
-    number = of_matter.count
+    number = of_matter.active_count
     fields = (mi.Float(v.ravel().tolist()) for v in (sigma_t, np.full(number, albedo)))
     arguments = *fields, of_matter
     return (
@@ -78,7 +78,7 @@ def test_light_of_one_direction():
     for light, sign in (([1.0, 0.0], -1), ([0.0, 1.0], 1)):
         entering = way, np.array([light]), offsets
         found = values(moments.carry(of_matter, *entering), moments.count)
-        irradiance = np.array(of_matter.carry(*entering))
+        irradiance = np.array(of_matter.uncollided(*entering))
         basis = np.ravel(
             [np.array(y) for y in moments.basis(mi.Vector3f((sign * way[0]).tolist()))]
         )

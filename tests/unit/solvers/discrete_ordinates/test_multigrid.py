@@ -24,7 +24,7 @@ def mode(request, monkeypatch):
     """One launch for all directions, or one for each; three levels."""
     monkeypatch.setattr(multigrid, "COARSEST", 4)
     if request.param == "apart":
-        monkeypatch.setattr(tracks, "SMALL", 0)
+        monkeypatch.setattr(tracks, "SMALL_GRID", 0)
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_channels_that_are_swept_together_do_not_mix(random):
         some = of(*channels)
         table = some.lattice.table(*of_rows)
         values = mi.Float(light[channels].ravel().tolist())
-        table.entering = Arriving(places, cells, values, len(channels))
+        table.boundary_source = Arriving(places, cells, values, len(channels))
         return [stacked(values) for values in some.scatter(flat(phi[channels]), table)]
 
     together, alone = scattered([0, 1, 2]), [scattered([c]) for c in range(3)]
@@ -117,7 +117,7 @@ def test_light_without_voxels_sending_is_carried_in_all_channels(random):
     def carried(channels: list[int]) -> np.ndarray:
         values = mi.Float(light[channels].ravel().tolist())
         entering = BoundarySource(places, cells, values, len(channels))
-        carry = of(0).lattice.carry
+        carry = of(0).lattice.uncollided
         return np.array(carry(directions, dark, offsets, lambda _: entering)).reshape(-1, VOXELS)
 
     together = carried([0, 1, 2])
@@ -146,7 +146,7 @@ def test_voxels_without_matter_need_not_be_known(random, evenly):
         all_matter = mi.Float(sigma_t.tolist())
         lines = Tracks(
             grid, all_matter, np.zeros(3, int), grid.resolution,
-            wanted=mi.UInt32(wanted.tolist()), sparse=len(wanted) < VOXELS,
+            active=mi.UInt32(wanted.tolist()), sparse=len(wanted) < VOXELS,
         )  # fmt: skip
         fields = (mi.Float(f[wanted].ravel().tolist()) for f in (sigma_t, albedo))
         some = MultigridLevel(*fields, lines, evenly)

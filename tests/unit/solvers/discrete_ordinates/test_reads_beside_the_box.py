@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, sharpened
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, values_at_centres
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -63,7 +63,7 @@ def test_sharpening(reports, grid, axis, channels, box):
 
     def action() -> None:
         for c in range(channels):
-            dr.eval(sharpened(values, grid, *map(np.array, box), axis, every, c, channels))
+            dr.eval(values_at_centres(values, grid, *map(np.array, box), axis, every, c, channels))
 
     assert not reports(action)
 
@@ -76,4 +76,4 @@ def test_light_that_enters(reports, grid, box):
     sigma_t = dr.opaque(mi.Float, 0.5, grid.voxel_count)
     lattice = Tracks(grid, sigma_t, *map(np.array, box))
     offsets = np.random.default_rng(1).random((3, 2))
-    assert not reports(lambda: dr.eval(lattice.carry(directions, np.ones((3, 2)), offsets)))
+    assert not reports(lambda: dr.eval(lattice.uncollided(directions, np.ones((3, 2)), offsets)))

@@ -10,8 +10,8 @@ import pytest
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.discrete_ordinates import tracks
-from mitsuba_irrcache.solvers.discrete_ordinates.kernel import ONE
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, sharpened
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, values_at_centres
 
 SHAPES = [(8, 8, 8), (7, 12, 5), (1, 6, 9), (5, 1, 1), (9, 4, 1)]
 #: Along axes, edges and diagonals, almost along them, and between.
@@ -35,9 +35,9 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 @pytest.fixture(params=["together", "apart"], autouse=True)
 def mode(request, monkeypatch, rgb):
     """One launch for all directions, or one for each; voxels hold what lines leave in them."""
-    monkeypatch.setattr(tracks, "RECEIVED", 0.0)
+    monkeypatch.setattr(tracks, "SECOND_DIFFERENCE", 0.0)
     if request.param == "apart":
-        monkeypatch.setattr(tracks, "SMALL", 0)
+        monkeypatch.setattr(tracks, "SMALL_GRID", 0)
     return request.param
 
 
@@ -55,7 +55,7 @@ def lines(grid: Grid, sigma_t, box=None) -> Tracks:
 def carried(lines: Tracks, light, places: np.ndarray, directions=DIRECTIONS) -> np.ndarray:
     """Irradiance (z, y, x) of light (n, 2) along pairs of directions."""
     light = np.broadcast_to(light, (len(directions), 2))
-    volume = lines.carry(directions, light, places)
+    volume = lines.uncollided(directions, light, places)
     return np.array(volume, dtype=np.float64).reshape(lines.grid.shape)
 
 
@@ -66,9 +66,11 @@ def passages(grid: Grid, direction: np.ndarray, offset, box=None) -> np.ndarray:
     axis = int(np.abs(velocity).argmax())
     at = np.moveaxis(np.indices(grid.shape)[::-1], 0, -1) + 0.5
     for k, start in zip([k for k in range(3) if k != axis], offset, strict=True):
-        slope = round(velocity[k] / velocity[axis] * ONE) or 1
+        slope = round(velocity[k] / velocity[axis] * FIXED_POINT_ONE) or 1
         steps = (at[..., axis] - 0.5 - lower[axis]).astype(int)
-        at[..., k] += (int(start * ONE) + steps * slope) % ONE / ONE - 0.5
+        at[..., k] += (
+            int(start * FIXED_POINT_ONE) + steps * slope
+        ) % FIXED_POINT_ONE / FIXED_POINT_ONE - 0.5
     return at
 
 
@@ -226,13 +228,13 @@ def test_both_modes_agree(monkeypatch):
     light, weights = rng.random((10, 2)), rng.random(10)
     results = []
     for small in (0, 40**3):
-        monkeypatch.setattr(tracks, "SMALL", small)
+        monkeypatch.setattr(tracks, "SMALL_GRID", small)
         medium = lines(grid, sigma_t, box)
-        assert medium.together == (small > 0)
+        assert medium.one_launch == (small > 0)
         volume = np.zeros((grid.voxel_count, 4), np.float32)
         volume[:, 0] = source
         volume = mi.Float(volume.ravel())
-        medium.scatter(volume, medium.table(DIRECTIONS, light, weights, places))
+        medium.sweep(volume, medium.table(DIRECTIONS, light, weights, places))
         results.append((carried(medium, light, places), np.array(volume).reshape(-1, 4)))
     np.testing.assert_allclose(results[0][0], results[1][0], rtol=3e-6)
     np.testing.assert_allclose(results[0][1], results[1][1], rtol=2e-5, atol=1e-6)
@@ -321,7 +323,7 @@ def test_sharpening_takes_back_a_mean(monkeypatch):
 
     def at(voxels, means: np.ndarray, axis: int) -> np.ndarray:
         wanted = mi.UInt32(index[voxels].ravel().tolist())
-        return np.array(sharpened(laid(means, axis), grid, *box, axis, wanted))
+        return np.array(values_at_centres(laid(means, axis), grid, *box, axis, wanted))
 
     for axis, curvature in enumerate((1 - 2, 3 - 2, 3 + 1)):
         means = np.zeros(grid.shape)
@@ -342,7 +344,7 @@ def test_dense_voxels_have_two_halves(scale, halves):
     sweep = lines(grid, np.broadcast_to(layers[:, None, None], grid.shape))
     volume = dr.opaque(mi.Float, 0, grid.voxel_count * 4)
     directions = np.array([[0.0, 0.0, 1.0]])
-    sweep.scatter(volume, sweep.table(directions, np.zeros((1, 2)), np.ones(1), offsets(1)))
+    sweep.sweep(volume, sweep.table(directions, np.zeros((1, 2)), np.ones(1), offsets(1)))
     depth = np.array(volume).reshape(*grid.shape, 4)[..., 3]  # both ways, over the cross section
     beside = np.concatenate([layers[:1], layers, layers[-1:]])
     expected = (beside[:-2] + 6 * layers + beside[2:]) / 8 if halves else layers

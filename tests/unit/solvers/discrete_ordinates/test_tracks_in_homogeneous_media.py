@@ -9,7 +9,7 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.discrete_ordinates import tracks
-from mitsuba_irrcache.solvers.discrete_ordinates.kernel import ONE
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -23,7 +23,7 @@ WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
 def mode(request, monkeypatch):
     """One launch for all directions, or one for each."""
     if request.param == "apart":
-        monkeypatch.setattr(tracks, "SMALL", 0)
+        monkeypatch.setattr(tracks, "SMALL_GRID", 0)
 
 
 def behind_the_entry(grid: Grid, way: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -34,9 +34,11 @@ def behind_the_entry(grid: Grid, way: np.ndarray, offset: np.ndarray) -> np.ndar
     axis = int(np.abs(velocity).argmax())
     at = np.moveaxis(np.indices(grid.shape)[::-1], 0, -1) + 0.5
     for k, start in zip([k for k in range(3) if k != axis], offset, strict=True):
-        slope = round(velocity[k] / velocity[axis] * ONE)
+        slope = round(velocity[k] / velocity[axis] * FIXED_POINT_ONE)
         steps = (at[..., axis] - 0.5).astype(int)
-        at[..., k] += (int(start * ONE) + steps * slope) % ONE / ONE - 0.5
+        at[..., k] += (
+            int(start * FIXED_POINT_ONE) + steps * slope
+        ) % FIXED_POINT_ONE / FIXED_POINT_ONE - 0.5
     entry = np.where(velocity > 0, 0, grid.resolution)
     return ((at - entry) / velocity).min(axis=-1)
 
@@ -53,7 +55,7 @@ def test_light_that_enters_is_less_by_what_it_has_passed(way, back):
     light, offset = np.zeros((1, 2)), np.array([[0.35, 0.8]])
     light[0, back] = 3.0
     volume = dr.opaque(mi.Float, 0, count * 4)
-    lines.scatter(volume, lines.table(way[None], light, np.ones(1), offset))
+    lines.sweep(volume, lines.table(way[None], light, np.ones(1), offset))
     received = np.array(volume, np.float64).reshape(*SHAPE, 4)[..., 1]
     length = behind_the_entry(grid, -way if back else way, offset[0])
     np.testing.assert_allclose(received, 3 * np.exp(-sigma_t * length), rtol=2e-3)
