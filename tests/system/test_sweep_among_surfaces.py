@@ -176,7 +176,7 @@ def test_white_furnace(scenes, around, tolerance):
 
 @pytest.mark.parametrize("size", [0.4, 2.4])
 def test_small_and_large_lamps_are_as_bright_as_paths(scenes, size):
-    """Lamps that are sampled from voxels, and those that lines meet: both layers of the cache as
+    """Lamps that are sampled from voxels, and those that tracks meet: both layers of the cache as
     ``path`` finds them, on average over all voxels. Light that is counted twice or left out shows.
     """
     scene, found = load(scenes, scene_room(scenes) | {"lamp": lamp(size)}), []

@@ -247,15 +247,15 @@ MUTANTS = (
     Mutant(
         "light in the voxel of a lamp as in its middle (sweep)",
         "solvers/discrete_ordinates/solver.py",
-        "else irradiance[channel] * self._spread",
+        "else irradiance[channel] * self._inverse_square_mean",
         "else irradiance[channel]",
         ("tests/system/test_lamps.py",),
     ),
     Mutant(
         "light from the opposite side (moments)",
         "solvers/discrete_ordinates/moments.py",
-        "even, odd = there + back, there - back",
-        "even, odd = there + back, back - there",
+        "even, odd = forward + backward, forward - backward",
+        "even, odd = forward + backward, backward - forward",
         (MOMENTS,),
     ),
     Mutant(
@@ -296,22 +296,22 @@ MUTANTS = (
     Mutant(
         "suns of skies as bright as directions met them",
         "solvers/discrete_ordinates/incident.py",
-        "light[number == k] *= factor",
-        "light[number == k] *= 1",
+        "incoming[number == k] *= factor",
+        "incoming[number == k] *= 1",
         ("tests/system/test_sweep.py",),
     ),
     Mutant(
         "light passes a sliver of its medium on its way in (arrivals)",
         "solvers/discrete_ordinates/boundary_condition.py",
-        "around.scene, around.others, ray, pointer",
-        "around.scene, around.media, ray, pointer",
+        "boundary.scene, boundary.other_media, ray, pointer",
+        "boundary.scene, boundary.media, ray, pointer",
         ("tests/stress/test_stability.py",),
     ),
     Mutant(
         "moments of lamps forgotten (directional sweep)",
         "solvers/discrete_ordinates/anisotropic.py",
-        "moments.part(smooth, k) + sum(light[k] for light in others)",
-        "moments.part(smooth, k)",
+        "moments.moment(smooth, k) + sum(values[k] for values in others)",
+        "moments.moment(smooth, k)",
         (PHASE,),
     ),
     Mutant(

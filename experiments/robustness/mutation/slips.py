@@ -64,8 +64,8 @@ SLIPS = (
     Mutant(
         "passes take the rows of the pass behind them (passes)",
         "solvers/discrete_ordinates/ordinates.py",
-        "np.cumsum([0] + [len(row[0]) for row in rows])",
-        "np.cumsum([len(row[0]) for row in rows])",
+        "np.cumsum([0] + [len(each.directions) for each in sets])",
+        "np.cumsum([len(each.directions) for each in sets])",
         (AMONG_SURFACES,),
     ),
     Mutant(
@@ -232,8 +232,8 @@ SLIPS = (
     Mutant(
         "lines enter half a slice later (arrivals)",
         "solvers/discrete_ordinates/boundary_condition.py",
-        "b, c = dr.fma(a - 0.5, slope_b, b)",
-        "b, c = dr.fma(a, slope_b, b)",
+        "b, c = dr.fma(a - 0.5, read.slope_b, b)",
+        "b, c = dr.fma(a, read.slope_b, b)",
         (LINE_DIRECTIONS,),
     ),
     Mutant(

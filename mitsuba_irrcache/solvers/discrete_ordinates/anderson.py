@@ -1,4 +1,9 @@
-"""Anderson's mixing: where an iteration leads, told by its last steps."""
+"""Anderson acceleration of fixed-point iterations.
+
+D. G. Anderson, *Iterative procedures for nonlinear integral equations*, Journal of the ACM 12,
+1965; H. F. Walker and P. Ni, *Anderson acceleration for fixed-point iterations*, SIAM Journal on
+Numerical Analysis 49, 2011.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +15,24 @@ import numpy as np
 
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 
-#: Below all light.
+#: Smaller than any quantity that is divided by.
 TINY = 1e-300
-#: Times the last change of the images, at most, that a step may go on behind its own.
-FARTHEST = 20.0
+#: Times the last change of the images by which a step may extrapolate beyond its own image.
+MAX_EXTRAPOLATION = 20.0
 
 
 class AndersonAcceleration:
-    """Of an iteration of large arrays, of which two steps are kept: how the error that falls most
-    slowly has fallen tells what is left of it.
+    """Acceleration of depth 1 for large arrays: the two last steps tell how the slowest error
+    decays, and so what remains of it.
     """
 
     def __init__(self, sums: Callable[[mi.Float], np.ndarray]) -> None:
-        """``sums``: of an array, in each of its channels, which lie next to each other."""
+        """``sums``: (weighted) sums over an array for each of its interleaved channels."""
         self._sums = sums
         self._last: tuple[mi.Float, mi.Float] | None = None
 
     def next(self, phi: mi.Float, image: mi.Float) -> mi.Float:
-        """From where to go on, if a step leads from ``phi`` to its ``image``."""
+        """The point to continue from, after a step from ``phi`` to its ``image``."""
         residual = image - phi
         dr.eval(residual)
         last, self._last = self._last, (residual, image)
@@ -37,8 +42,8 @@ class AndersonAcceleration:
         along, square = self._sums(residual * change), self._sums(change * change)
         with np.errstate(invalid="ignore", over="ignore"):
             share = -along / np.maximum(square, TINY)
-        # Squares of very bright light are not finite.
-        share = np.clip(np.where(np.isfinite(share), share, 0), -0.5, FARTHEST)
+        # Squares of very large radiance are not finite.
+        share = np.clip(np.where(np.isfinite(share), share, 0), -0.5, MAX_EXTRAPOLATION)
         channel = voxel_and_channel(dr.width(phi) // len(share), len(share))[1]
         # One more, since kernels that read an array of a single value are different ones.
         factor = dr.gather(mi.Float, mi.Float([*share, 0.0]), channel)
@@ -47,9 +52,9 @@ class AndersonAcceleration:
         return result
 
 
-def mixed(history: list, channel: int) -> np.ndarray:
-    """Of a short history of points and their images, few voxels each, the combination of images
-    that leaves the least residual in a channel.
+def accelerated(history: list, channel: int) -> np.ndarray:
+    """The combination of images with the least residual, in one channel of a short history of
+    points and their images: acceleration of any depth, for small arrays.
     """
     points, images = (np.array([x[channel] for x in xs]) for xs in zip(*history, strict=True))
     residuals = images - points

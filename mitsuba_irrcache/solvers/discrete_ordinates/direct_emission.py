@@ -1,4 +1,4 @@
-"""Light that reaches voxels straight from a medium that shines."""
+"""Uncollided irradiance from an emissive medium, sampled voxel by voxel."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from mitsuba_irrcache.transport.tracking import free_flight
 
 
 @symbolic
-def emitted_light(
+def emission_irradiance(
     medium: MediumGrid,
     position: mi.Point3f,
     count: int,
     seed: tuple[int, int],
-    directional: AngularBasis | None = None,
+    angular_basis: AngularBasis | None = None,
 ) -> list[mi.Spectrum]:
-    """Irradiance at ``position`` from the emission of ``medium``, and its moments if it is told by
-    its direction: unbiased estimates by ``count`` directions, spread evenly and shifted at random
-    at each position. ``seed`` ends with the number of the batch.
+    """Irradiance at ``position`` from the emission of ``medium``, then its moments if there is an
+    angular basis: unbiased estimates from ``count`` directions, a Kronecker sequence with a random
+    shift at each position. ``seed`` ends with the number of the batch.
     """
     place = dr.arange(mi.UInt32, dr.width(position))
     rng = random_stream(mi.sample_tea_32(place, hashed_seed(seed)[0]), 1)
     shift = [rng.next_uint32(), rng.next_uint32()]
-    total, weight = nothing(directional), dr.opaque(mi.Float, 4 * dr.pi / count)
+    total, weight = nothing(angular_basis), dr.opaque(mi.Float, 4 * dr.pi / count)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, count)
     while dr.hint(k < count, label="emission"):
         ray = mi.Ray3f(position, _direction(shift, k))
         hit, near, far = medium.intersect(ray)
-        *_, rng, light = free_flight(
+        *_, rng, emitted = free_flight(
             medium, ray, dr.maximum(near, 0), far, mi.Spectrum(1), rng, hit
         )
-        # None of it is of narrow lights.
-        total = added(total, position, ray.d, mi.Spectrum(0), light * weight, directional)
+        # Emission is no narrow source.
+        total = added(total, position, ray.d, mi.Spectrum(0), emitted * weight, angular_basis)
         k += 1
     dr.eval(total)
     return total
 
 
 def _direction(shift: list[mi.UInt32], k: mi.UInt32) -> mi.Vector3f:
-    """Direction ``k`` of the set with this random shift."""
+    """Direction ``k`` of the sequence with this random shift."""
     return mi.warp.square_to_uniform_sphere(mi.Point2f(unit_floats(kronecker_words(k, shift))))

@@ -1,4 +1,8 @@
-"""A pass of the solver ``sweep``: directions, and the light that enters along them."""
+"""Ordinate sets: the directions of one pass of the solver, and the sweeps along them.
+
+A pass sweeps one set of ordinates. `OrdinateSet` is for a medium with distant emitters only;
+`BoundaryOrdinateSet` for a medium among surfaces, whose radiance enters track by track.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import spread, spread_together
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
+    Ordinates,
+    hemisphere_ordinates,
+    joint_ordinates,
+    merged,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import (
     IncomingRadiance,
     SurfaceBoundary,
@@ -20,205 +29,203 @@ from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Directions and what belongs to them, as `Tracks.table` wants it.
-Rows = Sequence[np.ndarray]
-#: Directions of a pass along which light arrives where there are surfaces: it differs from one to
-#: the next by more than the light between voxels.
-ARRIVING = 64
+#: Ordinates of a pass along which radiance enters among surfaces: it varies more from one direction
+#: to the next than the radiance between voxels.
+BOUNDARY_ORDINATES = 64
 
 
 class OrdinateSet:
-    """Directions, light from far away along them in some ``channels`` or alike in all, weights and
-    offsets: light that enters and light from voxels goes the same ways.
+    """Ordinates along which both the radiance of distant emitters and that of voxels travel, in
+    some ``channels``, or alike in all.
     """
 
-    def __init__(self, rows: Rows, channels: Sequence[int], suns: int = 0) -> None:
-        """``suns`` of the last rows are those of suns, whose light is wanted apart."""
-        directions, light, weights, offsets = rows
-        self._suns = np.arange(len(weights)) >= len(weights) - suns if suns else None
-        own = light if light.shape[-1] == 1 else light[..., list(channels)]
-        self.rows = directions, own, weights, offsets
+    def __init__(self, ordinates: Ordinates, channels: Sequence[int], suns: int = 0) -> None:
+        """``suns`` of the last ordinates are those of suns, whose irradiance is to be separate."""
+        count, incoming = len(ordinates.weights), ordinates.incoming
+        self._is_sun = np.arange(count) >= count - suns if suns else None
+        own = incoming if incoming.shape[-1] == 1 else incoming[..., list(channels)]
+        self.ordinates = ordinates._replace(incoming=own)
 
     @staticmethod
-    def straight(
-        passes: Sequence[OrdinateSet], directional: AngularBasis | None = None
+    def uncollided(
+        sets: Sequence[OrdinateSet], angular_basis: AngularBasis | None = None
     ) -> list[tuple]:
-        """The light of all ``passes`` that comes straight from emitters, as `Tracks.carry` takes
-        it; where it is told by its direction, first without that of narrow lights, then that of
-        each; where that of suns is wanted apart, it comes last.
+        """Arguments of `Tracks.uncollided` for the radiance of distant emitters along all ``sets``.
+
+        With an ``angular_basis``, first for all but the narrow sources, then for each of these;
+        where the irradiance of suns is to be separate, it comes last.
         """
-        directions, light, _, offsets = merged([p.rows for p in passes])
-        parts = [light] if directional is None else directional.apart(directions, light)
-        if passes[0]._suns is not None:
-            suns = np.concatenate([p._suns for p in passes])[:, None, None]
-            parts = [np.where(suns, 0, light), np.where(suns, light, 0)]
-        lit = [part.any(axis=(1, 2)) for part in parts]
+        directions, incoming, _, offsets = merged([each.ordinates for each in sets])
+        parts = [incoming] if angular_basis is None else angular_basis.apart(directions, incoming)
+        if sets[0]._is_sun is not None:
+            is_sun = np.concatenate([each._is_sun for each in sets])[:, None, None]
+            parts = [np.where(is_sun, 0, incoming), np.where(is_sun, incoming, 0)]
+        used = [part.any(axis=(1, 2)) for part in parts]
         return [
             (directions[rows], part[rows], offsets[rows])
-            for part, rows in zip(parts, lit, strict=True)
+            for part, rows in zip(parts, used, strict=True)
         ]
 
-    def scatter(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
-        """As `MultigridLevel.scatter`, with the light that enters."""
-        return level.scatter(phi, level.lattice.table(*self.rows))
+    def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        """`MultigridLevel.sweep` with the radiance that enters."""
+        return level.sweep(phi, level.tracks.table(*self.ordinates))
 
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
         """All orders of scattering, of which ``b`` is the first, for so many further ``passes``:
-        what is left of its error these correct, and divide by their number.
+        these correct the remaining error, and divide it by their number.
         """
-        return level.solve(b, self.between, tolerance=max(1.0, passes / 2))
+        return level.solve(b, self.scattering, tolerance=max(1.0, passes / 2))
 
     def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
-        """As `MultigridLevel.corrected`, of a sweep along the lines of this pass."""
-        coarse = [] if level.coarsest else level.coarser.tables(self.between)
-        return level.corrected(phi, swept, coarse)
+        """`MultigridLevel.coarse_corrected` for a sweep along the ordinates of this set."""
+        coarse = [] if level.coarsest else level.coarser.tables(self.scattering)
+        return level.coarse_corrected(phi, swept, coarse)
 
     @property
-    def between(self) -> Rows:
-        """Those along which voxels send light, none from outside."""
-        return between(self.rows)
+    def scattering(self) -> Ordinates:
+        """The ordinates of radiance that voxels emit and scatter."""
+        return self.ordinates.scattering()
 
 
 class BoundaryOrdinateSet:
-    """Among surfaces: light that arrives comes along more directions than light between voxels,
-    ``inner`` ones.
+    """Among surfaces: radiance enters along more ordinates than it is exchanged between voxels
+    along, the ``scattering`` ones.
 
-    ``arrivals`` are those along the ``rows``, which are from number ``start`` on there; ``returns``
-    those along the inner ones, by which light that leaves the medium comes back to it while all
-    orders are solved for, if they are in this pass. Some ``channels`` are taken of both.
+    ``incoming`` is the radiance that enters along the ``ordinates``, which begin at number
+    ``start`` there. ``reflected`` is that which leaves the medium and returns to it along the
+    scattering ordinates while all orders are solved for, if this set does so. Some ``channels`` are
+    taken of both.
     """
 
     def __init__(
         self,
-        rows: Rows,
-        inner: Rows,
-        arrivals: IncomingRadiance,
+        ordinates: Ordinates,
+        scattering: Ordinates,
+        incoming: IncomingRadiance,
         start: int,
-        returns: IncomingRadiance | None,
+        reflected: IncomingRadiance | None,
         channels: Sequence[int],
     ) -> None:
-        self.rows, self.inner, self.between = rows, inner, inner
-        self.arrivals, self.returns, self.channels = arrivals, returns, channels
-        self.numbers = np.arange(start, start + len(rows[0]))
+        self.ordinates, self.scattering = ordinates, scattering
+        self.incoming, self.reflected, self.channels = incoming, reflected, channels
+        self.numbers = np.arange(start, start + len(ordinates.directions))
 
     @staticmethod
-    def straight(
-        passes: Sequence[BoundaryOrdinateSet], directional: AngularBasis | None = None
+    def uncollided(
+        sets: Sequence[BoundaryOrdinateSet], angular_basis: AngularBasis | None = None
     ) -> list[tuple]:
-        """As `OrdinateSet.straight`."""
-        directions, light, _, offsets = merged([p.rows for p in passes])
-        arrivals, channels = passes[0].arrivals, passes[0].channels
-        numbers = np.concatenate([p.numbers for p in passes])
+        """As `OrdinateSet.uncollided`."""
+        directions, unused, _, offsets = merged([each.ordinates for each in sets])
+        incoming, channels = sets[0].incoming, sets[0].channels
+        numbers = np.concatenate([each.numbers for each in sets])
         parts = []
-        for part, rows in enumerate(arrivals.lit):
-            lit = rows[numbers]
-            entering = partial(arrivals.directly, channels, rows=numbers[lit], part=part)
-            parts.append((directions[lit], light[lit], offsets[lit], entering))
+        for part, mask in enumerate(incoming.has_emitters):
+            used = mask[numbers]
+            source = partial(incoming.emitter_source, channels, numbers=numbers[used], part=part)
+            parts.append((directions[used], unused[used], offsets[used], source))
         return parts
 
-    def scatter(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
-        """As `MultigridLevel.scatter`, with the light that arrives."""
-        table = self._arriving(level)
-        table.boundary_source.receive(phi)
-        found = level.scatter(None, table)
+    def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        """`MultigridLevel.sweep` with the radiance that enters."""
+        table = self._table(level)
+        table.boundary_source.update(phi)
+        found = level.sweep(None, table)
         if phi is None:
             return found
-        # Apart from each other: either lets as much collide as its own lines lose.
-        between = level.scatter(phi, level.lattice.table(*self.inner))
-        both = tuple(a + b for a, b in zip(found, between, strict=True))
+        # Separately: the collisions of either balance what its own tracks lose.
+        scattered = level.sweep(phi, level.tracks.table(*self.scattering))
+        both = tuple(a + b for a, b in zip(found, scattered, strict=True))
         dr.eval(both)
         return both
 
-    def _arriving(self, level: MultigridLevel) -> TrackTable:
-        """The rows, with the light that arrives along them."""
-        table = level.lattice.table(*self.rows)
+    def _table(self, level: MultigridLevel) -> TrackTable:
+        """The ordinates, with the radiance that enters along them."""
+        table = level.tracks.table(*self.ordinates)
         of_table = self.channels, level, table, self.numbers
-        table.boundary_source = self.arrivals.returning(*of_table, emitted=True)
+        table.boundary_source = self.incoming.reflected_source(*of_table, emitted=True)
         return table
 
     def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
-        """The sweep as it is: what differs between passes here is light that arrives."""
+        """The sweep unchanged: what differs between passes here is the radiance that enters."""
         return swept
 
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
-        """All orders, of which ``b`` is the first; light may leave the medium between two."""
-        numbers = np.arange(len(self.inner[0]))
+        """All orders, of which ``b`` is the first; between two, radiance may leave the medium."""
+        numbers = np.arange(len(self.scattering.directions))
         return level.solve(
             b,
-            self.inner,
-            lambda *of_table: self.returns.returning(
+            self.scattering,
+            lambda *of_table: self.reflected.reflected_source(
                 self.channels, *of_table, numbers, emitted=False
             ),
         )
 
 
 class JointOrdinateSet(BoundaryOrdinateSet):
-    """Of light by its direction: what arrives and what voxels send go the same ways. What even
-    directions make of their sum, where it is alike from all sides, is what they make of nothing.
+    """For anisotropic scattering: radiance that enters and radiance of voxels use the same
+    ordinates, so that quadrature errors of both cancel where their sum is isotropic.
     """
 
-    def scatter(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
-        table = self._arriving(level)
+    def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        table = self._table(level)
         if phi is None:
-            table.boundary_source.receive(phi)
-        return level.scatter(phi, table)
+            table.boundary_source.update(phi)
+        return level.sweep(phi, table)
 
 
-def arriving(
-    around: SurfaceBoundary,
-    sky: DistantIllumination,
-    lattice: Tracks,
+def boundary_ordinate_sets(
+    boundary: SurfaceBoundary,
+    illumination: DistantIllumination,
+    tracks: Tracks,
     passes: int,
     pairs: int,
     rng: np.random.Generator,
     seed: tuple[int, int],
 ) -> tuple[Callable[[Sequence[int]], list[BoundaryOrdinateSet]], list[list[mi.Float]]]:
-    """Passes among surfaces, made of the channels that are wanted together, of which the first
-    one's orders can be solved for if there are several; and what differs between channels.
-    ``pairs`` are those between voxels.
+    """Ordinate sets of passes among surfaces, as a function of the channels that are swept
+    together; and all spectra that may differ between channels. If there are several passes, the
+    first one can solve for all orders. ``pairs`` are those of scattering ordinates.
     """
-    several, joint = passes > 1, around.directional is not None
-    many = max(ARRIVING // 2, pairs) if several else pairs
-    # The first one is apart, the others are even together.
-    rows = sky.rows(1, many, rng) + (sky.rows(passes - 1, many, rng) if several else [])
-    inner = [between(row) for row in rows] if joint else _inner(passes, pairs, rng)
-    arrivals = IncomingRadiance(around, lattice, merged(rows), several, (*seed, 0))
-    returns = IncomingRadiance(around, lattice, inner[0], several, (*seed, 1)) if several else None
-    starts = np.cumsum([0] + [len(row[0]) for row in rows])
-    kinds = [*arrivals.kinds, *(returns.kinds if several else ())]
+    several, joint = passes > 1, boundary.angular_basis is not None
+    many = max(BOUNDARY_ORDINATES // 2, pairs) if several else pairs
+    # The first one is independent, the union of the others is even.
+    sets = illumination.ordinates(1, many, rng)
+    if several:
+        sets += illumination.ordinates(passes - 1, many, rng)
+    if joint:
+        scattering = [each.scattering() for each in sets]
+    else:
+        scattering = _scattering_ordinates(passes, pairs, rng)
+    incoming = IncomingRadiance(boundary, tracks, merged(sets), several, (*seed, 0))
+    reflected = None
+    if several:
+        reflected = IncomingRadiance(boundary, tracks, scattering[0], several, (*seed, 1))
+    starts = np.cumsum([0] + [len(each.directions) for each in sets])
+    spectra = [*incoming.spectra, *(reflected.spectra if several else ())]
 
     def of(channels: Sequence[int]) -> list[BoundaryOrdinateSet]:
-        parts = enumerate(zip(rows, inner, starts, strict=False))
         kind = JointOrdinateSet if joint else BoundaryOrdinateSet
         return [
-            kind(dark(row), dark(own), arrivals, start, None if i else returns, channels)
-            for i, (row, own, start) in parts
+            kind(
+                each.without_incoming(),
+                own.without_incoming(),
+                incoming,
+                start,
+                None if number else reflected,
+                channels,
+            )
+            for number, (each, own, start) in enumerate(zip(sets, scattering, starts, strict=False))
         ]
 
-    return of, kinds
+    return of, spectra
 
 
-def _inner(passes: int, pairs: int, rng: np.random.Generator) -> list[tuple]:
-    """Rows of light between voxels, where it goes other ways than light that arrives."""
-    black = np.zeros((pairs, 2, dr.size_v(mi.Spectrum)))
-    sets = [spread(pairs, rng)] + (spread_together(passes - 1, pairs, rng) if passes > 1 else [])
-    return [(directions, black, weights, rng.random((pairs, 2))) for directions, weights in sets]
-
-
-def merged(rows: Sequence[Rows]) -> tuple[np.ndarray, ...]:
-    """Several sets as one."""
-    return tuple(np.concatenate(parts) for parts in zip(*rows, strict=True))
-
-
-def between(rows: Rows) -> Rows:
-    """Those along which voxels send light, none from outside."""
-    directions, light, weights, offsets = rows
-    even = weights != 0  # the others carry light of emitters only
-    none = np.zeros_like(light)
-    return [part[even] for part in (directions, none, weights, offsets)]
-
-
-def dark(rows: Rows) -> Rows:
-    """Rows for light that does not enter as tables tell."""
-    directions, _, weights, offsets = rows
-    return directions, np.zeros((len(directions), 2)), weights, offsets
+def _scattering_ordinates(passes: int, pairs: int, rng: np.random.Generator) -> list[Ordinates]:
+    """Ordinates for each pass of the radiance between voxels, along which nothing enters."""
+    none = np.zeros((pairs, 2, dr.size_v(mi.Spectrum)))
+    sets = [hemisphere_ordinates(pairs, rng)]
+    if passes > 1:
+        sets += joint_ordinates(passes - 1, pairs, rng)
+    return [
+        Ordinates(directions, none, weights, rng.random((pairs, 2))) for directions, weights in sets
+    ]

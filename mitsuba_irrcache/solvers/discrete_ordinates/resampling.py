@@ -1,4 +1,6 @@
-"""Fields of a medium at the voxels of other grids, as the solver ``sweep`` wants them."""
+"""Resampling of the medium to the voxels of the cache and of the tracks: means that conserve
+optical depth, and the albedo of collisions.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +15,18 @@ from mitsuba_irrcache.media.medium import MediumGrid
 
 #: Most points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
-#: Where collisions are counted along each axis of a voxel or, if it is larger than one of the data,
-#: of parts of it, and their weights: Radau's points of both halves, exact for products of fields
-#: that are linear in each. Values of the data lie in the middle where grids are alike.
+#: Quadrature points for collisions along each axis of a voxel or, if it is larger than one of the
+#: data, of parts of it, and their weights: Gauss-Radau points of both halves, exact for products of
+#: fields that are linear in each. Values of the data lie in the middle where grids are the same.
 RADAU = (1 / 6, 3 / 8), (1 / 2, 1 / 4), (5 / 6, 3 / 8)
-#: Values of the extinction along each axis of a voxel that lines see, about.
+#: Values of the extinction along each axis of a voxel that tracks read, about.
 DETAIL = 2
 
 
-def detail_of(medium: MediumGrid, grid: Grid) -> Grid:
-    """The voxels in which lines see the extinction, where ``grid`` lies over the same box as those
-    of the medium: these, or where ``grid`` is much coarser, blocks of them, about `DETAIL` in a
-    voxel along each axis.
+def extinction_grid(medium: MediumGrid, grid: Grid) -> Grid:
+    """The grid on which tracks read the extinction. Where ``grid`` lies over the same box as the
+    medium's, it is this one, or, if ``grid`` is much coarser, blocks of its voxels, about `DETAIL`
+    in a voxel along each axis; else it is ``grid``.
     """
     data = medium.sigma_t.grid
     if data is None or not medium.fills(grid) or not medium.fills(data):
@@ -37,9 +39,9 @@ def detail_of(medium: MediumGrid, grid: Grid) -> Grid:
     return data if (block == 1).all() else Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
 
 
-def baked(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
+def resampled(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
     """Channels of ``field`` at the voxels of ``grid``: its means over voxels that are larger than
-    the field's, or that the boundary of the medium may cut. Outside of it the field counts as 0.
+    the field's, or that the boundary of the medium may cut, outside of which the field is 0.
     """
     cut = not medium.fills(grid)
     if field.grid is not None and not cut:
@@ -54,9 +56,9 @@ def baked(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
     return values
 
 
-def albedo_of_collisions(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[mi.Float]:
-    """Channels of the albedo at these ``voxels`` of ``grid``: means over the collisions in even
-    light. At the edge of matter extinction and albedo change together.
+def collision_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[mi.Float]:
+    """Channels of the albedo at these ``voxels`` of ``grid``: means over the collisions in constant
+    radiance, weighted by extinction. At the edge of matter both change together.
     """
     albedo, extinction = medium.albedo, medium.sigma_t
     if albedo.grid is None:
@@ -65,7 +67,7 @@ def albedo_of_collisions(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> l
     fields = [f.grid for f in (albedo, extinction) if f.grid is not None]
     ratio = max((grid.voxel_size / data.voxel_size).max() for data in fields)
     parts = int(np.clip(np.ceil(ratio - 1e-3), 1, FINEST // 2))
-    values = _collided(medium, grid, voxels, parts, not medium.fills(grid))
+    values = _extinction_weighted_albedo(medium, grid, voxels, parts, not medium.fills(grid))
     dr.eval(values)
     return values
 
@@ -86,7 +88,7 @@ def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
 
 @symbolic
 def _mean(medium, field, grid, index, points: int, cut: bool):
-    """Means over points^3 places in the voxels ``index``."""
+    """Means over points^3 positions in the voxels ``index``."""
     corner, sides = mi.Point3f(*grid.places(index)), [Divisor(points)] * 2
     points, count = dr.opaque(mi.Float, points), dr.opaque(mi.UInt32, points**3)
     sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
@@ -105,8 +107,8 @@ def _mean(medium, field, grid, index, points: int, cut: bool):
 
 
 @symbolic
-def _collided(medium, grid, index, parts: int, cut: bool):
-    """Means of the albedo over the voxels ``index``, weighted by extinction: `RADAU` in so many
+def _extinction_weighted_albedo(medium, grid, index, parts: int, cut: bool):
+    """Means of the albedo over the voxels ``index``, weighted by extinction, by `RADAU` in so many
     ``parts`` along each axis.
     """
     channels = max(medium.albedo.channels, medium.sigma_t.channels)

@@ -6,7 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import spread, spread_together
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
+    hemisphere_ordinates,
+    joint_ordinates,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -20,7 +23,7 @@ def test_moments(count):
     """
     rng = np.random.default_rng(1)
     for _ in range(20):
-        d, w = spread(count, rng)
+        d, w = hemisphere_ordinates(count, rng)
         np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, rtol=1e-12)
         assert w.min() > 0 and w.sum() == pytest.approx(2 * np.pi, rel=1e-12)
         np.testing.assert_allclose((d.T * w) @ d, 2 * np.pi / 3 * np.eye(3), atol=1e-12)
@@ -31,7 +34,7 @@ def test_every_direction_is_uniform():
     that favours an axis, as a QR factor whose signs are not drawn, biases each batch alike.
     """
     rng = np.random.default_rng(2)
-    d = np.array([spread(8, rng)[0] for _ in range(3000)])
+    d = np.array([hemisphere_ordinates(8, rng)[0] for _ in range(3000)])
     for values, mean in ((d, 0), (d**2, 1 / 3), (d * np.roll(d, 1, axis=2), 0), (d**4, 1 / 5)):
         error = values.std(axis=0) / np.sqrt(len(d))
         assert (np.abs(values.mean(axis=0) - mean) < 4.5 * error).all()
@@ -48,7 +51,7 @@ def test_sets_are_even_together(sets, count):
     """
     rng, errors = np.random.default_rng(5), {"together": [], "apart": []}
     for _ in range(20):
-        together = spread_together(sets, count, rng)
+        together = joint_ordinates(sets, count, rng)
         for d, w in together:
             assert len(d) == count and w.min() > 0
             np.testing.assert_allclose((d.T * w) @ d, 2 * np.pi / 3 * np.eye(3), atol=1e-12)
@@ -56,7 +59,8 @@ def test_sets_are_even_together(sets, count):
         e = rng.normal(size=(3, 50))
         e /= np.linalg.norm(e, axis=0)
         for name, found in (
-            ("together", together), ("apart", [spread(count, rng) for _ in range(sets)]),
+            ("together", together), ("apart", [hemisphere_ordinates(count, rng) for _ in
+            range(sets)]),
         ):  # fmt: skip
             for power in (6, 8):
                 integral = sum(w @ (d @ e) ** power for d, w in found) / sets
@@ -70,7 +74,7 @@ def lights(scenes, batches: int, **emitters) -> list[list[tuple]]:
     sky = DistantIllumination(
         scenes.load({"type": "irrcache", "solver": "path"}, None, size=2, **emitters)
     )
-    rows, colour = sky.tables(batches, 8, 3, np.random.default_rng(3))
+    rows, colour = sky.factored_ordinates(batches, 8, 3, np.random.default_rng(3))
     np.testing.assert_array_equal(colour, 1)
     return rows
 
@@ -104,7 +108,7 @@ def test_an_environment_is_sampled_without_bias(scenes, bright):
     rng, sky = np.random.default_rng(4), DistantIllumination(scene)
     found = []
     for _ in range(64):
-        rows, _ = sky.tables(4, 8, 3, rng)
+        rows, _ = sky.factored_ordinates(4, 8, 3, rng)
         directions, light = (np.concatenate([row[i] for row in rows]) for i in range(2))
         net = ((light[:, 0] - light[:, 1]) * directions).sum(axis=0)
         found.append(np.array([light.sum(), *net]) / 4)

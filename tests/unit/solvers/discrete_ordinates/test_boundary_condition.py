@@ -26,7 +26,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 class Nothing:
     """What is around a medium where that does not matter."""
 
-    shines, directional = False, None
+    has_sources, angular_basis = False, None
 
 
 def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, offset) -> np.ndarray:
@@ -34,7 +34,7 @@ def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, of
     dark, rows = np.zeros((1, 2)), np.array([i])
 
     def entering(table):
-        return BoundarySource(*found._placed(lattice, table, rows), values)
+        return BoundarySource(*found._cells_of(lattice, table, rows), values)
 
     volume = lattice.uncollided(DIRECTIONS[rows], dark, offset[rows], entering)
     return np.array(volume, dtype=np.float64).reshape(lattice.grid.shape)
@@ -44,7 +44,7 @@ def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, of
 def alone(monkeypatch):
     """Arrivals without anything to be followed."""
     monkeypatch.setattr(
-        boundary_condition, "_follow", lambda *args: (None, None, None, mi.UInt32(0), None)
+        boundary_condition, "_trace_cells", lambda *args: (None, None, None, mi.UInt32(0), None)
     )
 
 
@@ -56,7 +56,7 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
     of the box as it is there: in a turned, stretched grid, on a coarser one, and if some lines
     share a cell, within its size.
     """
-    monkeypatch.setattr(boundary_condition, "CELLS", cells)
+    monkeypatch.setattr(boundary_condition, "PATH_CELLS", cells)
     place = scenes.placement((1.0, 3.0, 2.0), turn=35, mirror=True)
     grid = Grid((12, 10, 8), place)
     lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])
@@ -64,7 +64,9 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
     offsets = np.random.default_rng(3).random((len(DIRECTIONS), 2))
     rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
     found = IncomingRadiance(Nothing, fine, rows, True, (0, 0, 0))
-    _, _, hit, ray, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (0, 0, 0))
+    _, _, hit, ray, _ = found.sample_rays(
+        found._parameters(rows[0], [rows[1]], rows[2])[0], (0, 0, 0)
+    )
     lattice, low, high = fine, lower, upper
     if coarse:
         half = Grid((6, 5, 4), place)
@@ -107,9 +109,11 @@ def test_what_returns_is_linear_in_phi(scenes):
     found = IncomingRadiance(
         SurfaceBoundary(scene, medium, [], 1000), lattice, rows, True, (1, 2, 0)
     )
-    returned, voxel = np.array(found.returned[0]) * 4 * np.pi, np.array(found.voxel)
+    returned, voxel = np.array(found.reflected[0]) * 4 * np.pi, np.array(found.voxel)
     assert np.array(found.emitted).max() == 0
-    _, _, hit, _, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (1, 2, 0))
+    _, _, hit, _, _ = found.sample_rays(
+        found._parameters(rows[0], [rows[1]], rows[2])[0], (1, 2, 0)
+    )
     returned = returned[np.array(hit)]
     assert returned.mean() == pytest.approx(1, rel=0.02)
     places = np.stack(np.unravel_index(voxel[np.array(hit)], grid.shape), axis=1)

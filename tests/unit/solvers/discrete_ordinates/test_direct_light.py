@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.scene.compile import bake_media
-from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import Lamps, is_lamp
+from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
+    EmitterSampling,
+    is_area_emitter,
+)
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -32,10 +35,10 @@ def test_lamps_add_up(scenes, count):
         {"type": "irrcache", "solver": "path"}, shape, 2, emitter=None, sun=None, **objects
     )
     (medium,) = bake_media(scene)
-    small = [e for e in scene.emitters() if is_lamp(e)]
+    small = [e for e in scene.emitters() if is_area_emitter(e)]
     assert len(small) == count
     centre = mi.Point3f(dr.zeros(mi.Float, 4096), 0, 0)
-    (found,) = Lamps(scene, medium, small, [], centre).light((1, 2))
+    (found,) = EmitterSampling(scene, medium, small, [], centre).irradiance((1, 2))
     light = np.array(found[0][0], np.float64)
     error = light.std() / np.sqrt(len(light))
     assert error < 0.02 * expected

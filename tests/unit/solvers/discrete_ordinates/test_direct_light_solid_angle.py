@@ -25,7 +25,9 @@ def seen(lamp: dict, scale: float) -> tuple[float, list, list]:
     grid = Grid((4, 4, 4), frame)
     box = np.zeros(3, int), grid.resolution
     (emitter,) = scene.emitters()
-    return direct_light._solid_angle(emitter, grid, *box), *direct_light.split(scene, grid, *box)
+    return direct_light._solid_angle(emitter, grid, *box), *direct_light.split_by_solid_angle(
+        scene, grid, *box
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])

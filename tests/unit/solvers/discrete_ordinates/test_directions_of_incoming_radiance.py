@@ -53,7 +53,7 @@ def test_moments_of_light_through_nothing(way, back):
     and whatever the sign of its largest component.
     """
     moments, light = moments_of(0.5), np.array([[0.0, 2.0]] if back else [[2.0, 0.0]])
-    found = moments.carry(lines(0.0), way[None], light, np.array([[0.3, 0.6]]))
+    found = moments.sweep_uncollided(lines(0.0), way[None], light, np.array([[0.3, 0.6]]))
     found = np.array(found, np.float64).reshape(moments.count, -1)
     expected = 2 * harmonics(moments, way if back else -way)
     np.testing.assert_allclose(found, np.broadcast_to(expected[:, None], found.shape), atol=1e-5)
@@ -90,7 +90,7 @@ def test_light_that_a_voxel_scatters_goes_on_forward():
     for sign in (1, -1):
         phi = np.zeros((moments.count, *SHAPE))
         phi[(slice(None), *MIDDLE)] = harmonics(moments, -sign * heading)
-        light, _ = level.scatter(mi.Float(phi.ravel().tolist()), of_matter.table(*table))
+        light, _ = level.sweep(mi.Float(phi.ravel().tolist()), of_matter.table(*table))
         received.append(np.array(light, np.float64).reshape(phi.shape)[0])
     ahead, behind = received
     np.testing.assert_allclose(np.flip(behind), ahead, rtol=2e-3, atol=1e-5 * ahead.max())
@@ -110,7 +110,7 @@ def test_light_that_a_voxel_scatters_goes_on_forward():
 class Nothing:
     """What is around a medium where that does not matter."""
 
-    shines, directional = False, None
+    has_sources, angular_basis = False, None
 
 
 def test_paths_begin_on_their_lines(scenes, monkeypatch):
@@ -118,7 +118,7 @@ def test_paths_begin_on_their_lines(scenes, monkeypatch):
     places of the lattice: a whole number of voxels from the first line.
     """
     monkeypatch.setattr(
-        "mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition._follow",
+        "mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition._trace_cells",
         lambda *args: (None, None, None, mi.UInt32(0), None),
     )
     grid = Grid((12, 10, 8), scenes.placement((1.0, 3.0, 2.0), turn=35))
@@ -127,7 +127,9 @@ def test_paths_begin_on_their_lines(scenes, monkeypatch):
     offsets = np.random.default_rng(3).random((len(WAYS), 2))
     rows = WAYS, np.zeros((len(WAYS), 2, 3)), np.ones(len(WAYS)), offsets
     found = IncomingRadiance(Nothing, lattice, rows, True, (0, 0, 0))
-    number, _, hit, ray, _ = found.begin(found._numbers(rows[0], [rows[1]], rows[2])[0], (0, 0, 0))
+    number, _, hit, ray, _ = found.sample_rays(
+        found._parameters(rows[0], [rows[1]], rows[2])[0], (0, 0, 0)
+    )
     row, hit = np.array(number) // 2, np.array(hit)
     start = np.array(grid.coordinates.point(ray.o), np.float64)[:, hit].T
     velocities = WAYS @ grid.coordinates.matrix[:3, :3].T

@@ -109,7 +109,7 @@ def test_light_is_the_same(monkeypatch, box, detailed):
         for each in lines:
             level = MultigridLevel(dr.full(mi.Float, 1, count), phi * 0.8, each)
             table = each.table(directions, light, np.full(12, 0.5), offsets)
-            found.append([np.array(v) for v in level.scatter(phi, table)])
+            found.append([np.array(v) for v in level.sweep(phi, table)])
         for all_voxels, some in zip(*found, strict=True):
             np.testing.assert_allclose(all_voxels, some, rtol=2e-6)
 

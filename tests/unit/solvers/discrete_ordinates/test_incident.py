@@ -35,7 +35,7 @@ def of_passes(sky: DistantIllumination, count: int, pairs: int, value) -> np.nda
     """Integrals of radiance times ``value`` of where it comes from, of ``count`` single passes."""
     rng, found = np.random.default_rng(12), []
     for _ in range(count):
-        directions, light, *_ = sky.rows(1, pairs, rng)[0]
+        directions, light, *_ = sky.ordinates(1, pairs, rng)[0]
         both = np.stack([-directions, directions], axis=1)
         found.append((light[..., 0, None] * value(both)).sum(axis=(0, 1)))
     return np.array(found)

@@ -11,7 +11,7 @@ from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
 from mitsuba_irrcache.solvers.discrete_ordinates import tracks
-from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import spread
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import hemisphere_ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
@@ -65,7 +65,7 @@ def level(sigma_t: np.ndarray, albedo: float, moments: Moments | None) -> Multig
 def rows(pairs: int, light: float = 0.0, seed: int = 1) -> tuple[np.ndarray, ...]:
     """Even directions; the same radiance enters along all of them."""
     rng = np.random.default_rng(seed)
-    directions, weights = spread(pairs, rng)
+    directions, weights = hemisphere_ordinates(pairs, rng)
     entering = np.repeat(light * weights[:, None], 2, axis=1)
     return directions, entering, weights, rng.random((pairs, 2))
 
@@ -77,7 +77,7 @@ def test_light_of_one_direction():
     offsets = np.array([[0.2, 0.7]])
     for light, sign in (([1.0, 0.0], -1), ([0.0, 1.0], 1)):
         entering = way, np.array([light]), offsets
-        found = values(moments.carry(of_matter, *entering), moments.count)
+        found = values(moments.sweep_uncollided(of_matter, *entering), moments.count)
         irradiance = np.array(of_matter.uncollided(*entering))
         basis = np.ravel(
             [np.array(y) for y in moments.basis(mi.Vector3f((sign * way[0]).tolist()))]
@@ -92,9 +92,9 @@ def test_isotropic_scattering_is_that_of_levels():
     rng = np.random.default_rng(4)
     phi = rng.uniform(0, 1, sigma_t.size)
     table = rows(12, 1.0)
-    expected = isotropic.scatter(mi.Float(phi.tolist()), isotropic.lattice.table(*table))
+    expected = isotropic.sweep(mi.Float(phi.tolist()), isotropic.tracks.table(*table))
     several = np.concatenate([phi, rng.normal(size=3 * sigma_t.size)])
-    found = directional.scatter(mi.Float(several.tolist()), directional.lattice.table(*table))
+    found = directional.sweep(mi.Float(several.tolist()), directional.tracks.table(*table))
     for a, b in zip(expected, found, strict=True):
         np.testing.assert_allclose(values(b, 4)[0], np.array(a), rtol=2e-5)
 
@@ -109,8 +109,8 @@ def test_furnace(order, scale):
     white = level(matter() * np.float32(scale), 1.0, moments)
     phi = np.zeros((moments.count, white.grid.voxel_count))
     phi[0] = 4 * np.pi
-    table = white.lattice.table(*rows(16, 1.0))
-    for found in white.scatter(mi.Float(phi.ravel().tolist()), table):
+    table = white.tracks.table(*rows(16, 1.0))
+    for found in white.sweep(mi.Float(phi.ravel().tolist()), table):
         np.testing.assert_allclose(
             values(found, moments.count) / (4 * np.pi), phi / (4 * np.pi), atol=2e-3
         )
@@ -123,11 +123,11 @@ def test_white_matter_is_no_source(order):
     """
     moments = moments_of(0.58, order)
     white = level(matter(seed=2, empty=0.6), 1.0, moments)
-    table = white.lattice.table(*rows(16))
+    table = white.tracks.table(*rows(16))
     phi = np.random.default_rng(5).normal(size=(moments.count, white.grid.voxel_count))
     sizes = []
     for _ in range(40):
-        phi = values(white.scatter(mi.Float(phi.ravel().tolist()), table)[1], moments.count)
+        phi = values(white.sweep(mi.Float(phi.ravel().tolist()), table)[1], moments.count)
         sizes.append(np.linalg.norm(phi))
     assert sizes[-1] / sizes[-2] < 0.97
 
@@ -142,11 +142,11 @@ def test_solution():
     albedo = dr.full(mi.Float, 0.99, grid.voxel_count)
     white = AnisotropicMultigridLevel(sigma_t, albedo, box, moments=moments)
     table = rows(16, 1.0)
-    _, b = white.scatter(None, box.table(*table))
+    _, b = white.sweep(None, box.table(*table))
     directions, _, weights, offsets = table
     dark = directions, np.zeros((16, 2)), weights, offsets
     phi = white.solve(b, dark)
-    image = white.scatter(phi, box.table(*dark))[1] + b
+    image = white.sweep(phi, box.table(*dark))[1] + b
     phi, image = np.array(phi), np.array(image)
     assert np.abs(image - phi).mean() < 2e-3 * np.abs(phi).mean()
     assert phi[: grid.voxel_count].mean() > 2 * np.array(b)[: grid.voxel_count].mean()

@@ -9,7 +9,7 @@ import pytest
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.discrete_ordinates import multigrid, tracks
 from mitsuba_irrcache.solvers.discrete_ordinates.anderson import AndersonAcceleration
-from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import spread
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import hemisphere_ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
@@ -47,7 +47,7 @@ def level(random, evenly: bool):
 
 def rows(random) -> tuple:
     """Directions, no light, weights and offsets."""
-    directions, weights = spread(PAIRS, random)
+    directions, weights = hemisphere_ordinates(PAIRS, random)
     return directions, np.zeros((PAIRS, 2)), weights, random.random((PAIRS, 2))
 
 
@@ -72,10 +72,10 @@ def test_channels_that_are_swept_together_do_not_mix(random):
 
     def scattered(channels: list[int]) -> list[np.ndarray]:
         some = of(*channels)
-        table = some.lattice.table(*of_rows)
+        table = some.tracks.table(*of_rows)
         values = mi.Float(light[channels].ravel().tolist())
         table.boundary_source = Arriving(places, cells, values, len(channels))
-        return [stacked(values) for values in some.scatter(flat(phi[channels]), table)]
+        return [stacked(values) for values in some.sweep(flat(phi[channels]), table)]
 
     together, alone = scattered([0, 1, 2]), [scattered([c]) for c in range(3)]
     for kind in range(2):
@@ -117,7 +117,7 @@ def test_light_without_voxels_sending_is_carried_in_all_channels(random):
     def carried(channels: list[int]) -> np.ndarray:
         values = mi.Float(light[channels].ravel().tolist())
         entering = BoundarySource(places, cells, values, len(channels))
-        carry = of(0).lattice.uncollided
+        carry = of(0).tracks.uncollided
         return np.array(carry(directions, dark, offsets, lambda _: entering)).reshape(-1, VOXELS)
 
     together = carried([0, 1, 2])
@@ -151,7 +151,7 @@ def test_voxels_without_matter_need_not_be_known(random, evenly):
         fields = (mi.Float(f[wanted].ravel().tolist()) for f in (sigma_t, albedo))
         some = MultigridLevel(*fields, lines, evenly)
         phi = some.solve(mi.Float(b[wanted].ravel().tolist()), of_rows)
-        received = some.scatter(phi, lines.table(*of_rows))[0]
+        received = some.sweep(phi, lines.table(*of_rows))[0]
         found.append([np.array(v).reshape(-1, 2) for v in (phi, received)])
     for whole, part in zip(*found, strict=True):
         whole = whole[index]

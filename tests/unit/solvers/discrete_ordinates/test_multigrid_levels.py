@@ -35,7 +35,7 @@ def level_of(scenes, shape, edges, sigma_t: np.ndarray, evenly: bool) -> Multigr
 
 def centres(level: MultigridLevel) -> np.ndarray:
     """World positions of the voxels (n, 3)."""
-    return np.array(level.grid.centers(level.lattice.active), np.float64).T
+    return np.array(level.grid.centers(level.tracks.active), np.float64).T
 
 
 @pytest.mark.parametrize("evenly", [False, True])

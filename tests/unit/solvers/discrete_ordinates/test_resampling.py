@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.scene.compile import bake_scene
-from mitsuba_irrcache.solvers.discrete_ordinates.resampling import albedo_of_collisions
+from mitsuba_irrcache.solvers.discrete_ordinates.resampling import collision_albedo
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -21,7 +21,7 @@ def at_voxels(scenes, density: np.ndarray, albedo: np.ndarray | float, sides: in
     medium = bake_scene(scenes.load({"type": "volpath"}, shape))
     grid = Grid((sides,) * 3, medium.frame)
     voxels = dr.arange(mi.UInt32, grid.voxel_count)
-    found = albedo_of_collisions(medium, grid, voxels)
+    found = collision_albedo(medium, grid, voxels)
     return np.stack([np.array(c) for c in found], axis=-1).reshape(sides, sides, sides, -1)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.scene.compile import bake_scene
-from mitsuba_irrcache.solvers.discrete_ordinates.resampling import baked, detail_of
+from mitsuba_irrcache.solvers.discrete_ordinates.resampling import extinction_grid, resampled
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -26,7 +26,7 @@ def test_blocks_are_means_of_their_voxels(scenes, block):
     density = scenes.texture(SHAPE, 0.0, 3.0, 9)
     medium = medium_of(scenes, density)
     sides = tuple(n // k for n, k in zip(SHAPE, block, strict=True))
-    (found,) = baked(medium, medium.sigma_t, Grid(sides, medium.frame))
+    (found,) = resampled(medium, medium.sigma_t, Grid(sides, medium.frame))
     parts = density.reshape(sides[0], block[0], sides[1], block[1], sides[2], block[2])
     expected = parts.mean(axis=(1, 3, 5), dtype=np.float64)
     np.testing.assert_allclose(np.array(found).reshape(sides), expected, rtol=1e-5)
@@ -41,9 +41,9 @@ def test_lines_see_whole_voxels_of_the_data(scenes, shape, cache):
     density = scenes.texture(shape, 0.0, 3.0, 9)
     medium = medium_of(scenes, density)
     grid = Grid(cache, medium.frame)
-    detail = detail_of(medium, grid)
+    detail = extinction_grid(medium, grid)
     data = np.array(shape)
     assert detail.shape == cache or not (data % np.array(detail.shape)).any()
     if detail.shape != cache:
-        (found,) = baked(medium, medium.sigma_t, detail)
+        (found,) = resampled(medium, medium.sigma_t, detail)
         assert np.mean(np.array(found)) == pytest.approx(density.mean(), rel=1e-4)
