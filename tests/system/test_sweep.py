@@ -94,8 +94,8 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
     """
     if tolerance:
         monkeypatch.setattr(multigrid, "TOLERANCE", tolerance)
-        monkeypatch.setattr(multigrid, "FEW_TOLERANCE", tolerance / 10)
-        monkeypatch.setattr(multigrid, "CORRECTIONS", 40)
+        monkeypatch.setattr(multigrid, "COARSEST_TOLERANCE", tolerance / 10)
+        monkeypatch.setattr(multigrid, "MAX_CYCLES", 40)
     if kind == "homogeneous":
         shape = scenes.boundary(scenes.medium(25.0, 1.0))
     else:

@@ -72,8 +72,8 @@ MUTANTS = (
     Mutant(
         "extinction of coarse caches shifted by half a voxel (sweep)",
         "solvers/discrete_ordinates/tracks.py",
-        "self.lower[k] * ratio[k] - 0.5,",
-        "self.lower[k] * ratio[k],",
+        "self.lower[k] * ratio - 0.5,",
+        "self.lower[k] * ratio,",
         (SWEEP,),
     ),
     Mutant(

@@ -155,29 +155,13 @@ class Tracks:
             first_extinction = extinction_strides @ self.lower
         else:
             first_extinction = self.lower[axis] * extinction_strides[pairs, axis]
-        ratio = self.extinction_grid.resolution / self.grid.resolution
         last = self.extinction_grid.resolution - 1 - (self.lower if per_voxel else 0)
 
         def transverse(number: int) -> TransverseFields:
-            k, size = TRANSVERSE[axis, number], self.size
-            slope = np.rint(velocities[pairs, k] / along * FIXED_POINT_ONE).astype(np.int64)
-            slope[slope == 0] = 1  # tracks never stay in a face
-            start = (offsets[:, number] * FIXED_POINT_ONE).astype(np.int64)
-            start = np.minimum(start, FIXED_POINT_ONE - 1)
-            end = start + (size[axis] - 1) * slope
-            return TransverseFields(
-                size=size[k],
-                stride=strides[pairs, k],
-                extinction_stride=extinction_strides[pairs, k],
-                empty_stride=empty_strides[k],
-                slope=slope,
-                start=start,
-                last_shift=(end >> FIXED_POINT_BITS) % size[k],
-                last_position=end & (FIXED_POINT_ONE - 1),
-                extinction_ratio=ratio[k],
-                extinction_origin=self.lower[k] * ratio[k] - 0.5,
-                extinction_last=last[k],
-            )
+            k = TRANSVERSE[axis, number]
+            slope = velocities[pairs, k] / along
+            step = strides[pairs, k], extinction_strides[pairs, k], empty_strides[k]
+            return self._transverse_fields(axis, k, slope, offsets[:, number], step, last[k])
 
         along_axis = directions * np.sign(along)[:, None]
         record = TrackRecord(
@@ -273,6 +257,39 @@ class Tracks:
                 dr.eval(copies)
                 self.pause()
                 yield axis, group, copies
+
+    def _transverse_fields(
+        self,
+        axis: np.ndarray,
+        k: np.ndarray,
+        slope: np.ndarray,
+        offset: np.ndarray,
+        steps: tuple[np.ndarray, np.ndarray, np.ndarray],
+        last: np.ndarray,
+    ) -> TransverseFields:
+        """Fields of n pairs with these dominant axes for the transverse axes ``k``: voxels by which
+        tracks move per slice, random shifts, steps of the three flat indices, and the coordinates
+        of the last extinction value.
+        """
+        size = self.size
+        slope = np.rint(slope * FIXED_POINT_ONE).astype(np.int64)
+        slope[slope == 0] = 1  # tracks never stay in a face
+        start = np.minimum((offset * FIXED_POINT_ONE).astype(np.int64), FIXED_POINT_ONE - 1)
+        end = start + (size[axis] - 1) * slope
+        ratio = (self.extinction_grid.resolution / self.grid.resolution)[k]
+        return TransverseFields(
+            size=size[k],
+            stride=steps[0],
+            extinction_stride=steps[1],
+            empty_stride=steps[2],
+            slope=slope,
+            start=start,
+            last_shift=(end >> FIXED_POINT_BITS) % size[k],
+            last_position=end & (FIXED_POINT_ONE - 1),
+            extinction_ratio=ratio,
+            extinction_origin=self.lower[k] * ratio - 0.5,
+            extinction_last=last,
+        )
 
     def _per_voxel(self, has_source: bool) -> bool:
         """Whether sweeps read one value of the extinction for each voxel."""

@@ -87,7 +87,7 @@ def test_channels_that_are_swept_together_do_not_mix(random):
 class Arriving(BoundarySource):
     """Light that does not depend on phi."""
 
-    def receive(self, phi: mi.Float) -> None:
+    def update(self, phi: mi.Float) -> None:
         """Nothing."""
 
 
