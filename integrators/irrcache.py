@@ -1,5 +1,6 @@
-"""The integrator plugin ``irrcache``. Executed anew for every variant, since its base class belongs
-to one.
+"""The integrator plugin ``irrcache``.
+
+This file is executed once for every variant, because its base class differs between variants.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core import properties
-from mitsuba_irrcache.core.cancellation import Stopped, Stopping
+from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
@@ -27,8 +28,9 @@ from mitsuba_irrcache.render.denoise import FILTERS, filter_illumination
 from mitsuba_irrcache.render.film import check_film, exclusive, fill_film, planes, render_film
 from mitsuba_irrcache.render.quadrature import QUADRATURES
 from mitsuba_irrcache.scene.consistency import check_sensor
+from mitsuba_irrcache.solvers.base import registered
 
-SOLVERS = ("auto", "path", "sweep")
+SOLVERS = ("auto", *sorted(solver.name for solver in registered()))
 _NO_GRADIENTS = 'irrcache computes no gradients; use the integrator "prbvolpath" for them.'
 
 
@@ -56,33 +58,34 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - solver
        - |string|
-       - How the cache is computed: ``sweep`` (light carried along lines that all voxels share),
-         ``path`` (Monte Carlo at every voxel), or ``auto``: ``sweep`` unless surfaces or other
-         media are among the voxels. The log says which, and why. (Default: ``auto``)
+       - How the cache is computed: ``sweep`` (discrete ordinates along long characteristics that
+         all voxels share), ``path`` (Monte Carlo path tracing from every voxel), or ``auto``:
+         ``sweep`` unless surfaces or other media are among the voxels. The log states the choice
+         and its reason. (Default: ``auto``)
 
      * - resolution
        - |int|
        - Cache voxels along the longest side of the medium, near-cubic whatever its data;
-         0: chosen from an estimate of the error, 0.5 % of the mean radiance (``path``: 1 %): the
-         voxels of the data, up to six times as many along each axis where they are optically
-         thick, at least 32 along the longest side (``path``: 16), up to 64 or 128 where the
-         contrast is high or the boundary cuts through matter; at most 2^25, for ``path`` 128 along
-         a side, and 32 to 64 where there are surfaces or several media. An opaque homogeneous
-         medium in a box or sphere gets no cache: its radiance is that of a half-space.
+         0: chosen for an estimated error of 0.5 % of the mean radiance (``path``: 1 %): the
+         resolution of the data, up to six times as many voxels along each axis if they are
+         optically thick, at least 32 along the longest side (``path``: 16), up to 64 or 128 if the
+         contrast is high or the boundary cuts through dense regions; at most 2^25 in total, for
+         ``path`` 128 along a side, and 32 to 64 with surfaces or several media. An opaque
+         homogeneous medium in a box or sphere has no cache: its radiance is that of a half-space.
          (Default: 0)
 
      * - cache_spp
        - |int|
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
-         of 8 samples or 32 to 256 directions, as many as are wanted;
-         0: 128 directions, 64 among surfaces (256 for sharp phase functions), twice as many for
-         single scattering where the phase function is isotropic; 16 to 256 samples, about 2^24 for
-         all voxels, 2^22 among surfaces.
+         of 8 samples or 32 to 256 directions;
+         0: 128 directions, 64 with surfaces (256 for sharp phase functions), twice as many for
+         single scattering with an isotropic phase function; 16 to 256 samples, about 2^24 for
+         all voxels, 2^22 with surfaces.
          (Default: 0)
 
      * - cache_seed
        - |int|
-       - Random stream of the cache. Caches of different seeds can be merged. (Default: 0)
+       - Seed of the cache. Caches with different seeds can be merged. (Default: 0)
 
      * - quadrature
        - |string|
@@ -91,30 +94,33 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - step
        - |float|
-       - Length of a step in shortest voxel edges of the medium and the cache. (Default: 1.0)
+       - Step length, relative to the shortest voxel edge of the medium and the cache.
+         (Default: 1.0)
 
      * - filter
        - |string|
-       - Filter of the illumination image: ``bilateral``, whose strength follows the standard error
-         of the cache and fades to nothing as it converges; ``fixed``, a bilateral filter of one
-         strength (the paper's, which biases a converged image); ``none``. (Default: ``none``)
+       - Filter of the illumination image: ``bilateral``, whose strength is proportional to the
+         standard error of the cache and vanishes as the cache converges; ``fixed``, a bilateral
+         filter of constant strength (the paper's, which biases converged images); ``none``.
+         (Default: ``none``)
 
      * - aovs
        - |string|
-       - Further images, in the form of the ``aov`` integrator: a list of ``name:type`` or ``type``,
-         separated by commas, of these types: ``colour``, ``illumination`` and ``background`` (the
-         image is colour times illumination plus background), ``transmittance``, ``depth`` (mean
-         distance of what is seen of the medium), ``noise`` (standard error of the luminance, from
-         the noise of the cache), ``bias`` (expected error of the luminance, from the resolution of
-         the cache). (Default: none)
+       - Further images, specified as for the ``aov`` integrator: a comma-separated list of
+         ``name:type`` or ``type`` with the types ``colour``, ``illumination`` and ``background``
+         (the image is colour times illumination plus background), ``transmittance``, ``depth``
+         (mean distance of the visible part of the medium), ``noise`` (standard error of the
+         luminance due to the noise of the cache), ``bias`` (expected error of the luminance due to
+         the resolution of the cache). (Default: none)
 
      * - emission
        - |float|, |rgb| or |volume|
-       - Light that media send out themselves (Mitsuba's have none): radiance emitted along each
-         unit of length [W m^-3 sr^-1], sigma_a L_e of the paper's eq. 1. Nothing multiplies it:
-         matter with no extinction can shine. A ``gridvolume`` lies in world space by its own
-         ``to_world``; media shine within it. Emission counts as an emitter: depth 1 shows it, 2
-         what is scattered once. ``hide_emitters`` does not hide it. (Default: none)
+       - Volumetric emission, which Mitsuba's media do not support: radiance emitted per unit length
+         [W m^-3 sr^-1], the product sigma_a L_e in the paper's eq. 1. It is independent of the
+         extinction, which may be 0. A ``gridvolume`` is placed in world space by its ``to_world``;
+         all media inside of it are emissive. Emission counts as an emitter: it is visible from
+         depth 1 on, and scattered from depth 2 on. ``hide_emitters`` does not hide it.
+         (Default: none)
 
      * - emission_scale
        - |float|
@@ -122,38 +128,39 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - cache_file
        - |string|
-       - Load the cache from this file if it is there, write it when it was computed. A file
-         of another scene is refused. Of several media, each has a file with its id in the name.
-         (Default: none)
+       - File from which the cache is loaded if it exists, and to which a computed cache is written.
+         A file of another scene is rejected. With several media, each has a file with its id in
+         the name. (Default: none)
 
      * - timeout
        - |float|
-       - Seconds after which rendering ends with what there is: neither another batch of the cache
-         nor another pass of camera samples is begun. (Default: -1, never)
+       - Seconds after which no further batch of the cache and no further pass of camera samples is
+         started; the image then consists of the completed ones. (Default: -1, never)
 
-    Computes the irradiance (fluence rate) that reaches every point of a
-    medium once, independently of the camera, and integrates the radiative transfer equation along
-    camera rays from it. A moved camera, another film or another seed reuse the cache; an edited
-    medium or emitter renews it. The image is consistent, not unbiased: it converges to
-    ``volpath``'s as ``resolution`` and ``cache_spp`` grow and ``step`` falls.
+    Computes the irradiance (fluence rate) inside a medium once, independently of the camera, and
+    integrates the radiative transfer equation along camera rays with it. The cache is reused for
+    another camera, film or seed; it is recomputed when a medium or emitter changes. The image is
+    consistent, not unbiased: it converges to that of ``volpath`` as ``resolution`` and
+    ``cache_spp`` increase and ``step`` decreases.
 
-    Media (``heterogeneous`` or ``homogeneous``) may be several, in any
-    closed shapes with a null BSDF, apart, touching or nested; each has a cache of its own. Surfaces
-    and area emitters may be anywhere. What is seen on them is path traced, by as many paths as
-    there are samples per pixel, and is ``background``. Where there is no more than one medium in a
-    box or sphere, and light from far away or from points, nothing has to be ray traced. The
-    solver ``sweep`` can be used for media in boxes or spheres with neither surfaces nor other media
-    among their voxels; where there are surfaces, with ``max_depth`` 2 or -1.
-    Media without bounds and sharp phase functions are refused by name, and so are boundaries that
-    overlap or contradict each other. A scene without media, or with glass around all of them, is
-    rendered by ``volpath`` or, where extinction differs much between the channels, ``volpathmis``.
+    A scene may contain several media (``heterogeneous`` or ``homogeneous``) in arbitrary closed
+    shapes with a null BSDF, which may be disjoint, touching or nested; each has its own cache.
+    Surfaces and area emitters may be anywhere. Their reflected radiance is path traced, with one
+    path per camera sample, and is part of the ``background``. A scene with a single medium in a box
+    or sphere, and only distant and point emitters, requires no ray tracing. The solver ``sweep``
+    supports media in boxes or spheres without surfaces and other media among their voxels; with
+    surfaces elsewhere, it requires ``max_depth`` 2 or -1.
+    Unbounded media and sharp phase functions are rejected with an error that names them, and so are
+    boundaries that overlap or contradict each other. Scenes without media, or with dielectric
+    boundaries around all of them, are rendered by ``volpath`` or, if the extinction differs
+    strongly between the channels, ``volpathmis``.
 
     Phase functions may be ``isotropic``, ``hg`` with |g| up to 0.58, ``rayleigh``, or others that
-    depend on the scattering angle alone and are as broad. Where one is not isotropic, the cache
-    holds spherical harmonics of the radiance up to degree 4 beside the irradiance, and the light
-    of suns, points and lamps apart, whose direction is known. Where such a medium is swept, ``hg``
-    may have g up to 0.85 if ``max_depth`` is -1. The light in a forward peak that sharp counts as
-    not scattered, also in ``transmittance`` and alpha.
+    depend only on the scattering angle and are as broad. For anisotropic phase functions, the cache
+    also stores spherical harmonics of the radiance up to degree 4 and, separately, the irradiance
+    from suns, point lights and lamps, whose direction is known. With the solver ``sweep``, ``hg``
+    may have g up to 0.85 if ``max_depth`` is -1. Scattering into such a sharp forward peak is then
+    treated as unscattered (delta-M), also in ``transmittance`` and alpha.
 
     .. tabs::
         .. code-tab:: xml
@@ -174,7 +181,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         require_llvm()
         check_versions()
         super().__init__(props)
-        props = self._properties = properties.Record(props)
+        props = self._properties = properties.RecordedProperties(props)
         max_depth = properties.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0")
         self._hide_emitters = properties.flag(props, "hide_emitters", False)
         self._filter = properties.choice(props, "filter", "none", FILTERS)
@@ -206,23 +213,24 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._timeout = properties.number(
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
-        self._stopping = Stopping()
+        self._stopping = StopCondition()
         self._sight: ClosedFormCameraRays | TracedCameraRays | None = None
-        self._revision = 0  # of the builder, when the sight was made
-        #: Mitsuba's own integrators, by name, for scenes without a medium to be seen, and the one
-        #: that was chosen for the scene as it is
+        self._revision = 0  # revision of the builder for which the camera rays were created
+        #: Mitsuba's integrators for scenes without a visible medium, by name, and the current
+        #: choice
         self._stock: dict[str, mi.Integrator] = {}
         self._chosen = "volpath"
-        #: seconds that stages of the last image took, of those that can be told apart
+        #: duration [s] of those stages of the last image that are measured
         self.seconds: dict[str, float] = {}
-        #: called with (stage, done, total) while the cache is built; what it raises ends the build
+        #: called with (stage, done, total) while the cache is built; exceptions end the build
         self.progress = None
 
     @property
     def cache(self) -> IrradianceCache | None:
-        """The irradiance cache of the last scene rendered; None before, and where none is
-        needed. Of a scene with several media there are as many: see ``caches``. While another
-        thread renders with this integrator, this waits.
+        """The irradiance cache of the last scene rendered; None before, and if none is needed.
+
+        For a scene with several media use ``caches``. Waits while another thread renders with this
+        integrator.
         """
         caches = self.caches
         if len(caches) > 1:
@@ -240,8 +248,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     @property
     def cache_spp(self) -> int:
-        """Samples per cache voxel to build up to; 0: chosen. Once it is raised, the next rendering
-        refines the cache: the random stream goes on, nothing is computed again.
+        """Target number of samples per cache voxel; 0: chosen automatically.
+
+        After an increase the next rendering refines the cache: it continues the random stream and
+        reuses all existing samples.
         """
         return self._builder.samples
 
@@ -257,24 +267,25 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             callback.put("emission", self._emission, mi.ParamFlags.NonDifferentiable)
 
     def prepare(self, scene: mi.Scene) -> None:
-        """Builds or completes the cache for ``scene``, unless it is up to date. Of several threads
-        one does; the others wait for it.
+        """Build or complete the cache for ``scene``, unless it is up to date.
+
+        If several threads call it, one builds the cache and the others wait.
         """
         self._prepared(scene)
 
     def _prepared(self, scene: mi.Scene) -> ClosedFormCameraRays | TracedCameraRays | None:
-        """What sees the cache of ``scene``, complete; None where there is no medium to be seen."""
+        """Return the camera rays for the cache of ``scene``; None if no medium is visible."""
         require_same_variant(self._variant, mi.variant())
         with self._builder.lock:
             self._stopping.begin(self._timeout)
             try:
                 with dr.suspend_grad():
-                    self._builder.update(scene, self._stopping.checked(self.progress))
+                    self._builder.update(scene, self._stopping.raising(self.progress))
             except Stopped:
                 self._log_what_is_missing()
             if self._revision != self._builder.revision:
                 self._sight = self._make_sight()
-                # What a thread has scattered into an array, only this thread can evaluate.
+                # Only the thread that recorded a scatter operation can evaluate it.
                 dr.eval()
                 self._revision = self._builder.revision
                 if self._sight is None:
@@ -282,11 +293,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             return self._sight
 
     def _choose_stock(self, scene: mi.Scene) -> None:
-        """Chooses the integrator for a scene without a medium to be seen, and logs that."""
+        """Choose and log the integrator for a scene without a visible medium."""
         self._chosen, reason = choose_stock(scene)
         mi.Log(
             mi.LogLevel.Info,
-            f"irrcache: no medium can be seen, so no cache is used: {self._chosen} renders this "
+            f"irrcache: no medium is visible, so no cache is used: {self._chosen} renders this "
             f"scene ({reason}).",
         )
 
@@ -300,17 +311,17 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             )
 
     def cancel(self) -> None:
-        """Ends the rendering that is in progress, in whatever thread, with what there is."""
+        """End the current rendering, in any thread, with the samples completed so far."""
         self._stopping.cancel()
         for integrator in self._stock.values():
             integrator.cancel()
 
     def should_stop(self) -> bool:
-        """Whether rendering was cancelled, or reached its ``timeout``."""
+        """Whether rendering was cancelled or has reached its ``timeout``."""
         return self._stopping.is_due
 
     def _make_sight(self) -> ClosedFormCameraRays | TracedCameraRays | None:
-        """What sees the caches as they are; None where there is no medium to be seen."""
+        """Create the camera rays for the current caches; None if no medium is visible."""
         return camera_rays_of(
             self._builder.parts,
             self._settings,
@@ -323,16 +334,16 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     @property
     def _layered(self) -> bool:
-        """Whether anything is asked for that the radiance alone cannot tell."""
+        """Whether AOVs or the filter require more than the radiance."""
         return bool(self._aovs) or self._filter != "none"
 
     @property
     def _with_error(self) -> bool:
-        """Whether the error of the cache has to be projected with its light."""
+        """Whether the error of the cache must be projected with the radiance."""
         return self._filter == "bilateral" or bool({"noise", "bias"} & {*self._aovs.values()})
 
     def aov_names(self) -> list[str]:
-        """Names of the channels beside colour and alpha, in the film's order."""
+        """Names of the channels in addition to colour and alpha, in the film's order."""
         return [f"{name}.{c}" for name, kind in self._aovs.items() for c in AOVS[kind]]
 
     def sample(
@@ -343,8 +354,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-        """Radiance along ``ray``, for wrappers such as ``aov``; alpha is rounded at random to be a
-        mask.
+        """Radiance along ``ray``, for wrappers such as ``aov``.
+
+        The mask is a random rounding of alpha.
         """
         sight = self._prepared(scene)
         if sight is None:
@@ -366,9 +378,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     ) -> mi.TensorXf:
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        check_film(sensor.film(), spp, len(self.aov_names()))  # before the work of a cache
-        # Threads wait for each other where they share the integrator, whose cache one of them may
-        # refine, or the film, which has room for one image.
+        check_film(sensor.film(), spp, len(self.aov_names()))  # before the cache is built
+        # Threads exclude each other if they share the integrator, whose cache one of them may
+        # refine, or the film, which stores one image only.
         with dr.suspend_grad(), self._builder.lock, exclusive(sensor.film()):
             sight = self._prepared(scene)
             if sight is None:
@@ -391,8 +403,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         spp: int = 0,
         **targets: object,
     ) -> Iterator[Frame]:
-        """Images of ``scene`` while the cache is refined, until one of the ``targets`` is reached;
-        see `mitsuba_irrcache.pipeline.progressive.Targets` for these.
+        """Yield images of ``scene`` while the cache is refined, until one of the ``targets`` is
+        reached.
+
+        See `mitsuba_irrcache.pipeline.progressive.Targets`.
         """
 
         def image() -> tuple[mi.TensorXf, float]:
@@ -401,7 +415,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             return tensor, self.seconds.get("filter", 0.0)
 
         self._stopping.begin()
-        progress = self._stopping.checked(self.progress)
+        progress = self._stopping.raising(self.progress)
         return frames(self._builder, scene, image, Targets(**targets), progress)
 
     def render_forward(self, *args: object, **kwargs: object) -> mi.TensorXf:
@@ -419,7 +433,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         spp: int,
     ) -> mi.Film:
         medium = sensor.get_medium()
-        check_sensor(scene, sensor)  # it may have moved, or be no part of the scene
+        check_sensor(scene, sensor)  # the sensor may have moved, or may not belong to the scene
 
         def radiance(sampler, ray, weight, active) -> tuple:
             found = self._radiance(sight, scene, sampler, ray, medium, weight, active)
@@ -435,7 +449,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return film
 
     def _render_empty(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
-        """A scene without media to be seen, by Mitsuba's own integrator: all is background."""
+        """Render a scene without a visible medium by Mitsuba's own integrator, as background."""
         film = sensor.film()
         check_film(film, spp or sensor.sampler().sample_count(), 0, at_once=True)
         self._fallback().render(scene, sensor, seed, spp)
@@ -446,7 +460,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return film
 
     def _finish(self, film: mi.Film, layers: Layers, alpha: mi.Float | None) -> None:
-        """From layers to the image: filter, recombine, and tell how long that took."""
+        """Filter the layers, compose the image, and record the duration."""
         if self._filter != "none":
             dr.eval(layers)
             dr.sync_thread()
@@ -472,10 +486,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         weight: mi.Spectrum,
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, mi.Float, Layers | None]:
-        """Radiance times ``weight``, alpha, and the layers of the radiance if they are asked
-        for.
-        """
-        view = sight.look(scene, sampler, mi.Ray3f(ray), medium, active)
+        """Return radiance times ``weight``, alpha, and the layers of the radiance if required."""
+        view = sight.sample(scene, sampler, mi.Ray3f(ray), medium, active)
         layers = None
         if self._layered:
             layers = sight.projection.layers(
@@ -497,7 +509,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return self._stock[self._chosen]
 
     def to_string(self) -> str:
-        """All properties, as they are: the record of how an image was made."""
+        """All properties with their current values, as a record of how an image was computed."""
         aovs = ", ".join(f"{name}:{kind}" for name, kind in self._aovs.items())
         values = self._properties.values | {"cache_spp": self.cache_spp, "aovs": aovs}
         return f"IrradianceCachingIntegrator[\n{properties.described(values)}\n]"

@@ -1,7 +1,7 @@
 """Irradiance caching for participating media in Mitsuba 3.
 
-Importing this package, before or after ``mitsuba.set_variant``, makes ``<integrator
-type="irrcache"/>`` available in every variant set from then on.
+Importing this package registers the plugin ``<integrator type="irrcache"/>`` in the current variant
+and in every variant that ``mitsuba.set_variant`` selects later.
 """
 
 from __future__ import annotations

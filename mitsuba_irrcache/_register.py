@@ -1,8 +1,8 @@
-"""Registers the plugins for every variant that is set, before or after this package is imported.
+"""Register the plugins in every Mitsuba variant.
 
-A plugin's class derives from a base class of one variant, so its file is executed anew for each.
-Mitsuba 3.10 finds this module by the entry point group ``mitsuba`` and reloads it; on 3.9 a
-callback does the same.
+A plugin derives from a base class that differs between variants, so its file is executed once for
+each variant. Mitsuba 3.10 imports and reloads this module through the entry point group
+``mitsuba``; for Mitsuba 3.9 a variant callback does the same.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from functools import wraps
 import mitsuba as mi
 import mitsuba.python.util
 
-from .errors import explained
+from .errors import add_cause
 
 PLUGINS = ("mitsuba_irrcache.integrators.irrcache",)
 
 
 def register() -> None:
-    """Executes the plugin files for the variant that is set now; without one, nothing happens."""
+    """Execute the plugin files for the current variant; do nothing if no variant is set."""
     if mi.variant() is None:
         return
     for name in PLUGINS:
@@ -36,25 +36,27 @@ def _variant_changed(old: str | None, new: str) -> None:
 
 
 def _with_causes(render: Callable) -> Callable:
-    """``mi.render`` with errors that say what went wrong.
+    """Wrap ``mi.render`` so that its exceptions state the original cause.
 
-    It calls integrators by way of ``dr.custom``, which replaces the message of what they raise by
-    "error while performing a custom differentiable operation (see above)".
+    ``mi.render`` calls integrators through ``dr.custom``, which replaces the message of any
+    exception by "error while performing a custom differentiable operation (see above)".
     """
 
     @wraps(render)
-    def explaining(*args: object, **kwargs: object) -> object:
+    def render_with_cause(*args: object, **kwargs: object) -> object:
         try:
             return render(*args, **kwargs)
         except RuntimeError as error:
-            explained(error)
+            add_cause(error)
             raise
 
-    return explaining
+    return render_with_cause
 
 
 register()
-if "_listening" not in globals():  # a reload keeps the globals, and the one callback
+if (
+    "_listening" not in globals()
+):  # reloading a module keeps its globals: register the callback only once
     mi.detail.add_variant_callback(_variant_changed)
     mi.render = mitsuba.python.util.render = _with_causes(mitsuba.python.util.render)
     _listening = True

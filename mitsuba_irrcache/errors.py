@@ -1,4 +1,4 @@
-"""Errors that a user can act on: each names the thing, its value and the remedy."""
+"""Exceptions whose messages name the offending object, its value and a remedy."""
 
 from __future__ import annotations
 
@@ -6,36 +6,40 @@ import re
 
 
 class IrrcacheError(ValueError):
-    """Input that cannot be used, with the remedy in the message."""
+    """Invalid input; the message contains the remedy."""
 
 
 class UnsupportedSceneError(IrrcacheError):
-    """A scene contains something that ``irrcache`` would render wrongly; the object is named."""
+    """The scene contains an object that ``irrcache`` would render incorrectly; the message names
+    it.
+    """
 
 
 class CacheFileError(IrrcacheError):
-    """A cache file that is damaged, foreign, or belongs to another scene."""
+    """The cache file is damaged, of another format, or computed for a different scene."""
 
 
 def origin(error: BaseException) -> BaseException:
-    """The first cause: Mitsuba and Dr.Jit wrap what Python raises below them, even an interrupt."""
+    """Return the first exception of the chain of causes.
+
+    Mitsuba and Dr.Jit wrap every exception raised by a Python plugin, including KeyboardInterrupt.
+    """
     while error.__cause__ is not None:
         error = error.__cause__
     return error
 
 
 def essence(error: BaseException) -> str:
-    """What went wrong, for a reader: Mitsuba wraps what a Python plugin raises, as text or as a
-    cause.
-    """
+    """Return the message of the original exception, without the text that Mitsuba adds."""
     error = origin(error)
     raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", str(error), re.MULTILINE)
     return raised[-1] if raised else str(error).strip()
 
 
-def explained(error: RuntimeError) -> None:
-    """Puts the cause of an error that Dr.Jit has wrapped into its own message: ours as it is, which
-    names the remedy, others behind the message.
+def add_cause(error: RuntimeError) -> None:
+    """Insert the message of the original exception into an exception raised by Dr.Jit.
+
+    An IrrcacheError replaces the message; for other exceptions the cause is appended.
     """
     cause = origin(error)
     if cause is error or not isinstance(cause, Exception):

@@ -1,4 +1,4 @@
-"""Shared fixtures: Mitsuba's variant, and scenes small enough to be rendered many times."""
+"""Shared fixtures: the variant of Mitsuba, and builders of small scenes."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from tests.support.scenes import (
 
 @pytest.fixture
 def rgb():
-    """The variant ``llvm_ad_rgb``, with a quiet log."""
+    """Select the variant ``llvm_ad_rgb`` and silence the log."""
     _set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture
 def mono():
-    """The variant ``llvm_ad_mono`` for one test."""
+    """Select the variant ``llvm_ad_mono`` for one test."""
     _set_variant("llvm_ad_mono")
     yield
     _set_variant("llvm_ad_rgb")
@@ -46,7 +46,9 @@ def _set_variant(name: str) -> None:
 
 @pytest.fixture
 def scenes() -> SimpleNamespace:
-    """Builders of scene dictionaries; see the functions of the same names in this file."""
+    """Return builders of scene dictionaries; see the functions of the same names in
+    `support.scenes`.
+    """
     return SimpleNamespace(
         volume=volume,
         medium=medium,
@@ -63,26 +65,26 @@ def scenes() -> SimpleNamespace:
 
 @pytest.fixture
 def refine_calls(monkeypatch) -> list[int]:
-    """Samples per voxel of each call of the solver, while the test runs."""
+    """Record the samples per voxel of each call of the solver `path`."""
     from mitsuba_irrcache.solvers.path import solver as path_solver
 
     calls: list[int] = []
-    refine = path_solver.refine
+    refine = path_solver.PathSolver.refine
 
-    def counted(scene, medium, cache, samples, *args, **kwargs):
+    def counted(solver, samples, *args):
         calls.append(samples)
-        return refine(scene, medium, cache, samples, *args, **kwargs)
+        return refine(solver, samples, *args)
 
-    monkeypatch.setattr(path_solver, "refine", counted)
+    monkeypatch.setattr(path_solver.PathSolver, "refine", counted)
     return calls
 
 
 @pytest.fixture
 def kernels():
-    """A function: the kernels that Dr.Jit launched while ``action`` ran.
+    """Return a function that lists the kernels that Dr.Jit launches while ``action`` runs.
 
-    Without garbage collection: one in the middle of a trace moves the slots of Dr.Jit's tables of
-    calls, which are written into kernels, so that by accident there is one with another hash.
+    Garbage collection is disabled meanwhile: a collection during tracing would change the slots in
+    Dr.Jit's call tables, which are part of the kernels, and so the kernels' hashes.
     """
 
     def record(action) -> list[dict]:

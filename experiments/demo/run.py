@@ -1,6 +1,6 @@
-"""``make demo``: a chest from a procedural CT to a picture, and how it compares with volpath.
+"""``make demo``: render a procedural chest CT, and compare the result with volpath.
 
-Makes the thorax phantom, imports it with a transfer function, renders it with ``irrcache``, and
+Creates the thorax phantom, imports it with a transfer function, renders it with ``irrcache``, and
 prints the error of ``irrcache`` and of ``volpath`` after the same time, against a volpath
 reference.
 """
@@ -27,7 +27,7 @@ SCENE = {"max_depth": "2", "hide_emitters": "true", "radiance": "2"}
 
 
 def main() -> None:
-    """Runs the demo; everything it writes is below the output folder."""
+    """Run the demo; all its files are below the output folder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=Path("output/demo"))
     parser.add_argument("--phantom", default="phantom:thorax:190,120,165", help="volume")
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def picture(scene_file: Path, output: Path, size: int) -> None:
-    """The picture a user wants, at full size."""
+    """Render the full-size image."""
     scene = load_scene(scene_file, _sized(size), INTEGRATOR)
     with progress_bar(scene.integrator()):
         scene.integrator().prepare(scene)
@@ -66,9 +66,7 @@ def picture(scene_file: Path, output: Path, size: int) -> None:
 
 
 def compare(scene_file: Path, output: Path, size: int, reference_spp: int) -> None:
-    """Error after the same time, kernels compiled beforehand for both; prints a table and writes
-    the images.
-    """
+    """Compare errors after the same time, with compiled kernels for both; print and save them."""
     ours = load_scene(scene_file, _sized(size), INTEGRATOR)
     theirs = load_scene(scene_file, _sized(size), "volpath{rr_depth=1000}")
     _render(

@@ -1,8 +1,8 @@
-"""``make paper``: all experiments of the paper, and one page with what came out.
+"""``make paper``: all experiments of the paper, and one page with their results.
 
     python -m experiments.paper.run [--full] [--force]
 
-Computes what is missing and writes output/paper/paper.html, which holds everything it shows.
+Computes missing results and writes the self-contained output/paper/paper.html.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RECORDED_BY = "figure2"
 
 
 def run(options: Options) -> None:
-    """Runs and draws all experiments and writes the page."""
+    """Run and plot all experiments and write the page."""
     folder = options.folder("paper")
     spent = {}
     for name in sorted(EXPERIMENTS, key=lambda name: name != RECORDED_BY):
@@ -52,7 +52,7 @@ def run(options: Options) -> None:
 
 
 def findings(options: Options) -> list[str]:
-    """What a reader should take home, a sentence each."""
+    """Return the conclusions as sentences."""
     table = read_json(options.folder("table1") / "results.json")
     said = []
     for label, row in table["converged"].items():
@@ -73,13 +73,13 @@ def findings(options: Options) -> list[str]:
 
 
 def failures(options: Options) -> list[Measurement]:
-    """Recorded runs that did not finish."""
+    """Return the recorded runs that failed."""
     recorded = {volume: methods.PAPER for volume in VOLUMES} | {"chest": methods.ALL}
     return [m for v, own in recorded.items() for m in Session.of(v, options, own).failed]
 
 
 def facts(options: Options, spent: dict[str, float]) -> dict[str, str]:
-    """What was run, on what, and how long it took just now."""
+    """Return what was run, on what, and how long it took."""
     system, size = doctor.examine_system(), options.size
     volumes = (SOURCES[available(name)].about for name in VOLUMES)
     return {

@@ -1,6 +1,4 @@
-"""Errors of recorded images, and what they say: times to an error, and whether the filter fades as
-it should.
-"""
+"""Errors of recorded images and conclusions: times to an error, and the verdict on the filter."""
 
 from __future__ import annotations
 
@@ -15,19 +13,19 @@ from mitsuba_irrcache.compare.perceptual import display
 from mitsuba_irrcache.compare.reference import Reference
 from mitsuba_irrcache.compare.summary import Curve, Reached, time_to
 
-#: What the fading filter is asked for: at most this factor above the better of the two others.
+#: Requirement for the fading filter: at most this factor above the better of the two others.
 CLOSE = 1.1
 #: Standard errors within which two errors count as equal; several pairs are compared.
 NOISE = 2.0
 
 
 def errors(recording: Recording, truth: Reference) -> dict[str, list[float]]:
-    """Errors of all snapshots, by name and in the order of time.
+    """Compute the errors of all snapshots, by name and in the order of time.
 
-    ``display``: RMSE of the sRGB picture in [0, 1], the paper's measure, against the independent
+    ``display``: RMSE of the sRGB image in [0, 1], the paper's measure, against the independent
     reference and net of its noise; ``linear``: net RMSE of radiance in units of its mean; each with
-    the least error that the reference can tell from none. ``own``: the paper's criterion, display
-    RMSE against the method's own last image.
+    the smallest error that is detectable with the reference. ``own``: the paper's criterion,
+    display RMSE against the method's own last image.
     """
     halves = [metrics.colours(half) for half in (truth.a, truth.b)]
     shown = [_displayed(half) for half in halves]
@@ -47,22 +45,22 @@ def errors(recording: Recording, truth: Reference) -> dict[str, list[float]]:
                 "own": rms(own - last),
             }
         )
-    rows.sort(key=lambda row: row["seconds"])  # what a filter takes differs from time to time
+    rows.sort(key=lambda row: row["seconds"])  # the filter's duration varies
     return {key: [row[key] for row in rows] for key in rows[0]}
 
 
 def curve(label: str, errors: dict[str, list[float]], kind: str) -> Curve:
-    """A curve of ``errors`` (see `recording.errors`) for `compare.summary`."""
+    """Return a curve of ``errors`` (see `recording.errors`) for `compare.summary`."""
     columns = (errors["seconds"], errors[kind], errors.get(f"{kind}_resolved", [0.0]))
     seconds, values, resolved = (np.asarray(c, dtype=float) for c in columns)
     return Curve(label, seconds, values, np.broadcast_to(resolved, values.shape))
 
 
 def time_to_converged(errors: dict[str, list[float]], level: float) -> Reached:
-    """The paper's criterion: seconds until the RMSE to the method's own last image is below
+    """Return the paper's criterion: seconds until the RMSE to the own last image is below
     ``level``.
 
-    The last image itself has no error, so it says nothing; nor is anything extrapolated.
+    The last image itself has no error, so it is ignored; nothing is extrapolated.
     """
     before = {key: errors[key][:-1] for key in ("seconds", "own")}
     if not before["own"]:
@@ -72,7 +70,7 @@ def time_to_converged(errors: dict[str, list[float]], level: float) -> Reached:
 
 
 def speed_up(stock: Reached, other: Reached) -> float | None:
-    """How many times sooner ``other`` is there; None where nothing can be said."""
+    """Return the speed-up over ``other``; None if it is unknown."""
     if not np.isfinite([stock.seconds, other.seconds]).all() or stock.how == "at most":
         return None
     return stock.seconds / other.seconds
@@ -81,8 +79,10 @@ def speed_up(stock: Reached, other: Reached) -> float | None:
 def difference_of_squares(
     x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray
 ) -> tuple[float, float]:
-    """Mean square error of x minus that of y against the halves a and b of a reference, whose noise
-    drops out, and its standard error from the spread over about 64 blocks.
+    """Return the mean square error of x minus that of y, and its standard error.
+
+    The noise of the reference's halves a and b cancels; the standard error is from the spread over
+    about 64 blocks.
     """
     products = (x - a) * (x - b) - (y - a) * (y - b)
     means = block_means(products, max(1, min(x.shape[:2]) // 8)).mean(axis=-1)
@@ -91,7 +91,7 @@ def difference_of_squares(
 
 @dataclass(frozen=True)
 class Verdict:
-    """How the fading filter stands at one time.
+    """The comparison of the fading filter with the others at one time.
 
     Attributes:
         ratio: its error over that of the better of unfiltered and fixed filter.
@@ -107,16 +107,19 @@ class Verdict:
 def judge(
     unfiltered: float, fixed: float, fading: float, difference: float, uncertainty: float
 ) -> Verdict:
-    """The verdict on three errors; ``difference`` is fading minus unfiltered, in squares, with its
-    standard error.
+    """Return the verdict on three errors.
+
+    ``difference`` is fading minus unfiltered, in squares, with its standard error.
     """
     ratio = fading / min(unfiltered, fixed)
     return Verdict(ratio, difference > NOISE * uncertainty, ratio <= CLOSE)
 
 
 def fit_memory(rows: list[dict]) -> tuple[float, float, float]:
-    """Bytes at rest, per voxel of the volume and per pixel: peak = base + a n^3 + b m^2, by least
-    squares over rows with "voxels", "pixels" and "bytes".
+    """Fit peak = base + a n^3 + b m^2 by least squares.
+
+    Returns base, bytes per voxel of the volume and bytes per pixel; rows have "voxels", "pixels"
+    and "bytes".
     """
     columns = np.array([[1.0, row["voxels"], row["pixels"]] for row in rows])
     scale = columns.max(axis=0)
@@ -125,12 +128,12 @@ def fit_memory(rows: list[dict]) -> tuple[float, float, float]:
 
 
 def orders(steps: list[float], errors: list[float]) -> list[float]:
-    """Slopes of log error over log step between neighbours."""
+    """Return the slopes of log error over log step between neighbours."""
     return [float(s) for s in np.diff(np.log(errors)) / np.diff(np.log(steps))]
 
 
 def rms(x: np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(x))))
 
 
@@ -139,5 +142,5 @@ def _displayed(image: np.ndarray) -> np.ndarray:
 
 
 def _resolved(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """The least RMSE that the reference can tell from none."""
+    """Return the smallest RMSE that is detectable with the reference."""
     return float(np.sqrt(2 * metrics.net_mse(image, a, b)[1]))

@@ -1,4 +1,4 @@
-"""Errors of ``irrcache``'s image, and what of them is noise and what discretisation."""
+"""Errors of ``irrcache``'s image, split into noise and discretisation."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from mitsuba_irrcache.io.scene_files import load_scene
 def measure(
     path: Path, parameters: dict[str, str], truth: Reference, **properties: object
 ) -> dict[str, float]:
-    """Errors in units of the mean reference radiance of all pixels, and seconds.
+    """Return errors in units of the mean reference radiance of all pixels, and seconds.
 
-    Two caches of different seeds are built: what their images share is discretisation, what they do
-    not is noise.
+    Two caches of different seeds are built: the common part of their errors is discretisation, the
+    rest is noise.
     """
     a, b = truth.a, truth.b
     images, cache_seconds, image_seconds = [], 0.0, 0.0

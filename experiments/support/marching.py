@@ -1,4 +1,4 @@
-"""Camera rays without jitter: what the quadratures do on their own."""
+"""Camera rays without jitter, to measure the quadratures alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from mitsuba_irrcache.render.raymarch import Projection
 
 
 def unjittered(projection: Projection, ray: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
-    """Scattered radiance and transmittance, float64, (channel, ray); every first step is whole."""
+    """Return scattered radiance and transmittance, float64, (channel, ray), with whole first
+    steps.
+    """
     hit, near, far = projection.medium.intersect(ray)
     near = dr.maximum(near, 0)
     radiance, transmittance, *_ = projection.march(ray, near, far, mi.Spectrum(0), mi.Float(1), hit)
@@ -18,7 +20,7 @@ def unjittered(projection: Projection, ray: mi.Ray3f) -> tuple[np.ndarray, np.nd
 
 
 def pixel_rays(sensor: mi.Sensor) -> mi.Ray3f:
-    """A ray through the centre of every pixel, row by row."""
+    """Return a ray through the centre of every pixel, row by row."""
     width, height = sensor.film().crop_size()
     index = dr.arange(mi.UInt32, int(width) * int(height))
     position = mi.Point2f(

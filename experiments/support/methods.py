@@ -1,4 +1,4 @@
-"""The methods of the paper, and two controls beside them."""
+"""The methods of the paper, and two controls."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from mitsuba_irrcache.io.scene_files import describe_integrator, parse_integrato
 
 @dataclass(frozen=True)
 class Method:
-    """What is compared.
+    """A method of the comparison.
 
     Attributes:
-        name: of its files.
-        label: in figures and tables.
+        name: for file names.
+        label: for figures and tables.
         integrator: plugin with properties.
-        paper: seconds to convergence in the paper's table 1, where it has them.
+        paper: seconds to convergence in the paper's table 1, if given there.
     """
 
     name: str
@@ -24,7 +24,7 @@ class Method:
     paper: float | None = None
 
 
-#: Its best setting: Russian roulette off, which costs more variance than it saves time.
+#: Its best setting: Russian roulette off, as it costs more variance than it saves time.
 STOCK = "volpath{rr_depth=1000}"
 
 # The paper's names are SP-ES, MO and MO + BF.
@@ -41,6 +41,6 @@ ALL = (*PAPER, FIXED, FILTERED)
 
 
 def specify(integrator: str, **properties: object) -> str:
-    """``name{key=value,...}`` with some more or other properties."""
+    """Return the specification ``name{key=value,...}`` with added or replaced properties."""
     name, given = parse_integrator(integrator)
     return describe_integrator(name, given | properties)

@@ -1,4 +1,4 @@
-"""What the scripts of all experiments have in common: sizes, folders and the command line."""
+"""Sizes, folders and command line of all experiments."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mitsuba_irrcache.machine.llvm import require_llvm
 
 @dataclass(frozen=True)
 class Size:
-    """How big the paper's experiments are.
+    """The size of the paper's experiments.
 
     Attributes:
         longest: voxels of a volume along its longest side.
         pixels: of an image, per side.
-        horizon: seconds that every method gets on the chest.
-        others: seconds that every method gets on the other volumes.
-        reference: seconds that go into the reference of the chest; half of it into the others'.
+        horizon: seconds for every method on the chest.
+        others: seconds for every method on the other volumes.
+        reference: seconds for the reference of the chest; half of it for the others'.
     """
 
     longest: int
@@ -30,29 +30,33 @@ class Size:
     reference: float
 
 
-#: As many cache voxels for a pixel as in the paper, in about half an hour on two cores.
+#: As many cache voxels per pixel as in the paper, in about half an hour on two cores.
 QUICK = Size(longest=96, pixels=128, horizon=60, others=20, reference=180)
-#: The paper's: a chest of 512 x 150 x 350 voxels, 1024 x 1024 pixels, 5 minutes.
+#: The paper's size: a chest of 512 x 150 x 350 voxels, 1024 x 1024 pixels, 5 minutes.
 FULL = Size(longest=512, pixels=1024, horizon=300, others=100, reference=3600)
 
 
 @dataclass(frozen=True)
 class Options:
-    """Size, where files go, and whether to compute again what is there."""
+    """Size, output folder, whether to recompute existing results, and a Markdown file.
+
+    The marked tables of the Markdown file are replaced.
+    """
 
     size: Size = QUICK
     output: Path = Path("output")
     force: bool = False
+    document: Path | None = None
 
     def folder(self, experiment: str) -> Path:
-        """The folder of an experiment; the full size has its own."""
+        """Return the folder of an experiment; the full size has its own."""
         path = self.output / ("full" if self.size == FULL else "") / experiment
         path.mkdir(parents=True, exist_ok=True)
         return path
 
 
 def parser_of(description: str | None) -> argparse.ArgumentParser:
-    """The options that all experiments have which keep what is finished."""
+    """Return a parser with the options of all experiments that save results."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -61,17 +65,27 @@ def parser_of(description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
+def add_document(parser: argparse.ArgumentParser) -> None:
+    """Declare the option of experiments whose tables are part of the documentation."""
+    parser.add_argument(
+        "--document", type=Path, help="Markdown file whose marked tables are replaced"
+    )
+
+
 def begin() -> None:
-    """Sets Mitsuba's variant."""
+    """Set Mitsuba's variant."""
     require_llvm()
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
 
 
-def parse(description: str | None) -> Options:
-    """Options from the command line; sets Mitsuba's variant."""
+def parse(description: str | None, documented: bool = False) -> Options:
+    """Parse the command line, with ``--document`` if ``documented``; set Mitsuba's variant."""
     parser = parser_of(description)
+    if documented:
+        add_document(parser)
     parser.add_argument("--full", action="store_true", help="the paper's sizes: hours")
     args = parser.parse_args()
     begin()
-    return Options(FULL if args.full else QUICK, args.output, args.force)
+    document = args.document if documented else None
+    return Options(FULL if args.full else QUICK, args.output, args.force, document)

@@ -1,7 +1,7 @@
-"""Recorded runs: every method renders once, and all figures are drawn from what it left.
+"""Recorded runs: every method renders once, and all figures use the recorded images.
 
-A run is a process of its own that leaves an image at each of many times up to a horizon
-(`compare.processes`). One that is there is not made again, even if it failed, unless it is forced.
+A run is a process of its own that writes images at many times up to a horizon
+(`compare.processes`). An existing run is not repeated, even if it failed, unless it is forced.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from mitsuba_irrcache.compare.results import Measurement, Snapshot
 from mitsuba_irrcache.compare.scene_files import scene_digest
 from mitsuba_irrcache.io.images import write_image
 
-#: Single scattering, and half the presets' extinction: bone lets light through, and a voxel of a
+#: Single scattering, and half the presets' extinction, so that bone is translucent and a voxel of a
 #: coarse volume is not opaque on its own.
 APPEARANCE = {"max_depth": "2", "scale": "0.5"}
-#: The paper's figure 3, in seconds; the last one is at most the horizon.
+#: Times of the paper's figure 3 in seconds; the last one is at most the horizon.
 STRIP = (0.15, 1.0, 3.0, 12.0, 100.0)
-#: From one snapshot to the next.
+#: Ratio of the times of successive snapshots.
 TIME_RATIO = 1.4
-#: An image counts for a time that it misses by this factor.
+#: Factor by which the time of an image may differ from the requested one.
 LATE = 1.15
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A volume at one size: single scattering under a white sky that is seen, as in the paper."""
+    """A volume at one size: single scattering under a visible white sky, as in the paper."""
 
     name: str
     scene: Path
@@ -43,39 +43,41 @@ class Subject:
 
     @classmethod
     def of(cls, volume: str, options: Options) -> Subject:
-        """A volume, or what stands for it where its data are not at hand."""
+        """Return a volume, or its substitute if its data are missing."""
         name, size = available(volume), options.size
         path = scene_file(name, options.output, size.longest)
         parameters = APPEARANCE | {"width": str(size.pixels), "height": str(size.pixels)}
         return cls(f"{name}-{size.longest}-{size.pixels}px", path, parameters)
 
     def reference(self, output: Path, seconds: float) -> Reference:
-        """Single scattering by path tracing; rendered once, continued where it is too noisy."""
+        """Render the reference by path tracing once; continue it if it is too noisy."""
         print(f"{self.name}: reference, {seconds:g} s", flush=True)
         return reference(self.scene, self.parameters, STOCK, output / "references", seconds=seconds)
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What a method left."""
+    """The recorded images of a method."""
 
     method: Method
     measurement: Measurement
     folder: Path
 
     def image(self, snapshot: Snapshot) -> np.ndarray:
-        """Linear radiance (height, width, channel), float64; values that are not finite are 0."""
+        """Return linear radiance (height, width, channel), float64, with 0 for values that are
+        not finite.
+        """
         image = metrics.colours(snapshot.read(self.folder)).astype(np.float64)
         return np.nan_to_num(image, posinf=0, neginf=0)
 
     def at(self, seconds: float) -> Snapshot | None:
-        """The latest snapshot that was there by then; None before the first one."""
+        """Return the latest snapshot at this time; None before the first one."""
         there = [s for s in self.measurement.snapshots if s.total <= LATE * seconds]
         return max(there, key=lambda s: s.total, default=None)
 
 
 def times(horizon: float) -> list[float]:
-    """When snapshots are taken: those of figure 3, and evenly spaced ones in log time."""
+    """Return the times of snapshots: those of figure 3, and evenly spaced ones in log time."""
     first = STRIP[0]
     count = 1 + int(np.ceil(np.log(horizon / first) / np.log(TIME_RATIO)))
     spaced = np.geomspace(first, horizon, count)
@@ -83,14 +85,15 @@ def times(horizon: float) -> list[float]:
 
 
 def strip_times(horizon: float) -> list[float]:
-    """The times of figure 3 within the horizon."""
+    """Return the times of figure 3 within the horizon."""
     return [min(t, horizon) for t in STRIP]
 
 
 @dataclass(frozen=True)
 class Session:
-    """A volume, its reference (as a file too: ``picture``), and what the methods left: recordings
-    with images, and measurements that failed, whether with or without images.
+    """A volume, its reference (``picture`` is its file), and the recordings of all methods.
+
+    Failed measurements are listed separately, with or without images.
     """
 
     subject: Subject
@@ -103,7 +106,7 @@ class Session:
     def of(
         cls, volume: str, options: Options, methods: tuple[Method, ...], force: bool = False
     ) -> Session:
-        """Renders and records what is not there yet; with ``force`` it records all anew."""
+        """Render and record missing runs; with ``force`` record all anew."""
         subject, size = Subject.of(volume, options), options.size
         main = volume == "chest"
         horizon = size.horizon if main else size.others
@@ -120,7 +123,9 @@ class Session:
         return cls(subject, truth, picture, shown, failed)
 
     def picked(self, recording: Recording, seconds: float) -> dict:
-        """What a method shows after so many seconds, for JSON; no image before its first one."""
+        """Return the image of a method after this many seconds, for JSON; None before its first
+        one.
+        """
         snapshot, label = recording.at(seconds), recording.method.label
         if snapshot is None:
             return {"label": label, "image": "", "seconds": seconds, "display": None}
@@ -132,7 +137,7 @@ class Session:
 def record(
     subject: Subject, method: Method, horizon: float, folder: Path, force: bool = False
 ) -> Recording:
-    """The recording of a method, made unless it is there."""
+    """Return the recording of a method, made unless it exists."""
     path = folder / f"{method.name}.json"
     measurement = None if force or not path.exists() else Measurement.load(path)
     if measurement is None or measurement.integrator != method.integrator:
@@ -141,12 +146,12 @@ def record(
 
 
 def display_error(image: np.ndarray, truth: Reference) -> float:
-    """The paper's measure: RMSE of the sRGB picture in [0, 1], net of the reference's noise."""
+    """Return the paper's measure: net RMSE of the sRGB image in [0, 1]."""
     return perceptual.display_rmse(image, *(metrics.colours(half) for half in (truth.a, truth.b)))
 
 
 def _measure(subject: Subject, method: Method, horizon: float, path: Path) -> Measurement:
-    """Runs a method; what it had finished when it failed is kept with the reason."""
+    """Run a method; after a failure, return its finished results with the reason."""
     folder, partial = path.parent, path.with_suffix(".partial.json")
     job = {
         "scene": str(subject.scene.resolve()),

@@ -1,7 +1,6 @@
-"""The scenes of the experiments: real volumes where they are at hand, else phantoms that are
-generated.
+"""The scenes of the experiments: real volumes if available, else procedural phantoms.
 
-Real volumes are looked for in the folder that IRRCACHE_DATA names, or in ../shared/data.
+Real volumes are looked up in the folder that IRRCACHE_DATA names, or in ../shared/data.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ DATA = Path(os.environ.get("IRRCACHE_DATA", Path(__file__).parents[2] / ".." / "
 
 @dataclass(frozen=True)
 class Source:
-    """Where a volume comes from and how it is imported.
+    """A volume's origin and import options.
 
     Attributes:
-        about: what it is, for a caption.
+        about: description for a caption.
         arguments: of ``irrcache import``. "data:" marks files below DATA, "tar:" archives there
-            that are unpacked first, "phantom" a chest and "phantom:cloud" a cloud of the size
-            that is asked for.
-        longest: voxels along the longest side, unless told otherwise; 0: those of the data.
-        substitute: name of the source that takes its place where its data are not at hand.
+            that are unpacked first, "phantom" a chest and "phantom:cloud" a cloud of the requested
+            size.
+        longest: default voxels along the longest side; 0: those of the data.
+        substitute: name of the source that replaces it if its data are missing.
     """
 
     about: str
@@ -40,7 +39,7 @@ _CT_HEAD = (
     *("--raw-shape", "256,256,113", "--raw-type", "uint16", "--raw-endian", "big"),
     *("--raw-spacing", "0.9,0.9,1.8", "--rescale", "1,-1024", "--flip", "z"),
 )
-# Cropped to the patient; -300 HU frees the body of the table.
+# Cropped to the patient; -300 HU separates the body from the table.
 _CT_CHEST = ("tar:lidc_chest_ct/*.tar.gz", "--isolate", "-300", "--crop")
 _ORGANS = str(Path(__file__).with_name("abdomen.json"))
 
@@ -78,8 +77,8 @@ SOURCES = {
 
 
 def scene_file(name: str, output: Path, longest: int = 0) -> Path | None:
-    """The scene's XML below ``output``, imported if it is not there yet; None where its data are
-    not at hand.
+    """Return the scene's XML below ``output``, imported if missing; None if its data are
+    missing.
     """
     source = SOURCES[name]
     path = output / "scenes" / (f"{name}-{longest}" if longest else name) / "scene.xml"
@@ -102,7 +101,7 @@ def scene_file(name: str, output: Path, longest: int = 0) -> Path | None:
 
 
 def available(name: str) -> str:
-    """``name``, or its substitute where its data are not at hand."""
+    """Return ``name``, or its substitute if its data are missing."""
     first = SOURCES[name].arguments[0]
     marker, _, pattern = first.partition(":")
     if marker in ("data", "tar") and not any(DATA.glob(pattern)):
@@ -111,7 +110,7 @@ def available(name: str) -> str:
 
 
 def _resolve(argument: str, output: Path, longest: int) -> list[str]:
-    """What an argument stands for on the command line; nothing where data are missing."""
+    """Resolve an argument for the command line; None if data are missing."""
     marker, _, pattern = argument.partition(":")
     if argument == "phantom":
         return [f"phantom:thorax:{longest},{5 * longest // 8},{7 * longest // 8}"]
@@ -125,7 +124,7 @@ def _resolve(argument: str, output: Path, longest: int) -> list[str]:
 
 
 def _unpacked(archives: list[Path], folder: Path) -> list[str]:
-    """The folder with the contents of all ``archives``."""
+    """Return the folder with the contents of all ``archives``."""
     if not archives:
         return []
     for archive in archives:

@@ -1,4 +1,4 @@
-"""Results that are kept in a JSON file, each computed once."""
+"""Results in a JSON file, each computed once."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from mitsuba_irrcache.compare.results import write_json
 
 
 class Store:
-    """Rows by key. A row is written as soon as it is there, so that an interrupted experiment goes
-    on where it stopped; ``force`` forgets those of before.
+    """Rows by key. Each row is written when it is complete, so that an interrupted run can
+    continue.
+
+    ``force`` discards earlier rows.
     """
 
     def __init__(self, path: Path, force: bool = False) -> None:
@@ -19,7 +21,7 @@ class Store:
         self.rows: dict[str, dict] = {} if force or not path.exists() else read_json(path)
 
     def row(self, key: str, compute: Callable[[], dict]) -> dict:
-        """The row called ``key``, computed if it is not there yet."""
+        """Return the row ``key``, computed if it is missing."""
         if key not in self.rows:
             self.rows[key] = compute()
             write_json(self.path, self.rows)
@@ -27,5 +29,5 @@ class Store:
 
 
 def read_json(path: Path) -> dict:
-    """What an experiment's run.py left."""
+    """Read the results of an experiment's run.py."""
     return json.loads(path.read_text())

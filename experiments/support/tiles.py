@@ -1,4 +1,4 @@
-"""Grids of pictures with labels."""
+"""Grids of images with labels."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ def tiles(
     titles: list[list[str]],
     width: float = 1.9,
 ) -> None:
-    """Draws ``rows`` of images of linear radiance as a display shows them, each with a title; None
-    leaves an empty tile. ``width`` is that of a picture in inches.
+    """Draw ``rows`` of tone-mapped images of linear radiance, each with a title.
+
+    None leaves an empty tile. ``width`` is that of an image in inches.
     """
     shape = next(image.shape for row in rows for image in row if image is not None)
     size = (len(rows[0]) * (width + 0.1) + 0.4, len(rows) * (width * shape[0] / shape[1] + 0.3))
@@ -30,7 +31,7 @@ def tiles(
             for ax, image, title in zip(line, images, above, strict=True):
                 _bare(ax)
                 if image is None:
-                    ax.imshow(np.ones((*shape[:2], 3)))  # takes the room of a picture
+                    ax.imshow(np.ones((*shape[:2], 3)))  # occupies the space of an image
                     ax.text(
                         0.5, 0.5, "no image\nyet", transform=ax.transAxes, ha="center",
                         va="center", color=style.GREY,
@@ -41,22 +42,20 @@ def tiles(
 
 
 def read(picked: dict) -> np.ndarray | None:
-    """The image of what `recording.Session.picked` picked, if there is one."""
+    """Read the image that `recording.Session.picked` selected, if there is one."""
     if not picked["image"]:
         return None
     return read_image(picked["image"])
 
 
 def error_title(picked: dict) -> str:
-    """Label, and the error of the displayed picture."""
+    """Return label and error of the tone-mapped image."""
     error = picked["display"]
     return picked["label"] if error is None else f"{picked['label']}: {error:.4f}"
 
 
 def crop(image: np.ndarray, centre: tuple[float, float], share: float) -> np.ndarray:
-    """A square part of an image: ``share`` of its height, about a point given as parts of width and
-    height.
-    """
+    """Return a square part of an image: ``share`` of its height, centred at a relative position."""
     side = max(8, round(share * image.shape[0]))
     x, y = (round(c * n) - side // 2 for c, n in zip(centre, image.shape[1::-1], strict=True))
     y, x = np.clip((y, x), 0, (image.shape[0] - side, image.shape[1] - side))

@@ -1,1 +1,1 @@
-"""The irradiance cache: its values, statistics and files."""
+"""The irradiance cache: statistics, lookups, angular moments, error estimates and files."""

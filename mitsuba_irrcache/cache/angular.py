@@ -1,16 +1,16 @@
-"""Light by its direction, for media that do not scatter alike to all sides.
+"""Angular moments of the radiance, for media with anisotropic scattering.
 
-Beside the irradiance Phi a cache holds *moments* of the radiance then: its coefficients in
-spherical harmonics from degree 1 on, and the irradiance from each *narrow* light (a sun, a lamp
-nearby, a bright spot of the sky), whose direction is known and which spherical harmonics could not
-tell. What is scattered into the direction of a ray is
+In addition to the irradiance Phi, the cache of such a medium stores *moments* of the radiance: its
+spherical-harmonic coefficients L_lm for l >= 1, and the irradiance E_k from each *narrow* source (a
+sun, a nearby lamp, a bright spot of the environment), whose direction is known and which spherical
+harmonics of low order cannot represent. The radiance scattered towards the camera is
 
     J = Phi / (4 pi) f,   Phi f = Phi + sum_lm 4 pi g_l Y_lm L_lm + sum_k (4 pi p_k - 1) E_k
 
-where L_lm leaves out the light E_k of narrow lights. (Of lamps, which have a size, it does not, and
-p_k is without the degrees that L_lm has: only what these lack is told by one direction, blurred as
-the lamp's size has it.) Phi is what it is in isotropic media; the *factor* f is that of values
-interpolated alike, so that what is noisy or dark weighs little.
+where L_lm excludes E_k. (Lamps have an extent: their L_lm includes E_k, and p_k contains only the
+degrees that L_lm lacks, blurred by the lamp's extent.) Phi is interpolated as in isotropic media.
+The *factor* f is a ratio of values interpolated in the same way, so that voxels with little
+irradiance have little weight.
 """
 
 from __future__ import annotations
@@ -25,45 +25,49 @@ import numpy as np
 from mitsuba_irrcache.core.sequences import GOLDEN_STEP, lattice_points
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import kind_of
 from mitsuba_irrcache.media.phase import Phase
 
-#: Sine of half the angle that a lamp may take up to be told apart: one has to be beside it.
-WIDEST = 0.95
-#: Half the angle within which light from something without a size is its own.
-NARROWEST = 0.005
-#: Half the angle of a bright spot of the sky, at least and at most; the share of the sky's light
-#: that makes it one (even light would be 1/400); and how many there are at most.
-SPOT, WIDEST_SPOT, SPOT_SHARE, MOST_SPOTS = float(np.deg2rad(4)), float(np.deg2rad(12)), 0.02, 4
-#: Of what a spot has within its widest circle it has this share in its own.
-WHOLE_SPOT = 0.97
-#: Half the angle of spots that are as good as points.
-POINT_LIKE = float(np.deg2rad(1))
-#: Directions that are drawn to find these, and the step from one to the next.
+#: Maximum sine of the angular radius of a lamp that is treated as narrow.
+MAX_LAMP_SINE = 0.95
+#: Angular radius [rad] of sources without extent.
+MIN_ANGULAR_RADIUS = 0.005
+#: Bright spots of an environment: minimum and maximum angular radius.
+MIN_SPOT_RADIUS, MAX_SPOT_RADIUS = float(np.deg2rad(4)), float(np.deg2rad(12))
+#: Their minimum share of the total irradiance (1/400 if it is uniform), and maximum number.
+MIN_SPOT_SHARE, MAX_SPOTS = 0.02, 4
+#: Share of the energy within the maximum radius that the radius of a spot must enclose.
+ENCLOSED_ENERGY = 0.97
+#: Maximum root mean square radius of spots that are treated as points.
+MAX_POINT_RADIUS = float(np.deg2rad(1))
+#: Number of environment samples used to find spots.
 SPOT_SAMPLES = 1 << 16
-#: Lamps that are told apart, and points of each that tell how it lies.
-MOST_LAMPS, POINTS = 8, 1024
-#: Terms of a series of Legendre polynomials that are left out beyond the last one larger than this.
-NO_TERM = 1e-3
-#: A distance, or its square, that is not 0.
+#: Maximum number of narrow lamps, and surface samples that determine the extent of each.
+MAX_LAMPS, LAMP_SAMPLES = 8, 1024
+#: Legendre series are truncated behind the last coefficient larger than this.
+NEGLIGIBLE_TERM = 1e-3
+#: Lower bound of distances and squared distances, to avoid division by 0.
 TINY = 1e-30
-#: Values in one load.
+#: Number of values per load.
 WIDTH = 4
 
 
 class Source:
-    """A narrow light: at ``place``, or, if ``far``, in the direction ``place``; ``size`` is its
-    radius, or half its angle. ``spread`` is the covariance (3, 3) of the points of a lamp, or a
-    spot's mean square angle (None: as good as a point).
+    """A narrow source at ``place``, or, if ``far``, in direction ``place``.
+
+    ``size`` is its radius, or its angular radius if ``far``. ``spread`` is the covariance (3, 3) of
+    the points of a lamp, or the mean square angle of a spot; None for sources that are treated as
+    points.
     """
 
     def __init__(
         self, place: np.ndarray, size: float, far: bool, spread: np.ndarray | float | None = None
     ) -> None:
         self.far = far
-        #: whether it is so wide that it has to be told from a point
+        #: whether its extent has to be taken into account
         self.wide = spread is not None
         self._direction, self._cosine = np.array(place), np.cos(size)
-        #: whether it is so narrow that nothing of its light has to be in the moments
+        #: whether its radiance is excluded from the moments L_lm
         self.sharp = far or not size
         self.place = mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in place))
         self._size = dr.opaque(mi.Float, float(np.cos(size) if far else size))
@@ -74,36 +78,39 @@ class Source:
             self._covariance = [mi.Vector3f(*row) for row in rows]
 
     def seen_from(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
-        """The direction to it, and the cosine of the angle within which light is its own: 2 where
-        it is not narrow.
+        """Return the direction to the source, and the cosine of its angular radius.
+
+        The cosine is 2 at points where the source is not narrow.
         """
         if self.far:
             return self.place, self._size
-        way = self.place - mi.Vector3f(p)
-        distance = dr.maximum(dr.norm(way), TINY)
-        sine = dr.maximum(self._size / distance, NARROWEST)
-        cosine = dr.select(sine < WIDEST, dr.sqrt(1 - dr.square(sine)), 2)
-        return way / distance, cosine
+        offset = self.place - mi.Vector3f(p)
+        distance = dr.maximum(dr.norm(offset), TINY)
+        sine = dr.maximum(self._size / distance, MIN_ANGULAR_RADIUS)
+        cosine = dr.select(sine < MAX_LAMP_SINE, dr.sqrt(1 - dr.square(sine)), 2)
+        return offset / distance, cosine
 
     def variance(self, p: mi.Point3f) -> mi.Float:
-        """The mean square of the angles from its middle to its points, as seen from ``p``."""
+        """Mean square angle between the centre of the source and its points, seen from ``p``."""
         if self.far:
             return self._variance
-        way = self.place - mi.Vector3f(p)
-        inverse = dr.rcp(dr.maximum(dr.squared_norm(way), TINY))
-        along = sum(w * dr.dot(row, way) for w, row in zip(way, self._covariance, strict=True))
+        offset = self.place - mi.Vector3f(p)
+        inverse = dr.rcp(dr.maximum(dr.squared_norm(offset), TINY))
+        along_view = sum(
+            w * dr.dot(row, offset) for w, row in zip(offset, self._covariance, strict=True)
+        )
         total = sum(row[i] for i, row in enumerate(self._covariance))
-        return dr.maximum(total - along * inverse, 0) * inverse
+        return dr.maximum(total - along_view * inverse, 0) * inverse
 
     def covers(self, directions: np.ndarray) -> np.ndarray:
-        """Whether light from each of ``directions`` (..., 3) is its own, if it is ``far``."""
+        """Whether ``directions`` (..., 3) point to this source; False unless it is ``far``."""
         return (directions @ self._direction >= self._cosine) & self.far
 
 
 class AngularBasis:
-    """What is to be known of the light's directions in a medium with the phase function
-    ``phase``.
-    """
+    """Angular representation of the radiance in a medium with the phase function ``phase``."""
+
+    # docs/primer, eq. (1.6)
 
     def __init__(self, phase: Phase, sources: list[Source]) -> None:
         self.phase, self.sources = phase, sources
@@ -118,11 +125,11 @@ class AngularBasis:
             dr.opaque(mi.Float, float((2 * degree + 1) * phase.moments[degree]))
             for degree in range(1, self.order + 1)
         ]
-        # Those of the phase function itself; and less what the moments tell.
+        # Coefficients of the phase function, and the part that the moments do not represent.
         terms = 2 * np.arange(len(phase.all_moments)) + 1
         own = phase.all_moments * terms / (1 - phase.forward)
         rest = own - phase.moments * terms * (np.arange(len(own)) <= self.order)
-        last = int(np.flatnonzero(np.abs(own) > NO_TERM)[-1]) + 1
+        last = int(np.flatnonzero(np.abs(own) > NEGLIGIBLE_TERM)[-1]) + 1
         self._terms = [
             tuple(dr.opaque(mi.Float, float(v)) for v in pair)
             for pair in zip(own[:last], rest[:last], strict=True)
@@ -130,60 +137,64 @@ class AngularBasis:
 
     @property
     def count(self) -> int:
-        """Moments per channel."""
+        """Number of moments per channel."""
         return len(self._factors) + len(self.sources)
 
     def moments(self, position: mi.Point3f, contributions: list[tuple]) -> list[mi.Spectrum]:
-        """Of light that was found at ``position``: directions to where it comes from, with what
-        comes from there uncollided and scattered, both as irradiance.
+        """Compute the moments of radiance samples at ``position``.
+
+        ``contributions`` are tuples of the direction towards the origin of the radiance, and the
+        uncollided and scattered parts of its irradiance.
         """
         smooth = [mi.Spectrum(0)] * len(self._factors)
         narrow = [mi.Spectrum(0)] * len(self.sources)
-        seen = [source.seen_from(position) for source in self.sources]
+        directions_and_cosines = [source.seen_from(position) for source in self.sources]
         for direction, uncollided, scattered in contributions:
-            for k, (towards, cosine) in enumerate(seen):
+            for k, (towards, cosine) in enumerate(directions_and_cosines):
                 own = dr.dot(direction, towards) >= cosine
                 narrow[k] = narrow[k] + dr.select(own, uncollided, 0)
                 if self.sources[k].sharp:
                     uncollided = dr.select(own, 0, uncollided)
             basis = dr.sh_eval(direction, self.order)[1:]
-            light = uncollided + scattered
-            smooth = [m + y * light for m, y in zip(smooth, basis, strict=True)]
+            irradiance = uncollided + scattered
+            smooth = [m + y * irradiance for m, y in zip(smooth, basis, strict=True)]
         return smooth + narrow
 
-    def shines(
+    def hits_source(
         self, origin: mi.Point3f, direction: mi.Vector3f, far: mi.Bool, near: mi.Bool
     ) -> mi.Bool:
-        """Whether a narrow light is what is met along rays, those that meet something ``far`` away,
-        or an emitter ``near``.
-        """
+        """Whether rays that hit something ``far``, or an emitter ``near``, hit a narrow source."""
         found = mi.Bool(False)
         for source in self.sources:
             towards, cosine = source.seen_from(origin)
             found |= (far if source.far else near) & (dr.dot(direction, towards) >= cosine)
         return found
 
-    def apart(self, directions: np.ndarray, light: np.ndarray) -> list[np.ndarray]:
-        """Of ``light`` (n, 2, channels) along ``directions`` (n, 3) and their opposites what is not
-        of narrow lights far away, then that of each (0 for others).
+    def apart(self, directions: np.ndarray, radiance: np.ndarray) -> list[np.ndarray]:
+        """Separate the radiance of narrow distant sources.
+
+        ``radiance`` (n, 2, channels) is that along ``directions`` (n, 3) and their opposites.
+        Returns the remainder, followed by the part of each source (0 for sources that are not
+        distant).
         """
         towards, parts = np.stack([-directions, directions], axis=1), []
         for source in self.sources:
-            own = light * source.covers(towards)[..., None]
-            light = light - own
+            own = radiance * source.covers(towards)[..., None]
+            radiance = radiance - own
             parts.append(own)
-        return [light, *parts]
+        return [radiance, *parts]
 
     def basis(self, direction: mi.Vector3f) -> list[mi.Float]:
-        """What the smooth moments count for a ray along ``direction``."""
+        """Weights of the smooth moments for a ray along ``direction``."""
         values = dr.sh_eval(direction, self.order)[1:]
         return [factor * y for factor, y in zip(self._factors, values, strict=True)]
 
     def gains(
         self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool, with_peak: bool = True
     ) -> list[mi.Float]:
-        """What the narrow lights count for a ray along ``direction`` at ``p``; without a forward
-        peak, if wanted, light in which counts as not scattered.
+        """Weights of the narrow sources for a ray along ``direction`` at ``p``.
+
+        Without ``with_peak`` scattering into a forward peak is excluded.
         """
         found = []
         for source in self.sources:
@@ -201,27 +212,28 @@ class AngularBasis:
     def _blurred(
         self, gain: mi.Float, cosine: mi.Float, variance: mi.Float, whole: bool
     ) -> mi.Float:
-        """4 pi p of a light whose angles have this ``variance``, where its middle has ``gain``:
-        being as wide takes exp(-l (l + 1) variance / 4) of degree l. Without what the moments tell,
-        unless the ``whole`` of it is wanted.
+        """Return 4 pi p of a source with extent, given the ``gain`` 4 pi p of its centre.
+
+        A source with this ``variance`` of angles attenuates degree l by exp(-l (l + 1) variance /
+        4). The part represented by the moments is excluded unless ``whole``.
         """
-        result, left, ratio = mi.Float(0), mi.Float(1), mi.Float(1)
+        result, attenuation, ratio = mi.Float(0), mi.Float(1), mi.Float(1)
         blur = dr.exp(-0.5 * variance)
         for legendre, (own, rest) in zip(_legendre(cosine), self._terms, strict=False):
-            result += (own if whole else rest) * left * legendre
+            result += (own if whole else rest) * attenuation * legendre
             gain = gain - own * legendre
             ratio *= blur
-            left *= ratio
-        return dr.fma(gain, left, result)
+            attenuation *= ratio
+        return dr.fma(gain, attenuation, result)
 
     def _smooth(self, cosine: mi.Float) -> mi.Float:
-        """4 pi p - 1, as far as the moments tell."""
+        """Evaluate the part of 4 pi p - 1 that the moments represent."""
         polynomials = islice(_legendre(cosine), 1, None)
         return sum(m * p for m, p in zip(self._degrees, polynomials, strict=False))
 
 
 def _legendre(cosine: mi.Float) -> Iterator[mi.Float]:
-    """Legendre's polynomials, from degree 0 on."""
+    """Generate the Legendre polynomials from degree 0 on."""
     before, here = mi.Float(0), mi.Float(1)
     for degree in count():
         yield here
@@ -229,7 +241,7 @@ def _legendre(cosine: mi.Float) -> Iterator[mi.Float]:
 
 
 def nothing(directional: AngularBasis | None) -> list[mi.Spectrum]:
-    """Sums of light, as `added` has them, 0 so far."""
+    """Initial value of the sums computed by `added`."""
     moments = 0 if directional is None else directional.count
     return [mi.Spectrum(0) for _ in range(1 + moments)]
 
@@ -242,8 +254,9 @@ def added(
     scattered: mi.Spectrum,
     directional: AngularBasis | None,
 ) -> list[mi.Spectrum]:
-    """``sums``, an irradiance and its `AngularBasis.moments` if it has any, with the light that
-    comes to ``position`` from one direction.
+    """Add the radiance arriving at ``position`` from direction ``towards`` to ``sums``.
+
+    ``sums`` are an irradiance and, for anisotropic media, the moments of `AngularBasis.moments`.
     """
     found = [uncollided + scattered]
     if directional is not None:
@@ -252,9 +265,7 @@ def added(
 
 
 class AngularField:
-    """The factor f at all places. ``phi`` and ``moments`` are given per voxel; each list is one
-    channel after the other.
-    """
+    """The factor f as a field; ``phi`` and ``moments`` are given per voxel, ordered by channel."""
 
     def __init__(
         self, directional: AngularBasis, grid: Grid, phi: list[mi.Float], moments: list[mi.Float]
@@ -277,8 +288,9 @@ class AngularField:
         active: mi.Bool,
         with_peak: bool = True,
     ) -> mi.Float | mi.Color3f:
-        """At ``p`` for a ray along ``direction``, for which ``basis`` is that of `AngularBasis`;
-        ``with_peak`` is as of its `gains`.
+        """Evaluate f at ``p`` for a ray along ``direction``.
+
+        ``basis`` is the result of `AngularBasis.basis`; ``with_peak`` as in `AngularBasis.gains`.
         """
         directional = self.directional
         values = self._interpolated(self.grid.coordinates.point(p), active)
@@ -288,12 +300,12 @@ class AngularField:
             phi, *moments = values[c * self._row : (c + 1) * self._row]
             extra = sum(w * m for w, m in zip(weights, moments, strict=True))
             ratio = dr.select(phi > 0, 1 + extra / dr.select(phi > 0, phi, 1), 1)
-            # A sum of few moments can be negative, and noisy moments anything.
+            # A truncated series may be negative, and noisy moments are unbounded.
             found.append(dr.clip(ratio, 0, directional.phase.peak))
         return found[0] if self.channels == 1 else mi.Color3f(found)
 
     def _interpolated(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
-        """The values of a voxel, trilinear."""
+        """Interpolate the stored values trilinearly."""
         sums = [mi.Vector4f(0)] * self._loads
         for voxel, weight in self.grid.corners(u):
             for k in range(self._loads):
@@ -303,26 +315,26 @@ class AngularField:
 
 
 def sources_of(scene: mi.Scene) -> list[Source]:
-    """The narrow lights of a scene."""
+    """Find the narrow sources of a scene."""
     found, lamps = [], []
     for emitter in scene.emitters():
-        flags = emitter.flags()
-        if mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
-            found.append(Source(_sampled(emitter).d.numpy().ravel(), NARROWEST, far=True))
-        elif mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
+        kind = kind_of(emitter)
+        if kind.has_one_direction:
+            found.append(Source(_sampled(emitter).d.numpy().ravel(), MIN_ANGULAR_RADIUS, far=True))
+        elif kind.is_point_like:
             found.append(Source(_sampled(emitter).p.numpy().ravel(), 0.0, far=False))
-        elif emitter.is_environment():
+        elif kind.is_environment:
             found += spots_of(emitter)[0]
     for shape in scene.shapes():
         if shape.is_emitter():
             lamps.append(_lamp(shape))
-    return found + lamps[:MOST_LAMPS]
+    return found + lamps[:MAX_LAMPS]
 
 
 def _lamp(shape: mi.Shape) -> Source:
-    box, rng = shape.bbox(), np.random.default_rng(POINTS)
+    box, rng = shape.bbox(), np.random.default_rng(LAMP_SAMPLES)
     radius = 0.5 * float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
-    points = shape.sample_position(0.0, mi.Point2f(np.float32(rng.random((2, POINTS))))).p
+    points = shape.sample_position(0.0, mi.Point2f(np.float32(rng.random((2, LAMP_SAMPLES))))).p
     covariance = np.cov(np.array(points, dtype=np.float64))
     return Source(np.array(box.center()).ravel(), radius, False, covariance)
 
@@ -333,63 +345,70 @@ def _sampled(emitter: mi.Emitter) -> mi.DirectionSample3f:
 
 
 def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
-    """Bright spots of a sky: circles that a share of its light comes from. And the irradiance
-    (1 + n, channels) that comes from beside all of them, and from each.
+    """Find bright spots of an environment: circles that contain a large share of its irradiance.
+
+    Also returns the irradiance (1 + n, channels) from outside of all spots, and from each spot.
     """
     rng = np.random.default_rng(3)
-    even = lattice_points(SPOT_SAMPLES, GOLDEN_STEP)
-    samples = mi.Point2f(np.float32((even + rng.random((2, 1))) % 1))
+    points = lattice_points(SPOT_SAMPLES, GOLDEN_STEP)
+    samples = mi.Point2f(np.float32((points + rng.random((2, 1))) % 1))
     record, colours = environment.sample_direction(
         dr.zeros(mi.Interaction3f, SPOT_SAMPLES), samples
     )
     directions = np.array(record.d, dtype=np.float64)
     colours = np.stack([np.broadcast_to(np.array(c), SPOT_SAMPLES) for c in colours])
-    light = colours.mean(axis=0)
-    if not np.isfinite(light).all() or directions.shape != (3, SPOT_SAMPLES):
+    irradiance = colours.mean(axis=0)
+    if not np.isfinite(irradiance).all() or directions.shape != (3, SPOT_SAMPLES):
         return [], np.full((1, len(colours)), np.nan)
-    total, found, numbers = light.sum(), [], np.zeros(SPOT_SAMPLES, int)
-    while len(found) < MOST_SPOTS:
-        centre = _brightest(directions, light)
-        own = centre @ directions >= np.cos(SPOT)
-        if not light[own].sum() > SPOT_SHARE * total:
+    total, found, numbers = irradiance.sum(), [], np.zeros(SPOT_SAMPLES, int)
+    while len(found) < MAX_SPOTS:
+        centre = _brightest(directions, irradiance)
+        own = centre @ directions >= np.cos(MIN_SPOT_RADIUS)
+        if not irradiance[own].sum() > MIN_SPOT_SHARE * total:
             break
-        size, variance = _extent(np.arccos(np.clip(centre @ directions, -1, 1)), light)
-        found.append(Source(centre, size, True, variance if variance > POINT_LIKE**2 else None))
-        own = (light > 0) & (centre @ directions >= np.cos(size))
-        light, numbers[own] = np.where(own, 0, light), len(found)
+        size, variance = _extent(np.arccos(np.clip(centre @ directions, -1, 1)), irradiance)
+        found.append(
+            Source(centre, size, True, variance if variance > MAX_POINT_RADIUS**2 else None)
+        )
+        own = (irradiance > 0) & (centre @ directions >= np.cos(size))
+        irradiance, numbers[own] = np.where(own, 0, irradiance), len(found)
     shares = [colours[:, numbers == k].sum(axis=1) for k in range(1 + len(found))]
     return found, np.array(shares, dtype=np.float64) / SPOT_SAMPLES
 
 
-def _extent(angles: np.ndarray, light: np.ndarray) -> tuple[float, float]:
-    """Half the angle of a spot, given the ``light`` at ``angles`` from its middle, and the mean
-    square angle in it. What shines around it is not its own.
+def _extent(angles: np.ndarray, irradiance: np.ndarray) -> tuple[float, float]:
+    """Angular radius and mean square angle of a spot, given ``irradiance`` samples at ``angles``.
+
+    The radiance around the spot is subtracted as background.
     """
-    circle = 1 - np.cos(WIDEST_SPOT)
-    around = (angles > WIDEST_SPOT) & (angles < 1.5 * WIDEST_SPOT)
-    level = light[around].sum() / (np.cos(WIDEST_SPOT) - np.cos(1.5 * WIDEST_SPOT))
+    circle = 1 - np.cos(MAX_SPOT_RADIUS)
+    around = (angles > MAX_SPOT_RADIUS) & (angles < 1.5 * MAX_SPOT_RADIUS)
+    background = irradiance[around].sum() / (
+        np.cos(MAX_SPOT_RADIUS) - np.cos(1.5 * MAX_SPOT_RADIUS)
+    )
     order = np.argsort(angles)
-    order = order[angles[order] <= WIDEST_SPOT]
-    own = np.cumsum(light[order]) - level * (1 - np.cos(angles[order]))
-    whole = own >= WHOLE_SPOT * (light[order].sum() - level * circle)
-    size = max(SPOT, float(angles[order][whole.argmax()])) if whole.any() else SPOT
+    order = order[angles[order] <= MAX_SPOT_RADIUS]
+    own = np.cumsum(irradiance[order]) - background * (1 - np.cos(angles[order]))
+    encloses = own >= ENCLOSED_ENERGY * (irradiance[order].sum() - background * circle)
+    size = float(angles[order][encloses.argmax()]) if encloses.any() else MIN_SPOT_RADIUS
+    size = max(MIN_SPOT_RADIUS, size)
     within = angles <= size
-    return size, float((light[within] * angles[within] ** 2).sum() / light[within].sum())
+    return size, float((irradiance[within] * angles[within] ** 2).sum() / irradiance[within].sum())
 
 
-def _brightest(directions: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """A direction about which much of the light is concentrated."""
+def _brightest(directions: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+    """Direction of the largest concentration of irradiance."""
     z = np.minimum((directions[2] + 1) * 18, 35).astype(int)
     turn = (np.arctan2(directions[1], directions[0]) / (2 * np.pi) % 1 * 72).astype(int) % 72
     cell = z * 72 + turn
-    sums = np.bincount(cell, light)
+    sums = np.bincount(cell, irradiance)
     own = cell == sums.argmax()
     for _ in range(4):
-        mean = directions[:, own] @ light[own]
+        mean = directions[:, own] @ irradiance[own]
         if not np.linalg.norm(mean) > 0:
             break
         centre = mean / np.linalg.norm(mean)
-        own = centre @ directions >= np.cos(SPOT)
+        own = centre @ directions >= np.cos(MIN_SPOT_RADIUS)
     else:
         return centre
     return np.array([0.0, 0.0, 1.0])

@@ -29,7 +29,7 @@ from mitsuba_irrcache.lights.emitters import is_sun, point_lights, position_of, 
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
-from mitsuba_irrcache.transport.path import visibility
+from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import optical_depth
 
 #: Points along each axis of a voxel over which E, and over which exp(-tau), is averaged.
@@ -62,7 +62,7 @@ class DirectLight:
         #: what surfaces and other media let through at the voxels; None where there are none
         self._others: RootField | None = None
         passed = mi.Spectrum(1)
-        if medium.surroundings is not None:
+        if medium.is_traced:
             position = [dr.opaque(mi.Float, float(v)) for v in position_of(emitter)]
             passed = _past_others(scene, medium, p, mi.Point3f(position))
             dr.eval(passed)
@@ -97,6 +97,7 @@ class DirectLight:
 
     def depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """The optical depth of the medium between world positions and the emitter."""
+        # docs/primer, eq. (2.5)
         return self.extinction.at_world(p, active) * self.length(p)
 
     def length(self, p: mi.Point3f) -> mi.Float:
@@ -170,7 +171,7 @@ def direct_lights_of(
     surfaces, of points and suns, too. None in media that do not scatter isotropically,
     whose caches hold the irradiance of such lights apart from that of others.
     """
-    if medium.phase is not None or not dr.width(voxels):
+    if not medium.phase.is_isotropic or not dr.width(voxels):
         return []
     emitters = spot_lights(scene)
     if dense and medium.is_isolated:
@@ -214,7 +215,7 @@ def _past_others(
     scene: mi.Scene, medium: MediumGrid, p: mi.Point3f, target: mi.Point3f
 ) -> mi.Spectrum:
     """What surfaces and other media let through between ``p`` and ``target``."""
-    others = medium.surroundings.media.around(medium).without(medium)
+    others = Media.around(medium).without(medium)
     vertex = dr.zeros(mi.Interaction3f, dr.width(p))
     vertex.p = p
     rng = mi.PCG32(dr.width(p))
@@ -256,6 +257,7 @@ class DirectLightAlongRays:
         depth s0 to s0 + S, int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), however
         opaque that part is.
         """
+        # docs/primer, eq. (2.6)
         light, (a, b) = self._light, ends
         near, far = (extinction * (b - a) for extinction in sigma)
         at = self._parts(ray, a, b, 0.5 * (near + far))

@@ -1,4 +1,4 @@
-"""The file format of caches: an uncompressed npz with a description and digests."""
+"""File format of caches: an uncompressed npz with a description and digests."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from mitsuba_irrcache.errors import CacheFileError
 FORMAT = "mitsuba_irrcache 6"
 
 
-WITH_MOMENTS = "mitsuba_irrcache 7"  # of light by its direction
+WITH_MOMENTS = "mitsuba_irrcache 7"  # with angular moments of the radiance
 
 
-ARRAYS = ("active", "totals", "spreads")  # in a file, beside the description
+ARRAYS = ("active", "totals", "spreads")  # arrays of a file in addition to the description
 
 
-#: What a file may say at most: samples of a stream, and of a batch.
-MOST_SAMPLES, LARGEST_BATCH = 1 << 31, 1 << 16
+#: Upper limits for values read from a file: samples of a stream, and samples of a batch.
+MAX_SAMPLES, MAX_BATCH = 1 << 31, 1 << 16
 
 
 def unreadable(path: str | Path, error: Exception) -> CacheFileError:
-    """The error for a file that is not a cache, or a damaged one."""
+    """Return the error for a file that is damaged or not a cache."""
     return CacheFileError(
         f'"{path}" is not a readable irradiance cache ({error}); delete it or name another '
         "cache_file."
@@ -33,15 +33,15 @@ def unreadable(path: str | Path, error: Exception) -> CacheFileError:
 
 
 def samples_by_seed(description: dict) -> dict[int, int]:
-    """Samples by seed."""
+    """Read and validate the number of samples of each seed."""
     streams = {int(seed): int(n) for seed, n in description["streams"].items()}
-    if any(seed < 0 or not 0 <= n <= MOST_SAMPLES for seed, n in streams.items()):
-        raise ValueError(f"samples {streams}; a stream has 0 to {MOST_SAMPLES}")
+    if any(seed < 0 or not 0 <= n <= MAX_SAMPLES for seed, n in streams.items()):
+        raise ValueError(f"samples {streams}; a stream has 0 to {MAX_SAMPLES}")
     return streams
 
 
 def digest_of_arrays(arrays: dict[str, np.ndarray]) -> str:
-    """SHA-256 of the arrays of a file beside its description."""
+    """SHA-256 of all arrays of a file except its description."""
     sha = hashlib.sha256()
     for name in sorted(arrays.keys() - {"description"}):
         values = np.ascontiguousarray(arrays[name])
@@ -51,20 +51,21 @@ def digest_of_arrays(arrays: dict[str, np.ndarray]) -> str:
 
 
 def digest_of_description(description: dict) -> str:
-    """SHA-256 of all that a file says of itself."""
+    """SHA-256 of the description except its digest."""
     said = {key: value for key, value in description.items() if key != "digest"}
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def check_digest(description: dict) -> None:
-    """Raises ValueError unless a description is the one that was saved."""
+    """Raise ValueError if the description does not match its digest."""
     if digest_of_description(description) != description["digest"]:
         raise ValueError("its description is not the one that was saved")
 
 
 def read_arrays(path: Path, names: tuple[str, ...] = ARRAYS) -> dict[str, np.ndarray]:
-    """The description and some arrays of an uncompressed npz: a file cannot claim more memory than
-    it has bytes.
+    """Read the description and the named arrays of an npz.
+
+    Compressed files are rejected: the memory a file can claim is then limited by its size.
     """
     with zipfile.ZipFile(path) as archive:
         if any(info.compress_type != zipfile.ZIP_STORED for info in archive.infolist()):

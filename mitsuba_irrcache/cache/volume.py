@@ -1,6 +1,4 @@
-"""The irradiance cache: a camera-independent field with its statistics, kept, merged, saved and
-loaded.
-"""
+"""The irradiance cache: a camera-independent field with statistics, merging and files."""
 
 from __future__ import annotations
 
@@ -16,13 +14,14 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
-from mitsuba_irrcache.cache.conservative import conserving
+from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
 from mitsuba_irrcache.cache.direct_light import DirectLight
+from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation
 from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
 from mitsuba_irrcache.cache.storage import (
     ARRAYS,
     FORMAT,
-    LARGEST_BATCH,
+    MAX_BATCH,
     WITH_MOMENTS,
     check_digest,
     digest_of_arrays,
@@ -40,8 +39,8 @@ from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.scene.fingerprint import differing
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 
-#: Samples of a voxel come in batches of this many, spread evenly over directions. They are not
-#: independent of each other, the batches are: means and errors are statistics of batch means.
+#: Samples per batch. The samples of a batch are stratified and hence not independent, but batches
+#: are: means and errors are statistics of batch means.
 BATCH = 8
 
 
@@ -49,7 +48,7 @@ LAYERS = ("uncollided", "scattered")
 
 
 def _consistent(method: Callable) -> Callable:
-    """Lets a method of a cache see its sums and its number of samples as they belong together."""
+    """Decorate a method such that it sees consistent sums and numbers of samples."""
 
     @wraps(method)
     def call(self: IrradianceCache, *args: Any, **kwargs: Any) -> Any:
@@ -60,15 +59,15 @@ def _consistent(method: Callable) -> Callable:
 
 
 class IrradianceCache:
-    """Irradiance (fluence rate) Phi = int_S2 L dw [W m^-2, or the scene's unit of radiance times
-    sr] on a grid.
+    """Irradiance (fluence rate) Phi = int_S2 L dw on a grid.
 
-    It has two layers: ``uncollided`` (light straight from the emitters) and ``scattered`` (all
-    later orders, up to what ``max_depth`` admits: orders 0 .. max_depth - 2). Only ``active``
-    voxels, those that a lookup inside the medium can read, have values; the others are zero.
-    ``fingerprint`` maps each ingredient of the light (medium, boundary, emitters, settings) to a
-    digest.
+    The unit is W m^-2, or the scene's unit of radiance times sr. There are two layers:
+    ``uncollided`` (directly from emitters) and ``scattered`` (orders 1 to max_depth - 2). Only the
+    ``active`` voxels, those that a lookup inside the medium can read, have values; the others are
+    zero. ``fingerprint`` maps each input (medium, boundary, emitters, settings) to a digest.
     """
+
+    # docs/primer, eq. (1.4)
 
     def __init__(
         self,
@@ -80,10 +79,13 @@ class IrradianceCache:
         batch: int = BATCH,
         correlated: bool = False,
         moments: int = 0,
+        interpolation: Interpolation = PLAIN,
     ) -> None:
-        """``moments`` of the radiance are kept for each channel, where a medium is not isotropic;
-        see `angular`. ``correlated``: whether all voxels share their samples, and so their
-        errors. Such batches are few: sums are kept in float32 then, else in float64.
+        """Create an empty cache.
+
+        ``moments`` is the number of angular moments per channel (see `angular`), 0 for isotropic
+        scattering. ``correlated`` states that all voxels share their samples, and hence their
+        errors. Sums are then float32, because there are few batches, otherwise float64.
         """
         self._lock = RLock()
         self.grid = grid
@@ -94,29 +96,37 @@ class IrradianceCache:
         self.max_depth = max_depth
         self.fingerprint = fingerprint or {}
         self.moments = moments
-        #: what the moments are of
-        self.directional: AngularBasis | None = None
-        #: how the light of lamps nearby falls off; None where there are none
-        self.falloff: InverseSquareFactor | None = None
-        #: spot lights, whose irradiance camera rays look up apart; the layers hold its means
-        self.direct_lights: list[DirectLight] = []
-        #: where voxels lie among surfaces; None where there are none
-        self.survey: VoxelClasses | None = None
+        self.interpolation = interpolation
         #: samples taken per voxel from each random stream
         self.streams: dict[int, int] = {}
         self.correlated = correlated
         self.real = mi.Float if correlated else dr.float64_array_t(mi.Float)
-        # Sums of batch means for each layer and channel, and for each channel the sum of squared
-        # deviations of the batches' irradiance, both layers, from its mean. None stands for 0.
+        # Sums of batch means for each layer and channel; for each channel the sum of squared
+        # deviations of the batches' irradiance (both layers) from its mean. None stands for 0.
         self._totals: list = [None] * (len(LAYERS) * channels)
         self._spreads: list = [None] * channels
         # Sums of batch means for each moment and channel, in float32.
         self._moments: list = [None] * (moments * channels)
 
-    def lie_like(self, other: IrradianceCache) -> None:
-        """Takes over what is known of the place of ``other``, another cache of the same medium."""
-        self.directional, self.survey = other.directional, other.survey
-        self.falloff, self.direct_lights = other.falloff, other.direct_lights
+    @property
+    def directional(self) -> AngularBasis | None:
+        """See `Interpolation`."""
+        return self.interpolation.directional
+
+    @property
+    def falloff(self) -> InverseSquareFactor | None:
+        """See `Interpolation`."""
+        return self.interpolation.falloff
+
+    @property
+    def direct_lights(self) -> tuple[DirectLight, ...]:
+        """See `Interpolation`."""
+        return self.interpolation.direct_lights
+
+    @property
+    def voxel_classes(self) -> VoxelClasses | None:
+        """See `Interpolation`."""
+        return self.interpolation.voxel_classes
 
     # ------------------------------------------------------------------ statistics
 
@@ -146,9 +156,7 @@ class IrradianceCache:
     @property
     @_consistent
     def standard_error(self) -> mi.TensorXf:
-        """Standard error of ``irradiance``, (z, y, x, channel); NaN before there are two batches of
-        samples.
-        """
+        """Standard error of ``irradiance``, (z, y, x, channel); NaN with fewer than two batches."""
         variances = [self._variance(c) for c in range(self.channels)]
         return self._tensor(
             [
@@ -159,8 +167,10 @@ class IrradianceCache:
 
     @_consistent
     def mean_and_error(self) -> tuple[mi.Float, mi.Float]:
-        """Irradiance and its standard error at the active voxels, means over the channels (which
-        share their samples: their errors add). The error is 0 before there are two batches.
+        """Irradiance and its standard error at the active voxels, averaged over the channels.
+
+        Channels share their samples, so their errors add. The error is 0 with fewer than two
+        batches.
         """
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
         variances = [self._variance(c) for c in range(self.channels)]
@@ -170,8 +180,10 @@ class IrradianceCache:
     @property
     @_consistent
     def relative_error(self) -> float:
-        """Root mean square of the voxels' standard errors, in units of the mean irradiance; NaN
-        before there are two batches of samples. It falls as the root of the samples.
+        """Root mean square of the voxels' standard errors over the mean irradiance.
+
+        NaN with fewer than two batches. It is inversely proportional to the root of the number of
+        samples.
         """
         if self.samples < 2 * self.batch:
             return float("nan")
@@ -183,14 +195,14 @@ class IrradianceCache:
     @property
     @_consistent
     def is_finite(self) -> bool:
-        """Whether all light is a number in single precision."""
+        """Whether all values are finite in single precision."""
         pairs = zip(self._means(0), self._means(1), strict=True)
         finite = [dr.all(dr.isfinite(a + b)) for a, b in pairs]
         dr.eval(finite)
         return all(f[0] for f in finite)
 
     def _variance(self, channel: int):
-        """Squared standard error of the irradiance, None before there are two batches."""
+        """Squared standard error of the irradiance; None with fewer than two batches."""
         if self.samples < 2 * self.batch:
             return None
         n, spread = self._batch_count, self._spreads[channel]
@@ -198,18 +210,23 @@ class IrradianceCache:
 
     @_consistent
     def field(self) -> RootField:
-        """Phi for lookups, without `direct_lights`, and over the `falloff` if there is one: one
-        channel where all channels agree to the last bit. Its maximum is that of Phi, or more.
+        """Create the field for lookups of Phi.
+
+        It excludes `direct_lights` and is divided by the `falloff`, if any. It has one channel if
+        all channels are identical. Its ``maximum`` is an upper bound of Phi.
         """
         means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
         brightest = [dr.max(m)[0] for m in means] if self.direct_lights else []
         brightest += [light.maximum for light in self.direct_lights]
         for light in self.direct_lights:
             means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]
-        roots, variance = [dr.sqrt(m) for m in means], None
-        if not self.correlated:  # neighbours that err alike do no harm to interpolation
+        known, roots = marked(self.grid, self.active), [dr.sqrt(m) for m in means]
+        variance = share = None
+        if not self.correlated:  # errors shared by neighbours do not bias interpolation
             noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
-            roots = [r * root_correction(v) for r, v in zip(roots, noise, strict=True)]
+            share = share_of_noise(self.grid, self._tensor([sum(noise) / len(noise)]).array, known)
+            rest = 1 - dr.gather(mi.Float, share, self.active)
+            roots = [r * root_correction(v * rest) for r, v in zip(roots, noise, strict=True)]
         if all(dr.all(r == roots[0])[0] for r in roots[1:]):
             roots = roots[:1]
         channels = len(roots)
@@ -217,12 +234,11 @@ class IrradianceCache:
             smooth = dr.rsqrt(self.falloff.of_voxels(self.active))
             roots = [r * smooth for r in roots]
         values = self._tensor(roots).array
-        if self.correlated:
-            values = conserving(self.grid, values, marked(self.grid, self.active), channels)
-        else:  # it would enlarge the noise by more than it is worth
+        if not self.correlated:
             variance = self._tensor(noise[:channels]).array
-        if self.survey is not None:
-            values = self.survey.filled(values, channels)
+        values = conserving(self.grid, values, known, channels, share)
+        if self.voxel_classes is not None:
+            values = self.voxel_classes.filled(values, channels)
         field = RootField(self.grid, values, channels, variance)
         if self.falloff is not None:
             field.maximum *= self.falloff.maximum(self.active)
@@ -231,7 +247,7 @@ class IrradianceCache:
 
     @_consistent
     def directional_field(self, channels: int) -> AngularField | None:
-        """The moments for lookups, where there are any."""
+        """Create the field for lookups of the angular moments; None for isotropic scattering."""
         if not self.moments:
             return None
         n = mi.Float(self._batch_count)
@@ -244,11 +260,11 @@ class IrradianceCache:
         return AngularField(self.directional, self.grid, *scattered)
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
-        """Variance of the voxels over their squared mean, at most 1; 0 where it is not known."""
+        """Variance of the voxels over their squared mean, at most 1; 0 if unknown."""
         variance = self._variance(channel)
         if variance is None:
             return dr.zeros(mi.Float, dr.width(mean))
-        # Not the quotient of squares: these vanish for light of 1e-19 and less.
+        # Do not divide squares: they underflow for values below 1e-19.
         error = mi.Float(dr.sqrt(variance)) / dr.select(mean > 0, mean, 1)
         return dr.minimum(dr.square(error), 1)
 
@@ -259,12 +275,12 @@ class IrradianceCache:
 
     @property
     def _zeros(self):
-        """No light at the active voxels."""
+        """Zero at all active voxels."""
         return dr.zeros(self.real, max(self.active_count, 1))
 
     @property
     def _batch_count(self):
-        """Batches per voxel, at least 1; opaque, since it changes from pass to pass."""
+        """Number of batches per voxel, at least 1; opaque, because it changes from pass to pass."""
         return dr.opaque(self.real, max(self.samples // self.batch, 1))
 
     def _tensor(self, values: list[mi.Float]) -> mi.TensorXf:
@@ -279,11 +295,11 @@ class IrradianceCache:
 
     @_consistent
     def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
-        """Adds ``samples`` per voxel of the stream ``seed``.
+        """Add ``samples`` per voxel of the stream ``seed``.
 
-        For each block of voxels: the sums of batch means for each layer and channel, and for each
-        channel the squared deviations of the batches' irradiance from their mean. None stands for 0
-        in all blocks. Then the sums of batch means for each moment and channel, if there are any.
+        Each block of voxels consists of the sums of batch means for each layer and channel, the
+        squared deviations of the batches' irradiance from their mean for each channel (None, in all
+        blocks, stands for 0), and, if any, the sums of batch means for each moment and channel.
         """
         totals, spreads, *moments = (
             [concatenated(part) for part in zip(*parts, strict=True)]
@@ -292,7 +308,7 @@ class IrradianceCache:
         merged = self._merged(totals, spreads, samples // self.batch)
         moments = totals_of_pairs(self._moments, *moments) if moments else self._moments
         dr.eval(merged, moments)
-        # An interrupt comes before or after this line, never between the two.
+        # Assign in one statement, so that an interrupt cannot leave inconsistent sums.
         self._totals, self._spreads, self._moments, self.streams = (
             *merged,
             moments,
@@ -300,38 +316,39 @@ class IrradianceCache:
         )
 
     def _merged(self, totals: list, spreads: list, count: int) -> tuple[list, list]:
-        """Sums and spreads with those of ``count`` more batches (Chan et al.)."""
+        """Combine the sums with those of ``count`` more batches (Chan et al. 1979)."""
+        # docs/primer, eq. (3.5)
         known = self.samples // self.batch
         result = []
         for c, spread in enumerate(spreads):
             old, new = (total(t[c :: self.channels]) for t in (self._totals, totals))
             if known and (old is not None or new is not None):
                 n, more = (dr.opaque(self.real, k) for k in (known, count))
-                apart = (0 if old is None else old / n) - (0 if new is None else new / more)
-                spread = total([spread, dr.square(apart) * (n * more / (n + more))])
+                difference = (0 if old is None else old / n) - (0 if new is None else new / more)
+                spread = total([spread, dr.square(difference) * (n * more / (n + more))])
             result.append(total([self._spreads[c], spread]))
         return totals_of_pairs(self._totals, totals), result
 
     @_consistent
     def note_samples(self, seed: int, samples: int) -> None:
-        """Counts samples whose contribution is already in (or exactly zero)."""
+        """Count samples whose contribution has been added already or is exactly zero."""
         self.streams = self._streams_with(seed, samples)
 
     def _streams_with(self, seed: int, samples: int) -> dict[int, int]:
         return self.streams | {seed: self.streams.get(seed, 0) + samples}
 
     def merge(self, other: IrradianceCache) -> None:
-        """Adds the samples of ``other``, made with other seeds, perhaps elsewhere.
+        """Add the samples of ``other``, computed with other seeds.
 
-        Raises IrrcacheError if the two do not describe the same light, or share a seed.
+        Raises IrrcacheError if the caches belong to different scenes or share a seed.
         """
         for name in differing(self.fingerprint, other.fingerprint):
             raise IrrcacheError(
                 f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
             )
-        alike = ("max_depth", "channels", "batch", "correlated", "moments")
+        attributes = ("max_depth", "channels", "batch", "correlated", "moments")
         if self.grid.shape != other.grid.shape or any(
-            getattr(self, name) != getattr(other, name) for name in alike
+            getattr(self, name) != getattr(other, name) for name in attributes
         ):
             raise IrrcacheError(
                 f"IrradianceCache.merge: shape {self.grid.shape} with max_depth {self.max_depth} "
@@ -341,11 +358,11 @@ class IrradianceCache:
         common = sorted(self.streams.keys() & other.streams.keys())
         if common:
             raise IrrcacheError(
-                f"IrradianceCache.merge: both caches were made with cache_seed {common[0]}, so "
-                "their samples are the "
-                "same, not independent; make one of them with another cache_seed."
+                f"IrradianceCache.merge: both caches were computed with cache_seed {common[0]}, so "
+                "their samples are identical, not independent; compute one of them with "
+                "another cache_seed."
             )
-        with other._lock:  # one after the other: two caches may be merged into each other
+        with other._lock:  # never hold both locks: two threads may merge two caches into each other
             totals, spreads, moments = other._totals, other._spreads, other._moments
             streams = other.streams
         with self._lock:
@@ -357,8 +374,10 @@ class IrradianceCache:
     # ------------------------------------------------------------------ files
 
     @_consistent
-    def save(self, path: str | Path) -> None:
-        """Writes the cache with all its statistics; the file appears whole or not at all."""
+    def save(self, path: str | Path, fingerprint: dict[str, str] | None = None) -> None:
+        """Writes the cache with all its statistics; the file appears whole or not at all.
+        ``fingerprint`` takes the place of the cache's own.
+        """
         description = {
             "format": WITH_MOMENTS if self.moments else FORMAT,
             "shape": self.grid.shape,
@@ -369,7 +388,7 @@ class IrradianceCache:
             **({"moments": self.moments} if self.moments else {}),
             "max_depth": self.max_depth,
             "streams": {str(seed): n for seed, n in self.streams.items()},
-            "fingerprint": self.fingerprint,
+            "fingerprint": self.fingerprint if fingerprint is None else fingerprint,
         }
         arrays = {
             "active": np.array(self.active),
@@ -387,9 +406,9 @@ class IrradianceCache:
         return np.array([np.array(self._zeros if v is None else v, kind) for v in values])
 
     @classmethod
-    def load(cls, path: str | Path) -> IrradianceCache:
-        """Reads a cache that ``save`` wrote. Raises CacheFileError, naming the file, for anything
-        else.
+    def load(cls, path: str | Path, interpolation: Interpolation = PLAIN) -> IrradianceCache:
+        """Reads a cache that ``save`` wrote; a file does not hold its ``interpolation``. Raises
+        CacheFileError, naming the file, for anything else.
         """
         path = Path(path)
         try:
@@ -400,15 +419,18 @@ class IrradianceCache:
                     f'"{path}" has the format {description["format"]!r}, this version reads '
                     f"{FORMAT!r} and {WITH_MOMENTS!r}."
                 )
-            return cls._restore(description, arrays)
+            return cls._restore(description, arrays, interpolation)
         except CacheFileError:
             raise
-        except Exception as error:  # whatever a damaged file makes of itself
+        except Exception as error:  # a damaged file may cause any exception
             raise unreadable(path, error) from error
 
     @staticmethod
     def description_of(path: str | Path) -> tuple[dict[str, str], int]:
-        """Fingerprint of a file and its samples per voxel, without its arrays; raises as `load`."""
+        """Return the fingerprint of a file and its samples per voxel, without reading the arrays.
+
+        Raises the same errors as `load`.
+        """
         try:
             description = json.loads(read_arrays(Path(path), ())["description"].tobytes())
             check_digest(description)
@@ -417,7 +439,9 @@ class IrradianceCache:
             raise unreadable(path, error) from error
 
     @classmethod
-    def _restore(cls, description: dict, arrays: dict[str, np.ndarray]) -> IrradianceCache:
+    def _restore(
+        cls, description: dict, arrays: dict[str, np.ndarray], interpolation: Interpolation
+    ) -> IrradianceCache:
         grid = Grid(tuple(int(n) for n in description["shape"]), np.array(description["to_world"]))
         active, totals, spreads = (arrays[name] for name in ARRAYS)
         channels = int(description["channels"])
@@ -441,16 +465,16 @@ class IrradianceCache:
             raise ValueError(f"moments of shape {moments.shape} and type {moments.dtype}")
         largest = np.max([np.abs(v).max(initial=0) for v in (totals, spreads, moments)])
         if not largest < float(np.finfo(np.float32).max):  # NaN too
-            raise ValueError("it holds values that are not finite")
+            raise ValueError("it contains values that are not finite")
         if min(values.min(initial=0) for values in (totals, spreads)) < 0:
-            raise ValueError("it holds light that is negative")
+            raise ValueError("it contains negative values")
         streams, batch = samples_by_seed(description), int(description["batch"])
-        smallest, largest = (1, LARGEST_BATCH) if correlated else (BATCH, BATCH)
+        smallest, largest = (1, MAX_BATCH) if correlated else (BATCH, BATCH)
         if not smallest <= batch <= largest or any(n % batch for n in streams.values()):
             raise ValueError(f"samples {streams} in batches of {batch}")
         batches = sum(streams.values()) // batch
         if (batches < 1 and totals.any()) or (batches < 2 and spreads.any()):
-            raise ValueError(f"more light than {batches} batches of samples can have")
+            raise ValueError(f"non-zero sums, but only {batches} batches of samples")
         check_digest(description)
         if digest_of_arrays(arrays) != description["values"]:
             raise ValueError("its values are not those that were saved")
@@ -463,6 +487,7 @@ class IrradianceCache:
             batch,
             correlated,
             count,
+            interpolation,
         )
         cache._moments = [mi.Float(t) if t.any() else None for t in moments]
         cache.streams = streams
@@ -471,8 +496,9 @@ class IrradianceCache:
         return cache
 
     def export_vol(self, path: str | Path) -> None:
-        """Writes ``irradiance`` as a Mitsuba ``.vol`` file (float32, bounding box of the grid; a
-        rotation is lost).
+        """Write ``irradiance`` as a Mitsuba ``.vol`` file (float32, bounding box of the grid).
+
+        A rotation of the grid is lost.
         """
         from mitsuba_irrcache.io.mitsuba_vol import write_vol
 

@@ -15,8 +15,9 @@ from mitsuba_irrcache.machine.extras import missing_package
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit status (1: an error was printed, 130:
-    interrupted).
+    """Run the command line and return the exit status.
+
+    The status is 1 if an error was printed, and 130 after an interrupt.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if any("\0" in argument for argument in arguments):
@@ -32,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message = str(missing)
     except (IrrcacheError, OSError) as error:
         message = str(error)
-    except (KeyboardInterrupt, RuntimeError) as error:  # the latter is how Mitsuba reports both
+    except (KeyboardInterrupt, RuntimeError) as error:  # Mitsuba reports interrupts as errors
         if isinstance(origin(error), KeyboardInterrupt):
             what_is_left = f"; {origin(error)}" if str(origin(error)) else ""
             print(f"irrcache: interrupted{what_is_left}", file=sys.stderr)
@@ -43,11 +44,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def command() -> NoReturn:
-    """`main` as a process, which ends at once: all that it has goes back to the system, and to look
-    for garbage in it first takes a tenth of a second.
+    """Run `main` as a process that ends at once.
+
+    Python's finalisation is skipped: searching for garbage takes a tenth of a second, and the
+    operating system frees all memory anyway.
     """
     status = main()
-    with suppress(OSError):  # what cannot be written is reported by the usual end
+    with suppress(OSError):  # errors while flushing are reported by Python's regular finalisation
         for stream in (sys.stdout, sys.stderr):
             if stream is not None:
                 stream.flush()
@@ -55,26 +58,27 @@ def command() -> NoReturn:
     sys.exit(status)
 
 
-#: Name, module, description and extra of each command; the extra has all packages that it needs.
+#: Name, module, description and extra of each command; the extra installs all packages it needs.
 COMMANDS = (
     ("render", "cli.render", "render a scene with irrcache", ""),
-    ("view", "view.command", "look at a scene or a volume in the browser", "view"),
-    ("compare", "compare.command", "measure error against time of any integrators", "compare"),
-    ("import", "volumes.importer", "make a scene of a CT, MR or other volume", "volumes"),
+    ("view", "view.command", "display a scene or a volume in the browser", "view"),
+    ("compare", "compare.command", "compare integrators: error against time", "compare"),
+    ("import", "volumes.importer", "convert a CT, MR or other volume to a scene", "volumes"),
     ("doctor", "machine.doctor", "check this machine and say what to install", ""),
 )
 
 
 def _missing_package(error: ModuleNotFoundError, arguments: Sequence[str]) -> Exception | None:
-    """What to say where an import failed below a command; None if no package is to be installed."""
+    """Return a message about a missing package, or None if no extra provides it."""
     extra = {name: extra for name, _, _, extra in COMMANDS}
     name = arguments[0] if arguments and arguments[0] in extra else ""
     return missing_package(error, f"irrcache {name}".strip(), extra.get(name, ""))
 
 
 def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser of these arguments: it imports no command but the one they name, since what each
-    needs takes a while.
+    """Return the parser of these arguments.
+
+    Only the command that they name is imported, since each takes time to import.
     """
     parser = argparse.ArgumentParser(
         prog="irrcache", description="Irradiance caching for participating media in Mitsuba 3."

@@ -1,4 +1,4 @@
-"""``irrcache render``: a scene file to an EXR and a PNG."""
+"""``irrcache render``: render a scene file to an EXR and a PNG."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import SUPPORTED
 from mitsuba_irrcache.pipeline.progressive import Frame, render_progressive
 
-#: Stock integrators that ``irrcache`` stands in for when a scene names one of them.
+#: Stock integrators that ``irrcache`` replaces when a scene uses one of them.
 REPLACED = ("path", "volpath", "volpathmis", "prbvolpath")
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """What it takes to load a scene: the variant, and its parameters."""
+    """Declare the options for loading a scene: the variant and the scene's parameters."""
     parser.add_argument(
         "-m",
         "--mode",
@@ -50,7 +50,7 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``irrcache render``: those of the ``mitsuba`` command where it has them."""
+    """Declare the options of ``irrcache render``, named as those of ``mitsuba``."""
     parser.add_argument("scene", help="scene XML")
     parser.add_argument("-o", "--output", help="EXR to write (default: beside the scene)")
     add_scene_options(parser)
@@ -72,18 +72,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--budget", type=float, metavar="SECONDS",
-        help="refine the cache and render again and again, for so many seconds once the scene is "
+        help="refine the cache and render repeatedly for this many seconds after the scene is "
         "loaded; Ctrl-C ends it earlier",
     )  # fmt: skip
     parser.add_argument(
         "--error", type=float, metavar="E",
-        help="refine until the standard error of the cache is this part of its mean, e.g. 0.02",
+        help="refine until the relative standard error of the cache is this, e.g. 0.02",
     )  # fmt: skip
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Renders, and prints where the time went."""
+    """Render, and print the time of each stage."""
     source = check_scene_file(args.scene)
     output = check_output(args.output or source.with_suffix(".exr"))
     if args.spp < 0:
@@ -126,7 +126,7 @@ def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]
             image = mi.render(scene, sensor=args.sensor, seed=args.seed, spp=args.spp)
             dr.sync_thread()
     except (KeyboardInterrupt, RuntimeError) as error:
-        _say_what_is_left(error, "no image was written")
+        _add_message_to_interrupt(error, "no image was written")
         raise
     return np.array(image)
 
@@ -134,7 +134,7 @@ def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]
 def _render_progressive(
     scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], output: Path
 ) -> None:
-    """Writes the last image there is, whether the run reaches its end or is stopped."""
+    """Render progressively and write the last image, also if the run is interrupted."""
     frame = None
     targets = {"seconds": args.budget or math.inf, "standard_error": args.error or 0.0}
     try:
@@ -149,7 +149,7 @@ def _render_progressive(
                 tqdm.write(f"{frame.elapsed:8.2f} s  {_reached(frame)}")
     except (KeyboardInterrupt, RuntimeError) as error:
         left = f"the image of {_reached(frame)} was written" if frame else "no image was written"
-        _say_what_is_left(error, left)
+        _add_message_to_interrupt(error, left)
         raise
     finally:
         if frame is not None:
@@ -158,8 +158,8 @@ def _render_progressive(
             _write(output, np.array(frame.image), scene, about, seconds)
 
 
-def _say_what_is_left(error: BaseException, left: str) -> None:
-    """Gives an interrupt a message; other errors have one."""
+def _add_message_to_interrupt(error: BaseException, left: str) -> None:
+    """Add a message about the written image to an interrupt, which has none of its own."""
     if isinstance(origin(error), KeyboardInterrupt):
         raise KeyboardInterrupt(left) from None
 
@@ -185,7 +185,7 @@ def _write(
 
 @contextmanager
 def _terminated_like_interrupted():
-    """A request to terminate ends the block as Ctrl-C does."""
+    """Treat a request to terminate like Ctrl-C within this context."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -195,7 +195,7 @@ def _terminated_like_interrupted():
 
 @contextmanager
 def progress_bar(integrator: mi.Integrator):
-    """Shows the growth of the cache on a terminal, once it takes longer than a second."""
+    """Show the progress of the cache on a terminal if it takes longer than a second."""
     with tqdm(unit="sample", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
 
         def advance(stage: str, done: int, total: int) -> None:
@@ -220,7 +220,7 @@ def _stopwatch(seconds: dict[str, float], name: str):
 def _check_targets(args: argparse.Namespace) -> None:
     for name, value, wanted in (
         ("budget", args.budget, "a number of seconds"),
-        ("error", args.error, "a part of the mean, for example 0.02,"),
+        ("error", args.error, "a relative error, for example 0.02,"),
     ):
         if value is not None and not 0 < value < math.inf:
             raise IrrcacheError(f"--{name} is {value:g}; it must be {wanted} above 0.")
@@ -237,8 +237,9 @@ def _require_progressive(scene: mi.Scene, integrator: str) -> None:
 def _describe(
     scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], samples: int = 0
 ) -> dict[str, object]:
-    """What made the image, for the header of the EXR; ``samples`` per voxel of the cache that it
-    shows, if it is not the cache as it is now.
+    """Describe how the image was made, for the header of the EXR.
+
+    ``samples`` are those per voxel of the cache that the image shows; None: those of the cache now.
     """
     described = {
         "version": __version__,

@@ -1,5 +1,5 @@
-"""Comparing integrators on one scene: error against time, with a reference whose noise drops out.
+"""Comparison of integrators on one scene: error against time, net of the reference's noise.
 
-Integrators are known by plugin name only. Every integrator runs in a process of its own (`worker`),
-which leaves images and times in the report's folder; the rest reads those.
+Integrators are known by plugin name only. Each runs in a process of its own (`worker`), which
+writes images and times to the report's folder; the other modules read them from there.
 """

@@ -1,8 +1,9 @@
-"""``irrcache compare``: how fast integrators get rid of their error on your scene.
+"""``irrcache compare``: error against rendering time of several integrators on one scene.
 
-Any integrators of Mitsuba, stock or not; each runs in a process of its own and is measured against
-a reference that is rendered once and kept. Any of them may be given ``filter=bilateral``: one that
-knows no such property has its images filtered here, as a fair opponent of one that does.
+Any integrators of Mitsuba can be compared, stock or not. Each runs in a process of its own and is
+measured against a reference that is rendered once and stored. ``filter=bilateral`` is accepted for
+any integrator: if a plugin has no such property, its images are filtered here, so that it competes
+on equal terms with integrators that have a filter.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ from .results import Measurement, file_name
 from .summary import maximum_depths
 
 DEFAULT_REFERENCE = "volpath"
-#: Seconds spent on the reference for every second of the longest budget, unless told otherwise.
+#: Default time for the reference in units of the longest budget.
 REFERENCE_SHARE = 4
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``irrcache compare``."""
+    """Declare the options of ``irrcache compare``."""
     add = parser.add_argument
     add("scene", help="scene XML")
     add(
@@ -69,24 +70,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add(
         "--references", type=Path, default=None, metavar="FOLDER",
-        help="where references are kept (default: irrcache/references in your cache folder)",
+        help="folder of the references (default: irrcache/references in your cache folder)",
     )  # fmt: skip
     add(
         "--exposure",
         type=finite,
         default=0.0,
         metavar="EV",
-        help="brightness of the pictures, stops",
+        help="exposure of the displayed images in stops",
     )
     add(
         "--import", dest="modules", action="append", default=[], metavar="MODULE",
-        help="Python module that registers integrators of others; repeatable",
+        help="Python module that registers third-party integrators; repeatable",
     )  # fmt: skip
-    add("--overwrite", action="store_true", help="replace a report that is in the folder")
+    add("--overwrite", action="store_true", help="replace an existing report in the folder")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measures, writes the report and prints the tables; 1 if an integrator failed."""
+    """Measure, write the report and print the tables; return 1 if an integrator failed."""
     require("matplotlib", "compare", "irrcache compare")
     job, budgets = _common_job(args), _budgets(args.budget)
     integrators = _integrators(args)
@@ -121,7 +122,10 @@ def run(args: argparse.Namespace) -> int:
 def _measure(
     job: dict, integrator: str, name: str, budgets: list[float], folder: Path
 ) -> Measurement:
-    """One integrator: a cold process with all its budgets, then one that finds its kernels."""
+    """Measure one integrator in two processes: with an empty and a filled kernel cache.
+
+    The first process renders all budgets.
+    """
     result = folder / "measurements" / f"{name}.json"
     log = folder / "logs" / f"{name}.txt"
     own = job | {"integrator": integrator, "name": name, "budgets": budgets}
@@ -146,7 +150,7 @@ def _measure(
 
 
 def _kept(folder: Path, name: str, integrator: str, why: str) -> list[Measurement]:
-    """What an integrator had finished when something ended it."""
+    """Return what an integrator had finished when an error ended its process."""
     result = folder / "measurements" / f"{name}.json"
     measurement = Measurement.load(result) if result.exists() else Measurement(integrator, name)
     measurement.error = why
@@ -212,7 +216,7 @@ def _facts(args: argparse.Namespace, reference: Reference, checked: dict) -> dic
 
 
 def _scene_name(args: argparse.Namespace) -> str:
-    """The file with its folder: many scenes are called scene.xml."""
+    """Return the file name with its folder, since many scenes are called scene.xml."""
     return "/".join(Path(args.scene).resolve().parts[-2:])
 
 
@@ -249,7 +253,7 @@ def _budgets(text: str) -> list[float]:
 
 
 def _check_folder(folder: Path, overwrite: bool) -> Path:
-    """The folder for the report, before any work is done for it."""
+    """Check the folder for the report before any rendering starts."""
     if folder.exists() and not folder.is_dir():
         raise IrrcacheError(f'-o "{folder}" is a file; name a folder.')
     if not folder.resolve().parent.is_dir():
@@ -261,13 +265,13 @@ def _check_folder(folder: Path, overwrite: bool) -> Path:
             )
         if not overwrite:
             raise IrrcacheError(
-                f'"{folder}" holds a report already; name another folder, or add --overwrite.'
+                f'"{folder}" already holds a report; name another folder, or add --overwrite.'
             )
     return folder
 
 
 def _make_folders(folder: Path) -> None:
-    """An empty folder with its sub-folders; only what a former report put there is removed."""
+    """Create the empty report folders; only files of a former report are removed."""
     folder.mkdir(exist_ok=True)
     for name in ("results.json", "results.csv", "report.html"):
         (folder / name).unlink(missing_ok=True)
@@ -278,7 +282,7 @@ def _make_folders(folder: Path) -> None:
 
 
 def _now_and_then(name: str) -> Callable[[str], None]:
-    """Prints lines of progress, a few seconds apart."""
+    """Print lines of progress, at most one every few seconds."""
     printed = time.monotonic()
 
     def report(line: str) -> None:

@@ -1,7 +1,7 @@
-"""Errors of an image against a reference that was rendered in two independent halves a and b.
+"""Errors of an image against a reference that consists of two independent halves a and b.
 
-The halves' noise is independent of the image and of each other, so it drops out of products such as
-(x - a)(x - b). Images are arrays (height, width, channel) of linear radiance.
+The halves' noise is independent of the image and of each other, so its expectation vanishes in
+products such as (x - a)(x - b). Images are arrays (height, width, channel) of linear radiance.
 """
 
 from __future__ import annotations
@@ -10,26 +10,28 @@ import numpy as np
 
 
 def colours(image: np.ndarray) -> np.ndarray:
-    """The colour channels of an image (height, width, channel), without alpha and AOVs."""
+    """Return the colour channels of an image (height, width, channel), without alpha and AOVs."""
     return image[..., : 3 if image.shape[-1] >= 3 else 1]
 
 
 def net_mse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """Mean square error without the reference's noise, mean((x - a)(x - b)), and the standard error
-    of this estimate if pixels are independent.
+    """Return the mean square error without the reference's noise, mean((x - a)(x - b)).
+
+    The second value is the standard error of this estimate for independent pixels.
     """
     products = np.multiply(image - a, image - b, dtype=np.float64)
     return float(products.mean()), float(products.std() / np.sqrt(products.size))
 
 
 def net_rmse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Root mean square error without the reference's noise: sqrt(mean((x - a)(x - b)))."""
+    """Return the RMSE without the reference's noise, sqrt(mean((x - a)(x - b)))."""
     return _root(net_mse(image, a, b)[0])
 
 
 def relative_mse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Mean of (x - a)(x - b) / (r^2 + 0.01 mean(r)^2) with the reference r = (a + b) / 2: errors in
-    dark pixels weigh as much as in bright ones.
+    """Return the mean of (x - a)(x - b) / (r^2 + 0.01 mean(r)^2), where r = (a + b) / 2.
+
+    Errors in dark pixels have the same weight as errors in bright ones.
     """
     r = 0.5 * (np.asarray(a, dtype=np.float64) + b)
     floor = 0.01 * r.mean() ** 2 or 1.0
@@ -37,13 +39,15 @@ def relative_mse(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
 
 
 def mean_error(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Mean signed error: what is left when all noise is averaged out."""
+    """Return the mean signed error: the bias, to which noise does not contribute in expectation."""
     return float(np.mean(image - 0.5 * (a + b), dtype=np.float64))
 
 
 def mean_error_uncertainty(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Standard error of `mean_error`, from the spread of the means over about 64 blocks: the errors
-    of nearby pixels may be correlated, as those of a cache and of a filter are.
+    """Return the standard error of `mean_error`.
+
+    It is estimated from the spread of the means over about 64 blocks, because the errors of nearby
+    pixels may be correlated, for example by a cache or a filter.
     """
     size = max(1, min(image.shape[:2]) // 8)
     means = block_means(image - 0.5 * (a + b), size).mean(axis=-1)
@@ -51,10 +55,9 @@ def mean_error_uncertainty(image: np.ndarray, a: np.ndarray, b: np.ndarray) -> f
 
 
 def block_error(image: np.ndarray, a: np.ndarray, b: np.ndarray, size: int = 8) -> float:
-    """Net RMSE of the means over blocks of ``size`` x ``size`` pixels: what the eye sees as
-    blotches and bands.
+    """Return the net RMSE of means over blocks of ``size`` x ``size`` pixels.
 
-    NaN for an image smaller than a block.
+    It measures blotches and bands. NaN for an image smaller than a block.
     """
     if min(image.shape[:2]) < size:
         return float("nan")
@@ -62,24 +65,22 @@ def block_error(image: np.ndarray, a: np.ndarray, b: np.ndarray, size: int = 8) 
 
 
 def discretisation_error(x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """What two independent runs x and y of one method have in common: its error without its
-    noise.
-    """
+    """Return the error common to two independent runs x and y, without their noise."""
     return _root(np.mean((x - a) * (y - b), dtype=np.float64))
 
 
 def noise(x: np.ndarray, y: np.ndarray) -> float:
-    """Standard deviation of one run, from two independent ones."""
+    """Return the standard deviation of one run, estimated from two independent ones."""
     return _root(0.5 * np.mean((x - y) ** 2, dtype=np.float64))
 
 
 def block_means(image: np.ndarray, size: int) -> np.ndarray:
-    """Means over blocks; what does not fill a block at the right and bottom is left out."""
+    """Return means over blocks; incomplete blocks at the right and bottom are ignored."""
     height, width = (n // size for n in image.shape[:2])
     cropped = np.asarray(image, dtype=np.float64)[: height * size, : width * size]
     return cropped.reshape(height, size, width, size, -1).mean(axis=(1, 3))
 
 
 def _root(value: float) -> float:
-    """Square root that keeps the sign: an estimate of a vanishing square may be negative."""
+    """Return the square root with the sign of x: the estimate of a small square may be negative."""
     return float(np.copysign(np.sqrt(abs(value)), value))

@@ -1,4 +1,4 @@
-"""From measurements to what people and programs read: JSON, CSV, figures, images, the report."""
+"""Output of the measurements as JSON, CSV, figures, images and a report."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .tables import Table, equal_error_table, equal_time_table, metrics_table, s
 
 @dataclass
 class Comparison:
-    """All that was measured on one scene."""
+    """All measurements on one scene."""
 
     title: str
     budgets: list[float]
@@ -36,7 +36,7 @@ class Comparison:
 
 
 def write_output(comparison: Comparison, folder: Path) -> list[Table]:
-    """Fills ``folder``: results.json, results.csv, report.html, figures/, images/.
+    """Write results.json, results.csv, report.html, figures/ and images/ to ``folder``.
 
     Returns the tables for the terminal.
     """
@@ -81,10 +81,10 @@ def _sections(
     plots.stages(files["stages"], measured)
     equal_time, equal_error, stages = tables
     captions = {
-        "error": "Error against time. Hollow: smaller than what the reference can resolve.",
-        "strip": "The pictures, as a display shows them.",
-        "differences": "Signed difference to the reference, whose own noise shows in it.",
-        "blocks": "The same, averaged over 8 × 8 pixels: noise fades, what stays is blotches, "
+        "error": "Error against time. Hollow: below the resolution of the reference.",
+        "strip": "The tone-mapped images.",
+        "differences": "Signed difference to the reference, including the reference's own noise.",
+        "blocks": "The same, averaged over 8 × 8 pixels: less noise, hence visible blotches, "
         "bands and bias.",
         "stages": "Seconds to a first image, by stage.",
         "metrics": "Other measures of error against seconds.",
@@ -95,8 +95,8 @@ def _sections(
         Section("Error after equal time", [equal_time]),
         Section("Time to equal error", [equal_error]),
         Section("Pictures", [figure["strip"]]),
-        Section("Where they are wrong", [figure["differences"], figure["blocks"]]),
-        Section("Where the time goes", [figure["stages"], stages]),
+        Section("Signed errors", [figure["differences"], figure["blocks"]]),
+        Section("Time by stage", [figure["stages"], stages]),
         Section("All errors", [figure["metrics"], metrics_table(rows)]),
     ]
 
@@ -125,12 +125,12 @@ def _record(comparison: Comparison, rows: list[dict]) -> dict:
     }
 
 
-#: Columns of a row that say what was measured rather than how wrong it is.
+#: Columns of a row that describe the measurement; the others are errors.
 _OWN_COLUMNS = ("integrator", "budget", "spp", "note", "image")
 
 
 def _plain(value: object) -> object:
-    """NaN and infinity have no place in JSON."""
+    """Replace NaN and infinity, which JSON does not have, by None."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 

@@ -1,7 +1,7 @@
-"""Errors of the picture that a display shows: sRGB in [0, 1], colour difference, FLIP, OpenImageIO.
+"""Errors of the tone-mapped image: sRGB in [0, 1], colour difference, FLIP, OpenImageIO.
 
-Unlike those in `metrics` they need one reference image and include its noise, but for
-`display_rmse`.
+Except for `display_rmse` they compare with one reference image and include its noise, unlike the
+errors in `metrics`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from .metrics import net_rmse
 
 
 def display(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
-    """The picture on a display: sRGB values in [0, 1] of linear radiance times 2^``exposure``.
+    """Return sRGB values in [0, 1] of linear radiance times 2^``exposure``.
 
-    Returns (height, width, 3), float32; a grey image is repeated.
+    The result is float32 (height, width, 3); a grey image is repeated in all channels.
     """
     clipped = np.clip(image * 2.0**exposure, 0, 1).astype(np.float32)
     srgb = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
@@ -25,15 +25,13 @@ def display(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
 
 
 def display_rmse(image: np.ndarray, a: np.ndarray, b: np.ndarray, exposure: float = 0.0) -> float:
-    """RMSE of the displayed pictures in [0, 1], the paper's measure, net of the reference's
-    noise.
-    """
+    """Return the net RMSE of sRGB values in [0, 1], the measure of the paper."""
     return net_rmse(*(np.float64(display(x, exposure)) for x in (image, a, b)))
 
 
 def ciede2000(image: np.ndarray, reference: np.ndarray, exposure: float = 0.0) -> np.ndarray:
-    """CIEDE2000 colour difference of every pixel (height, width); about 1 is just noticeable."""
-    with warnings.catch_warnings():  # colour-science warns of each optional package it lacks
+    """Return the CIEDE2000 difference of each pixel (height, width); 1 is just noticeable."""
+    with warnings.catch_warnings():  # colour-science warns of each missing optional package
         warnings.simplefilter("ignore")
         import colour
 
@@ -44,9 +42,9 @@ def ciede2000(image: np.ndarray, reference: np.ndarray, exposure: float = 0.0) -
 
 
 def flip(image: np.ndarray, reference: np.ndarray, exposure: float = 0.0) -> float | None:
-    """Mean FLIP (NVIDIA's difference between alternating pictures, 0 to 1) at 67 pixels per degree.
+    """Return the mean FLIP (perceptual difference, 0 to 1) at 67 pixels per degree.
 
-    None where the package flip-evaluator is not installed.
+    None if the package flip-evaluator is not installed.
     """
     try:
         import flip_evaluator
@@ -57,7 +55,7 @@ def flip(image: np.ndarray, reference: np.ndarray, exposure: float = 0.0) -> flo
 
 
 def openimageio(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """OpenImageIO's comparison in linear radiance: mean, RMS and largest error, and PSNR in dB."""
+    """Compare in linear radiance with OpenImageIO: mean, RMS and maximum error, and PSNR in dB."""
     buffers = [oiio.ImageBuf(np.ascontiguousarray(x, np.float32)) for x in (image, reference)]
     result = oiio.ImageBufAlgo.compare(*buffers, 0.0, 0.0)
     return {

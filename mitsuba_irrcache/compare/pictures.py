@@ -1,4 +1,4 @@
-"""Strips of images: what each integrator shows after each budget, and where it is wrong."""
+"""Strips of images: the image of each integrator after each budget, and its signed error."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from .perceptual import display
 from .reference import Reference
 from .results import Measurement, Snapshot
 
-#: Columns of a strip beside the reference.
+#: Number of columns of a strip besides the reference.
 MOST_COLUMNS = 5
 
 
 def strip(
     path: Path, measurements: list[Measurement], reference: Reference, folder: Path, exposure: float
 ) -> None:
-    """The pictures as a display shows them, the reference on the right."""
+    """Draw a strip of tone-mapped images, with the reference on the right."""
     shown = [m for m in measurements if m.snapshots]
     budgets = _columns(shown)
     size = _size(reference.a.shape, len(budgets) + 1, len(shown))
@@ -44,8 +44,9 @@ def strip(
 def differences(
     path: Path, measurements: list[Measurement], reference: Reference, folder: Path, block: int = 1
 ) -> None:
-    """Signed errors, averaged over the channels and over blocks of ``block`` x ``block`` pixels, in
-    % of the mean radiance of the reference, all on one scale.
+    """Draw a strip of signed errors, averaged over channels and square blocks of pixels.
+
+    They are in % of the mean radiance of the reference, with one colour scale for all.
     """
     shown = [m for m in measurements if m.snapshots]
     budgets = _columns(shown)
@@ -79,7 +80,7 @@ def _signed_error(image: np.ndarray, truth: np.ndarray, block: int) -> np.ndarra
 
 
 def _columns(measurements: list[Measurement]) -> list[float]:
-    """The budgets to show: all, or some evenly spaced ones with the first and the last."""
+    """Return the budgets to show: all, or evenly spaced ones including the first and the last."""
     budgets = sorted({s.budget for m in measurements for s in m.snapshots})
     picked = np.linspace(0, len(budgets) - 1, min(len(budgets), MOST_COLUMNS)).round().astype(int)
     return [budgets[i] for i in picked]
@@ -90,7 +91,7 @@ def _snapshot(measurement: Measurement, budget: float) -> Snapshot | None:
 
 
 def _size(shape: tuple[int, ...], columns: int, rows: int) -> tuple[float, float]:
-    """Inches, such that a picture is about 1.9 wide, plus room for labels."""
+    """Return the figure size in inches for images about 1.9 wide, plus space for labels."""
     width = 1.9
     return columns * (width + 0.1) + 0.5, rows * (width * shape[0] / shape[1] + 0.35) + 0.2
 
@@ -107,7 +108,7 @@ def _label(row: np.ndarray, measurement: Measurement) -> None:
 
 
 def _empty(ax: Axes, budget: float, shape: tuple[int, ...]) -> None:
-    ax.imshow(np.ones((*shape[:2], 3)))  # takes the room of a picture
+    ax.imshow(np.ones((*shape[:2], 3)))  # occupies the space of an image
     ax.text(
         0.5, 0.5, "no image\nyet", transform=ax.transAxes, ha="center", va="center",
         color=style.GREY, fontsize=8,

@@ -1,4 +1,4 @@
-"""Curves and bars of a comparison."""
+"""Curves and bar charts of a comparison."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .scores import METRICS
 from .summary import Curve
 from .tables import STAGES
 
-#: Errors beside RMSE that are drawn against time.
+#: Errors other than RMSE that are plotted against time.
 SMALL = ("relative_mse", "display_rmse", "block_rmse", "ciede2000", "flip")
 
 STAGE_COLOURS = dict(
@@ -23,7 +23,7 @@ STAGE_COLOURS = dict(
 
 
 def error_over_time(path: Path, curves: list[Curve], noise: float) -> None:
-    """RMSE against seconds, both logarithmic, with the slope of Monte Carlo noise."""
+    """Plot RMSE against seconds, both logarithmic, with the slope of Monte Carlo noise."""
     with style.figure(path, figsize=(6.6, 4.0)) as (_, axes):
         ax = axes[0, 0]
         for index, curve in enumerate(curves):
@@ -48,7 +48,7 @@ def error_over_time(path: Path, curves: list[Curve], noise: float) -> None:
 
 
 def small_multiples(path: Path, rows: list[dict]) -> None:
-    """The other errors against seconds, a panel each."""
+    """Plot the other errors against seconds, one panel each."""
     names = [n for n in SMALL if any(_drawable(row[n]) for row in rows)]
     integrators = list(dict.fromkeys(row["integrator"] for row in rows))
     columns = 3
@@ -76,7 +76,7 @@ def small_multiples(path: Path, rows: list[dict]) -> None:
 
 
 def stages(path: Path, measurements: list[Measurement]) -> None:
-    """Bars of the seconds to a first image: cold, and with compiled kernels."""
+    """Plot the seconds to a first image by stage: cold, and with compiled kernels."""
     bars = [
         (f"{m.integrator}\n{label}", values)
         for m in measurements
@@ -99,7 +99,7 @@ def stages(path: Path, measurements: list[Measurement]) -> None:
 
 
 def _noise_slope(ax: Axes, curves: list[Curve]) -> None:
-    """A guide that falls as the square root of time, through the worst first point."""
+    """Draw a line proportional to 1 / sqrt(time) through the first point with the largest error."""
     starts = [(c.seconds[0], c.shown[0]) for c in curves if len(c.seconds)]
     end = max((c.seconds[-1] for c in curves if len(c.seconds)), default=0)
     if not starts:
@@ -120,7 +120,7 @@ def _logarithmic(ax: Axes) -> None:
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         low, high = axis.get_view_interval()
-        if high < 100 * low:  # too short for powers of ten to tell the scale
+        if high < 100 * low:  # an axis too short for two powers of ten needs more labels
             axis.set_minor_formatter(FuncFormatter(_minor_label))
         else:
             axis.set_minor_formatter(NullFormatter())

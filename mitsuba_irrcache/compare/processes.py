@@ -1,4 +1,4 @@
-"""Running workers: one process per job, so that a crash ends one job only."""
+"""Worker processes, one per job, so that a crash ends one job only."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pathlib import Path
 
 from mitsuba_irrcache.errors import IrrcacheError
 
-#: Dr.Jit keeps compiled kernels in the folder that this variable names.
+#: Environment variable with the folder of Dr.Jit's compiled kernels.
 KERNEL_CACHE = "DRJIT_CACHE_DIR"
 
 
 class WorkerError(IrrcacheError):
-    """A worker that did not finish its job; the message says why."""
+    """A worker process that failed; the message says why."""
 
 
 def run_job(
@@ -30,18 +30,18 @@ def run_job(
     kernels: Path | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict:
-    """Runs one job in a process of its own and returns the JSON that it left in ``result``.
+    """Run one job in a process of its own and return the JSON that it wrote to ``result``.
 
     Args:
         kind: one of `worker.KINDS`.
-        job: what the worker needs to know, JSON-serialisable.
+        job: the arguments of the job, JSON-serialisable.
         result: file that the worker writes.
-        log: file for what the worker says on standard error; removed if it is empty.
+        log: file for the worker's standard error; removed if it is empty.
         kernels: folder for compiled kernels; None for the user's own.
         report: called with each line of progress.
 
     Raises:
-        WorkerError: the worker failed or was killed; what it had finished is in ``result``.
+        WorkerError: the worker failed or was killed; its finished results are in ``result``.
     """
     environment = dict(os.environ)
     if kernels is not None:

@@ -1,4 +1,4 @@
-"""References in two independent halves, rendered once and kept on disk."""
+"""References in two independent halves, rendered once and stored on disk."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ from .scene_files import scene_digest
 
 #: Samples per pixel of one launch.
 CHUNK = 32
-#: Seconds after which an unfinished reference is put on disk, so that little is lost.
+#: Interval in seconds at which an unfinished reference is saved.
 SAVE_INTERVAL = 20.0
 
 
 @dataclass
 class Reference:
-    """Two independent images a and b (height, width, channel), float64, of ``spp`` samples per
-    pixel each, that took ``seconds`` together.
+    """Two independent images a and b (height, width, channel), float64.
+
+    Each has ``spp`` samples per pixel; both together took ``seconds``.
     """
 
     a: np.ndarray
@@ -37,23 +38,23 @@ class Reference:
 
     @property
     def mean(self) -> np.ndarray:
-        """The best estimate of the truth."""
+        """Return the mean of both halves."""
         return 0.5 * (self.a + self.b)
 
     @classmethod
     def load(cls, path: Path) -> Reference:
-        """Reads what `save` wrote."""
+        """Read a reference that `save` wrote."""
         with np.load(path, allow_pickle=False) as stored:
             return cls(stored["a"], stored["b"], int(stored["spp"]), float(stored["seconds"]))
 
     def save(self, path: Path) -> None:
-        """Writes an .npz, whole or not at all."""
+        """Write an .npz atomically."""
         with atomic_write(path) as file:
             np.savez(file, a=self.a, b=self.b, spp=self.spp, seconds=self.seconds)
 
 
 def default_folder() -> Path:
-    """Where references are kept: irrcache/references in the user's folder for caches."""
+    """Return the default folder: irrcache/references in the user's cache folder."""
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
     return Path(base or Path.home() / ".cache") / "irrcache" / "references"
 
@@ -61,8 +62,10 @@ def default_folder() -> Path:
 def reference_path(
     scene_file: Path, parameters: dict[str, str], integrator: str, sensor: int, folder: Path
 ) -> Path:
-    """The file of a reference: named by a digest of all files of the scene, the parameters, the
-    integrator, the sensor, the variant and Mitsuba's version.
+    """Return the file of a reference, named by a digest of everything that determines the image.
+
+    These are all files of the scene, the parameters, the integrator, the sensor, the variant and
+    Mitsuba's version.
     """
     parts = (scene_digest(scene_file, parameters), integrator, sensor, mi.variant(), mi.__version__)
     digest = hashlib.sha256(repr(parts).encode()).hexdigest()
@@ -79,11 +82,10 @@ def reference(
     sensor: int = 0,
     advance: Callable[[int, float], None] | None = None,
 ) -> Reference:
-    """A reference of at least ``spp`` samples per pixel in each half and at least ``seconds`` of
-    rendering, one of which is given.
+    """Return a reference with at least ``spp`` samples per half or ``seconds`` of rendering.
 
-    One in ``folder`` that suffices is not rendered again, one that does not is continued, and one
-    of a scene that has changed since is never found. ``advance`` is told (samples, seconds).
+    A sufficient one in ``folder`` is reused, an insufficient one is continued; a changed scene has
+    a different file. ``advance`` is called with (samples, seconds).
     """
     scene_file = Path(scene_file)
     folder.mkdir(parents=True, exist_ok=True)
@@ -109,7 +111,7 @@ def reference(
 
 
 def _extend(scene: mi.Scene, old: Reference | None, sensor: int, spp: int) -> Reference:
-    """The reference with ``spp`` more samples; seeds go on where the last launch stopped."""
+    """Return the reference with ``spp`` more samples, continuing the sequence of seeds."""
     started = time.perf_counter()
     done = 0 if old is None else old.spp
     new = [

@@ -1,4 +1,4 @@
-"""The report: one HTML file with everything in it, for a person to read."""
+"""The report as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ dt { color: #666; } dd { margin: 0; overflow-wrap: anywhere; }
 
 @dataclass
 class Figure:
-    """A picture file and what it shows."""
+    """An image file and its caption."""
 
     path: Path
     caption: str
@@ -63,9 +63,7 @@ def write_report(
     failed: list[Measurement],
     facts: dict[str, str],
 ) -> None:
-    """Writes the page, whole or not at all; figures are embedded, nothing is loaded from
-    elsewhere.
-    """
+    """Write the page atomically, with embedded figures, so that it loads no other file."""
     body = [f"<h1>{escape(title)}</h1>", _subtitle(facts), _findings(findings), _failures(failed)]
     body += [_section(section) for section in sections]
     rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in facts.items())
@@ -83,12 +81,12 @@ def write_report(
 def findings(
     curves: list[Curve], budgets: list[float], rows: list[dict], depths: dict[str, int]
 ) -> list[str]:
-    """What a reader should take home, a sentence each; errors are RMSE."""
+    """Return the conclusions of the comparison as sentences; errors are RMSE."""
     if not curves:
         return ["No integrator produced an image."]
     said = []
     table = dict(zip(sorted(budgets), equal_time(curves, budgets), strict=True))
-    # The longest time of those at which most integrators have an image.
+    # The longest budget at which most integrators have an image.
     longest = max(table, key=lambda budget: (sum(e is not None for e in table[budget]), budget))
     errors = dict(zip(curves, table[longest], strict=True))
     ranked = sorted((c for c in curves if errors[c] is not None), key=lambda c: errors[c])
@@ -101,9 +99,9 @@ def findings(
     said += [_ratio(ranked[0], other, errors[other]) for other in ranked[1:]]
     if len(set(depths.values())) > 1:
         said.append(
-            "Their images need not agree, for max_depth differs: "
+            "Their images differ systematically, because max_depth differs: "
             f"{', '.join(f'{depth} in {name}' for name, depth in depths.items())}. Plugins have "
-            "different defaults; say it in braces."
+            "different defaults; set it in braces."
         )
     said += [_biased(row) for row in _last_rows(rows) if _is_biased(row)]
     said += [
@@ -142,9 +140,9 @@ def _is_biased(row: dict) -> bool:
 def _biased(row: dict) -> str:
     error = with_uncertainty(row["bias"], row["bias_uncertainty"])
     return (
-        f"{row['integrator']} is off by {error} of the mean radiance on average in its last image, "
-        "more than noise explains that is independent between distant pixels: bias, most likely, "
-        "which no further sample removes."
+        f"{row['integrator']} has a mean error of {error} of the mean radiance in its last image, "
+        "more than the noise of independent pixels explains: most likely bias, which more samples "
+        "do not reduce."
     )
 
 
@@ -163,7 +161,7 @@ def _failures(failed: list[Measurement]) -> str:
     return "".join(
         f'<div class="failed"><p><strong>{escape(m.integrator)} did not finish.</strong> '
         f"{escape(m.error)} "
-        f"{'What it had finished is shown.' if m.snapshots else 'It has no image to show.'}"
+        f"{'Its finished results are shown.' if m.snapshots else 'It has no image to show.'}"
         "</p></div>"
         for m in failed
     )

@@ -1,4 +1,4 @@
-"""What was measured, as data that goes to JSON and comes back."""
+"""The measurements as data classes that are stored as JSON."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Snapshot:
     """The image of an integrator after a time budget.
 
     Attributes:
-        budget: seconds that were asked for.
-        seconds: of each stage, with compiled kernels: cache (where there is one), image, filter.
+        budget: requested seconds.
+        seconds: by stage, with compiled kernels: cache (if there is one), image, filter.
         spp: camera samples per pixel in the image.
         image: name of the EXR file, relative to the report.
-        note: how the budget was spent, for people.
+        note: a description of how the budget was spent.
     """
 
     budget: float
@@ -33,20 +33,20 @@ class Snapshot:
 
     @property
     def total(self) -> float:
-        """Seconds of all stages."""
+        """Return the seconds of all stages."""
         return sum(self.seconds.values())
 
     def read(self, folder: Path) -> np.ndarray:
-        """The image (height, width, channel) of linear radiance, from the report's ``folder``."""
+        """Read the image (height, width, channel), linear radiance, in the report's ``folder``."""
         return read_image(folder / self.image)
 
 
 @dataclass
 class Measurement:
-    """All that is known of one integrator; ``error`` says why something is missing.
+    """All measurements of one integrator; ``error`` says why some are missing.
 
     ``cold``, ``warm`` and ``again`` are seconds by stage up to a first image: in a new process
-    without compiled kernels, in a new process with them, and of another view in the same process.
+    without compiled kernels, in a new process with them, and for another view in the same process.
     ``memory`` is in bytes.
     """
 
@@ -62,22 +62,22 @@ class Measurement:
 
     @classmethod
     def load(cls, path: Path) -> Measurement:
-        """Reads what `save` wrote."""
+        """Read measurements that `save` wrote."""
         data = json.loads(path.read_text())
         data["snapshots"] = [Snapshot(**s) for s in data["snapshots"]]
         return cls(**data)
 
     def save(self, path: Path) -> None:
-        """Writes JSON, whole or not at all."""
+        """Write the measurements as JSON, atomically."""
         write_json(path, asdict(self))
 
 
 def write_json(path: Path, data: object) -> None:
-    """Writes JSON, whole or not at all."""
+    """Write JSON atomically."""
     with atomic_write(path) as file:
         file.write(json.dumps(data, indent=1).encode())
 
 
 def file_name(index: int, integrator: str) -> str:
-    """A name for an integrator's files: number and specification, without odd characters."""
+    """Return the name of an integrator's files: number and specification in safe characters."""
     return f"{index + 1}-{re.sub(r'[^A-Za-z0-9.]+', '-', integrator).strip('-')[:60]}"

@@ -1,12 +1,12 @@
-"""How an integrator spends time budgets.
+"""Strategies by which integrators spend time budgets.
 
 A runner is a generator: given a `Subject` and budgets in seconds it yields pairs (snapshot, image).
-An integrator is told apart by what it offers, never by its name:
+It is selected by the methods that an integrator offers, never by the integrator's name:
 
 * ``progressive(scene, sensor, seed, spp, times)`` iterates over frames while a cache is refined,
   one at each of the ``times``; each has an ``image``, ``samples`` of the cache, and ``seconds`` by
-  stage since the beginning, without those between frames. Images that are rendered there show the
-  cache as it is. All snapshots are of one run.
+  stage since the beginning, excluding time between frames. Images that are rendered during the
+  iteration use the cache as it is. All snapshots are of one run.
 * ``prepare(scene)`` builds a cache; images are averaged after it.
 * Others have images only, which are averaged.
 """
@@ -34,18 +34,17 @@ from mitsuba_irrcache.io.scene_files import (
 from .metrics import colours
 from .results import Snapshot
 
-#: The property by which an integrator with a cache is told how much to spend on it, and its
-#: smallest value.
+#: The property that sets the effort for an integrator's cache, and its minimum.
 EFFORT = "cache_spp"
 LEAST_EFFORT = 8
-#: Where an integrator has no such property, its averaged images are filtered here.
+#: The property of integrators with a filter; images of others are averaged and filtered here.
 FILTER = ("filter", "bilateral")
-#: Part of the time that goes into a cache that is refined, and images meanwhile; the rest goes into
-#: more samples of the snapshots.
+#: Share of the time for refining the cache and for images meanwhile; the rest goes into more camera
+#: samples of the snapshots.
 CACHE_SHARE = 0.7
-#: A frame may come early: from this part of its time on it counts.
+#: A frame counts for a budget from this share of its time on.
 REACHED = 0.95
-#: Most samples per pixel of one launch.
+#: Maximum samples per pixel of one launch.
 MOST_SPP = 64
 
 Frames = Iterator[tuple[Snapshot, np.ndarray]]
@@ -53,8 +52,9 @@ Frames = Iterator[tuple[Snapshot, np.ndarray]]
 
 @dataclass
 class Subject:
-    """An integrator on a scene, seen by one sensor; ``filter_seconds`` is what filtering took the
-    last time.
+    """An integrator on a scene, as seen by one sensor.
+
+    ``filter_seconds`` is the duration of the last filtering.
     """
 
     scene_file: Path
@@ -66,31 +66,29 @@ class Subject:
 
     @cached_property
     def is_filtered_here(self) -> bool:
-        """Whether the integrator is asked for a filter that it does not know."""
+        """Return whether a filter is requested that the integrator does not have."""
         name, value = FILTER
         asked = parse_integrator(self.integrator)[1].get(name) == value
         return asked and name in unknown_properties(self.integrator)
 
     def specification(self, **properties: object) -> str:
-        """The integrator, which gets some more properties."""
+        """Return the specification of the integrator with additional properties."""
         name, given = parse_integrator(self.integrator)
         if self.is_filtered_here:
             del given[FILTER[0]]
         return describe_integrator(name, given | properties)
 
     def load(self, **properties: object) -> mi.Scene:
-        """The scene with the integrator, which gets some more properties."""
+        """Load the scene with the integrator and its additional properties."""
         return load_scene(self.scene_file, self.parameters, self.specification(**properties))
 
     def render(self, scene: mi.Scene, spp: int) -> tuple[np.ndarray, dict[str, float]]:
-        """An image with a seed of its own, and the seconds it took by stage."""
+        """Render an image with a new seed; return it with the seconds by stage."""
         self.launches += 1
         return render(scene, self.sensor, spp, self.launches)
 
     def finish(self, average: Average) -> tuple[np.ndarray, dict[str, float]]:
-        """The averaged image, or its colours filtered if that is done here, and the seconds it
-        took.
-        """
+        """Return the averaged image, filtered if that is done here, and the seconds for it."""
         if not self.is_filtered_here:
             return average.mean, {}
         from mitsuba_irrcache.render.denoise import denoise
@@ -102,14 +100,14 @@ class Subject:
 
 
 class Average:
-    """The mean of images, and the standard error that their scatter tells."""
+    """The mean of images, and its standard error estimated from their scatter."""
 
     def __init__(self) -> None:
         self.count = 0
         self._total, self._grey, self._squares = 0.0, 0.0, 0.0
 
     def add(self, image: np.ndarray) -> None:
-        """One more image (height, width, channel), independent of the others."""
+        """Add one image (height, width, channel), independent of the others."""
         grey = colours(image).mean(axis=-1, dtype=np.float64)
         self.count += 1
         self._total = self._total + image.astype(np.float64)
@@ -117,12 +115,12 @@ class Average:
 
     @property
     def mean(self) -> np.ndarray:
-        """The mean (height, width, channel), float64."""
+        """Return the mean (height, width, channel), float64."""
         return self._total / self.count
 
     @property
     def standard_error(self) -> np.ndarray:
-        """Standard error of the mean over the colours (height, width), from at least two images."""
+        """Return the standard error of the mean over colours, (height, width)."""
         variance = self._squares / self.count - (self._grey / self.count) ** 2
         return np.sqrt(np.maximum(variance, 0) / (self.count - 1))
 
@@ -130,8 +128,9 @@ class Average:
 def render(
     scene: mi.Scene, sensor: int, spp: int, seed: int
 ) -> tuple[np.ndarray, dict[str, float]]:
-    """An image (height, width, channel), float32, and the seconds until it was there by stage:
-    image, and filter where the integrator says that it has spent some on one.
+    """Render an image (height, width, channel), float32; return it with the seconds by stage.
+
+    The stages are image and, if the integrator reports it, filter.
     """
     started = time.perf_counter()
     image = np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed))
@@ -142,7 +141,7 @@ def render(
 
 
 def prepare(scene: mi.Scene) -> float:
-    """Builds the integrator's cache; the seconds it took."""
+    """Build the integrator's cache; return the seconds."""
     started = time.perf_counter()
     scene.integrator().prepare(scene)
     dr.sync_thread()
@@ -150,13 +149,14 @@ def prepare(scene: mi.Scene) -> float:
 
 
 def is_progressive(scene: mi.Scene) -> bool:
-    """Whether the integrator gives images while it refines its cache."""
+    """Return whether the integrator renders images while it refines its cache."""
     return callable(getattr(scene.integrator(), "progressive", None))
 
 
 def effort_is_free(subject: Subject) -> bool:
-    """Whether the effort spent on the cache may be chosen: the integrator knows the property, and
-    the user has not set it.
+    """Return whether the effort for the cache may be chosen here.
+
+    The integrator must have the property, and the user must not have set it.
     """
     if EFFORT in parse_integrator(subject.integrator)[1]:
         return False
@@ -164,8 +164,9 @@ def effort_is_free(subject: Subject) -> bool:
 
 
 def run(subject: Subject, scene: mi.Scene, budgets: list[float]) -> Frames:
-    """The runner that fits the integrator of ``scene``, which has rendered an image already: its
-    kernels are compiled.
+    """Return the runner for the integrator of ``scene``.
+
+    The integrator must have rendered an image already, so that its kernels are compiled.
     """
     if is_progressive(scene) and effort_is_free(subject) and not subject.is_filtered_here:
         yield from _refined(subject, scene, budgets)
@@ -187,10 +188,10 @@ def accumulate(
     spp: int,
     spent: dict[str, float],
 ) -> Frames:
-    """Averages images of ``spp`` samples and different seeds; a snapshot at every budget.
+    """Average images of ``spp`` samples and different seeds; yield a snapshot at each budget.
 
-    ``spent`` are the seconds of earlier stages. Where they outlast several budgets, the first image
-    stands for the largest of these. A filter needs two images, to know their noise.
+    ``spent`` are the seconds of earlier stages. If they exceed several budgets, the first image is
+    reported for the largest of these. A filter needs two images to estimate their noise.
     """
     waiting, average, seconds = sorted(budgets), Average(), dict(spent)
     while waiting:
@@ -208,8 +209,10 @@ def accumulate(
 def follow(
     subject: Subject, scene: mi.Scene, frames: Iterable, budgets: list[float], spp: int
 ) -> Frames:
-    """Snapshots of a progressive run, whose frames have ``spp`` samples: for every budget the first
-    frame that reaches `CACHE_SHARE` of it, averaged with further images until the budget is spent.
+    """Yield snapshots of a progressive run, whose frames have ``spp`` samples.
+
+    For each budget, the first frame that reaches `CACHE_SHARE` of it is averaged with further
+    images until the budget is spent.
     """
     waiting, between = sorted(budgets), {}
     for frame in frames:
@@ -231,7 +234,10 @@ def follow(
 
 
 def _refined(subject: Subject, scene: mi.Scene, budgets: list[float]) -> Frames:
-    """One progressive run; if it ends early, with a cache that is complete, images are averaged."""
+    """Yield the snapshots of one progressive run.
+
+    If the run ends early because the cache is complete, further images are averaged.
+    """
     times = [CACHE_SHARE * b for b in budgets]
 
     def frames(scene: mi.Scene, spp: int) -> Iterator:
@@ -239,7 +245,8 @@ def _refined(subject: Subject, scene: mi.Scene, budgets: list[float]) -> Frames:
             scene, sensor=subject.sensor, seed=0, spp=spp, times=times
         )
 
-    # Compiles the kernels that only such a run has, and tells when the first image is there.
+    # Compiles the kernels that only a progressive run has, and measures the time to its first
+    # image.
     first = next(iter(frames(subject.load(), 1)))
     spp = _samples_per_launch(subject, scene, max(min(budgets), sum(first.seconds.values())))
     scene, last = subject.load(), 0.0
@@ -255,7 +262,7 @@ def _sum(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
 
 
 def _warm_up_filter(subject: Subject, scene: mi.Scene, spp: int) -> None:
-    """Compiles the filter's kernels, and measures it."""
+    """Compile the filter's kernels and measure the filter's duration."""
     average = Average()
     for _ in range(2):
         average.add(subject.render(scene, spp)[0])
@@ -264,12 +271,14 @@ def _warm_up_filter(subject: Subject, scene: mi.Scene, spp: int) -> None:
 
 
 def _samples_per_launch(subject: Subject, scene: mi.Scene, budget: float) -> int:
-    """Samples per launch: a power of two that takes about a tenth of the smallest budget, or 50 ms
-    if that is longer. The kernels for it are compiled afterwards.
+    """Return the samples per launch, and compile the kernels for them.
+
+    It is a power of two whose launch takes about a tenth of the smallest budget, or 50 ms if that
+    is longer.
     """
     once, more = (min(sum(subject.render(scene, n)[1].values()) for _ in range(2)) for n in (1, 4))
     rate = max((more - once) / 3, 1e-4)
-    # What every launch costs, whatever its samples (a filter, say), should not be most of it.
+    # The fixed cost of a launch, for example of a filter, should be less than half of it.
     wanted = max(1 + (max(0.1 * budget, 0.05) - once) / rate, once / rate)
     spp = 2 ** int(np.log2(np.clip(wanted, 1, MOST_SPP)))
     subject.render(scene, spp)

@@ -1,4 +1,4 @@
-"""What a scene consists of on disk: its XML files and every file that they name."""
+"""The files of a scene: its XML files and every file that they name."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import mitsuba as mi
 
 
 def scene_files(path: Path, parameters: dict[str, str]) -> list[Path]:
-    """The scene's XML, the XML files it includes and all files that its objects name, sorted.
+    """Return the scene's XML files and all files that its objects name, sorted.
 
-    Names are looked up as Mitsuba does it: beside the scene and in its ``<path>`` folders.
+    Names are resolved as Mitsuba does: beside the scene and in its ``<path>`` folders.
     """
     saved = mi.file_resolver()
     resolver = mi.FileResolver(saved)
@@ -34,8 +34,9 @@ def scene_files(path: Path, parameters: dict[str, str]) -> list[Path]:
 
 
 def scene_digest(path: Path, parameters: dict[str, str]) -> str:
-    """SHA-256 of the contents of `scene_files` and of the parameters; where they lie does not
-    count.
+    """Return the SHA-256 of the contents of `scene_files` and of the parameters.
+
+    The folders of the files do not matter.
     """
     sha = hashlib.sha256(repr(sorted(parameters.items())).encode())
     for file in scene_files(path, parameters):
@@ -54,5 +55,5 @@ def _digest(file: Path) -> bytes:
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except OSError:  # a string that is no name of a file, for instance too long
+    except OSError:  # a string that is not a file name, for instance because it is too long
         return False

@@ -13,13 +13,13 @@ from .results import Measurement, Snapshot
 #: Heading, unit (% of the mean radiance of the reference, or none) and meaning of each error.
 METRICS = {
     "rmse": ("RMSE", "%", "root mean square error, net of the reference's noise"),
-    "bias": ("mean error", "%", "signed; what is left when all noise is averaged out"),
+    "bias": ("mean error", "%", "mean signed error: the bias, since noise averages out"),
     "relative_mse": ("relative MSE", "", "squared error over squared radiance, pixel by pixel"),
     "display_rmse": ("display RMSE", "", "of the sRGB picture in [0, 1], as in the paper"),
     "block_rmse": ("blocks 8 × 8", "%", "net RMSE of block means: blotches, streaks and bands"),
     "ciede2000": ("CIEDE2000", "", "mean colour difference; about 1 is just noticeable"),
     "ciede2000_95": ("CIEDE2000, 95 %", "", "the colour difference that 5 % of pixels exceed"),
-    "flip": ("FLIP", "", "difference seen when flipping between the pictures, 0 to 1"),
+    "flip": ("FLIP", "", "perceived difference when alternating the images, 0 to 1"),
     "oiio_rms": ("OIIO RMS", "", "OpenImageIO's RMS error, with the reference's noise"),
     "oiio_max": ("OIIO max", "", "OpenImageIO's largest error"),
     "oiio_psnr": ("OIIO PSNR", " dB", "OpenImageIO's peak signal to noise ratio"),
@@ -29,8 +29,9 @@ METRICS = {
 def score_all(
     measurements: list[Measurement], reference: Reference, folder: Path, exposure: float
 ) -> list[dict]:
-    """One row for each snapshot of the report in ``folder``: integrator, budget, seconds, and
-    the errors of `METRICS`.
+    """Return one row per snapshot of the report in ``folder``.
+
+    Its columns are the integrator, the budget, the seconds and the errors of `METRICS`.
     """
     rows = []
     for measurement in measurements:
@@ -41,9 +42,9 @@ def score_all(
 
 
 def score(image: np.ndarray, reference: Reference, exposure: float = 0.0) -> dict:
-    """The errors of an image (height, width, channel) of linear radiance.
+    """Compute the errors of an image (height, width, channel) of linear radiance.
 
-    "rmse", "bias", "block_rmse" and what goes with them are in units of the mean radiance of the
+    "rmse", "bias", "block_rmse" and their uncertainties are in units of the mean radiance of the
     reference. Values that are not finite count as 0; "invalid" is their share.
     """
     x, a, b = (np.float64(metrics.colours(i)) for i in (image, reference.a, reference.b))
@@ -69,7 +70,7 @@ def score(image: np.ndarray, reference: Reference, exposure: float = 0.0) -> dic
 
 
 def reference_noise(reference: Reference) -> float:
-    """Standard error of the mean of the two halves, in units of its mean radiance."""
+    """Return the standard error of the reference in units of its mean radiance."""
     a, b = metrics.colours(reference.a), metrics.colours(reference.b)
     return metrics.noise(a, b) / np.sqrt(2) / (float(np.mean(0.5 * (a + b))) or 1.0)
 

@@ -1,4 +1,4 @@
-"""How figures look: one place for fonts, colours and sizes."""
+"""The style of figures: fonts, colours and sizes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from matplotlib import pyplot
 
 from mitsuba_irrcache.io.files import atomic_write
 
-#: Okabe and Ito's colours, which colour-blind people can tell apart, and a marker for print.
+#: Okabe and Ito's palette, which is distinguishable with colour blindness, and markers for print.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 MARKERS = "osD^vPX"
-#: Signed errors: blue is too dark, red is too bright.
+#: Colour map of signed errors: blue is too dark, red is too bright.
 SIGNED = "RdBu_r"
 GREY = "#777777"
 
@@ -40,9 +40,7 @@ SETTINGS = {
 
 @contextmanager
 def figure(path: Path, rows: int = 1, columns: int = 1, **options) -> Iterator[tuple]:
-    """Figure and axes, an array (rows, columns), in this style; written to ``path`` when the block
-    ends.
-    """
+    """Create a figure with axes (rows, columns); the end of the context writes it to ``path``."""
     with pyplot.rc_context(SETTINGS):
         drawn, axes = pyplot.subplots(rows, columns, squeeze=False, **options)
         try:
@@ -54,5 +52,5 @@ def figure(path: Path, rows: int = 1, columns: int = 1, **options) -> Iterator[t
 
 
 def line(index: int) -> dict[str, str]:
-    """Colour and marker of the integrator with this number."""
+    """Return the colour and marker of the integrator with this number."""
     return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)]}

@@ -1,4 +1,4 @@
-"""Who is ahead: errors at equal time and times to equal error, from curves of error over time."""
+"""Errors at equal time and times to equal error, from curves of error over time."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: The first and the last snapshot count for a budget that is off by at most this factor.
+#: Factor by which the time of the first and the last snapshot may differ from a budget.
 TOLERANCE = 1.1
-#: Slopes of log error over log time that pass for Monte Carlo noise, and may be extrapolated.
+#: Slopes of log error over log time that are taken for Monte Carlo noise and extrapolated.
 NOISE_SLOPES = (-0.65, -0.35)
-#: Beyond this many times the longest measurement nothing is extrapolated.
+#: Limit of extrapolation in units of the longest measurement.
 FARTHEST = 1e4
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Errors of one integrator over seconds, both rising in time; ``resolved`` is the least error
-    that the reference can tell from none.
+    """Errors of one integrator over seconds, sorted by time.
+
+    ``resolved`` is the smallest error that is detectable with this reference.
     """
 
     integrator: str
@@ -28,14 +29,16 @@ class Curve:
 
     @property
     def shown(self) -> np.ndarray:
-        """Errors, not below what is resolved."""
+        """Return the errors, clamped from below to ``resolved``."""
         return np.maximum(self.errors, self.resolved)
 
 
 @dataclass(frozen=True)
 class Reached:
-    """Seconds to an error; ``how`` is "measured", "at most" (the first snapshot is better already),
-    "extrapolated" (as noise), or "never" where nothing can be said.
+    """Seconds to an error, and how they were obtained.
+
+    ``how`` is "measured", "at most" (the first snapshot is better already), "extrapolated" (as
+    Monte Carlo noise), or "never" if nothing can be said.
     """
 
     seconds: float
@@ -43,7 +46,7 @@ class Reached:
 
 
 def curves(rows: list[dict]) -> list[Curve]:
-    """The curve of every integrator, in the order of the rows."""
+    """Return the curve of every integrator, in the order of the rows."""
     result = []
     for name in dict.fromkeys(row["integrator"] for row in rows):
         own = sorted((r for r in rows if r["integrator"] == name), key=lambda r: r["seconds"])
@@ -53,33 +56,35 @@ def curves(rows: list[dict]) -> list[Curve]:
 
 
 def uncertainty(curve: Curve) -> float:
-    """Standard error of the last error, if pixels are independent."""
+    """Return the standard error of the last error, assuming independent pixels."""
     # resolved = sqrt(2 u) with u, the standard error of the square; d sqrt(s) = ds / (2 sqrt(s))
     return float(curve.resolved[-1] ** 2 / 4 / curve.shown[-1])
 
 
 def maximum_depths(described: dict[str, str]) -> dict[str, int]:
-    """``max_depth`` of each integrator that prints one, -1 for all orders."""
+    """Return ``max_depth`` of each integrator that prints one, -1 for all orders."""
     found = {name: re.search(r"max_depth = (-?\d+)", text) for name, text in described.items()}
     depths = {name: int(match[1]) for name, match in found.items() if match}
     return {name: -1 if depth >= 2**31 else depth for name, depth in depths.items()}
 
 
 def equal_time(curves: list[Curve], budgets: list[float]) -> list[list[float | None]]:
-    """A row for each budget with the error of every curve; None before the first snapshot
-    and after the last; in between log-log interpolated.
+    """Return a row for each budget with the error of every curve, interpolated in log-log.
+
+    It is None before the first and after the last snapshot.
     """
     return [[_error_at(curve, budget) for curve in curves] for budget in sorted(budgets)]
 
 
 def equal_error(curves: list[Curve], targets: list[float]) -> list[list[Reached]]:
-    """A row for each target error with the time that every curve takes."""
+    """Return a row for each target error with the time of every curve to reach it."""
     return [[time_to(curve, target) for curve in curves] for target in targets]
 
 
 def targets(curves: list[Curve], count: int = 6) -> list[float]:
-    """Round errors within what the curves span, from coarse to fine: of steps 1, 2, 5 or, where
-    these are few, finer ones.
+    """Return round errors within the range of the curves, in decreasing order.
+
+    They are in steps of 1, 2, 5, or in finer steps if these are few.
     """
     values = np.concatenate([curve.shown for curve in curves]) if curves else np.array([])
     values = values[values > 0]
@@ -95,7 +100,7 @@ def targets(curves: list[Curve], count: int = 6) -> list[float]:
 
 
 def time_to(curve: Curve, target: float) -> Reached:
-    """Seconds until the error is at most ``target``: between snapshots log-log interpolated."""
+    """Return the seconds until the error is at most ``target``, interpolated in log-log."""
     t, e = curve.seconds, curve.shown
     below = np.flatnonzero(e <= target)
     if not below.size:
@@ -108,8 +113,9 @@ def time_to(curve: Curve, target: float) -> Reached:
 
 
 def nearest(curve: Curve, budget: float) -> tuple[float, float] | None:
-    """Error and seconds of the first image after a ``budget``, or else of the last one; None if
-    there is no image. It is what there is to show where `equal_time` has no error.
+    """Return error and seconds of the first image after a ``budget``, or else of the last one.
+
+    None if there is no image. It is displayed where `equal_time` has no error.
     """
     if not len(curve.seconds):
         return None
@@ -126,7 +132,7 @@ def _error_at(curve: Curve, budget: float) -> float | None:
 
 
 def _extrapolated(curve: Curve, target: float) -> Reached:
-    """Variance falls as 1 / t; used only where the last snapshots bear this out."""
+    """Extrapolate as variance ~ 1 / t if the last snapshots decrease like that."""
     t, e = curve.seconds, curve.errors
     resolved = e > curve.resolved
     if len(t) < 2 or not resolved[-2:].all():

@@ -1,4 +1,4 @@
-"""The tables of a comparison, as text in cells: the terminal and the report show the same."""
+"""The tables of a comparison as text in cells, for both the terminal and the report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STAGES = ("import", "load", "kernels", "cache", "image", "filter")
 
 @dataclass
 class Table:
-    """Cells of text under a heading; ``best`` are the (row, column) of the cells to emphasise."""
+    """Cells of text under a heading; ``best`` holds the (row, column) of the cells to emphasise."""
 
     title: str
     head: list[str]
@@ -24,7 +24,7 @@ class Table:
     best: set[tuple[int, int]] = field(default_factory=set)
 
     def as_text(self) -> str:
-        """Columns aligned with spaces, the best cells marked by a star."""
+        """Format columns aligned with spaces; the best cells have a star."""
         cells = [self.head] + [
             [f"{cell} *" if (r, c) in self.best else cell for c, cell in enumerate(row)]
             for r, row in enumerate(self.rows)
@@ -38,7 +38,7 @@ class Table:
 
 
 def equal_time_table(curves: list[Curve], budgets: list[float]) -> Table:
-    """RMSE after each budget."""
+    """Return the table of the RMSE after each budget."""
     rows, best = [], set()
     for r, (budget, errors) in enumerate(
         zip(sorted(budgets), equal_time(curves, budgets), strict=True)
@@ -49,15 +49,15 @@ def equal_time_table(curves: list[Curve], budgets: list[float]) -> Table:
         best |= {(r, c + 1) for c, e in enumerate(errors) if len(known) > 1 and e == min(known)}
     note = (
         "RMSE in units of the mean radiance of the reference, whose own noise is removed. "
-        "Interpolated between snapshots. In brackets: the time of the image that is nearest, where "
-        "there is none by then, or none so late; it takes no part in who is best. A dash: no image "
-        "at all. Kernels are compiled beforehand."
+        "Interpolated between snapshots. In brackets: the time of the nearest image, if there is "
+        "none at this time; such values are no candidates for the best one. A dash: no image at "
+        "all. Kernels are compiled beforehand."
     )
     return Table("Error after equal time", ["budget", *_names(curves)], rows, note, best)
 
 
 def equal_error_table(curves: list[Curve]) -> Table:
-    """Time to reach round errors."""
+    """Return the table of the times to round errors."""
     goals, best, rows = targets(curves), set(), []
     for r, (goal, reached) in enumerate(zip(goals, equal_error(curves, goals), strict=True)):
         rows.append([percent(goal), *map(_reached, reached)])
@@ -73,7 +73,7 @@ def equal_error_table(curves: list[Curve]) -> Table:
 
 
 def stages_table(measurements: list[Measurement]) -> Table:
-    """Where the time to a first image goes, and memory."""
+    """Return the table of memory and of the seconds by stage to a first image."""
     rows = []
     for m in measurements:
         for label, stages in (("cold", m.cold), ("warm kernels", m.warm), ("next view", m.again)):
@@ -92,11 +92,11 @@ def stages_table(measurements: list[Measurement]) -> Table:
         "generation and compilation. Memory: peak of the whole run, of the process on the CPU side."
     )
     head = ["integrator", "start", *STAGES, "total", "peak memory"]
-    return Table("Where the time goes", head, rows, note)
+    return Table("Time by stage", head, rows, note)
 
 
 def metrics_table(rows: list[dict]) -> Table:
-    """All errors of all snapshots."""
+    """Return the table of all errors of all snapshots."""
     cells = []
     for row in rows:
         values = [_metric(row, name) for name in METRICS]
@@ -113,18 +113,18 @@ def metrics_table(rows: list[dict]) -> Table:
 
 
 def percent(value: float) -> str:
-    """Three digits, in percent."""
+    """Format in percent with three digits."""
     return f"{100 * value:.3g} %"
 
 
 def with_uncertainty(value: float, uncertainty: float) -> str:
-    """In percent, to the first digit that the uncertainty leaves."""
+    """Format in percent up to the first uncertain digit."""
     digits = int(np.clip(-np.floor(np.log10(max(100 * uncertainty, 1e-9))), 0, 6))
     return f"{100 * value:+.{digits}f} ± {100 * uncertainty:.{digits}f} %"
 
 
 def seconds(value: float) -> str:
-    """Three digits at most, in seconds."""
+    """Format in seconds with at most three digits."""
     return f"{value:.0f}" if value >= 99.95 else f"{value:.3g}" if value >= 0.1 else f"{value:.2f}"
 
 
@@ -133,7 +133,7 @@ def _names(curves: list[Curve]) -> list[str]:
 
 
 def _at(curve: Curve, error: float | None, budget: float) -> str:
-    """The error after a budget; if there is none, that of another image, with its real time."""
+    """Format the error after a budget, or that of the nearest image with its actual time."""
     if error is not None:
         return percent(error)
     found = nearest(curve, budget)
@@ -148,7 +148,7 @@ def _reached(reached: Reached) -> str:
 
 
 def _spent(row: dict) -> str:
-    """The stages of a snapshot, where there are several, and how the budget was spent."""
+    """Describe the stages of a snapshot if there are several, and how the budget was spent."""
     stages = {k.removeprefix("seconds_"): v for k, v in row.items() if k.startswith("seconds_")}
     parts = [f"{stage} {seconds(value)}" for stage, value in stages.items()]
     return ", ".join((parts if len(parts) > 1 else []) + [row["note"]] * bool(row["note"]))

@@ -1,8 +1,8 @@
 """The process that runs one integrator: ``python -m mitsuba_irrcache.compare.worker JOB.json``.
 
-A job is JSON; its ``kind`` names one of the functions below. What it finds out goes to the file
-``result``, piece by piece, so that a crash loses only what was not finished. Lines on standard
-output say how far it is.
+A job is JSON; its ``kind`` names one of the functions below. Results are written to the file
+``result`` step by step, so that a crash loses only the unfinished ones. Lines on standard output
+report the progress.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ try:
 except ImportError:  # Windows
     resource = None
 
-#: Samples per pixel of the first image, whose kernels are compiled.
+#: Samples per pixel of the first image, for which the kernels are compiled.
 FIRST_SPP = 4
 
 
 def check(job: dict) -> None:
-    """Loads the scene with every integrator once; a name or property that is wrong ends it."""
+    """Load the scene with every integrator once, to find wrong names and properties early."""
     described = {}
     for integrator in job["integrators"]:
         scene = _subject(job, integrator).load()
@@ -60,7 +60,7 @@ def check(job: dict) -> None:
 
 
 def _described(integrator: mi.Integrator) -> str:
-    """What the integrator prints of itself, on one line; its class where it prints nothing."""
+    """Return the integrator's string representation on one line, or its class name."""
     try:
         return " ".join(str(integrator).split())
     except RuntimeError:  # a plugin in Python without to_string
@@ -68,7 +68,7 @@ def _described(integrator: mi.Integrator) -> str:
 
 
 def make_reference(job: dict) -> None:
-    """Renders, continues or finds the reference."""
+    """Render, continue or find the reference."""
     where = (Path(job["scene"]), job["parameters"], job["integrator"])
     folder = Path(job["folder"])
 
@@ -83,7 +83,7 @@ def make_reference(job: dict) -> None:
 
 
 def measure(job: dict) -> None:
-    """A first image with cold kernels, snapshots with warm ones, another view, and memory."""
+    """Measure a first image with an empty kernel cache, snapshots, another view, and memory."""
     result, images = Path(job["result"]), Path(job["images"])
     measurement = Measurement(job["integrator"], job["name"])
     subject, scene = _first_image(job, measurement.cold)
@@ -104,14 +104,14 @@ def measure(job: dict) -> None:
 
 
 def start(job: dict) -> None:
-    """A first image in a process that finds its kernels compiled."""
+    """Measure a first image in a process that finds its kernels compiled."""
     seconds: dict[str, float] = {}
     _first_image(job, seconds)
     write_json(Path(job["result"]), seconds)
 
 
 def _first_image(job: dict, seconds: dict[str, float]) -> tuple[Subject, mi.Scene]:
-    """Loads the scene and renders it twice; what the second time saves is the kernels' share.
+    """Load the scene and render it twice; the difference of the times is the kernels' share.
 
     Fills ``seconds``: import, load, cache, image, filter, and of them kernels (tracing, code
     generation and compilation), whose parts are given by ``dr.kernel_history``.
@@ -145,9 +145,7 @@ def _cache_and_image(subject: Subject, scene: mi.Scene, cached: bool) -> dict[st
 
 
 def _another_view(subject: Subject, scene: mi.Scene) -> dict[str, float]:
-    """Seconds by stage of the next sensor's image, or of another seed's where there is one
-    sensor.
-    """
+    """Return the seconds by stage for another sensor, or another seed if there is only one."""
     sensor = (subject.sensor + 1) % len(scene.sensors())
     runners.render(scene, sensor, FIRST_SPP, seed=10**6)
     seconds = {"cache": runners.prepare(scene)} if runners.has_cache(scene) else {}
@@ -161,10 +159,9 @@ def _note_memory(measurement: Measurement) -> None:
 
 
 def peak_memory() -> int:
-    """Peak memory of this process in bytes; 0 where the system does not tell.
+    """Return the peak memory of this process in bytes; 0 if the system does not report it.
 
-    Linux lets ``getrusage`` start at the peak of the parent process, so its own count is asked
-    first.
+    On Linux ``getrusage`` starts at the peak of the parent process, so /proc is read first.
     """
     with suppress(OSError):
         text = Path("/proc/self/status").read_text()
@@ -181,7 +178,7 @@ def _subject(job: dict, integrator: str) -> Subject:
 
 
 def _set_up(job: dict) -> None:
-    """Everything before the scene: variant, log, and the modules that bring other plugins."""
+    """Set up the variant, the log and the modules that register other plugins."""
     if job["variant"] not in mi.variants():
         raise IrrcacheError(
             f'Mitsuba has no variant "{job["variant"]}"; it has {", ".join(mi.variants())}.'
@@ -198,7 +195,7 @@ KINDS = {"check": check, "reference": make_reference, "measure": measure, "start
 
 
 def main() -> int:
-    """Does the job; what goes wrong is written to its ``error`` file."""
+    """Run the job; an exception is written to its ``error`` file."""
     job = json.loads(Path(sys.argv[1]).read_text())
     try:
         _set_up(job)

@@ -1,1 +1,1 @@
-"""Arithmetic, properties of plugins and other things that know nothing of rendering."""
+"""Numerical helpers, plugin properties and utilities that do not depend on rendering."""

@@ -1,4 +1,4 @@
-"""Types of command-line arguments: a value that is refused is shown with what it must be."""
+"""Converters for command-line arguments whose error messages show the value and the valid range."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-#: What a message shows of a value.
-SHOWN = 60
+#: Maximum number of characters of a value that an error message shows.
+MAX_SHOWN_LENGTH = 60
 
 
 def argument(wanted: str) -> Callable[[Callable[[str], Any]], Callable[[str], Any]]:
-    """Makes a converter of text, which raises ValueError, a type for argparse: its message says
-    what is ``wanted``. That of argparse itself would show the name of the function.
+    """Turn a converter that raises ValueError into an argparse type.
+
+    The error message states what is ``wanted``; argparse itself would print the function's name.
     """
 
     def decorate(convert: Callable[[str], Any]) -> Callable[[str], Any]:
@@ -23,7 +24,7 @@ def argument(wanted: str) -> Callable[[Callable[[str], Any]], Callable[[str], An
             try:
                 return convert(text)
             except ValueError:
-                shown = text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+                shown = text if len(text) <= MAX_SHOWN_LENGTH else f"{text[:MAX_SHOWN_LENGTH]}..."
                 raise argparse.ArgumentTypeError(f"{shown!r} given; it must be {wanted}") from None
 
         return converted
@@ -32,7 +33,7 @@ def argument(wanted: str) -> Callable[[Callable[[str], Any]], Callable[[str], An
 
 
 def finite_number(text: str) -> float:
-    """A number; raises ValueError for infinity and NaN, too."""
+    """Convert to float; raise ValueError for infinity and NaN as well."""
     value = float(text)
     if not math.isfinite(value):
         raise ValueError
@@ -43,7 +44,7 @@ finite = argument("a finite number")(finite_number)
 
 
 def whole(least: int, most: int = 2**31 - 1) -> Callable[[str], int]:
-    """The type of a whole number between ``least`` and ``most``."""
+    """Return an argparse type for integers from ``least`` to ``most``."""
 
     @argument(f"a whole number from {least} to {most}")
     def number(text: str) -> int:
@@ -57,7 +58,7 @@ def whole(least: int, most: int = 2**31 - 1) -> Callable[[str], int]:
 
 @argument("a number of seconds, above 0")
 def seconds(text: str) -> float:
-    """A finite duration."""
+    """Convert to a finite, positive duration in seconds."""
     value = finite_number(text)
     if not value > 0:
         raise ValueError

@@ -1,4 +1,4 @@
-"""When rendering has to end early: Mitsuba's ``cancel`` and ``timeout``."""
+"""Early termination of a rendering: Mitsuba's ``cancel`` and ``timeout``."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable
 from time import perf_counter
 
 
-class Stopped(Exception):  # noqa: N818 (no error: the user wants it)
-    """Ends the build of a cache; what is complete stays."""
+class Stopped(Exception):  # noqa: N818 (requested by the user, not an error)
+    """Raised to end the construction of a cache; completed passes are retained."""
 
 
 class Pause:
-    """What a solver calls between its launches: ``action``, which may be set at any time."""
+    """Callback that solvers invoke between kernel launches; ``action`` may change at any time."""
 
     def __init__(self) -> None:
         self.action: Callable[[], None] | None = None
@@ -22,21 +22,22 @@ class Pause:
             self.action()
 
 
-class Stopping:
-    """Says when to stop: once `cancel` was called, from any thread, or so long after `begin`."""
+class StopCondition:
+    """Decides when to stop: after `cancel` (from any thread), or when the timeout has expired."""
 
     def __init__(self) -> None:
         self._cancelled, self._deadline = False, math.inf
 
     def begin(self, timeout: float = 0.0) -> None:
-        """Forgets what was before, as Mitsuba does at the start of every rendering; there are
-        ``timeout`` seconds for this one, if that is above 0.
+        """Clear an earlier cancellation and start the timeout; ``timeout`` <= 0 means no limit.
+
+        Mitsuba also clears it at the start of every rendering.
         """
         self._cancelled = False
         self._deadline = perf_counter() + timeout if timeout > 0 else math.inf
 
     def end(self) -> None:
-        """Time does not count any more."""
+        """Disable the timeout."""
         self._deadline = math.inf
 
     def cancel(self) -> None:
@@ -44,11 +45,11 @@ class Stopping:
 
     @property
     def is_due(self) -> bool:
-        """Whether to stop."""
+        """Whether rendering was cancelled or the timeout has expired."""
         return self._cancelled or perf_counter() > self._deadline
 
-    def checked(self, progress: Callable | None) -> Callable:
-        """``progress``, which also raises `Stopped` when it is time."""
+    def raising(self, progress: Callable | None) -> Callable:
+        """Wrap ``progress`` such that it also raises `Stopped` when stopping is due."""
 
         def advance(stage: str, done: int, total: int) -> None:
             if progress is not None:

@@ -1,4 +1,4 @@
-"""Loops and conditions of Dr.Jit in Python's own words."""
+"""Dr.Jit loops written in Python syntax, and integer division by constants."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from mitsuba_irrcache.errors import IrrcacheError
 
 
 def symbolic(function: Callable) -> Callable:
-    """``dr.syntax``, applied when the function is called for the first time.
+    """Apply ``dr.syntax`` when the function is called for the first time.
 
-    Each costs some milliseconds, and most programs call a few of the many that they import.
-    ``dr.syntax`` reads the function's source from its file, by line numbers: in a file that was
-    changed after it was imported, these are lines of something else. So that is an error.
+    The transformation takes some milliseconds for each function, and a program calls only a few of
+    the functions that it imports. ``dr.syntax`` reads the source by line numbers, so a file that
+    changed after its import would yield the wrong lines; this raises an error instead.
     """
     transformed, file = None, function.__code__.co_filename
     imported = _modification_time(file)
@@ -37,7 +37,7 @@ def symbolic(function: Callable) -> Callable:
 
 
 def _modification_time(file: str) -> int | None:
-    """When ``file`` was last changed [ns]; None where there is no such file."""
+    """Return the modification time of ``file`` [ns], or None if it does not exist."""
     try:
         return os.stat(file).st_mtime_ns
     except OSError:
@@ -45,12 +45,11 @@ def _modification_time(file: str) -> int | None:
 
 
 class Divisor:
-    """A ``number`` from 1 to 2^32 - 1 that divides any UInt32. Another number is the same
-    kernel.
+    """Division of UInt32 by a ``number`` from 1 to 2^32 - 1 without recompiling for another number.
 
-    There is no division of integer vectors: it is done one by one, and took most of the time of
-    kernels that lay volumes out anew. A product and two shifts do the same (Granlund and
-    Montgomery, *Division by invariant integers using multiplication*, 1994).
+    There is no vector instruction for integer division; scalar division dominated kernels that
+    reorder volumes. It is replaced by a product and two shifts (Granlund and Montgomery, *Division
+    by invariant integers using multiplication*, 1994).
     """
 
     def __init__(self, number: int) -> None:
@@ -60,15 +59,16 @@ class Divisor:
         self._shifts = [dr.opaque(mi.UInt32, n) for n in (min(bits, 1), max(bits - 1, 0))]
 
     def split(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-        """Quotient and rest."""
+        """Return quotient and remainder."""
         product = dr.mul_hi(index, self._factor)
         quotient = (((index - product) >> self._shifts[0]) + product) >> self._shifts[1]
         return quotient, index - quotient * self._number
 
 
 def unravelled(index: mi.UInt32, sides: Sequence[Divisor]) -> tuple[mi.UInt32, ...]:
-    """Places along all axes, the fastest first, of flat indices; ``sides`` are those of all axes
-    but the last, which may have any.
+    """Convert flat indices to indices along all axes, fastest first.
+
+    ``sides`` holds the sizes of all axes but the last one.
     """
     places = []
     for side in sides:

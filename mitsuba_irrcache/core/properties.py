@@ -1,7 +1,7 @@
-"""Properties of a plugin as they are given: each of its type and in its range, or refused by name.
+"""Validated access to plugin properties: each must have its type and lie in its range.
 
-`mi.Properties.get` takes what there is, and what Python makes of that is another thing: "false" is
-true, and a folder a name of a file.
+`mi.Properties.get` accepts any type, and implicit conversions would hide mistakes: the string
+"false" is true in Python, and the name of a folder is a valid string for a file name.
 """
 
 from __future__ import annotations
@@ -13,18 +13,16 @@ import mitsuba as mi
 
 from mitsuba_irrcache.errors import IrrcacheError
 
-#: What a message shows of a value.
-SHOWN = 60
+#: Maximum number of characters of a value that an error message shows.
+MAX_SHOWN_LENGTH = 60
 
 
-class Record:
-    """Properties that note what is read of them, and with which value: the list of all properties
-    that a plugin has.
-    """
+class RecordedProperties:
+    """Wrapper of ``mi.Properties`` that records each property read and its value or default."""
 
     def __init__(self, props: mi.Properties) -> None:
         self._props = props
-        #: every property that was read, by its name: as given, or its default
+        #: value, or default, of every property read so far, by name
         self.values: dict[str, object] = {}
 
     def get(self, name: str, default: object) -> object:
@@ -33,7 +31,7 @@ class Record:
 
 
 def described(values: dict[str, object]) -> str:
-    """Properties as Mitsuba's plugins print theirs: a line each."""
+    """Format properties in the style of Mitsuba's plugins, one per line."""
     lines = [f"{name} = {_shown(value)}" for name, value in values.items()]
     return ",\n".join(f"  {line}".replace("\n", "\n  ") for line in lines)
 
@@ -49,12 +47,12 @@ def _shown(value: object) -> str:
 
 
 def integer(props: mi.Properties, name: str, default: int, least: int, wanted: str) -> int:
-    """A number of at least ``least``, below 2^31."""
+    """Read an integer from ``least`` to 2^31 - 1."""
     return checked_integer(name, props.get(name, default), least, wanted)
 
 
 def checked_integer(name: str, value: object, least: int, wanted: str) -> int:
-    """``value``, if it is one."""
+    """Return ``value`` if it is an integer from ``least`` to 2^31 - 1."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
         raise _refusal(name, value, wanted)
     return value
@@ -63,7 +61,7 @@ def checked_integer(name: str, value: object, least: int, wanted: str) -> int:
 def number(
     props: mi.Properties, name: str, default: float, least: float, most: float, wanted: str
 ) -> float:
-    """A number between ``least`` and ``most``, in single precision too."""
+    """Read a finite number from ``least`` to ``most``."""
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise _refusal(name, value, wanted)
@@ -73,7 +71,7 @@ def number(
 
 
 def choice(props: mi.Properties, name: str, default: str, choices: tuple[str, ...]) -> str:
-    """One of ``choices``."""
+    """Read a string that must be one of ``choices``."""
     value = props.get(name, default)
     if not isinstance(value, str) or value not in choices:
         raise _refusal(name, value, f"one of: {', '.join(choices)}")
@@ -81,7 +79,7 @@ def choice(props: mi.Properties, name: str, default: str, choices: tuple[str, ..
 
 
 def flag(props: mi.Properties, name: str, default: bool) -> bool:
-    """True or false."""
+    """Read a boolean."""
     value = props.get(name, default)
     if not isinstance(value, bool):
         raise _refusal(name, value, "true or false (a boolean)")
@@ -89,7 +87,7 @@ def flag(props: mi.Properties, name: str, default: bool) -> bool:
 
 
 def text(props: mi.Properties, name: str) -> str:
-    """A string; "" if there is none."""
+    """Read a string; the default is ""."""
     value = props.get(name, "")
     if not isinstance(value, str):
         raise _refusal(name, value, "a string")
@@ -97,7 +95,7 @@ def text(props: mi.Properties, name: str) -> str:
 
 
 def file_name(props: mi.Properties, name: str) -> str:
-    """What can be the name of a file; "" if there is none."""
+    """Read the name of a file, which must not be a folder; the default is ""."""
     value = text(props, name)
     if "\0" in value or os.path.isdir(value):
         raise _refusal(name, value, "the name of a file, not of a folder")
@@ -106,5 +104,5 @@ def file_name(props: mi.Properties, name: str) -> str:
 
 def _refusal(name: str, value: object, wanted: str) -> IrrcacheError:
     shown = " ".join(repr(value).split())
-    shown = shown if len(shown) <= SHOWN else f"{shown[:SHOWN]}..."
+    shown = shown if len(shown) <= MAX_SHOWN_LENGTH else f"{shown[:MAX_SHOWN_LENGTH]}..."
     return IrrcacheError(f"irrcache: {name} is {shown}; it must be {wanted}.")

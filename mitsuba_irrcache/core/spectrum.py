@@ -1,4 +1,4 @@
-"""Colours and arrays of them."""
+"""Colours and arrays of colours."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import mitsuba as mi
 
 
 def interleaved(planes: mi.Spectrum | list[mi.Float], width: int = 0) -> mi.Float:
-    """Planes of an image (or of a grid) as one array, the values of a pixel side by side; of
-    ``width`` pixels, where it may be that no plane varies.
+    """Interleave the channels of an image or grid into one array.
+
+    ``width`` is the number of pixels; it is needed only if all channels may be constant.
     """
     values, width = list(planes), width or max(map(dr.width, planes))
     flat = dr.zeros(mi.Float, width * len(values))
@@ -19,5 +20,5 @@ def interleaved(planes: mi.Spectrum | list[mi.Float], width: int = 0) -> mi.Floa
 
 
 def luminance(spectrum: mi.Spectrum) -> mi.Float:
-    """Luminance of a colour; the value itself in monochromatic variants."""
+    """Return the luminance of a colour, or the value itself in monochromatic variants."""
     return spectrum[0] if mi.is_monochromatic else mi.luminance(mi.Color3f(spectrum))

@@ -1,1 +1,1 @@
-"""Voxel grids, fields on them, majorants and occupied voxels."""
+"""Voxel grids: placement, interpolation, majorants, occupancy, and bounding shapes."""

@@ -1,8 +1,8 @@
-"""The convex bounding shape of a medium, intersected in closed form.
+"""Convex bounding shape of a medium, with closed-form ray intersection.
 
-No ray ever starts on the boundary by way of an epsilon, so nothing here depends on the scene's
-scale or position. Boxes may be placed by any affine map; they are recognised from their mesh,
-whatever plugin made it.
+Intersections need no epsilon offsets, so results depend neither on the scale nor on the position of
+the scene. A box may have any affine transform; it is recognised from its mesh, whichever plugin
+created it.
 """
 
 from __future__ import annotations
@@ -17,17 +17,15 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.grid import Affine
 
-#: Vertices of a mesh that may still be a box: corners that are almost the same are one.
-MOST_VERTICES = 256
-#: Rays that find out on which side of a shape its normals are, what they may cross, and the share
-#: of them that may err: at edges.
-ORIENTATION_RAYS, MOST_SHAPES, INWARDS = 256, 256, 0.02
+#: Meshes with more vertices are not tested for being a box. (Corners may occur several times.)
+MAX_VERTICES = 256
+#: Orientation test: number of rays, maximum number of crossings per ray, and tolerated share of
+#: rays that hit a back face, which occurs at edges.
+ORIENTATION_RAYS, MAX_CROSSINGS, MAX_INWARD_SHARE = 256, 256, 0.02
 
 
 class Boundary:
-    """The image of the cube [-1, 1]^3 (``kind="box"``) or of the unit sphere (``"sphere"``) under
-    ``to_world``.
-    """
+    """Image of the cube [-1, 1]^3 ("box") or of the unit sphere ("sphere") under ``to_world``."""
 
     def __init__(self, kind: str, to_world: np.ndarray) -> None:
         self.kind = kind
@@ -45,28 +43,30 @@ class Boundary:
         return self.to_world @ unit
 
     def contains(self, position: np.ndarray) -> bool:
-        """Whether a world position (3,) is inside or on the boundary."""
+        """Whether a world position (3,) lies inside or on the boundary."""
         local = np.linalg.inv(self.to_world) @ np.append(position, 1.0)
         order = np.inf if self.kind == "box" else 2
         return bool(np.linalg.norm(local[:3], order) <= 1.0)
 
     def surrounds(self, p: mi.Point3f) -> mi.Bool:
-        """Whether world positions are inside."""
+        """Whether world positions lie inside or on the boundary."""
         local = self._to_local.point(p)
         if self.kind == "box":
             return dr.max(dr.abs(local)) <= 1
         return dr.squared_norm(local) <= 1
 
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Whether the ray's line meets the inside, and the distances of entry and exit (entry < 0:
-        from within).
+        """Intersect the line of a ray: whether it hits, and the distances of entry and exit.
+
+        The entry distance is negative for rays that start inside.
         """
         origin = self._to_local.point(ray.o)
         direction = self._to_local.vector(ray.d)
-        return _slabs(origin, direction) if self.kind == "box" else _sphere(origin, direction)
+        intersect = _intersect_box if self.kind == "box" else _intersect_sphere
+        return intersect(origin, direction)
 
     def outward_normal(self, p: mi.Point3f) -> mi.Normal3f:
-        """The unit normal that points outwards at ``p``, a position on the boundary."""
+        """Return the outward unit normal at ``p``, a position on the boundary."""
         local = mi.Vector3f(self._to_local.point(p))
         if self.kind == "box":
             largest = dr.max(dr.abs(local))
@@ -74,10 +74,8 @@ class Boundary:
         return mi.Normal3f(dr.normalize(self._normals.vector(local)))
 
 
-def _slabs(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-    """The cube [-1, 1]^3. Directions in a face are handled by a reciprocal that is never
-    infinite.
-    """
+def _intersect_box(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    """Intersect the cube [-1, 1]^3 by the slab method, also for rays that lie in a face."""
     rcp = safe_rcp(d)
     lower, upper = (-1.0 - o) * rcp, (1.0 - o) * rcp
     near = dr.max(dr.minimum(lower, upper))
@@ -85,9 +83,10 @@ def _slabs(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
     return near < far, near, far
 
 
-def _sphere(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-    """The unit sphere; the closest approach is found first, which keeps far away cameras
-    accurate.
+def _intersect_sphere(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    """Intersect the unit sphere.
+
+    Computing the closest approach first preserves accuracy for distant cameras.
     """
     rcp_length = dr.rsqrt(dr.squared_norm(d))
     direction = d * rcp_length
@@ -99,42 +98,44 @@ def _sphere(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]
 
 
 def safe_rcp(d: mi.Vector3f) -> mi.Vector3f:
-    """1 / d, finite also for components that are 0 or denormal."""
+    """Return 1 / d, finite also for components that are 0 or denormal."""
     return dr.rcp(dr.select(dr.abs(d) > 1e-20, d, dr.mulsign(mi.Vector3f(1e-20), d)))
 
 
 def boundary_of(scene: mi.Scene, shape: mi.Shape) -> Boundary:
-    """The boundary that ``shape`` describes: a sphere or any box (cube plugin or mesh, whatever its
-    placement).
+    """Return the boundary described by ``shape``: a sphere or a box (cube plugin or mesh).
 
-    Raises UnsupportedSceneError for every other shape, and for one whose normals point inwards:
-    there Mitsuba takes the whole outside for the interior medium (a cube mirrored by its
-    ``to_world`` is such a case).
+    Raises UnsupportedSceneError for other shapes, and for shapes with inward normals: Mitsuba would
+    treat their whole exterior as the interior medium (for example a cube mirrored by ``to_world``).
     """
     boundary = None
     if shape.class_name() == "Sphere":
         boundary = Boundary("sphere", _sphere_frame(shape))
-    elif shape.is_mesh() and "vertex_positions" in mi.traverse(shape):  # rectangles have none
+    elif shape.is_mesh() and "vertex_positions" in mi.traverse(
+        shape
+    ):  # rectangles lack this parameter
         vertices = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64)
         frame = _box_frame(vertices.reshape(-1, 3))
         area = float(np.ravel(shape.surface_area())[0])
-        # A face may be missing, or be there twice.
+        # Reject meshes with missing or duplicate faces.
         if frame is not None and abs(_box_area(frame) - area) < 1e-3 * area:
             boundary = Boundary("box", frame)
     name = f'shape "{shape.id()}" ({shape.class_name()})'
     if boundary is None:
         raise UnsupportedSceneError(
             f"irrcache: the medium is bounded by {name}, but only boxes (a cube with any to_world, "
-            "or a mesh of that "
-            'form) and spheres are supported so far; bound the medium by a cube, or use "volpath".'
+            "or a mesh of this form) and spheres are supported; bound the medium by a cube, or use "
+            '"volpath".'
         )
     _check_normals(scene, shape, name)
     return boundary
 
 
 def _sphere_frame(shape: mi.Shape) -> np.ndarray:
-    """``to_world`` of the unit sphere: spheres in Mitsuba are round, whatever ``to_world`` is, and
-    its first column is their radius.
+    """Return ``to_world`` of the unit sphere.
+
+    Mitsuba's spheres are round whatever ``to_world`` is; the length of its first column is the
+    radius.
     """
     matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     radius = np.linalg.norm(matrix[:3, 0])
@@ -146,13 +147,13 @@ def _sphere_frame(shape: mi.Shape) -> np.ndarray:
 
 
 def _box_area(frame: np.ndarray) -> float:
-    """The surface of the image of [-1, 1]^3."""
+    """Surface area of the image of [-1, 1]^3."""
     x, y, z = 2 * frame[:3, :3].T
     return 2 * sum(float(np.linalg.norm(np.cross(*pair))) for pair in ((x, y), (y, z), (z, x)))
 
 
 def rays_through(shape: mi.Shape) -> mi.Ray3f:
-    """Rays from outside through the bounding box of a shape."""
+    """Sample rays from outside through the bounding box of a shape."""
     rng = mi.PCG32(ORIENTATION_RAYS)
     lower, upper = mi.Point3f(shape.bbox().min), mi.Point3f(shape.bbox().max)
     u = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
@@ -163,19 +164,22 @@ def rays_through(shape: mi.Shape) -> mi.Ray3f:
 
 
 def orientation(scene: mi.Scene, shape: mi.Shape) -> tuple[float, float]:
-    """Two shares of the rays from outside that intersect ``shape``, ignoring other shapes: rays
-    that hit its back side first, and rays that do not leave it as often as they enter.
+    """Estimate how consistently the normals of ``shape`` point outwards, ignoring other shapes.
+
+    Returns two shares of the rays from outside that hit it: those that hit a back face first, and
+    those that do not leave it as often as they enter.
     """
     first, depth = _crossings(scene, mi.ShapePtr(shape), rays_through(shape))
     dr.eval(first, depth)
-    met = max(int(dr.count(first != 0)[0]), 1)
-    return int(dr.count(first < 0)[0]) / met, int(dr.count(depth != 0)[0]) / met
+    hits = max(int(dr.count(first != 0)[0]), 1)
+    return int(dr.count(first < 0)[0]) / hits, int(dr.count(depth != 0)[0]) / hits
 
 
 @symbolic
 def _crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
-    """How rays cross ``shape`` first (1: inwards, -1: outwards, 0: never), and the sum over all
-    crossings.
+    """Trace rays through all crossings with ``shape``.
+
+    Returns the first crossing (1: entering, -1: leaving, 0: none), and the sum over all crossings.
     """
     ray, first, depth = mi.Ray3f(ray), mi.Int32(0), mi.Int32(0)
     crossings, active = mi.UInt32(0), mi.Bool(True)
@@ -188,30 +192,27 @@ def _crossings(scene: mi.Scene, shape: mi.ShapePtr, ray: mi.Ray3f):
         depth += step
         ray = si.spawn_ray(ray.d)
         crossings += 1
-        active &= crossings < MOST_SHAPES
+        active &= crossings < MAX_CROSSINGS
     return first, depth
 
 
 def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
-    """Refuses a convex shape whose normals do not point outwards everywhere."""
+    """Reject a convex shape whose normals do not all point outwards."""
     inwards, _ = orientation(scene, shape)
-    if inwards > INWARDS:
-        some = "the normals" if inwards > 1 - INWARDS else f"{inwards:.0%} of the normals"
+    if inwards > MAX_INWARD_SHARE:
+        some = "the normals" if inwards > 1 - MAX_INWARD_SHARE else f"{inwards:.0%} of the normals"
         raise UnsupportedSceneError(
             f"irrcache: {some} of {name} point inwards, so Mitsuba puts its interior medium "
-            "outside of it; "
-            "mirror its to_world once more (or drop flip_normals)."
+            "outside of it; mirror its to_world once more (or drop flip_normals)."
         )
 
 
 def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
-    """The affine map of [-1, 1]^3 onto the box with these vertices, or None if they do not form
-    one.
-    """
+    """Return the affine map of [-1, 1]^3 onto the box with these vertices; None if it is no box."""
     size = np.ptp(vertices, axis=0).max()
     tolerance = 1e-5 * size + 4 * np.finfo(np.float32).eps * np.abs(vertices).max()
     vertices = np.unique(vertices, axis=0)
-    if len(vertices) > MOST_VERTICES:
+    if len(vertices) > MAX_VERTICES:
         return None
     same = _distances(vertices, vertices) <= tolerance
     corners = vertices[np.unique(same.argmax(axis=1))]
@@ -226,21 +227,19 @@ def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
         built = origin + bits @ linear.T
         if _distances(built, corners).min(axis=1).max() <= tolerance:
             frame = np.eye(4)
-            frame[:3, :3] = 0.5 * _conventional(linear)
+            frame[:3, :3] = 0.5 * _ordered_edges(linear)
             frame[:3, 3] = np.mean(corners, axis=0)
             return frame
     return None
 
 
 def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Largest differences of a coordinate between points (n, 3) and (m, 3): (n, m)."""
+    """Chebyshev distances between points (n, 3) and (m, 3), as an array (n, m)."""
     return np.abs(a[:, None] - b[None]).max(axis=-1)
 
 
-def _conventional(edges: np.ndarray) -> np.ndarray:
-    """The same edges (columns) ordered and signed so that each points along its world axis where it
-    can.
-    """
+def _ordered_edges(edges: np.ndarray) -> np.ndarray:
+    """Order and sign the edges (columns) such that each points along its world axis if possible."""
     along = np.abs(edges) / np.linalg.norm(edges, axis=0)
     best = max(
         itertools.permutations(range(3)),

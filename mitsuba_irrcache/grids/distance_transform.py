@@ -1,4 +1,4 @@
-"""Distances to the nearest occupied cell of a grid: how far a ray may go without meeting one."""
+"""Chebyshev distance transform: the number of cells a ray may cross before it can reach matter."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 
 
 def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.UInt32:
-    """For each cell of a grid of ``shape`` (z, y, x) the Chebyshev distance to the nearest one that
-    is ``occupied``, in cells: 0 where it is itself, at most ``reach``.
+    """Chebyshev distance of each grid cell to the nearest ``occupied`` cell, at most ``reach``.
+
+    ``shape`` is (z, y, x); distances are in cells.
     """
     nz, ny, nx = shape
     distance = dr.select(occupied, mi.UInt32(0), dr.opaque(mi.UInt32, reach))
@@ -18,18 +19,20 @@ def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.
     places = unravelled(dr.arange(mi.UInt32, dr.width(distance)), [Divisor(nx), Divisor(ny)])
     for place, side, stride in zip(places, (nx, ny, nz), (1, nx, nx * ny), strict=True):
         limits = (dr.opaque(mi.Int32, n) for n in (side, stride))
-        distance = _along(distance, mi.Int32(place), *limits)
+        distance = _transform_axis(distance, mi.Int32(place), *limits)
     return distance
 
 
 @symbolic
-def _along(distance: mi.UInt32, place: mi.Int32, side: mi.Int32, stride: mi.Int32) -> mi.UInt32:
-    """One axis of the transform: the least of max(|k|, distance of the cell k further)."""
+def _transform_axis(
+    distance: mi.UInt32, place: mi.Int32, side: mi.Int32, stride: mi.Int32
+) -> mi.UInt32:
+    """Transform along one axis: minimise max(|k|, distance of the cell at offset k) over k."""
     index = dr.arange(mi.Int32, dr.width(distance))
     k, nearest = mi.Int32(1), mi.Int32(distance)
     while dr.hint(k < nearest, label="clearance"):
-        for there, inside in ((-k, place >= k), (k, place + k < side)):
-            found = dr.gather(mi.UInt32, distance, mi.UInt32(index + there * stride), inside)
+        for offset, inside in ((-k, place >= k), (k, place + k < side)):
+            found = dr.gather(mi.UInt32, distance, mi.UInt32(index + offset * stride), inside)
             found = dr.maximum(k, mi.Int32(found))
             nearest = dr.select(inside, dr.minimum(nearest, found), nearest)
         k += 1

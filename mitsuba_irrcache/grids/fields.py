@@ -1,4 +1,4 @@
-"""Constant and trilinear fields."""
+"""Constant and trilinearly interpolated fields."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mitsuba_irrcache.grids.grid import Grid, stencil
 
 
 class ConstantField:
-    """A value that is the same everywhere: a Float (grey) or a Color3f."""
+    """A spatially constant value: a Float (grey) or a Color3f."""
 
     grid = None
 
@@ -23,14 +23,14 @@ class ConstantField:
         self.maximum = float(np.max(values)) * scale
 
     def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        return type(self.value)(self.value)  # a copy: loops write to what they carry
+        return type(self.value)(self.value)  # a copy, because symbolic loops write to their state
 
 
 class GridField:
-    """Values at the voxel centres of a grid, trilinear between them, clamped at the border.
+    """Values at the voxel centres of a grid, interpolated trilinearly and clamped at the border.
 
     ``data`` is flat with ``channels`` (1 or 3) interleaved values per voxel and is not copied;
-    ``scale`` multiplies every lookup, so that a scaled medium needs no array of its own.
+    ``scale`` multiplies every lookup, so that a scaled medium needs no copy of its data.
     """
 
     def __init__(self, grid: Grid, data: mi.Float, channels: int, scale: float = 1.0) -> None:
@@ -43,14 +43,12 @@ class GridField:
         self.maximum = float(dr.max(data)[0]) * scale
 
     def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """Trilinear value at the voxel coordinates ``u``: a Float for one channel, else a
-        Color3f.
-        """
+        """Interpolate at the voxel coordinates ``u``: a Float for one channel, else a Color3f."""
         values = [v * self.scale for v in self._interpolate(u, active)]
         return values[0] if self.channels == 1 else mi.Color3f(values)
 
     def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """Trilinear value at the world position ``p``."""
+        """Interpolate at the world position ``p``."""
         return self.at(self.grid.coordinates.point(p), active)
 
     def _interpolate(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
@@ -58,7 +56,8 @@ class GridField:
         corners, weights, steps = zip(
             *(stencil(c, n) for c, n in zip(u, self.grid.sides, strict=True)), strict=True
         )
-        # One product per lookup; the other corners are a stride away, or 0 at the border.
+        # Compute one flat index per lookup; the other corners are a stride away, or 0 at the
+        # border.
         base = ((corners[2] * ny + corners[1]) * nx + corners[0]) * self.channels
         dx = dr.select(steps[0], self.channels, 0)
         dy = dr.select(steps[1], nx * self.channels, 0)

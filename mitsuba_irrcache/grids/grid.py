@@ -1,12 +1,12 @@
-"""Regular voxel grids in the world: placement, coordinates and trilinear lookups.
+"""Regular voxel grids: placement in the world, coordinates and trilinear stencils.
 
-One convention everywhere, the one of Mitsuba's ``gridvolume``: arrays are ``(z, y, x, channel)``,
-values sit at voxel *centres*, are clamped at the border, and the grid fills the unit cube carried
-by ``to_world``. *Voxel coordinates* ``u`` run from 0 to n along each axis, so voxel ``i`` is
-centred at ``u = i + 0.5``.
+The convention is that of Mitsuba's ``gridvolume``: arrays are ``(z, y, x, channel)``, values are at
+voxel *centres* and clamped at the border, and the grid fills the image of the unit cube under
+``to_world``. *Voxel coordinates* ``u`` run from 0 to n along each axis, so voxel ``i`` is centred
+at ``u = i + 0.5``.
 
-The classes here and those built on them are plain ones: Dr.Jit would carry every array of a
-dataclass through its loops as a loop variable.
+These classes and those derived from them are not dataclasses: Dr.Jit would carry every array of a
+dataclass through symbolic loops as a loop variable.
 """
 
 from __future__ import annotations
@@ -23,9 +23,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 
 
 class Grid:
-    """A voxel grid: ``shape`` is ``(z, y, x)``, ``to_world`` a 4x4 affine map of the unit cube
-    (float64).
-    """
+    """A voxel grid of ``shape`` (z, y, x) over the unit cube transformed by ``to_world`` (4x4)."""
 
     def __init__(self, shape: tuple[int, int, int], to_world: np.ndarray) -> None:
         matrix = np.array(to_world, dtype=np.float64)
@@ -37,7 +35,7 @@ class Grid:
             raise IrrcacheError(f"Grid: every side needs at least one voxel, got shape {shape}")
         self.shape = tuple(int(n) for n in shape)
         self.to_world = matrix
-        # Opaque values cannot be made inside a recorded loop, so all are made here.
+        # Opaque values cannot be created inside a recorded loop, so create all of them here.
         forward = matrix @ np.diag([*(1.0 / self.resolution), 1.0])
         self.world = Affine(forward)  #: voxel coordinates -> world position
         self.coordinates = Affine(np.linalg.inv(forward))  #: world position -> voxel coordinates
@@ -50,23 +48,23 @@ class Grid:
 
     @property
     def resolution(self) -> np.ndarray:
-        """Voxels along x, y, z."""
+        """Number of voxels along x, y, z."""
         return np.array(self.shape[::-1])
 
     @cached_property
     def side_lengths(self) -> np.ndarray:
-        """World lengths of the three edges of the grid."""
+        """World lengths of the edges of the grid."""
         return np.linalg.norm(self.to_world[:3, :3], axis=0)
 
     @cached_property
     def voxel_size(self) -> np.ndarray:
-        """World lengths of the edges of one voxel."""
+        """World lengths of the edges of a voxel."""
         return self.side_lengths / self.resolution
 
     def shared(self, *others: Grid | None) -> Grid:
-        """The first of ``others`` with the same voxels as this grid, else this grid.
+        """Return the first of ``others`` with the same voxels as this grid, else this grid.
 
-        Lookups through one and the same grid share the arithmetic of their coordinates.
+        Lookups that use the same grid object share the computation of voxel coordinates.
         """
         for other in others:
             if other is not None and other.shape == self.shape:
@@ -76,22 +74,20 @@ class Grid:
         return self
 
     def centers(self, index: mi.UInt32) -> mi.Point3f:
-        """World positions of the voxels with the flat indices ``index`` (x fastest)."""
+        """World positions of the voxel centres with the flat indices ``index`` (x fastest)."""
         return self.world.point(mi.Point3f(*self.places(index)) + 0.5)
 
     def places(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Voxels along x, y, z of the flat indices ``index`` (x fastest)."""
+        """Convert flat indices (x fastest) to voxel indices along x, y, z."""
         return unravelled(index, self._divisors)
 
     def index(self, x: mi.UInt32, y: mi.UInt32, z: mi.UInt32) -> mi.UInt32:
-        """The flat indices of voxels: the inverse of `places`."""
+        """Convert voxel indices along x, y, z to flat indices: the inverse of `places`."""
         nx, ny, _ = (mi.UInt32(n) for n in self.sides)
         return (mi.UInt32(z) * ny + mi.UInt32(y)) * nx + mi.UInt32(x)
 
     def corners(self, u: mi.Point3f) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Flat indices of the eight voxels around ``u``, voxel coordinates, and their trilinear
-        weights.
-        """
+        """Flat indices and trilinear weights of the eight voxels around voxel coordinates ``u``."""
         axes = []
         for c, n in zip(u, self.sides, strict=True):
             lower, weight, more = stencil(c, n)
@@ -105,20 +101,17 @@ class Grid:
 
     @staticmethod
     def near_cubic(to_world: np.ndarray, resolution: int) -> Grid:
-        """A grid over the unit cube ``to_world`` with ``resolution`` near-cubic voxels along its
-        longest side.
-        """
+        """Create a grid with ``resolution`` nearly cubic voxels along the longest side."""
         sides = np.linalg.norm(np.asarray(to_world, dtype=np.float64)[:3, :3], axis=0)
         counts = np.maximum(1, np.rint(resolution * sides / sides.max())).astype(int)
         return Grid(tuple(int(n) for n in counts[::-1]), to_world)
 
 
 class Affine:
-    """An affine map of points and vectors, its entries opaque to the kernels (a new placement
-    recompiles nothing).
+    """An affine map of points and vectors with opaque entries: a new placement reuses kernels.
 
-    Points are taken relative to the centre of the unit cube first, so that a grid far from the
-    world's origin loses no more bits than its float32 positions already have.
+    Points are first taken relative to the centre of the unit cube, so that a grid far from the
+    world origin loses no more precision than its float32 positions already have.
     """
 
     def __init__(self, matrix: np.ndarray) -> None:
@@ -136,9 +129,7 @@ class Affine:
 
 
 def stencil(u: mi.Float, n: mi.Int32) -> tuple[mi.Int32, mi.Float, mi.Bool]:
-    """The lower of the two voxels around ``u``, the weight of the upper, and whether there is
-    one.
-    """
+    """Return the lower voxel around ``u``, the weight of the upper one, and whether it exists."""
     s = clipped(u - 0.5, 0.0, mi.Float(n - 1))
     lower = mi.Int32(s)
     return lower, s - mi.Float(lower), lower < n - 1

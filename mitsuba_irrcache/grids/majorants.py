@@ -1,6 +1,4 @@
-"""Coarse cells over the extinction grid: local majorants, empty-space skipping, and a walk through
-them.
-"""
+"""Macrocells: coarse cells with extinction bounds for tracking and empty-space skipping."""
 
 from __future__ import annotations
 
@@ -17,9 +15,10 @@ from mitsuba_irrcache.grids.grid import Affine
 
 
 class Macrocells:
-    """Bounds of sigma_t [1/scene unit], over all channels, over blocks of voxels.
+    """Bounds of sigma_t [1/scene unit], over all channels, for blocks of voxels.
 
-    Conservative under trilinear interpolation and clamping: the outermost cells reach to infinity.
+    The bounds hold under trilinear interpolation and clamping; the outermost cells extend to
+    infinity.
     """
 
     def __init__(
@@ -32,13 +31,17 @@ class Macrocells:
         self.majorant = majorant
         self.minorant = minorant
         self.shape = shape
-        self.coordinates = coordinates  #: world -> macrocell coordinates, 0 to n along each axis
+        self.coordinates = (
+            coordinates  #: world position -> macrocell coordinates, 0 to n along each axis
+        )
         self.sides = tuple(dr.opaque(mi.Int32, n) for n in shape[::-1])
 
     @staticmethod
     def build(sigma_t: Field, boundary: Boundary | None, size: int = 0) -> Macrocells:
-        """Blocks of ``size`` voxels along each edge (0: at least 4, at most 64 blocks); of a
-        constant, one cell over the ``boundary``.
+        """Build macrocells of ``size`` voxels along each edge; one cell for a constant field.
+
+        With ``size`` 0 cells have at least 4 voxels along an edge, and there are at most 64 along
+        an axis. The cell of a constant field covers the ``boundary``.
         """
         if isinstance(sigma_t, ConstantField):
             majorant = dr.opaque(mi.Float, sigma_t.maximum)
@@ -56,13 +59,14 @@ class Macrocells:
         return int(np.prod(self.shape))
 
     def walk(self, ray: mi.Ray3f) -> Walk:
-        """The constants of a walk along ``ray``."""
+        """Prepare the traversal of the macrocells along ``ray``."""
         return Walk(self, ray)
 
 
 class Walk:
-    """A ray in macrocell coordinates. The cell is kept as integers by the caller; nothing
-    accumulates.
+    """A ray in macrocell coordinates.
+
+    The caller stores the current cell as integers, so that rounding errors do not accumulate.
     """
 
     def __init__(self, cells: Macrocells, ray: mi.Ray3f) -> None:
@@ -75,7 +79,7 @@ class Walk:
         """The cell that contains the point at distance ``t``."""
         u = dr.fma(self.direction, t, self.origin)
         limits = mi.Vector3i(*self.cells.sides) - 1
-        # Clipped as floats first: a float beyond 2^31 has no integer.
+        # Clamp before the conversion: floats beyond 2^31 cannot be converted to integers.
         return mi.Vector3i(dr.clip(dr.floor(u), 0.0, mi.Vector3f(limits)))
 
     def index(self, cell: mi.Vector3i) -> mi.UInt32:
@@ -89,18 +93,19 @@ class Walk:
         return dr.gather(mi.Float, self.cells.minorant, self.index(cell), active)
 
     def exit(self, cell: mi.Vector3i, t: mi.Float) -> tuple[mi.Float, mi.Vector3i]:
-        """Distance, at least ``t``, at which the ray leaves ``cell``, and the cell behind.
+        """Return the distance, at least ``t``, at which the ray leaves ``cell``, and the next cell.
 
-        The distance is infinite for a border cell, which reaches that far.
+        The distance is infinite if the ray leaves the grid through ``cell``, which extends to
+        infinity.
         """
-        forward = self.rcp > 0  # also tells 0 from -0, as the reciprocal does
+        forward = self.rcp > 0  # distinguishes 0 from -0, as the reciprocal does
         wall = mi.Vector3f(cell + dr.select(forward, 1, 0))
         limits = mi.Vector3i(*self.cells.sides) - 1
         last = dr.select(forward, cell >= limits, cell <= 0)
         distance = dr.select(last, dr.inf, (wall - self.origin) * self.rcp)
         nearest = dr.min(distance)
         step = dr.select(forward, mi.Vector3i(1), mi.Vector3i(-1))
-        # Ties step along one axis only; the next call leaves through the other at the same
+        # Ties step along one axis only; the next call leaves through the other face at the same
         # distance.
         on_x = distance.x == nearest
         on_y = ~on_x & (distance.y == nearest)
@@ -113,12 +118,11 @@ class Walk:
 def _block_bounds(
     sigma_t: GridField, size: int, shape: tuple[int, int, int]
 ) -> tuple[mi.Float, mi.Float]:
-    """Least and largest value in each block grown by the one voxel that trilinear stencils reach
-    beyond it.
-    """
+    """Minimum and maximum of each block, grown by one voxel, which trilinear stencils may read."""
     channels = sigma_t.channels
     least = largest = sigma_t.data
-    # Channels first, then axis by axis: windows overlap, so this reads less than blocks would.
+    # Reduce the channels first, then axis by axis: windows overlap, so this reads less than blocks
+    # would.
     if channels > 1:
         index = dr.arange(mi.UInt32, sigma_t.grid.voxel_count) * channels
         values = [dr.gather(mi.Float, sigma_t.data, index + c) for c in range(channels)]
@@ -126,19 +130,20 @@ def _block_bounds(
         dr.eval(least, largest)
     sides = list(sigma_t.grid.shape[::-1])
     for axis in range(3):
-        least, largest = _reduced(least, largest, sides, axis, size, shape[2 - axis])
+        least, largest = _window_bounds(least, largest, sides, axis, size, shape[2 - axis])
         sides[axis] = shape[2 - axis]
-    # A little slack, since interpolation may round beyond its eight values.
+    # Widen the bounds, since interpolation may round beyond its eight values.
     least, largest = least * sigma_t.scale * (1 - 1e-6), largest * sigma_t.scale * (1 + 1e-6)
     dr.eval(least, largest)
     return least, largest
 
 
-def _reduced(
+def _window_bounds(
     least: mi.Float, largest: mi.Float, sides: list[int], axis: int, size: int, count: int
 ) -> tuple[mi.Float, mi.Float]:
-    """Bounds of ``count`` windows along one axis, each of ``size`` values and one more at both
-    ends; at first both are bounds of the same array.
+    """Bounds of ``count`` windows of ``size`` + 2 values along one axis.
+
+    ``least`` and ``largest`` are the same array for the first axis.
     """
     stride, side = int(np.prod(sides[:axis])), sides[axis]
     index = dr.arange(mi.UInt32, int(np.prod(sides)) // side * count)

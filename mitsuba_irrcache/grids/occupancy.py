@@ -1,4 +1,4 @@
-"""Voxels of a grid that lookups in a medium can read."""
+"""Determine the voxels of a grid that lookups in a medium can read."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Affine, Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
 
-#: Share of active voxels below which they are told apart more closely, by cells of so many voxels
-#: of the medium along an edge.
-SPARSE, FINE = 0.3, 2
+#: If fewer than this share of the voxels is active, they are determined more precisely, with
+#: macrocells of this many voxels of the medium along an edge.
+SPARSE_SHARE, SPARSE_CELL_SIZE = 0.3, 2
 
 
 def marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
-    """Of all voxels of ``grid``, whether they are among ``voxels``."""
+    """Convert a list of voxels into a mask over all voxels of ``grid``."""
     marks = dr.zeros(mi.Bool, grid.voxel_count)
     if dr.width(voxels):
         dr.scatter(marks, mi.Bool(True), voxels)
@@ -24,11 +24,10 @@ def marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
 
 
 def active_voxels(medium, grid: Grid) -> mi.UInt32:
-    """Flat indices, ascending, of the voxels of ``grid`` that a lookup where ``sigma_t > 0`` can
-    read.
+    """Flat indices, ascending, of the voxels of ``grid`` that lookups where sigma_t > 0 can read.
 
-    Every macrocell that is not empty marks the voxels whose trilinear support its box may overlap;
-    where these are few, smaller cells mark still fewer.
+    Every macrocell that is not empty marks the voxels whose trilinear support may overlap it. If
+    these are few, the computation is repeated with smaller macrocells.
     """
     cells = medium.macrocells
     occupied = dr.compress(cells.majorant > 0)
@@ -37,20 +36,19 @@ def active_voxels(medium, grid: Grid) -> mi.UInt32:
     if cells.count == 1:
         return dr.arange(mi.UInt32, grid.voxel_count)
     marked = _mark(cells, occupied, grid)
-    if dr.width(marked) < SPARSE * grid.voxel_count:
-        cells = Macrocells.build(medium.sigma_t, medium.boundary, FINE)
+    if dr.width(marked) < SPARSE_SHARE * grid.voxel_count:
+        cells = Macrocells.build(medium.sigma_t, medium.boundary, SPARSE_CELL_SIZE)
         marked = _mark(cells, dr.compress(cells.majorant > 0), grid)
     return marked
 
 
 def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], list[mi.Int32]]:
-    """First and last voxel along x, y, z whose trilinear support the box of each macrocell
-    meets.
-    """
+    """First and last voxel along x, y, z whose trilinear support overlaps each macrocell."""
     nz, ny, nx = cells.shape
     index = unravelled(occupied, [Divisor(nx), Divisor(ny)])
     to_voxels = grid.coordinates.matrix @ np.linalg.inv(cells.coordinates.matrix)
-    # Border cells reach beyond their own grid, whose values are clamped: here as far as the cache.
+    # Border cells extend beyond their grid, whose values are clamped: extend them to the cache's
+    # bounds.
     corners = np.array(list(np.ndindex(2, 2, 2))) * grid.resolution
     to_cells = np.linalg.inv(to_voxels)
     reach = corners @ to_cells[:3, :3].T + to_cells[:3, 3]
@@ -66,7 +64,8 @@ def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], l
     for side, c, row in zip(grid.sides, center, np.abs(to_voxels[:3, :3]), strict=True):
         extent = sum(dr.opaque(mi.Float, float(m)) * h for m, h in zip(row, half, strict=True))
         limit = mi.Float(side - 1)
-        # Voxel i is read from u in (i - 1/2, i + 3/2); border voxels also from beyond the grid.
+        # Lookups at u in (i - 1/2, i + 3/2) read voxel i; border voxels are read beyond the grid,
+        # too.
         first.append(mi.Int32(dr.clip(dr.floor(c - extent - 0.5 - 1e-3), 0, limit)))
         last.append(mi.Int32(dr.clip(dr.floor(c + extent + 0.5 + 1e-3), 0, limit)))
     return first, last

@@ -1,10 +1,9 @@
-"""Several fields of one grid, laid out for rays: a lookup needs few loads of little memory.
+"""Several fields of one grid, packed for ray marching: few, wide loads from little memory.
 
-What rays read of large volumes waits for memory, not for arithmetic. So values are kept in 16 bits,
-floating-point numbers without a sign: 5 bits of exponent and 11 of mantissa, rounded up or down at
-random, such that they are right on average over any few neighbours. And what a lookup reads
-together lies together: the fields of a voxel, and while there is room in four words, those of the
-voxel's neighbour along x.
+Ray marching of large volumes is limited by memory bandwidth, not by arithmetic. Values are
+therefore stored as 16-bit floats without sign (5 bits of exponent, 11 of mantissa), with dithered
+rounding such that the mean over neighbouring voxels is preserved. The fields of a voxel are stored
+together, and, if at most four 32-bit words result, with those of its neighbour along x.
 """
 
 from __future__ import annotations
@@ -19,68 +18,67 @@ from mitsuba_irrcache.grids.fields import Field, GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import Extension, RootField
 
-#: Most values of a voxel, two in each word; so many have those of their neighbours with them.
-MOST, PAIRED = 8, (1, 2, 4)
-#: Larger copies could not be addressed with 32 bits.
-LARGEST = 2**32 // 4
-#: Bits of a float's mantissa that are left out, and the exponent, as floats keep it, that is 0 in
-#: 16 bits. What is below 2^-30 of the largest value is 0.
-DROPPED, LEAST = 12, 96
-#: 2^32 over x, x^2 and x^3 where x^4 = x + 1: multiples spread evenly over all axes (Roberts,
-#: *The unreasonable effectiveness of quasirandom sequences*, 2018).
-SPREAD = (3518319155, 2882110345, 2360945575)
-#: Smaller largest values count as this one: its reciprocal is a number still.
-SMALLEST = 1e-37
+#: Maximum number of values of a voxel, two per word; numbers of values stored with the neighbour's.
+MAX_VALUES, PAIRED_COUNTS = 8, (1, 2, 4)
+#: Grids with more voxels are not packed: 32 bits could not address the copy.
+MAX_VOXELS = 2**32 // 4
+#: Number of mantissa bits of a float32 that are dropped, and the biased float32 exponent that is
+#: stored as 0. Values below 2^-30 of the maximum become 0.
+DROPPED, ZERO_EXPONENT = 12, 96
+#: 2^32 divided by x, x^2 and x^3 where x^4 = x + 1: a low-discrepancy sequence in three dimensions
+#: (Roberts, *The unreasonable effectiveness of quasirandom sequences*, 2018).
+DITHER_STEPS = (3518319155, 2882110345, 2360945575)
+#: Lower bound of a field's maximum, such that its reciprocal is finite.
+MIN_SCALE = 1e-37
 
 
 class Packets:
-    """Fields, at most `MOST` values in all, with values at the voxel centres of ``grid``, trilinear
-    between them and clamped at the border: the numbers of a `GridField`, copied.
+    """Packed copy of several `GridField` on one ``grid``, at most `MAX_VALUES` per voxel.
 
-    ``planes`` gives, for flat indices of voxels, what is kept of them, not negative; of each
-    ``largest`` is the largest that is told apart.
+    ``planes`` maps flat voxel indices to their non-negative values, one array for each value, and
+    ``largest`` holds the maximum representable value of each.
     """
 
     def __init__(self, grid: Grid, planes: Callable, largest: Sequence[float]) -> None:
         self.grid, self.count = grid, len(largest)
-        #: whether a word holds a value and that of the voxel's neighbour along x
-        self.paired = self.count in PAIRED
+        #: whether a word holds a value and that of the neighbour along x
+        self.paired = self.count in PAIRED_COUNTS
         sides = [int(n) for n in grid.resolution]
         self._last = [dr.opaque(mi.Float, n - 1) for n in sides]
         self._lowest = [dr.opaque(mi.Int32, max(n - 2, 0)) for n in sides]
         steps = zip(sides, (1, sides[0], sides[0] * sides[1]), strict=True)
         self._steps = [dr.opaque(mi.Int32, step if n > 1 else 0) for n, step in steps]
-        largest = [max(value, SMALLEST) for value in largest]
+        largest = [max(value, MIN_SCALE) for value in largest]
         self._scales = [dr.opaque(mi.Float, value) for value in largest]
         scales = [dr.opaque(mi.Float, 1 / value) for value in largest]
         index = dr.arange(mi.UInt32, grid.voxel_count)
         x, y, z = grid.places(index)
-        noise = x * SPREAD[0] + y * SPREAD[1] + z * SPREAD[2]
+        noise = x * DITHER_STEPS[0] + y * DITHER_STEPS[1] + z * DITHER_STEPS[2]
 
         def numbers(index: mi.UInt32, noise: mi.UInt32) -> list[mi.UInt32]:
             values = zip(planes(index), scales, strict=True)
-            return [_encoded(value * scale, noise) for value, scale in values]
+            return [_encode(value * scale, noise) for value, scale in values]
 
         here = numbers(index, noise)
         if self.paired:
             step = dr.select(x + 1 < mi.UInt32(grid.sides[0]), mi.UInt32(1), 0)
-            right = numbers(index + step, noise + step * SPREAD[0])
+            right = numbers(index + step, noise + step * DITHER_STEPS[0])
             here = [number for pair in zip(here, right, strict=True) for number in pair]
         words = [low | high << 16 for low, high in zip(here[::2], here[1::2], strict=False)]
         words += here[len(words) * 2 :]
         self.words = 1 << (len(words) - 1).bit_length()
         words += [mi.UInt32(0)] * (self.words - len(words))
-        # Made by a kernel, never borrowed from elsewhere: wide loads need an aligned array.
+        # Allocated by Dr.Jit, because wide loads need an aligned array.
         self.data = dr.empty(mi.UInt32, grid.voxel_count * self.words)
         dr.scatter(self.data, _load(self.words)(*words), index)
         dr.eval(self.data)
 
     def at(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
-        """The fields at the voxel coordinates ``u``."""
+        """Interpolate all fields at the voxel coordinates ``u``."""
         corners, weights = [], []
         for c, last, most in zip(u, self._last, self._lowest, strict=True):
             s = clipped(c - 0.5, 0.0, last)
-            # Of the last voxel nothing but the upper one of two.
+            # A pair starts at the last voxel but one at most.
             corners.append(dr.minimum(mi.Int32(s), most))
             weights.append(s - mi.Float(corners[-1]))
         wx, wy, wz = weights
@@ -93,71 +91,72 @@ class Packets:
             return [words] if self.words == 1 else list(words)
 
         def edge(place: mi.Int32) -> list[mi.Float]:
-            """Interpolated along x."""
-            low = [half for word in load(place) for half in _decoded(word)]
+            """Interpolate along x."""
+            low = [half for word in load(place) for half in _decode(word)]
             if self.paired:
                 low, high = low[::2], low[1::2]
             else:
-                high = [half for word in load(place + dx) for half in _decoded(word)]
+                high = [half for word in load(place + dx) for half in _decode(word)]
             return [dr.lerp(a, b, wx) for a, b in zip(low, high, strict=True)][: self.count]
 
         def face(place: mi.Int32) -> list[mi.Float]:
-            """Interpolated along x and y."""
+            """Interpolate along x and y."""
             return [dr.lerp(a, b, wy) for a, b in zip(edge(place), edge(place + dy), strict=True)]
 
         values = zip(face(base), face(base + dz), self._scales, strict=True)
-        return [dr.lerp(near, far, wz) * 2.0**LEAST * scale for near, far, scale in values]
+        return [dr.lerp(near, far, wz) * 2.0**ZERO_EXPONENT * scale for near, far, scale in values]
 
 
 def _load(words: int) -> type:
-    """So many words that are read together."""
+    """Return the type that loads this many words at once."""
     return {1: mi.UInt32, 2: mi.Vector2u, 4: mi.Array4u}[words]
 
 
-def _encoded(value: mi.Float, noise: mi.UInt32) -> mi.UInt32:
-    """A number in [0, 1], greater ones are 1, in 16 bits, rounded by ``noise``."""
+def _encode(value: mi.Float, noise: mi.UInt32) -> mi.UInt32:
+    """Encode a value, clamped to [0, 1], in 16 bits; ``noise`` dithers the rounding."""
     bits = dr.reinterpret_array(mi.UInt32, dr.clip(value, 0, 1)) + (noise >> (32 - DROPPED))
-    # An exponent of 0 has another meaning for floats.
-    told = bits >= (LEAST + 1) << 23
-    return dr.select(told, (bits - (LEAST << 23)) >> DROPPED, 0)
+    # Flush smaller values to 0: a float with exponent 0 is denormal.
+    representable = bits >= (ZERO_EXPONENT + 1) << 23
+    return dr.select(representable, (bits - (ZERO_EXPONENT << 23)) >> DROPPED, 0)
 
 
-def _decoded(word: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Both numbers of a word, times 2^-`LEAST`: what is left out are zeros."""
+def _decode(word: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Decode both values of a word, scaled by 2^-`ZERO_EXPONENT`; dropped bits are 0."""
     low = (word & 0xFFFF) << DROPPED
     high = (word >> (16 - DROPPED)) & (0xFFFF << DROPPED)
     return dr.reinterpret_array(mi.Float, low), dr.reinterpret_array(mi.Float, high)
 
 
 class Lookups:
-    """The values of several fields at one place. Those that share their voxels, and fit, are read
-    together from a copy, after which they are not needed; others, and constants, by their own.
+    """Simultaneous lookups in several fields.
 
-    Values of a field above its ``limits``, if there are any, count as these.
+    Fields on the same grid are packed as far as they fit (see `Packets`); the original arrays are
+    not needed any more. Other fields, and constants, are looked up separately. Values of a field
+    above its entry in ``limits`` are clamped.
     """
 
     def __init__(self, fields: list[Field], limits: Sequence[float] | None = None) -> None:
-        self.groups: list[Group] = []
+        self.groups: list[PackedGroup] = []
         limits = limits or [dr.inf] * len(fields)
         grids = [f if isinstance(f, GridField) else None for f in fields]
-        alone = [i for i, f in enumerate(grids) if f and f.grid.voxel_count < LARGEST]
-        self._others = {i: f for i, f in enumerate(fields) if i not in alone}
-        while alone:
-            group = [alone.pop(0)]
-            for i in list(alone):
+        remaining = [i for i, f in enumerate(grids) if f and f.grid.voxel_count < MAX_VOXELS]
+        self._others = {i: f for i, f in enumerate(fields) if i not in remaining}
+        while remaining:
+            group = [remaining.pop(0)]
+            for i in list(remaining):
                 candidate = [fields[j] for j in [*group, i]]
-                if _together(candidate) and sum(f.channels for f in candidate) <= MOST:
+                if _on_same_grid(candidate) and sum(f.channels for f in candidate) <= MAX_VALUES:
                     group.append(i)
-                    alone.remove(i)
-            self.groups.append(Group([(i, fields[i], limits[i]) for i in group]))
+                    remaining.remove(i)
+            self.groups.append(PackedGroup([(i, fields[i], limits[i]) for i in group]))
 
     def at_world(self, p: mi.Point3f, active: mi.Bool) -> list:
-        """The values at world positions."""
+        """Interpolate at world positions."""
         found = [group.at(group.place(p), active) for group in self.groups]
         return self._all(found, p, active)
 
     def along(self, ray: mi.Ray3f) -> AlongRay:
-        """The values along a ray."""
+        """Prepare lookups along a ray."""
         return AlongRay(self, ray)
 
     def _all(self, found: list[dict], p: mi.Point3f, active: mi.Bool) -> list:
@@ -168,36 +167,36 @@ class Lookups:
 
 
 class AlongRay:
-    """`Lookups` at places of a ``ray``, which is straight in the grids' coordinates too."""
+    """Lookups along a ``ray``, which is straight in voxel coordinates, too."""
 
     def __init__(self, lookups: Lookups, ray: mi.Ray3f) -> None:
         self.ray, self._lookups = ray, lookups
-        self._ways = [
+        self._group_rays = [
             (group.place(ray.o), group.grid.coordinates.vector(ray.d)) for group in lookups.groups
         ]
 
     def at(self, t: mi.Float, active: mi.Bool) -> list:
-        """The values at the distance ``t``."""
-        groups = zip(self._lookups.groups, self._ways, strict=True)
+        """Interpolate at the distance ``t``."""
+        groups = zip(self._lookups.groups, self._group_rays, strict=True)
         found = [group.at(dr.fma(d, t, o), active) for group, (o, d) in groups]
         return self._lookups._all(found, self.ray(t), active)
 
 
-def _inner(field: GridField) -> Grid:
+def _base_grid(field: GridField) -> Grid:
     return field.inner if isinstance(field, RootField) else field.grid
 
 
-def _together(fields: list[GridField]) -> bool:
-    first = _inner(fields[0])
-    return all(_inner(f).shared(first) is first for f in fields[1:])
+def _on_same_grid(fields: list[GridField]) -> bool:
+    first = _base_grid(fields[0])
+    return all(_base_grid(f).shared(first) is first for f in fields[1:])
 
 
-class Group:
-    """Fields of one ``grid`` in `Packets`: each has a number, and a limit."""
+class PackedGroup:
+    """Fields of one ``grid`` in `Packets`, each with its index in `Lookups` and its upper limit."""
 
     def __init__(self, fields: list[tuple[int, GridField, float]]) -> None:
-        self.grid = _inner(fields[0][1])
-        #: numbers, channels, and whether roots are kept
+        self.grid = _base_grid(fields[0][1])
+        #: index, number of channels, and whether square roots are stored
         self.members = [(i, f.channels, isinstance(f, RootField)) for i, f, _ in fields]
         extended = any(root for *_, root in self.members)
         extension = Extension(self.grid) if extended else None
@@ -218,11 +217,11 @@ class Group:
         self.packets = Packets(extension.grid if extended else self.grid, planes, largest)
 
     def place(self, p: mi.Point3f) -> mi.Point3f:
-        """Voxel coordinates of world positions in what is kept."""
+        """Convert world positions to voxel coordinates of the packed grid."""
         return self.grid.coordinates.point(p) + self._shift
 
     def at(self, u: mi.Point3f, active: mi.Bool) -> dict:
-        """The fields, by their numbers, at these coordinates."""
+        """Interpolate at voxel coordinates; returns the fields by index."""
         values = self.packets.at(u, active)
         found = {}
         for i, channels, root in self.members:

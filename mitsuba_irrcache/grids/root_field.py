@@ -1,4 +1,4 @@
-"""Fields whose square roots are trilinear, and their extrapolation beyond the border."""
+"""Fields whose square roots are interpolated, with extrapolation beyond the border."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ import numpy as np
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 
-#: Largest ratio of neighbouring roots of irradiance that is extrapolated beyond the border.
+#: Maximum ratio of neighbouring square roots of irradiance used for extrapolation.
 STEEPEST = 4.0
 
 
 class RootField(GridField):
-    """Non-negative values whose square *roots* are trilinear; made of those roots.
+    """Non-negative values whose square *roots*, which it is made of, are interpolated trilinearly.
 
-    Irradiance falls off like an exponential inside dense matter, where it is convex and plain
-    interpolation reads too much light: +1.3 % of the mean radiance on a CT head, against +0.4 % for
-    roots (experiments/validation/accuracy). Roots are still exact for constants and of second
-    order.
+    Irradiance decays about exponentially inside dense media. Interpolating such a convex function
+    overestimates it: by +1.3 % of the mean radiance on a CT head, against +0.4 % for square roots
+    (experiments/validation/accuracy). Constants are still exact, and the order of convergence is 2.
 
-    Beyond the outermost centres values go on as they change from there inwards: dense matter that
-    the border cuts is brightest in just that half of a voxel. Clamped, a cube of 0.6 mean free
-    paths per voxel lost 20 % of its light.
+    Beyond the outermost voxel centres values are extrapolated: if the boundary cuts a dense medium,
+    the irradiance is largest in that outer half of a voxel. With clamping, a cube of 0.6 mean free
+    paths per voxel lost 20 % of its radiance.
     """
 
     def __init__(
         self, grid: Grid, roots: mi.Float, channels: int, variance: mi.Float | None = None
     ) -> None:
-        """``variance`` is that of the values, relative, where they are noisy."""
+        """Extrapolate ``roots``; ``variance`` is the relative variance of noisy values."""
         self.inner, extension = grid, Extension(grid)
         roots = extrapolated(extension, roots, channels, variance)
         super().__init__(extension.grid, roots, channels)
         self.maximum = self.maximum**2
 
     def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """Trilinear value at the voxel coordinates ``u`` of the grid without its extension."""
+        """Interpolate at the voxel coordinates ``u`` of the grid without its extension."""
+        # docs/primer, eq. (2.1)
         return dr.square(super().at(u + 1, active))
 
     def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
@@ -44,7 +44,7 @@ class RootField(GridField):
 
 
 class Extension:
-    """A grid with one more voxel at both ends of each axis: ``grid``."""
+    """``grid`` with one additional layer of voxels on each side."""
 
     def __init__(self, grid: Grid) -> None:
         place = grid.to_world @ np.diag([*((n + 2) / n for n in grid.resolution), 1.0])
@@ -52,12 +52,13 @@ class Extension:
         self.inner, self.grid = grid, Grid(tuple(n + 2 for n in grid.shape), place)
 
     def inside(self, voxel: mi.UInt32) -> mi.UInt32:
-        """The voxels of the grid without its extension that are nearest to these ones."""
+        """The nearest voxels of the original grid."""
         return self.inner.index(*(nearest for nearest, _ in self._nearest(voxel)))
 
     def inwards(self, voxel: mi.UInt32) -> list[mi.UInt32]:
-        """Along each axis the next ones from there: the same, unless a voxel lies beyond that end
-        of the grid.
+        """For each axis, the neighbour of the nearest original voxel in inward direction.
+
+        It equals the nearest voxel unless the extended voxel lies outside the grid along that axis.
         """
         nearest = self._nearest(voxel)
         places = [near for near, _ in nearest]
@@ -68,7 +69,7 @@ class Extension:
         return found
 
     def _nearest(self, voxel: mi.UInt32) -> list[tuple[mi.UInt32, mi.Int32]]:
-        """Along each axis the nearest voxel inside, and the step inwards from there."""
+        """For each axis, the index of the nearest original voxel, and the inward step."""
         found = []
         for place, side in zip(self.grid.places(voxel), self.inner.sides, strict=True):
             at = mi.Int32(place) - 1
@@ -81,12 +82,12 @@ class Extension:
 def extrapolated(
     extension: Extension, roots: mi.Float, channels: int = 1, variance: mi.Float | None = None
 ) -> mi.Float:
-    """Roots on the extended grid: beyond an end the outermost value times its ratio to the next one
-    inwards, at most `STEEPEST`, axis by axis.
+    """Extrapolate square roots to the extended grid, axis by axis.
 
-    Ratios of noisy values are too large on average. With relative variances v and v' of the two,
-    extrapolated and interpolated values are right on average over the half voxel with 1 - 0.36 (v +
-    v') (second moments of the weights 0 to 1/2, and 4/9 for the other two axes).
+    The outermost value is multiplied by its ratio to the next inner one, which is clamped to [1 /
+    `STEEPEST`, `STEEPEST`]. Ratios of noisy values are too large on average: with relative
+    variances v and v' of the two voxels, the factor 1 - 0.36 (v + v') makes the mean over the outer
+    half voxel correct (second moments of the weights 0 to 1/2, and 4/9 for the other two axes).
     """
     index = dr.arange(mi.UInt32, extension.grid.voxel_count * channels)
     voxel = index // channels

@@ -1,1 +1,1 @@
-"""Files: images, scenes and volumes in Mitsuba's format."""
+"""File input and output: images, scenes and volumes in Mitsuba's format."""

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from typing import BinaryIO
 
 from mitsuba_irrcache.errors import IrrcacheError
 
-#: Seconds after which a temporary file that nobody has written to is left over from a process that
-#: was killed.
+#: Age [s] at which an unmodified temporary file is considered left over from a killed process.
 ABANDONED = 3600.0
 _MASKING = threading.Lock()
 
 
 @contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
-    """A binary file that replaces ``path`` when the block ends, and vanishes if the block raises.
+    """Open a binary file that replaces ``path`` when the block ends; delete it if the block raises.
 
-    It is written beside ``path`` under a temporary name, flushed to the disk, then renamed. Those
-    that killed processes have left are removed. Raises IrrcacheError where it cannot be written.
+    The data is written to a temporary file in the same folder, flushed to disk, then renamed.
+    Temporary files left over from killed processes are removed. Raises IrrcacheError if ``path`` is
+    not writable.
     """
     path = Path(path)
     if not path.parent.is_dir():
@@ -52,7 +52,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[BinaryIO]:
 
 
 def _remove_abandoned(folder: Path, prefix: str, suffix: str) -> None:
-    """Removes temporary files of one name that nobody writes to any more."""
+    """Remove temporary files with this name that are no longer being written."""
     with suppress(OSError):
         for entry in os.scandir(folder):
             if entry.name.startswith(prefix) and entry.name.endswith(suffix):
@@ -62,10 +62,12 @@ def _remove_abandoned(folder: Path, prefix: str, suffix: str) -> None:
 
 
 def _umask() -> int:
-    """The mask of the process. Reading it means setting it, for all threads: two that did this at
-    once could leave it at 0.
+    """Return the umask of the process.
+
+    Reading the umask requires setting it, for all threads; without the lock, two threads could
+    leave it at 0.
     """
     with _MASKING:
-        mask = os.umask(0o077)  # a file that another thread makes meanwhile is nobody else's
+        mask = os.umask(0o077)  # a file created meanwhile by another thread stays private
         os.umask(mask)
     return mask

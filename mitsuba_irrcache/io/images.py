@@ -1,4 +1,4 @@
-"""Writing images: EXR with metadata and a PNG beside it, whole or not at all."""
+"""Atomic writing of images: an EXR with metadata and a PNG next to it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,15 @@ import OpenImageIO as oiio  # noqa: N813 (the name its documentation uses)
 
 from mitsuba_irrcache.errors import IrrcacheError
 
-#: Names of the channels of an image, by their number.
+#: Channel names of an image by their number.
 CHANNELS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def check_output(path: str | Path) -> Path:
-    """The path of an EXR that can be written; raises IrrcacheError before any work is done for
-    it.
-    """
+    """Return the path of a writable EXR; raise IrrcacheError before any work is done otherwise."""
     path = Path(path)
     if path.suffix.lower() != ".exr":
-        raise IrrcacheError(f'the output "{path}" must end in .exr (a PNG is written beside it).')
+        raise IrrcacheError(f'the output "{path}" must end in .exr (a PNG is written next to it).')
     if not path.parent.is_dir():
         raise IrrcacheError(f'cannot write "{path}": the folder "{path.parent}" does not exist.')
     if path.is_dir():
@@ -37,12 +35,11 @@ def write_image(
     metadata: dict[str, object],
     further: Sequence[str] = (),
 ) -> Path:
-    """Writes ``image`` (height, width, channel), linear radiance, to ``path`` (.exr) and as sRGB to
-    a PNG.
+    """Write ``image`` (height, width, channel), linear radiance, to an EXR and an sRGB PNG.
 
-    Channels are luminance or RGB, perhaps alpha, and then those that ``further`` names, which go
-    into the EXR only. ``metadata`` goes into its header under ``irrcache:``. Returns the PNG's
-    path.
+    The channels are luminance or RGB, optionally alpha, followed by those named in ``further``,
+    which are stored in the EXR only. ``metadata`` is stored in its header with the prefix
+    ``irrcache:``. Returns the path of the PNG.
     """
     path = check_output(path)
     image = np.ascontiguousarray(image, dtype=np.float32)
@@ -62,12 +59,12 @@ def write_image(
 
 
 def write_pixels(path: Path, pixels: np.ndarray) -> None:
-    """Writes ``pixels``, uint8 (height, width, channel), to a PNG as they are."""
+    """Write ``pixels``, uint8 (height, width, channel), to a PNG without conversion."""
     _write(oiio.ImageBuf(np.ascontiguousarray(pixels)), path, oiio.UINT8)
 
 
 def read_image(path: str | Path) -> np.ndarray:
-    """The pixels of an image file (height, width, channel), float32, as they are stored."""
+    """Read the pixels of an image file (height, width, channel) as float32, without conversion."""
     return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
 
 

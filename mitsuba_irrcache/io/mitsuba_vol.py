@@ -31,8 +31,8 @@ def read_vol(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
         ``(2, 3)`` (which Mitsuba ignores unless ``use_grid_bbox`` is set).
 
     Raises:
-        IrrcacheError: missing, foreign, truncated or over-long file; the header is checked against
-            the size of the file before anything is allocated.
+        IrrcacheError: the file is missing, of another format, truncated or too long; the header is
+            compared with the file size before memory is allocated.
     """
     path = Path(path)
     if not path.is_file():
@@ -50,7 +50,7 @@ def write_vol(
     """Write ``array`` of shape ``(z, y, x)`` or ``(z, y, x, channel)`` atomically.
 
     Args:
-        path: the file; it appears whole, or not at all.
+        path: the output file.
         array: any real dtype, converted to float32 slice by slice.
         bbox: ``((x, y, z) min, (x, y, z) max)`` stored in the header.
 
@@ -58,7 +58,7 @@ def write_vol(
         the number of bytes written.
 
     Raises:
-        IrrcacheError: a shape that the format cannot hold, or a value that is not finite.
+        IrrcacheError: the format does not support the shape, or a value is not finite.
     """
     if array.ndim == 3:
         array = array[..., None]
@@ -84,7 +84,7 @@ def write_vol(
 
 
 def _read_header(path: Path) -> tuple[tuple[int, int, int], int, np.ndarray]:
-    """Size (x, y, z), channels and bounding box of a file that is what its header says."""
+    """Read and validate the header: size (x, y, z), number of channels and bounding box."""
     file_bytes = path.stat().st_size
     if file_bytes < _HEADER.size:
         raise IrrcacheError(
@@ -94,7 +94,7 @@ def _read_header(path: Path) -> tuple[tuple[int, int, int], int, np.ndarray]:
         fields = _HEADER.unpack(stream.read(_HEADER.size))
     magic, version, encoding, *size, channels = fields[:7]
     if magic != b"VOL":
-        raise IrrcacheError(f"{path} is no Mitsuba volume: it begins with {magic!r}, not b'VOL'")
+        raise IrrcacheError(f"{path} is not a Mitsuba volume: it begins with {magic!r}, not b'VOL'")
     if version != _VERSION or encoding != _FLOAT32:
         raise IrrcacheError(
             f"{path} has version {version} and encoding {encoding}; convert it to version "

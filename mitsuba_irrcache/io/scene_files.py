@@ -1,4 +1,4 @@
-"""Scene files, with parameters, and with another integrator where one is asked for."""
+"""Load scene files with parameters, optionally replacing the integrator."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import mitsuba as mi
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.scene_xml import scene_element
 
-#: Properties that every volumetric path integrator shares, and that keep their meaning here.
+#: Properties common to all volumetric path integrators, with the same meaning in irrcache.
 SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
 
 
-#: What stands between commas, of which those in quotes do not count.
+#: A list item: text without commas, except inside quotes.
 _ITEM = r"""(?:[^,"']|"[^"]*"|'[^']*')+"""
 
 
@@ -27,13 +27,11 @@ def load_scene(
     parameters: dict[str, str] | None = None,
     integrator: str | None = None,
 ) -> mi.Scene:
-    """Loads a scene XML with ``$parameters`` and gives it the ``integrator``, for example
-    ``irrcache{step=0.5}``.
+    """Load a scene XML with ``$parameters``, optionally replacing its integrator.
 
-    Depth, Russian roulette and visibility of emitters are taken over from the scene's own
-    integrator, unless the specification sets them or the plugin does not know them. With None the
-    scene's integrator stays as it is.
-    Raises IrrcacheError if the file is missing or has no integrator to replace.
+    ``integrator`` is a specification such as ``irrcache{step=0.5}``. The `SHARED_PROPERTIES` of the
+    scene's own integrator are preserved unless the specification sets them or the new plugin does
+    not support them. Raises IrrcacheError if the file is missing or has no integrator to replace.
     """
     path = Path(path)
     config, state = _parse(path, parameters)
@@ -46,12 +44,14 @@ def load_scene(
 
 
 def check_scene_file(path: str | Path) -> Path:
-    """The path of a scene file that can be read; raises IrrcacheError for anything else."""
+    """Return the path of a readable scene file; raise IrrcacheError for anything else."""
     path = Path(path)
     try:
         found, folder, readable = path.is_file(), path.is_dir(), os.access(path, os.R_OK)
-    except (OSError, ValueError) as error:  # a name too long, or with a NUL
-        raise IrrcacheError(f'"{str(path)[:80]!s}" is no name of a scene file: {error}.') from None
+    except (OSError, ValueError) as error:  # a name that is too long or contains NUL
+        raise IrrcacheError(
+            f'"{str(path)[:80]!s}" is not a valid name of a scene file: {error}.'
+        ) from None
     if folder:
         inside = sorted(p.name for p in path.glob("*.xml"))[:5]
         there = f", for example {path / inside[0]}" if inside else ""
@@ -68,8 +68,9 @@ def check_scene_file(path: str | Path) -> Path:
 def scene_text(
     path: str | Path, parameters: dict[str, str] | None = None, integrator: str | None = None
 ) -> str:
-    """The XML of a scene with all its $parameters filled in and all included files in one; with
-    another ``integrator`` as in `load_scene`.
+    """Return the XML of a scene with all $parameters substituted and all includes inlined.
+
+    ``integrator`` replaces the scene's integrator as in `load_scene`.
     """
     path = Path(path)
     _, state = _parse(path, parameters)
@@ -79,7 +80,7 @@ def scene_text(
 
 
 def filled(text: str, integrator: str, parameters: dict[str, str] | None = None) -> str:
-    """An XML text as `scene_text` makes it of a file."""
+    """Apply the transformations of `scene_text` to an XML string."""
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_string(config, text, **(parameters or {}))
     _replace_integrator(state, integrator, Path("scene.xml"))
@@ -89,8 +90,9 @@ def filled(text: str, integrator: str, parameters: dict[str, str] | None = None)
 def scene_of_text(
     text: str, folder: str | Path, grids: dict[str, mi.VolumeGrid] | None = None
 ) -> mi.Scene:
-    """The scene of an XML text whose files are in ``folder``, but for those named in ``grids``:
-    volumes that need no file.
+    """Load a scene from an XML string whose file names are relative to ``folder``.
+
+    Volumes whose file name is a key of ``grids`` use that grid instead of the file.
     """
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_string(config, text)
@@ -106,17 +108,17 @@ def scene_of_text(
 
 
 def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) -> str:
-    """Name of the integrator plugin in a scene file; "path" where it names none, as in Mitsuba."""
+    """Return the integrator plugin named in a scene file, or "path", Mitsuba's default."""
     _, state = _parse(Path(path), parameters)
     node = _integrator_node(state)
     return "path" if node is None else node.props.plugin_name()
 
 
 def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
-    """Splits ``name`` or ``name{key=value,...}`` into the plugin's name and its properties.
+    """Split ``name`` or ``name{key=value,...}`` into the plugin's name and its properties.
 
-    Values become booleans (true, false), integers, floats or strings, whichever they look like;
-    those with commas have to be quoted.
+    Values are converted to booleans (true, false), integers, floats or strings; values that contain
+    commas must be quoted.
     """
     match = re.fullmatch(r"\s*([A-Za-z_]\w*)\s*(?:\{(.*)\})?\s*", specification, re.DOTALL)
     if match is None:
@@ -137,25 +139,26 @@ def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
 
 
 def unknown_properties(specification: str) -> list[str]:
-    """Those of the properties in ``name{key=value,...}`` that the plugin does not read; none where
-    that cannot be told, because the plugin refuses what it reads.
+    """Return the properties in ``name{key=value,...}`` that the plugin does not query.
+
+    The list is empty if the plugin cannot be constructed with these properties.
     """
     name, properties = parse_integrator(specification)
-    return _unread(name, properties)
+    return _unqueried(name, properties)
 
 
-def _unread(name: str, properties: dict[str, object]) -> list[str]:
+def _unqueried(name: str, properties: dict[str, object]) -> list[str]:
     trial = mi.Properties(name)
     for key, value in properties.items():
         trial[key] = value
-    with suppress(Exception):  # loading the scene will tell it, with the place in the file
+    with suppress(Exception):  # loading the scene reports the error with its location in the file
         mi.PluginManager.instance().create_object(trial)
         return trial.unqueried()
     return []
 
 
 def parse_parameters(definitions: list[str]) -> dict[str, str]:
-    """The ``$parameters`` that options ``-D name=value`` give."""
+    """Parse the ``$parameters`` given by options ``-D name=value``."""
     result = {}
     for item in definitions:
         key, equals, value = item.partition("=")
@@ -195,9 +198,7 @@ def _literal(text: str) -> object:
 
 
 def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
-    """The scene's integrator: nodes are in the file's order, so one nested in a wrapper comes after
-    it.
-    """
+    """Return the scene's outermost integrator, which comes first in file order."""
     return next((n for n in state.nodes if n.type == mi.ObjectType.Integrator), None)
 
 
@@ -210,14 +211,14 @@ def _replace_integrator(state: mi.parser.ParserState, specification: str, path: 
     for key in list(node.props.keys()):
         del node.props[key]
     node.props.set_plugin_name(name)
-    unread = _unread(name, inherited | properties)
-    inherited = {k: v for k, v in inherited.items() if k not in unread}
+    unqueried = _unqueried(name, inherited | properties)
+    inherited = {k: v for k, v in inherited.items() if k not in unqueried}
     for key, value in (inherited | properties).items():
         node.props[key] = value
 
 
 class _search_path:  # noqa: N801 (a context manager)
-    """Mitsuba looks for files of a scene beside it."""
+    """Make Mitsuba resolve file names relative to the folder of the scene."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = str(folder.resolve())
@@ -233,7 +234,7 @@ class _search_path:  # noqa: N801 (a context manager)
 
 
 def has_cache(scene: mi.Scene) -> bool:
-    """Whether the integrator builds a cache before it renders."""
+    """Whether the scene's integrator builds a cache before rendering."""
     method = getattr(scene.integrator(), "prepare", None)
-    # Mitsuba's differentiable integrators have another method of this name.
+    # Mitsuba's differentiable integrators have an unrelated method of this name.
     return callable(method) and "scene" in inspect.signature(method).parameters

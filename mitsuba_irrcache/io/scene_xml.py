@@ -1,7 +1,7 @@
-"""The XML of a parsed scene.
+"""Serialise a parsed scene to XML.
 
-Mitsuba's own writer takes transforms apart into scale, rotation and translation, which loses up to
-a part in a hundred; here they are matrices, to the last bit.
+Mitsuba's own writer decomposes transforms into scale, rotation and translation, with errors of up
+to 1 %; here transforms are written as matrices with all digits.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _TAGS = {
     "PhaseFunction": "phase",
     "ReconstructionFilter": "rfilter",
 }
-#: Names that Mitsuba gives to nested objects without one.
-_NAMELESS = "_arg_"
+#: Prefix of the names that Mitsuba gives to unnamed nested objects.
+_UNNAMED_PREFIX = "_arg_"
 
 
 def scene_element(state: mi.parser.ParserState) -> ElementTree.Element:
-    """The root element of a scene in one file: without $parameters, includes and defaults."""
+    """Return the root element of a scene in one file, without $parameters, includes, defaults."""
     return _element(state, state.nodes[0])
 
 
@@ -45,7 +45,7 @@ def _element(state: mi.parser.ParserState, node: mi.parser.SceneNode) -> Element
         element.set("id", props.id())
     for name in props.keys():
         child = _child(state, props, name)
-        if not name.startswith(_NAMELESS):
+        if not name.startswith(_UNNAMED_PREFIX):
             child.set("name", name)
         element.append(child)
     return element
@@ -76,7 +76,7 @@ def _child(state: mi.parser.ParserState, props: mi.Properties, name: str) -> Ele
     if kind not in ("Bool", "Integer", "Float", "String"):
         raise IrrcacheError(
             f'scene: the property "{name}" of "{props.plugin_name()}" is a {kind.lower()}, which '
-            "XML cannot tell."
+            "cannot be written to XML."
         )
     tag = {"Bool": "boolean"}.get(kind, kind.lower())
     text = str(value).lower() if kind == "Bool" else str(value)

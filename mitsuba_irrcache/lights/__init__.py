@@ -1,1 +1,1 @@
-"""Emitters: which kinds there are, and the inverse-square law near small ones."""
+"""Emitters: their classification, and the inverse-square factor of nearby small ones."""

@@ -1,51 +1,135 @@
-"""Emitters infinitely far away, and placements of theirs that Mitsuba itself does not get right."""
+"""What kinds of emitters there are, and placements that Mitsuba itself does not get right."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from enum import Enum
 
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.errors import UnsupportedSceneError
 
-#: How far columns of a rotation may be from unit length, and from right angles.
-ORTHONORMAL = 2e-3
+#: Tolerated deviation of the columns of a rotation from orthonormality.
+ORTHONORMAL_TOLERANCE = 2e-3
+
+
+class EmitterKind(Enum):
+    """What an emitter is to irrcache. A new kind is added here and in `kind_of`; solvers say which
+    kinds they support.
+    """
+
+    #: infinitely far away, from all directions with the same radiance
+    CONSTANT_ENVIRONMENT = "constant environment"
+    #: infinitely far away, with a radiance that depends on the direction
+    ENVIRONMENT_MAP = "environment map"
+    #: infinitely far away, from a single direction
+    SUN = "sun"
+    #: at a position, with the same intensity in all directions
+    POINT = "point"
+    #: at a position, within a cone
+    SPOT = "spot"
+    #: at a position, with an intensity that depends on the direction in any other way
+    PROJECTOR = "projector"
+    #: on a surface, in all directions
+    AREA = "area"
+    #: on a surface, in a single direction
+    DIRECTIONAL_AREA = "directional area"
+    UNKNOWN = "unknown"
+
+    @property
+    def is_environment(self) -> bool:
+        """Whether rays that leave the scene meet it."""
+        return self in (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP)
+
+    @property
+    def has_one_direction(self) -> bool:
+        """Whether it emits in a single direction."""
+        return self in (EmitterKind.SUN, EmitterKind.DIRECTIONAL_AREA)
+
+    @property
+    def is_point_like(self) -> bool:
+        """Whether it has a position and no extent."""
+        return self in POINT_LIKE
+
+
+#: Kinds that have a position and no extent; and those of them whose intensity depends on direction.
+POINT_LIKE = (EmitterKind.POINT, EmitterKind.SPOT, EmitterKind.PROJECTOR)
+SPOT_LIKE = (EmitterKind.SPOT, EmitterKind.PROJECTOR)
+
+
+def kind_of(emitter: mi.Emitter) -> EmitterKind:
+    """The kind of an emitter, by Mitsuba's flags and, where these are the same, its plugin."""
+    flags, name = emitter.flags(), emitter.class_name()
+    if mi.has_flag(flags, mi.EmitterFlags.Surface):
+        if mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
+            return EmitterKind.DIRECTIONAL_AREA
+        if mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
+            return EmitterKind.UNKNOWN
+        return EmitterKind.AREA
+    if mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
+        return EmitterKind.SUN
+    if mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
+        kinds = {"PointLight": EmitterKind.POINT, "SpotLight": EmitterKind.SPOT}
+        return kinds.get(name, EmitterKind.PROJECTOR)
+    if mi.has_flag(flags, mi.EmitterFlags.Infinite):
+        is_constant = name == "ConstantBackgroundEmitter"
+        return EmitterKind.CONSTANT_ENVIRONMENT if is_constant else EmitterKind.ENVIRONMENT_MAP
+    return EmitterKind.UNKNOWN
+
+
+class EmittersByKind(Immutable):
+    """The emitters of a scene, in its order, with their kinds."""
+
+    def __init__(self, emitters: Sequence[mi.Emitter]) -> None:
+        self._emitters = tuple((emitter, kind_of(emitter)) for emitter in emitters)
+
+    def __len__(self) -> int:
+        return len(self._emitters)
+
+    def __iter__(self) -> Iterator[tuple[mi.Emitter, EmitterKind]]:
+        return iter(self._emitters)
+
+    def of(self, *kinds: EmitterKind) -> list[mi.Emitter]:
+        """The emitters of these kinds."""
+        return [emitter for emitter, kind in self._emitters if kind in kinds]
 
 
 def check_placement(emitter: mi.Emitter) -> None:
-    """Raises UnsupportedSceneError for an emitter infinitely far away whose ``to_world`` is
-    more than a rotation and a mirror, and for a cylinder that is not round.
+    """Reject emitters whose ``to_world`` Mitsuba evaluates and samples inconsistently.
 
-    Environments in Mitsuba are then evaluated and sampled differently (``volpath`` converges to a
-    mixture of both), and the directions that they or suns are sampled in are not of unit length,
-    which surfaces and phase functions rely on.
+    Raises UnsupportedSceneError for distant emitters whose ``to_world`` is more than a rotation
+    with an optional reflection: ``volpath`` converges to a mixture of two different environments,
+    and the sampled directions are not of unit length, which BSDFs and phase functions rely on.
+    Likewise for emissive cylinders that are not circular.
     """
-    flags = emitter.flags()
-    if mi.has_flag(flags, mi.EmitterFlags.Surface):
+    kind = kind_of(emitter)
+    if kind in (EmitterKind.AREA, EmitterKind.DIRECTIONAL_AREA):
         _check_shape(emitter)
-    if not (
-        mi.has_flag(flags, mi.EmitterFlags.Infinite)
-        or mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
-    ):
+    if not (kind.is_environment or kind.has_one_direction):
         return
     params = mi.traverse(emitter)
     if "to_world" not in params:
         return
     linear = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
-    if np.abs(linear.T @ linear - np.eye(3)).max() <= ORTHONORMAL:
+    if np.abs(linear.T @ linear - np.eye(3)).max() <= ORTHONORMAL_TOLERANCE:
         return
     lengths = ", ".join(f"{n:.3g}" for n in np.linalg.norm(linear, axis=0))
     raise UnsupportedSceneError(
-        f'irrcache: emitter "{emitter.id()}" ({emitter.class_name()}) has a to_world that is no '
-        f"rotation (its axes have the lengths {lengths}, or are not at right angles), and Mitsuba "
-        "evaluates and samples it differently then. Take scale and shear out of it: distances mean "
-        "nothing for what is infinitely far away. (rotate needs an axis of length 1.) A mirror may "
-        'stay. Otherwise render this scene with "volpath".'
+        f'irrcache: emitter "{emitter.id()}" ({emitter.class_name()}) has a to_world that is not '
+        f"a rotation (its axes have the lengths {lengths}, or are not orthogonal), which Mitsuba "
+        "evaluates and samples inconsistently. Remove scale and shear, which have no meaning for a "
+        "distant emitter; a reflection is supported. (rotate needs an axis of length 1.) Otherwise "
+        'render this scene with "volpath".'
     )
 
 
 def _check_shape(emitter: mi.Emitter) -> None:
-    """Refuses an emissive cylinder that is not round: Mitsuba samples it as if it was, and
-    ``volpath`` converges to a mixture of that and of what rays meet.
+    """Reject emissive cylinders that are not circular.
+
+    Mitsuba samples them as if they were circular, and ``volpath`` converges to a mixture of that
+    and of the shape that rays intersect.
     """
     shape = emitter.get_shape()
     if shape is None or shape.class_name() != "Cylinder":
@@ -53,37 +137,36 @@ def _check_shape(emitter: mi.Emitter) -> None:
     matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     x, y, z = matrix[:3, :3].T
     radius = np.linalg.norm(x)
-    uneven = abs(np.linalg.norm(y) - radius) > ORTHONORMAL * radius
+    uneven = abs(np.linalg.norm(y) - radius) > ORTHONORMAL_TOLERANCE * radius
     cosines = [
         abs(a @ b) / np.linalg.norm(a) / np.linalg.norm(b) for a, b in ((x, y), (x, z), (y, z))
     ]
-    if uneven or max(cosines) > ORTHONORMAL:
+    if uneven or max(cosines) > ORTHONORMAL_TOLERANCE:
         raise UnsupportedSceneError(
             f'irrcache: shape "{shape.id()}" (Cylinder) is an emitter and not round: its to_world '
-            f"has the radii {radius:.3g} and {np.linalg.norm(y):.3g}, or a shear, and Mitsuba "
-            "evaluates and samples it differently then. Give it the same scale along x and y, or "
+            f"has the radii {radius:.3g} and {np.linalg.norm(y):.3g}, or a shear, which Mitsuba "
+            "evaluates and samples inconsistently. Give it the same scale along x and y, or "
             'use a mesh. Otherwise render this scene with "volpath".'
         )
 
 
 def point_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """The emitters of a scene that have a place and no size."""
-    flag = mi.EmitterFlags.DeltaPosition
-    return [e for e in scene.emitters() if mi.has_flag(e.flags(), flag)]
-
-
-def position_of(emitter: mi.Emitter) -> np.ndarray:
-    """Where a point-like emitter is (3), world space."""
-    params = mi.traverse(emitter)
-    position = params["position"] if "position" in params else params["to_world"].translation()
-    return np.array(position, dtype=np.float64).ravel()
+    """The emitters of a scene that have a position and no extent."""
+    return EmittersByKind(scene.emitters()).of(*POINT_LIKE)
 
 
 def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """The emitters of a scene whose intensity depends on the direction and that have no size."""
-    return [e for e in point_lights(scene) if e.class_name() != "PointLight"]
+    """Those of them whose intensity depends on the direction."""
+    return EmittersByKind(scene.emitters()).of(*SPOT_LIKE)
 
 
 def is_sun(emitter: mi.Emitter) -> bool:
     """Whether an emitter is infinitely far away, in a single direction."""
-    return mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
+    return kind_of(emitter) is EmitterKind.SUN
+
+
+def position_of(emitter: mi.Emitter) -> np.ndarray:
+    """World position (3) of a point-like emitter."""
+    params = mi.traverse(emitter)
+    position = params["position"] if "position" in params else params["to_world"].translation()
+    return np.array(position, dtype=np.float64).ravel()

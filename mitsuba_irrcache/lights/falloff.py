@@ -68,6 +68,8 @@ class InverseSquareFactor:
     way from there.
     """
 
+    # docs/primer, eq. (2.4)
+
     def __init__(
         self, places: VoxelSamplePoints, points: list[tuple[np.ndarray, float, float]]
     ) -> None:

@@ -1,1 +1,1 @@
-"""The machine that runs: LLVM, versions, variants, memory, optional packages."""
+"""The machine and its software: LLVM, package versions, Mitsuba variants, memory."""

@@ -1,6 +1,6 @@
-"""``irrcache doctor``: what this machine offers, and the remedy for what is wrong.
+"""``irrcache doctor``: report the capabilities of this machine and remedies for problems.
 
-Every backend is tried in a process of its own, so that an LLVM which aborts ends in a message.
+Every backend is tried in a subprocess, so that an LLVM that aborts only ends that subprocess.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _OPTIX_FILES = (
     "/usr/lib/wsl/lib/*optix*",
 )
 _PROBE_TIMEOUT = 180  # seconds; the first render of a cold machine takes about five
-# dr.minimum is what an old LLVM cannot compile; the render needs Embree or OptiX besides.
+# An old LLVM cannot compile dr.minimum; rendering additionally requires Embree or OptiX.
 _PROBE = """
 import sys
 import drjit as dr
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the report; returns the exit status, 0 if a variant works that the user can use."""
+    """Print the report; return the exit status: 0 if at least one usable variant works."""
     report = examine([args.mode] if args.mode else list(DEFAULT_VARIANTS))
     print(json.dumps(report, indent=2) if args.json else as_text(report))
     return 0 if report["ok"] else 1
@@ -80,11 +80,11 @@ def examine(variants: list[str]) -> dict[str, Any]:
         variants: names of Mitsuba variants to try; one that works is enough.
 
     Returns:
-        JSON-serialisable; ``ok`` tells whether one of the variants works and all packages are new
-        enough, ``remedies`` what to do otherwise.
+        JSON-serialisable; ``ok`` states whether one of the variants works and all packages are new
+        enough, ``remedies`` lists what to do otherwise.
 
     Raises:
-        IrrcacheError: a variant that this Mitsuba does not have.
+        IrrcacheError: this Mitsuba does not have one of the variants.
     """
     built = _built_variants()
     unknown = [variant for variant in variants if variant not in built]
@@ -121,7 +121,7 @@ def examine_system() -> dict[str, Any]:
 
 
 def examine_packages() -> list[dict[str, Any]]:
-    """Every required or optional package with its version and whether that is new enough."""
+    """Every required or optional package with its version and whether it is sufficient."""
     return [
         {
             "name": requirement.name,
@@ -136,7 +136,7 @@ def examine_packages() -> list[dict[str, Any]]:
 
 
 def examine_llvm() -> dict[str, Any]:
-    """Which LLVM Dr.Jit was told to use, which one it has loaded, and what was found besides."""
+    """The LLVM selected by the environment variable, the one loaded by Dr.Jit, and others found."""
     chosen = os.environ.get(runtime.LLVM_VARIABLE, "")
     loaded = runtime.loaded_llvm()
     problem = runtime.inspect_llvm(chosen).problem if chosen else ""
@@ -171,7 +171,7 @@ def examine_cuda() -> dict[str, Any]:
 
 
 def examine_kernel_cache() -> dict[str, Any]:
-    """Where Dr.Jit keeps compiled kernels, how many bytes they take, and whether it may write."""
+    """Folder of Dr.Jit's cache of compiled kernels, its size in bytes, whether it is writable."""
     folder = _kernel_cache_folder()
     exists = folder.is_dir()
     writable = os.access(folder if exists else folder.parent, os.W_OK)
@@ -180,19 +180,19 @@ def examine_kernel_cache() -> dict[str, Any]:
 
 
 def try_variant(variant: str) -> dict[str, Any]:
-    """Compile a kernel and render a sphere with a variant, in a process of its own.
+    """Compile a kernel and render a sphere with a variant, in a subprocess.
 
-    One that irrcache does not run in does not work, whatever Mitsuba can do with it.
+    Variants that irrcache does not support count as not working, whatever Mitsuba can do with them.
 
     Returns:
-        ``works``, the ``seconds`` it took, and in ``problem`` the last thing it said otherwise.
+        ``works``, the ``seconds`` it took, and in ``problem`` the last error message, if any.
     """
     try:
         require_variant(variant)
     except IrrcacheError as error:
         return {"works": False, "seconds": 0.0, "problem": str(error)}
     start = time.perf_counter()
-    # A kernel from the cache would hide that LLVM cannot compile it.
+    # Use an empty kernel cache: a cached kernel would hide that LLVM cannot compile it.
     with tempfile.TemporaryDirectory(prefix="irrcache-doctor-") as cache:
         problem = _probe(variant, {**os.environ, "DRJIT_CACHE_DIR": cache})
     seconds = round(time.perf_counter() - start, 2)
@@ -200,7 +200,7 @@ def try_variant(variant: str) -> dict[str, Any]:
 
 
 def as_text(report: dict[str, Any]) -> str:
-    """The report for people to read."""
+    """Format the report as text."""
     lines = [
         *_system_lines(report),
         *_package_lines(report["packages"]),
@@ -218,7 +218,7 @@ def as_text(report: dict[str, Any]) -> str:
 
 
 def _probe(variant: str, environment: dict[str, str]) -> str:
-    """Run the probe; returns ``""`` where it succeeds, and otherwise what went wrong."""
+    """Run the probe; return ``""`` on success, otherwise the error."""
     command = [sys.executable, "-c", _PROBE, variant]
     try:
         done = subprocess.run(
@@ -238,7 +238,7 @@ def _probe(variant: str, environment: dict[str, str]) -> str:
 
 
 def _remedies(packages: list[dict], trials: dict[str, dict], ok: bool) -> list[str]:
-    """What to do, one line each; nothing where all that is needed works."""
+    """What to do, one line each; empty if everything required works."""
     remedies = []
     wrong = [
         package
@@ -272,28 +272,28 @@ def _processor() -> str:
 
 
 def _vector_extensions() -> list[str]:
-    """The vector extensions of the processor as Linux names them; empty on other systems."""
+    """Vector extensions of the processor as named by Linux; empty on other systems."""
     flags = re.search(r"^(?:flags|Features)\s*: (.*)", _read("/proc/cpuinfo"), re.MULTILINE)
     present = flags[1].split() if flags else []
     return [extension for extension in _EXTENSIONS if extension in present]
 
 
 def _cores() -> int:
-    """The cores that this process may use."""
+    """Number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def _total_memory() -> int | None:
-    """The memory of the machine in bytes; None where the system does not say."""
+    """Memory of the machine in bytes, or None if the system does not report it."""
     if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
         return None
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _optix_library() -> str | None:
-    """The OptiX library of the driver on Linux, or what the user has named."""
+    """Path of the OptiX library: the one selected by the user, else the driver's (Linux only)."""
     named = os.environ.get("DRJIT_LIBOPTIX_PATH")
     found = [path for pattern in _OPTIX_FILES for path in glob.glob(pattern)]
     return named or (found[0] if found else None)
@@ -309,7 +309,7 @@ def _kernel_cache_folder() -> Path:
 
 
 def _read(path: str) -> str:
-    """The text of a file of the system, or ``""`` where there is none."""
+    """Return the text of a system file, or ``""`` if it does not exist."""
     try:
         return Path(path).read_text(errors="replace")
     except OSError:

@@ -1,4 +1,4 @@
-"""Optional packages: which extra of this package installs them, and the command for it."""
+"""Optional packages: which extra of this package installs them, and by which command."""
 
 from __future__ import annotations
 
@@ -11,33 +11,35 @@ from mitsuba_irrcache.machine.versions import DISTRIBUTION, extras, requirements
 
 
 class MissingPackageError(IrrcacheError):
-    """A package that a command needs is not installed; the message says what to install."""
+    """A package required by a command is not installed; the message says what to install."""
 
 
 def require(module: str, extra: str, what: str) -> None:
-    """Raises MissingPackageError unless ``module`` of this ``extra`` is there; ``what`` needs
-    it.
+    """Raise MissingPackageError, on behalf of the feature ``what``, if ``module`` is not installed.
+
+    ``extra`` is the extra of this package that installs the module.
     """
     if importlib.util.find_spec(module) is None:
         raise MissingPackageError(_message(what, module, extra))
 
 
 def missing_package(error: ModuleNotFoundError, what: str, extra: str = "") -> IrrcacheError | None:
-    """What to say of an import that failed: which package ``what`` lacks, and the remedy.
+    """Convert a failed import in the feature ``what`` into an error that names package and remedy.
 
-    ``extra`` is the one that has all packages of ``what``, "" if it has none of its own. None where
-    the module belongs to no package that this one requires: the error is a mistake in the code.
+    ``extra`` is the extra with all packages of the feature, or "". Returns None if no requirement
+    of this package provides the module: the import error is then a programming error.
     """
     module = (error.name or "").partition(".")[0]
     for known in dict.fromkeys((extra, *extras(), "")):
         if any(_module(r.name) == _normal(module) for r in requirements(known)):
-            # The extra of the command installs what others of its packages need, too.
+            # Prefer the extra of the command: it installs the other packages the command needs,
+            # too.
             return MissingPackageError(_message(what, module, extra or known))
     return None
 
 
 def remedy(extra: str) -> str:
-    """The command that installs an extra; "" stands for what is always required."""
+    """Return the command that installs an extra; "" stands for the required packages."""
     wanted = f"{DISTRIBUTION}[{extra}]" if extra else DISTRIBUTION
     return f'{sys.executable} -m pip install "{wanted}"'
 
@@ -47,10 +49,10 @@ def _message(what: str, module: str, extra: str) -> str:
 
 
 def _normal(name: str) -> str:
-    """A name of a distribution or module, as packaging tools compare them."""
+    """Normalise the name of a distribution or module for comparison (PEP 503)."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _module(distribution: str) -> str:
-    """The module of a distribution, where its name is another one."""
+    """Return the module name of a distribution, which may differ from the distribution's name."""
     return {"colour-science": "colour"}.get(_normal(distribution), _normal(distribution))

@@ -1,6 +1,6 @@
-"""Installs an LLVM that Dr.Jit can use, where that needs nobody's consent; otherwise says how.
+"""Install an LLVM that Dr.Jit can use if no confirmation is required; otherwise print a remedy.
 
-``python -m mitsuba_irrcache.machine.install_llvm`` is a step of ``make setup``. It acts only where
+``python -m mitsuba_irrcache.machine.install_llvm`` is a step of ``make setup``. It installs only if
 no usable LLVM is found, apt-get exists, and the user is root or may use sudo without a password.
 """
 
@@ -19,7 +19,7 @@ _PACKAGE = re.compile(r"^(libllvm(\d+)(?:t64)?) ", re.MULTILINE)
 
 
 def main() -> int:
-    """Make sure that there is a usable LLVM; returns the exit status, 0 if there is."""
+    """Ensure that a usable LLVM is installed; return the exit status, 0 if there is one."""
     if not llvm.usable_llvm():
         _install()
     library = llvm.usable_llvm()
@@ -34,10 +34,10 @@ def main() -> int:
 
 
 def choose_package(search_output: str) -> str | None:
-    """The package to install, from what ``apt-cache search '^libllvm'`` prints.
+    """Choose the package to install from the output of ``apt-cache search '^libllvm'``.
 
     Returns:
-        The one of LLVM 19, else the newest that is new enough, else None.
+        The package of LLVM 19, else the newest one that is supported, else None.
     """
     packages = {int(version): name for name, version in _PACKAGE.findall(search_output)}
     usable = [version for version in packages if version >= llvm.minimum_llvm()]
@@ -47,7 +47,7 @@ def choose_package(search_output: str) -> str | None:
 
 
 def _install() -> None:
-    """Install the runtime library of LLVM with apt-get, where that is possible without asking."""
+    """Install the LLVM runtime library with apt-get, if possible without interaction."""
     prefix = _as_root()
     if prefix is None or not shutil.which("apt-get"):
         return
@@ -63,7 +63,7 @@ def _install() -> None:
 
 
 def _as_root() -> list[str] | None:
-    """What to put before a command to run it as root; None where that is not possible."""
+    """Return the command prefix that runs a command as root, or None if that is not possible."""
     if not hasattr(os, "geteuid"):
         return None
     if os.geteuid() == 0:

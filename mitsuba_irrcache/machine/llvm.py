@@ -1,8 +1,8 @@
-"""An LLVM that Dr.Jit can use: finding one, and a clear error where there is none.
+"""Find an LLVM that Dr.Jit can use, and report a clear error if there is none.
 
 Dr.Jit 1.5 emits ``llvm.minimum``, which LLVM cannot select on x86-64 before version 17: the process
-aborts at the first such kernel (seen with 15 and 16; 19 and 22 work). Dr.Jit loads LLVM when it is
-imported, so a better one must be named in ``DRJIT_LIBLLVM_PATH`` before that.
+aborts at the first such kernel (observed with 15 and 16; 19 and 22 work). Dr.Jit loads LLVM when it
+is imported, so a suitable one must be named in ``DRJIT_LIBLLVM_PATH`` before that.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ elif hasattr(library, "LLVMDisposeMessage"):
 
 
 class LLVMUnusableError(IrrcacheError):
-    """There is no LLVM that Dr.Jit can use; the message says what was found and what to do."""
+    """No LLVM that Dr.Jit can use was found; the message states what was found and a remedy."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class LLVMLibrary:
     """A file that may be the LLVM shared library.
 
     Attributes:
-        path: where it is, as found.
-        version: its numbers, as many as are known, for example ``(19, 1)``; empty if unknown.
+        path: as found.
+        version: the known components, for example ``(19, 1)``; empty if unknown.
         problem: why Dr.Jit cannot use it, or ``""``.
     """
 
@@ -63,12 +63,12 @@ class LLVMLibrary:
 
     @property
     def version_text(self) -> str:
-        """The version as people write it, or ``"unknown"``."""
+        """The version as text, or ``"unknown"``."""
         return ".".join(map(str, self.version)) or "unknown"
 
 
 def minimum_llvm() -> int:
-    """The lowest major version of LLVM that Dr.Jit can use on this processor."""
+    """Lowest major version of LLVM that Dr.Jit supports on this processor."""
     return 17 if platform.machine().lower() in ("x86_64", "amd64") else 15
 
 
@@ -80,10 +80,10 @@ def version_problem(version: tuple[int, ...]) -> str:
 
 
 def inspect_llvm(path: str | Path) -> LLVMLibrary:
-    """Find the version of a library and whether Dr.Jit can use it, without loading it here.
+    """Determine the version of a library and whether Dr.Jit can use it, without loading it here.
 
-    The version comes from the file's name and neighbours; where these do not tell, a subprocess
-    loads the library. A bare name without a folder is searched for as the system's loader does.
+    The version is taken from the file's name and its neighbours; if they do not contain it, a
+    subprocess loads the library. A name without a folder is resolved by the system's loader.
     """
     path = Path(path)
     if path.parent != Path():
@@ -94,10 +94,10 @@ def inspect_llvm(path: str | Path) -> LLVMLibrary:
 
 
 def find_llvm() -> list[LLVMLibrary]:
-    """All LLVM libraries in the places where package managers put them, best first.
+    """Find all LLVM libraries where package managers install them, best first.
 
-    Usable ones come first, newer before older, those of unknown version last. Nothing is loaded
-    and no process is started, so this takes a few milliseconds.
+    Usable libraries come first, newest first, those of unknown version last. Nothing is loaded and
+    no process is started, so this takes a few milliseconds.
     """
     found: dict[Path, LLVMLibrary] = {}
     for pattern in _llvm_patterns():
@@ -115,10 +115,10 @@ def find_llvm() -> list[LLVMLibrary]:
 
 
 def prepare_llvm() -> None:
-    """Name the newest usable LLVM in ``DRJIT_LIBLLVM_PATH``, unless the user has named one.
+    """Set ``DRJIT_LIBLLVM_PATH`` to the newest usable LLVM unless the user has set it.
 
-    Call it before Dr.Jit is imported. Never fails: where nothing usable is found, Dr.Jit keeps its
-    own search, and `require_llvm` reports what came of it.
+    Must be called before Dr.Jit is imported. Never fails: if nothing usable is found, Dr.Jit
+    searches by itself, and `require_llvm` reports the outcome.
     """
     if os.environ.get(LLVM_VARIABLE):
         return
@@ -128,12 +128,12 @@ def prepare_llvm() -> None:
 
 
 def usable_llvm() -> LLVMLibrary | None:
-    """The best of `find_llvm`, or None where none is usable."""
+    """The first entry of `find_llvm` without a problem, or None."""
     return next((library for library in find_llvm() if not library.problem), None)
 
 
 def loaded_llvm() -> tuple[int, ...]:
-    """The version of the LLVM that Dr.Jit has loaded into this process; empty if there is none."""
+    """Version of the LLVM that Dr.Jit has loaded into this process; empty if there is none."""
     import drjit as dr
 
     if not dr.has_backend(dr.JitBackend.LLVM):
@@ -145,7 +145,7 @@ def require_llvm() -> None:
     """Check that the LLVM loaded by Dr.Jit works, before a kernel makes it abort the process.
 
     Raises:
-        LLVMUnusableError: none was loaded or it is too old; says what to install on this system.
+        LLVMUnusableError: LLVM was not loaded or is too old; the message states the remedy.
     """
     version = loaded_llvm()
     if not version or version_problem(version):
@@ -153,7 +153,7 @@ def require_llvm() -> None:
 
 
 def llvm_remedy() -> str:
-    """What to do on this system to have an LLVM that Dr.Jit can use, as lines of text."""
+    """Describe how to obtain an LLVM that Dr.Jit can use on this system."""
     usable = usable_llvm()
     if usable:
         chosen = os.environ.get(LLVM_VARIABLE, "")
@@ -217,7 +217,7 @@ def _judge(path: Path, version: tuple[int, ...]) -> LLVMLibrary:
 
 
 def _version_from_name(path: Path) -> tuple[int, ...]:
-    """The version that the name, the folder or the neighbours of a library state, or ``()``."""
+    """Version contained in the name, folder or neighbouring files of a library, or ``()``."""
     real = path.resolve()
     match = _LIBRARY_NAME.match(real.name)
     stated = match and (match["start"] or match["end"])
@@ -237,7 +237,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 
 def _version_by_loading(path: Path) -> tuple[int, ...]:
-    """The version that the library itself states, asked in a process of its own, or ``()``."""
+    """Version reported by the library itself, loaded in a subprocess, or ``()``."""
     try:
         probe = subprocess.run(
             [sys.executable, "-I", "-c", _PROBE, str(path)],
@@ -251,7 +251,7 @@ def _version_by_loading(path: Path) -> tuple[int, ...]:
 
 
 def _explain_llvm(version: tuple[int, ...]) -> str:
-    """What is wrong with the LLVM in use."""
+    """Describe what is wrong with the current LLVM."""
     chosen = os.environ.get(LLVM_VARIABLE, "")
     library = inspect_llvm(chosen) if chosen else None
     if library and library.problem:
@@ -262,7 +262,7 @@ def _explain_llvm(version: tuple[int, ...]) -> str:
 
 
 def _install_remedy() -> str:
-    """How to install LLVM on this system, with and without administrator's rights."""
+    """How to install LLVM on this system, with and without administrator rights."""
     if platform.system() == "Darwin":
         return "`brew install llvm`; or, " + _conda_remedy("libllvm19", "libLLVM*.dylib in lib")
     if platform.system() == "Windows":

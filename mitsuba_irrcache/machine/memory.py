@@ -1,4 +1,4 @@
-"""Memory of this machine."""
+"""Available memory of this machine, and returning freed memory to the system."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ import drjit as dr
 
 from mitsuba_irrcache.errors import IrrcacheError
 
-#: Bytes of the smallest array that is freed at once; where glibc begins.
-LARGE = 1 << 17
-#: Voxels of a cache from which on arrays are the system's again after every step of work.
-MANY = 1 << 22
-#: glibc's name of that, from its malloc.h.
+#: Arrays of at least this many bytes are returned to the system when freed: glibc's initial
+#: threshold.
+MMAP_THRESHOLD = 1 << 17
+#: Number of voxels above which Dr.Jit's free arrays are returned to the system after every pass.
+FLUSH_ABOVE = 1 << 22
+#: M_MMAP_THRESHOLD of glibc's malloc.h.
 _M_MMAP_THRESHOLD = -3
 
 
 def available_memory() -> int:
-    """Bytes that a new array can take without swapping; 2^63 where the system does not say."""
+    """Bytes that can be allocated without swapping; 2^63 if the system does not report it."""
     with suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -32,8 +33,9 @@ def available_memory() -> int:
 
 
 def require_memory(needed: int, what: str, remedy: str) -> None:
-    """Raises IrrcacheError where ``what``, which takes so many bytes, finds less; it names both and
-    the ``remedy``.
+    """Raise IrrcacheError if fewer than ``needed`` bytes are available.
+
+    The message names ``what`` needs them and the ``remedy``.
     """
     available = available_memory()
     if needed > available:
@@ -44,18 +46,23 @@ def require_memory(needed: int, what: str, remedy: str) -> None:
 
 
 def free_at_once() -> None:
-    """From now on arrays are the system's again as soon as they are freed. Only glibc needs it: it
-    learns from the first large array that is freed to keep those of up to 32 MiB in arenas, up to
-    eight for each core, and `malloc_trim` leaves what lies at the end of each, up to 64 MiB.
+    """Make glibc return arrays to the system as soon as they are freed.
+
+    By default it raises its threshold when the first large array is freed, so that arrays of up to
+    32 MiB stay in up to eight arenas per core, where `malloc_trim` leaves up to 64 MiB at the end
+    of each.
     """
     if platform.libc_ver()[0] == "glibc":
-        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)  # and it learns no more
+        ctypes.CDLL(None).mallopt(
+            _M_MMAP_THRESHOLD, MMAP_THRESHOLD
+        )  # also disables the dynamic threshold
 
 
 def give_back(voxels: int) -> None:
-    """Hands arrays that are free again back to the system, after a step of work on so many voxels.
-    Dr.Jit keeps them for others of their size, which the next step may not want. Small ones stay:
-    to have them anew would take longer than they are worth.
+    """Return Dr.Jit's free arrays to the system after a pass over ``voxels`` voxels.
+
+    Dr.Jit retains freed arrays for reuse at the same size, which the next pass may not need. For
+    small grids allocating them again would take longer than the memory is worth.
     """
-    if voxels >= MANY:
+    if voxels >= FLUSH_ABOVE:
         dr.flush_malloc_cache()

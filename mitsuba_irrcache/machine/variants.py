@@ -1,4 +1,4 @@
-"""Mitsuba variants that the integrator can run in."""
+"""Mitsuba variants that the integrator supports."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ SUPPORTED = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
 
 def require_variant(variant: str) -> None:
-    """Raises IrrcacheError, with the reason, for a variant that would be wrong or endless."""
+    """Raise IrrcacheError, with the reason, for an unsupported variant."""
     if variant in SUPPORTED:
         return
     if variant.startswith("scalar"):
         reason = "it would trace every voxel in interpreted Python"
     elif "spectral" in variant:
-        reason = "the cache holds colours or grey values, not wavelengths"
+        reason = "the cache stores RGB or grey values, not wavelengths"
     elif "polarized" in variant:
-        reason = "the cache holds no polarisation"
+        reason = "the cache stores no polarisation"
     else:
         reason = "it was never tested there"
     raise IrrcacheError(
@@ -26,9 +26,9 @@ def require_variant(variant: str) -> None:
 
 
 def require_same_variant(made: str, current: str) -> None:
-    """Raises IrrcacheError where a scene is to be rendered in another variant than it is of."""
+    """Raise IrrcacheError if the current variant is not the one that the scene was loaded in."""
     if made != current:
         raise IrrcacheError(
-            f'irrcache: the scene was loaded in variant "{made}", and "{current}" is set now; load '
-            f'it again, or say mi.set_variant("{made}").'
+            f'irrcache: the scene was loaded in variant "{made}", but the current variant is '
+            f'"{current}"; load the scene again, or call mi.set_variant("{made}").'
         )

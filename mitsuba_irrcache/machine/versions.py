@@ -1,4 +1,4 @@
-"""Packages that are new enough: what is installed against the lower bounds that were tested."""
+"""Check installed packages against the tested lower bounds."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class PackageVersionError(IrrcacheError):
 
 
 def requirements(extra: str = "") -> list[Requirement]:
-    """What this package requires by its own metadata, with the lower bounds that were tested.
+    """Return the requirements declared in this package's metadata, with the tested lower bounds.
 
     Args:
-        extra: with a name, only what that extra (``volumes``, ``compare``, ``test``) adds.
+        extra: if given, only the requirements of this extra (``volumes``, ``compare``, ``test``).
 
     Returns:
-        The requirements, without those of one extra on another.
+        The requirements, without references from one extra to another.
 
     Raises:
         PackageVersionError: this package itself is not installed.
@@ -45,7 +45,7 @@ def requirements(extra: str = "") -> list[Requirement]:
 
 
 def extras() -> list[str]:
-    """Names of this package's extras, in the order in which it declares them."""
+    """Names of this package's extras in the order of declaration."""
     try:
         return list(metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or [])
     except metadata.PackageNotFoundError:
@@ -53,10 +53,10 @@ def extras() -> list[str]:
 
 
 def installed_version(name: str) -> str | None:
-    """The version of a package, or None where it is not installed.
+    """Return the version of a package, or None if it is not installed.
 
-    A module that is imported already speaks for itself: a Mitsuba built from source has no
-    distribution metadata.
+    Prefer ``__version__`` of an imported module: a Mitsuba built from source has no distribution
+    metadata.
     """
     imported = getattr(sys.modules.get(name), "__version__", None)
     if imported:
@@ -68,7 +68,7 @@ def installed_version(name: str) -> str | None:
 
 
 def is_satisfied(requirement: Requirement) -> bool:
-    """Whether the installed package is within the bounds of a requirement."""
+    """Whether the installed package fulfils a requirement."""
     version = installed_version(requirement.name)
     return version is not None and requirement.specifier.contains(
         Version(version), prereleases=True
@@ -76,10 +76,10 @@ def is_satisfied(requirement: Requirement) -> bool:
 
 
 def check_versions() -> None:
-    """Compare the installed packages with the lower bounds that were tested.
+    """Compare the installed packages with the tested lower bounds.
 
     Raises:
-        PackageVersionError: some are missing or too old; names them and the command that helps.
+        PackageVersionError: some are missing or too old; the message names them and the remedy.
     """
     wrong = [requirement for requirement in requirements() if not is_satisfied(requirement)]
     if wrong:
@@ -94,7 +94,7 @@ def check_versions() -> None:
 
 
 def _is_wanted(requirement: Requirement, extra: str) -> bool:
-    """Whether a requirement holds on this system and, given an extra, only because of it."""
+    """Whether a requirement applies on this system and, if given, only because of ``extra``."""
     if requirement.marker is None:
         return not extra
     without = requirement.marker.evaluate({"extra": ""})

@@ -1,4 +1,4 @@
-"""Media of Mitsuba on grids."""
+"""Convert Mitsuba's media to grids."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ MEDIA = ("HeterogeneousMedium", "HomogeneousMedium")
 
 
 def bake(medium: mi.Medium, boundary: Boundary) -> MediumGrid:
-    """The fields of a ``heterogeneous`` or ``homogeneous`` Mitsuba medium, on the medium's own
-    grids.
+    """Convert a ``heterogeneous`` or ``homogeneous`` medium to fields on the medium's own grids.
 
     Raises UnsupportedSceneError for other media, volume plugins and phase functions, and
-    IrrcacheError for values no medium can have (NaN, negative extinction, albedo outside [0, 1]).
+    IrrcacheError for invalid values (NaN, negative extinction, albedo outside [0, 1]).
     """
     name = f'medium "{medium.id()}" ({medium.class_name()})'
     if medium.class_name() not in MEDIA:
@@ -45,19 +44,17 @@ def bake(medium: mi.Medium, boundary: Boundary) -> MediumGrid:
     if albedo.maximum > 1.0 + 1e-6:
         raise IrrcacheError(
             f"irrcache: the albedo of {name} reaches {albedo.maximum:g}; above 1 a medium creates "
-            "light. "
-            "Clip it to [0, 1]."
+            "energy. Clip it to [0, 1]."
         )
     bounded = medium.class_name() == "HeterogeneousMedium"
     bbox = _clipping_box(volumes["sigma_t"], boundary) if bounded else None
-    grid = MediumGrid(sigma_t, albedo, boundary, bbox)
-    grid.phase = phase
+    grid = MediumGrid(sigma_t, albedo, boundary, bbox, phase=phase, name=medium.id())
     _verify(medium, grid, name)
     return grid
 
 
 def children(node: mi.Object) -> dict[str, mi.Object]:
-    """The Mitsuba objects that ``node`` reports to a traversal, by name."""
+    """Return the Mitsuba objects that ``node`` exposes to a traversal, by name."""
 
     class Children(mi.TraversalCallback):
         def __init__(self) -> None:
@@ -74,14 +71,13 @@ def children(node: mi.Object) -> dict[str, mi.Object]:
 
 
 def baked_field(volume: mi.Volume, name: str, scale: float) -> Field:
-    """A ``constvolume`` or ``gridvolume`` times ``scale``; errors call it ``name``."""
+    """Convert a ``constvolume`` or ``gridvolume``, times ``scale``; errors call it ``name``."""
     if volume.class_name() == "ConstVolume":
         return _constant(volume, name, scale)
     if volume.class_name() != "GridVolume":
         raise UnsupportedSceneError(
             f'irrcache: the {name} is a {volume.class_name()}; only "gridvolume" and "constvolume" '
-            "are "
-            'supported. Resample it to a gridvolume or use "volpath".'
+            'are supported. Resample it to a gridvolume or use "volpath".'
         )
     tensor = dr.detach(mi.traverse(volume)["data"])
     channels = tensor.shape[3]
@@ -117,19 +113,17 @@ def _check_values(data: mi.Float, shape: tuple[int, ...], name: str) -> None:
     value = float(dr.slice(data, where))
     raise IrrcacheError(
         f"irrcache: the {name} has {count} values that are negative or not finite, the first at "
-        "voxel "
-        f"(z, y, x) = ({z}, {y}, {x}): {value:g}. Clean the data first (numpy.nan_to_num, "
-        "numpy.clip, or "
-        '"irrcache import --clip ... --replace-nan ...").'
+        f"voxel (z, y, x) = ({z}, {y}, {x}): {value:g}. Clean the data first (numpy.nan_to_num, "
+        'numpy.clip, or "irrcache import --clip ... --replace-nan ...").'
     )
 
 
 def _placement(volume: mi.Volume) -> np.ndarray:
-    """``to_world`` of a volume's unit cube.
+    """Return ``to_world`` of a volume's unit cube.
 
-    Mitsuba exposes it only as text of six digits; the exact bounding box then corrects position and
-    size, which leaves axis-aligned placements exact and rotated ones good to about 1e-6 of the
-    grid's size.
+    Mitsuba exposes it only as text with six digits. Position and size are therefore corrected with
+    the bounding box, which makes axis-aligned placements exact, and rotated ones accurate to 1e-6
+    of the size of the grid.
     """
     number = r"[-+0-9.einfa]+"
     row = rf"\[({number}), ({number}), ({number}), ({number})\]"
@@ -137,8 +131,7 @@ def _placement(volume: mi.Volume) -> np.ndarray:
     if match is None:
         raise UnsupportedSceneError(
             f"irrcache: cannot read the placement of {volume.class_name()} from its description; "
-            "this version "
-            'of Mitsuba is not supported. Use "volpath" and report this.'
+            'this version of Mitsuba is not supported. Use "volpath" and report this.'
         )
     to_world = np.linalg.inv(np.array([float(v) for v in match.groups()]).reshape(4, 4))
     lower, upper = (np.array(p, dtype=np.float64) for p in (volume.bbox().min, volume.bbox().max))
@@ -150,8 +143,9 @@ def _placement(volume: mi.Volume) -> np.ndarray:
 
 
 def _clipping_box(volume: mi.Volume, boundary: Boundary) -> tuple[np.ndarray, np.ndarray] | None:
-    """The world box outside which Mitsuba's heterogeneous medium ends, or None if the boundary is
-    inside it.
+    """Return the world box that Mitsuba clips a heterogeneous medium to.
+
+    None if the boundary lies inside of it.
     """
     lower, upper = (np.array(p, dtype=np.float64) for p in (volume.bbox().min, volume.bbox().max))
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
@@ -163,9 +157,10 @@ def _clipping_box(volume: mi.Volume, boundary: Boundary) -> tuple[np.ndarray, np
 
 
 def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
-    """Compares the baked fields with Mitsuba's own at scattered points: nearest filtering, repeated
-    grids and whatever else cannot be seen from outside would show here instead of in a wrong
-    picture.
+    """Compare the converted fields with Mitsuba's own at random points.
+
+    This detects properties of volumes that cannot be queried, such as nearest-neighbour filtering
+    and repetition, which would otherwise render incorrectly.
     """
     rng = mi.PCG32(512)
     frame = Grid((1, 1, 1), grid.frame)
@@ -173,11 +168,12 @@ def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
     interaction = dr.zeros(mi.MediumInteraction3f, 512)
     interaction.p = p
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(interaction, True)
-    mine_t = mi.Spectrum(grid.sigma_t.at_world(p))
-    mine_s = mine_t * grid.albedo.at_world(p)
+    own_sigma_t = mi.Spectrum(grid.sigma_t.at_world(p))
+    own_sigma_s = own_sigma_t * grid.albedo.at_world(p)
     scale = max(grid.sigma_t.maximum, 1e-30)
     error = dr.maximum(
-        dr.max(dr.abs(mi.Spectrum(sigma_t) - mine_t)), dr.max(dr.abs(mi.Spectrum(sigma_s) - mine_s))
+        dr.max(dr.abs(mi.Spectrum(sigma_t) - own_sigma_t)),
+        dr.max(dr.abs(mi.Spectrum(sigma_s) - own_sigma_s)),
     )
     worst = float(dr.max(error)[0]) / scale
     if worst > 0.02:
@@ -185,7 +181,7 @@ def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
 
 
 def volume_error(name: str) -> UnsupportedSceneError:
-    """For volumes whose values between the voxels are not those that are expected."""
+    """Return the error for a volume that does not interpolate as expected."""
     return UnsupportedSceneError(
         f"irrcache: {name} does not interpolate as expected. Only trilinear, clamped volumes are "
         'supported: use filter_type "trilinear" and wrap_mode "clamp", or render with "volpath". '

@@ -1,17 +1,17 @@
-"""Sharp forward scattering as less scattering (delta-M, Wiscombe 1977; TMS, Nakajima 1988).
+"""Truncation of sharp forward peaks (delta-M, Wiscombe 1977) with TMS correction (Nakajima 1988).
 
-Of light that a sharp phase function scatters, a share f goes on almost straight: as if nothing had
-happened. The medium
+A sharp phase function scatters a fraction f almost straight ahead, which is treated as unscattered.
+The medium
 
     sigma_t' = sigma_t (1 - f albedo),   albedo' = albedo (1 - f) / (1 - f albedo)
 
-with the moments (g_l - f) / (1 - f) has the same light but for a blur of a few degrees, and needs
-as few moments as a broad one. f is the first moment that is left out. What is scattered once from
-narrow lights takes the phase function as it is, divided by 1 - f.
+with the phase function moments (g_l - f) / (1 - f) has the same radiance up to a blur of a few
+degrees, and requires as few moments as a broad phase function. f is the first moment that is
+truncated. Single scattering of narrow light sources uses the original phase function over 1 - f.
 
-So transmittance counts what is scattered into the peak as not scattered. Of narrow lights that is
-known otherwise: where they are seen themselves, through the medium, it counts as scattered. To
-paths from surfaces, which see light from all sides at once, nothing is scattered into the peak.
+Transmittance therefore treats scattering into the peak as unscattered, with two exceptions: narrow
+sources seen directly through the medium are attenuated by the original extinction; and paths from
+surfaces, which receive radiance from all directions, exclude the peak from scattering.
 """
 
 from __future__ import annotations
@@ -25,23 +25,25 @@ import numpy as np
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.media.medium import MediumGrid
 
 
-def take_away_peak(medium: MediumGrid) -> None:
-    """Makes of ``medium``, whose phase function has a forward peak, the one that is like it but for
-    that.
+def without_forward_peak(medium: MediumGrid) -> MediumGrid:
+    """``medium``, whose phase function has a forward peak, scaled by delta-M: light scattered into
+    the peak counts as not scattered.
     """
-    medium.keep_peak()
+    # docs/primer, eq. (4.12)
     phase = medium.phase.without_peak()
     share, sigma_t, albedo = phase.forward, medium.sigma_t, medium.albedo
-    medium.sigma_t = _combined(lambda s, a: s * (1 - share * a), sigma_t, albedo)
-    medium.albedo = _combined(lambda a: a * (1 - share) / (1 - share * a), albedo)
-    remaining = _mean(medium.sigma_t)
-    medium.unscattered_exponent = _mean(sigma_t) / remaining if remaining else 1.0
-    medium.phase = phase
-    medium.macrocells = Macrocells.build(medium.sigma_t, medium.boundary)
+    scaled = _combined(lambda s, a: s * (1 - share * a), sigma_t, albedo)
+    remaining = _mean(scaled)
+    return medium.replaced(
+        sigma_t=scaled,
+        albedo=_combined(lambda a: a * (1 - share) / (1 - share * a), albedo),
+        phase=phase,
+        unscattered_exponent=_mean(sigma_t) / remaining if remaining else 1.0,
+        original=medium,
+    )
 
 
 def _mean(field: Field) -> float:
@@ -51,7 +53,7 @@ def _mean(field: Field) -> float:
 
 
 def _combined(function: Callable, *fields: Field) -> Field:
-    """A ``function`` of the values of ``fields``, on the first grid that one of these has."""
+    """Apply ``function`` to the values of ``fields`` on the first grid that one of them has."""
     channels = max(field.channels for field in fields)
     grid = next((field.grid for field in fields if field.grid is not None), None)
     index = dr.arange(mi.UInt32, 1 if grid is None else grid.voxel_count)
@@ -66,7 +68,7 @@ def _combined(function: Callable, *fields: Field) -> Field:
 
 
 def _channels(field: Field, grid: Grid | None, index: mi.UInt32, count: int) -> list[mi.Float]:
-    """Values of so many channels at the voxel centres of ``grid``."""
+    """Evaluate ``count`` channels of a field at the voxel centres of ``grid``."""
     place = mi.Point3f(0)
     if grid is not None:
         place = grid.world.point(mi.Point3f(*grid.places(index)) + 0.5)

@@ -1,23 +1,40 @@
-"""A participating medium baked on grids: extinction, albedo, extent, occupancy and majorants."""
+"""A participating medium on grids: extinction, albedo, extent, and majorants."""
 
 from __future__ import annotations
-
-from copy import copy
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
-from mitsuba_irrcache.media.phase import Phase
+from mitsuba_irrcache.media.emission import Emission
+from mitsuba_irrcache.media.phase import ISOTROPIC, Phase
 
 
-class MediumGrid:
-    """``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and the world box ``bbox``
-    (None: unbounded).
+class MediumGrid(Immutable):
+    """``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and the world box ``bbox``.
+
+    Attributes:
+        bbox: lower and upper corner; None: unbounded.
+        emission: emission coefficient of the medium; None where it emits nothing.
+        phase: phase function, the same everywhere.
+        name: unique among the media of a scene.
+        pointer: Mitsuba's medium, by which rays know the medium they are in. None where rays are
+            not traced through the scene's shapes, since an isotropic medium in its boundary is all
+            there is.
+        number: place in the scene's list of media.
+        others: the other media of the scene in the order of that list, before delta-M scaling.
+        is_isolated: whether this medium in its boundary is all there is beside emitters.
+        has_exact_boundary: whether the medium fills ``boundary``, which otherwise encloses it.
+        unscattered_exponent: power of the transmittance that gives the share of light that is not
+            scattered at all, where light scattered into a forward peak counts as transmitted (see
+            `delta_m`).
+        original: the medium before delta-M scaling; None where it is not scaled.
+        macrocells: local majorants of ``sigma_t``.
     """
 
     def __init__(
@@ -26,39 +43,45 @@ class MediumGrid:
         albedo: Field,
         boundary: Boundary,
         bbox: tuple[np.ndarray, np.ndarray] | None = None,
+        *,
+        emission: Emission | None = None,
+        phase: Phase = ISOTROPIC,
+        name: str = "",
+        pointer: mi.MediumPtr | None = None,
+        number: int = 0,
+        others: tuple[MediumGrid, ...] = (),
+        is_isolated: bool = True,
+        has_exact_boundary: bool = True,
+        unscattered_exponent: float = 1.0,
+        original: MediumGrid | None = None,
+        macrocells: Macrocells | None = None,
     ) -> None:
-        self.sigma_t = sigma_t
-        self.albedo = albedo
-        self.boundary = boundary
-        self.bbox = bbox
-        #: what it sends out itself; None where it does not (see `emission`)
-        self.emission: object | None = None
-        #: whether there is no more to its bounds than ``boundary``; others are larger than it
-        self.has_exact_boundary = True
-        #: None where it is isotropic
-        self.phase: Phase | None = None
-        #: the power of transmittance that is left of light if what is scattered into a forward peak
-        #: is taken from it, too (see `delta_m`)
-        self.unscattered_exponent = 1.0
-        self._with_peak: MediumGrid | None = None
-        #: what it is called among others
-        self.name = ""
-        #: Mitsuba's medium, as rays carry it, and what else there is in the scene; None where
-        #: this medium in its boundary is all, and it is isotropic
-        self.pointer: mi.MediumPtr | None = None
-        self.surroundings: object | None = None
-        #: whether this medium in its boundary is all, and the light around it
-        self.is_isolated = True
-        self.macrocells = Macrocells.build(sigma_t, boundary)
+        self.sigma_t, self.albedo, self.boundary, self.bbox = sigma_t, albedo, boundary, bbox
+        self.emission, self.phase = emission, phase
+        self.name, self.pointer = name, pointer
+        self.number, self.others = number, others
+        self.is_isolated, self.has_exact_boundary = is_isolated, has_exact_boundary
+        self.unscattered_exponent, self.original = unscattered_exponent, original
+        self.macrocells = macrocells or Macrocells.build(sigma_t, boundary)
         if bbox is not None:
             corners = [mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in p)) for p in bbox]
             self._clip = mi.BoundingBox3f(*corners)
 
+    def replaced(self, **changes: object) -> MediumGrid:
+        """A medium with other attributes; ``macrocells`` are those of its extinction."""
+        attributes = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        if "sigma_t" in changes or "boundary" in changes:
+            del attributes["macrocells"]
+        return MediumGrid(**attributes | changes)
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether rays in the medium are traced through the scene's shapes."""
+        return self.pointer is not None
+
     @property
     def frame(self) -> np.ndarray:
-        """``to_world`` of the smallest known unit cube that encloses the medium: where a cache
-        goes.
-        """
+        """``to_world`` of the smallest known unit cube around the medium: extent of its cache."""
         frames = [self.boundary.frame]
         if self.bbox is not None:
             frames.append(axis_aligned(*self.bbox))
@@ -66,7 +89,7 @@ class MediumGrid:
 
     @property
     def channels(self) -> int:
-        """3 where extinction or albedo is coloured, else 1."""
+        """3 for coloured extinction or albedo, else 1."""
         return max(self.sigma_t.channels, self.albedo.channels)
 
     @property
@@ -75,30 +98,21 @@ class MediumGrid:
 
     @property
     def shortest_edge(self) -> float:
-        """Of a voxel of the extinction [scene units]; infinite where nothing varies."""
+        """Edge of a voxel of the extinction [scene units]; infinite where nothing varies."""
         return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
 
-    @property
-    def with_peak(self) -> MediumGrid:
-        """The medium before a forward peak was taken away from it."""
-        return self._with_peak or self
-
-    def keep_peak(self) -> None:
-        """Remembers the medium as it is."""
-        self._with_peak = copy(self)
-
     def contains(self, p: mi.Point3f) -> mi.Bool:
-        """Whether a point is in the medium."""
+        """Whether points lie in the medium."""
         inside = self.boundary.surrounds(p)
         return inside if self.bbox is None else inside & self._clip.contains(p)
 
     def fills(self, grid: Grid) -> bool:
-        """Whether the medium is all of the box that ``grid`` covers."""
+        """Whether the medium fills the whole box covered by ``grid``."""
         same = np.abs(self.boundary.frame - grid.to_world).max() <= 1e-6 * grid.side_lengths.max()
         return self.boundary.kind == "box" and self.bbox is None and bool(same)
 
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Whether the ray's line meets the medium, and its distances of entry and exit."""
+        """Whether the line of a ray intersects the medium, and its distances of entry and exit."""
         hit, near, far = self.boundary.intersect(ray)
         if self.bbox is not None:
             _, box_near, box_far = self._clip.ray_intersect(ray)
@@ -107,7 +121,7 @@ class MediumGrid:
 
 
 def axis_aligned(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """``to_world`` of the unit cube over a world box."""
+    """Return ``to_world`` of the unit cube for an axis-aligned world box."""
     frame = np.diag([*(upper - lower), 1.0])
     frame[:3, 3] = lower
     return frame

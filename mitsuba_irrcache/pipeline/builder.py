@@ -1,4 +1,4 @@
-"""From a scene to a filled cache, and when an old one still holds."""
+"""From a scene to filled caches, and which of them remain valid when the scene changes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.cancellation import Pause
-from mitsuba_irrcache.media.emission import Emission, bake_emission
+from mitsuba_irrcache.media.bake_emission import bake_emission
+from mitsuba_irrcache.media.emission import Emission
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.pipeline.defaults import choose_solver
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.fingerprint import Snapshot
-from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.solvers.base import Progress as SolverProgress
 
 __all__ = ["CacheBuilder", "CacheSettings", "Progress"]
 
@@ -33,8 +34,8 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(eq=False)
 class Stage:
-    """How far a progressive run has the caches built: ``samples`` per voxel (0: it has not begun),
-    and whether the first two batches may be shown in pieces.
+    """What a progressive run asks of the caches: ``samples`` per voxel (0: it has not begun), and
+    whether the first two batches may be shown while incomplete.
     """
 
     samples: int = 0
@@ -42,32 +43,32 @@ class Stage:
 
 
 class CacheBuilder:
-    """Keeps the media and caches of one scene up to date, and does no work twice.
+    """Keeps the media and caches of one scene up to date without repeating work.
 
-    Threads may share it: whatever changes media or caches does so under its ``lock``. Who needs
-    several of its attributes to fit each other holds the lock while reading them.
+    Threads may share it: media and caches change under its ``lock`` only. To read several
+    attributes that have to be consistent, hold the lock.
     """
 
     def __init__(
         self, settings: CacheSettings, emission: object = None, emission_scale: float = 1.0
     ) -> None:
-        """``emission`` is what `emission.bake_emission` takes; None: media do not shine."""
+        """``emission`` is the argument of `bake_emission`; None: media emit nothing."""
         self.settings = settings
         self.lock = RLock()
         self._emission, self._emission_scale = emission, emission_scale
-        #: samples per voxel to build up to (0: chosen); a higher number refines the caches
+        #: samples per voxel to build up to (0: the default); a higher number refines the caches
         self.samples = settings.samples
-        #: goes up with every change of a medium or a cache
+        #: increases with every change of a medium or a cache
         self.revision = 0
-        #: the media of the scene that can be seen, each with its cache
+        #: the visible media of the scene, each with its cache
         self.parts: list[CachedMedium] = []
         self._snapshot: Snapshot | None = None
         self._stages: list[Stage] = []
         self._checkpointed = 0  # runs that save the caches themselves
-        #: whether the first two batches may be shown in pieces; see `path.solver.Opening`
+        #: whether the first two batches may be shown while incomplete; see `Solver.preview`
         self.early = False
-        #: its action is called often while the solver ``sweep`` is at work, between launches: other
-        #: things may be computed meanwhile; what it raises drops the batch that is computed
+        #: its action is called between kernel launches of a solver, which may compute other things
+        #: meanwhile; an exception drops the batch in progress
         self.pause = Pause()
 
     @property
@@ -77,23 +78,28 @@ class CacheBuilder:
 
     @property
     def cache(self) -> IrradianceCache | None:
-        """The cache of the first medium, None where no light needs caching."""
+        """The cache of the first medium, None where it needs none."""
         return self.parts[0].cache if self.parts else None
 
     @property
     def solver(self) -> str:
-        """Of all caches: path or sweep."""
-        return self.parts[0].solver if self.parts else ""
+        """Name of the solver of the first medium."""
+        return self.parts[0].solver.name if self.parts else ""
+
+    @property
+    def has_preview(self) -> bool:
+        """Whether the first two batches of the first medium may be shown while incomplete."""
+        return bool(self.parts) and self.parts[0].solver.has_preview
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
-        """Makes media and caches fit ``scene``."""
+        """Brings media and caches up to date with ``scene``."""
         with self.lock:
             self.fit(scene)
             for number, part in enumerate(self.parts):
-                self._refine(scene, part, _of_the_caches(progress, number, len(self.parts)))
+                self._refine(scene, part, _progress_of_one(progress, number, len(self.parts)))
 
     def fit(self, scene: mi.Scene) -> None:
-        """Makes the media fit ``scene``, with empty caches where the old ones do not hold."""
+        """Brings the media up to date with ``scene``; caches that are not valid become empty."""
         with self.lock:
             self._fit(scene)
 
@@ -108,12 +114,14 @@ class CacheBuilder:
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             self.parts, self._snapshot = [], None
             self.revision += 1
-            media = bake_media(scene, self._baked_emission())
+            description = compile_scene(scene, self._baked_emission())
+            media = description.visible
             wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
             settings = replace(self.settings, samples=self._wanted)
             self.parts = [
                 CachedMedium(
                     scene,
+                    description,
                     medium,
                     settings,
                     choose_solver(scene, medium, *wanted),
@@ -130,10 +138,8 @@ class CacheBuilder:
             return None
         return bake_emission(self._emission, self._emission_scale)
 
-    def _refine(
-        self, scene: mi.Scene, part: CachedMedium, progress: path_solver.Progress | None
-    ) -> None:
-        changed = True  # the solver may be stopped half-way
+    def _refine(self, scene: mi.Scene, part: CachedMedium, progress: SolverProgress | None) -> None:
+        changed = True  # an exception may end the solver half-way
         try:
             early = self.early or any(stage.early for stage in self._stages)
             changed = part.refine(scene, self._wanted, early, progress)
@@ -145,23 +151,23 @@ class CacheBuilder:
                 part.save()
 
     def save(self) -> None:
-        """Writes the caches to their files, where they have ones that have fewer samples."""
+        """Writes the caches to their files unless these hold at least as many samples."""
         with self.lock:
             for part in self.parts:
                 part.save()
 
     def close(self) -> None:
-        """Ends `early`; incomplete batches are dropped."""
+        """Ends `early` and drops incomplete batches."""
         with self.lock:
             self.early = False
             if any(stage.early for stage in self._stages):
-                return  # another thread shows them
+                return  # another thread shows incomplete batches
             for part in self.parts:
                 self.revision += part.close()
 
     @contextmanager
     def stage(self) -> Iterator[Stage]:
-        """What this gives says how far caches are built while it lasts, in place of ``samples``."""
+        """A context whose `Stage` replaces ``samples`` while it lasts."""
         stage = Stage()
         with self.lock:
             self._stages.append(stage)
@@ -174,43 +180,44 @@ class CacheBuilder:
 
     @property
     def _wanted(self) -> int:
-        """Samples per voxel that are wanted now; 0: chosen."""
+        """Samples per voxel to build up to now; 0: the default."""
         return max((stage.samples for stage in self._stages), default=0) or self.samples
 
     @property
     def done(self) -> int:
-        """Samples per voxel that all caches have, those in incomplete batches included."""
-        shown = [p.shown.samples for p in self._lit or self.parts if p.shown is not None]
+        """Samples per voxel that all caches have, including those in incomplete batches."""
+        shown = [p.shown.samples for p in self._nonzero or self.parts if p.shown is not None]
         return min(shown, default=0)
 
     @property
     def saved_samples(self) -> int:
-        """Samples per voxel that all caches had in their files."""
-        return min((p.saved_samples for p in self._lit), default=0)
+        """Samples per voxel that all caches have in their files."""
+        return min((p.saved_samples for p in self._nonzero), default=0)
 
     @property
     def relative_error(self) -> float:
-        """The largest of the caches' relative errors; 0 where there is nothing to err."""
-        return max((p.shown.relative_error for p in self._lit), default=0.0)
+        """The largest relative error of the caches; 0 where all are zero."""
+        return max((p.shown.relative_error for p in self._nonzero), default=0.0)
 
     @property
     def target(self) -> int:
-        """Samples per voxel that `update` builds up to, the most of all caches."""
+        """Samples per voxel that `update` builds up to, the maximum over the caches."""
         return max((p.target(self._wanted) for p in self.parts if p.cache is not None), default=0)
 
     @property
     def is_dark(self) -> bool:
         """Whether all caches are zero, or there are none: samples change nothing."""
-        return not self._lit
+        return not self._nonzero
 
     @property
-    def _lit(self) -> list[CachedMedium]:
+    def _nonzero(self) -> list[CachedMedium]:
+        """The media whose caches are not known to be zero."""
         return [p for p in self.parts if not p.is_dark]
 
     @contextmanager
     def checkpoints(self) -> Iterator[Callable[[], None]]:
-        """For a cache that is filled in many passes: they do not save it while this lasts. The
-        function that it gives does, when it is time; and its end does, however it comes.
+        """A context in which `update` does not save caches, for runs of many passes. The function
+        it yields saves them when the last time was long ago; leaving the context saves them, too.
         """
         ended, took = perf_counter(), 0.0
 
@@ -232,10 +239,8 @@ class CacheBuilder:
                 self.save()
 
 
-def _of_the_caches(
-    progress: Progress | None, number: int, count: int
-) -> path_solver.Progress | None:
-    """``progress`` for a solver, which knows neither its stage nor that there are more caches."""
+def _progress_of_one(progress: Progress | None, number: int, count: int) -> SolverProgress | None:
+    """``progress`` of all caches together, for the solver of the one with this ``number``."""
     if progress is None:
         return None
     return lambda done, total: progress("cache", number * total + done, count * total)

@@ -1,4 +1,4 @@
-"""One medium of a scene, and the cache of the light in it."""
+"""One visible medium of a scene, and its cache."""
 
 from __future__ import annotations
 
@@ -14,29 +14,25 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
 from mitsuba_irrcache.cache.direct_light import direct_lights_of
-from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
+from mitsuba_irrcache.cache.interpolation import Interpolation
+from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, marked
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.machine.memory import give_back, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.pipeline.defaults import (
+from mitsuba_irrcache.pipeline.defaults import needs_no_cache
+from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.scene.fingerprint import differing, digests
+from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask
+from mitsuba_irrcache.solvers.grid_size import (
     SMALL_BORDER_ERROR,
     border_error,
     choose_grid,
-    choose_samples,
-    follows_straight_ways,
-    needs_no_cache,
-    swept_samples,
     warn_of_dense_border,
 )
-from mitsuba_irrcache.scene.fingerprint import differing, digests
-from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
-from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, least_batch
-from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.half_space import HalfSpace
-from mitsuba_irrcache.solvers.path import solver as path_solver
 
 #: Held by the thread that writes a cache file.
 _SAVING = Lock()
@@ -44,7 +40,7 @@ _SAVING = Lock()
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """What a cache is asked to be; see the plugin's documentation."""
+    """Properties of the integrator that caches depend on; see the plugin's documentation."""
 
     max_depth: int = -1
     rr_depth: int = 5
@@ -57,34 +53,37 @@ class CacheSettings:
 
 
 class CachedMedium:
-    """A medium with its cache, which is None where no light needs caching (``max_depth`` below
-    2).
+    """A medium with its cache, which is None where none is needed (``max_depth`` below 2, or a
+    closed form).
 
-    ``solver`` is what `defaults.choose_solver` says; ``name`` tells the medium from the
-    scene's others, "" where there are none; ``pause`` is as in `CacheBuilder`.
+    ``solver`` is a result of `choose_solver`; ``name`` distinguishes the medium from other visible
+    ones of the scene, "" where there are none; ``edited``: the scene is an edited version of one
+    that had a cache; ``pause`` is as in `CacheBuilder`.
     """
 
     def __init__(
         self,
         scene: mi.Scene,
+        description: SceneDescription,
         medium: MediumGrid,
         settings: CacheSettings,
-        solver: tuple[str, str],
+        solver: tuple[type[Solver], str],
         name: str,
         edited: bool,
         pause: Callable[[], None] = lambda: None,
     ) -> None:
         self.settings, self.medium, self.name = settings, medium, name
+        self.description = description
         self._pause = pause
         #: samples per voxel in the file
         self.saved_samples = 0
-        #: path or sweep, and why
+        #: the solver, and why it was chosen
         self.solver, self._reason = solver
-        self._opening: path_solver.Opening | None = None
+        self._opening: Preview | None = None
         self._preview: IrradianceCache | None = None
-        self._sweep: Sweep | None = None
+        self._kept_solver: Solver | None = None
         self.cache: IrradianceCache | None = None
-        #: closed form in place of a cache; None where there is one, or nothing to be computed
+        #: closed form that replaces the cache; None where there is a cache, or nothing is scattered
         self.half_space: HalfSpace | None = None
         if settings.max_depth in (0, 1):
             return
@@ -101,12 +100,12 @@ class CachedMedium:
 
     @property
     def label(self) -> str:
-        """Before a message about it."""
+        """Prefix of messages about it."""
         return f'medium "{self.name}": ' if self.name else ""
 
     @property
     def file(self) -> str:
-        """Its own where there are several media, with the medium's name in it."""
+        """File of the cache; of several media, each has its own with the medium's name in it."""
         if not self.settings.file or not self.name:
             return self.settings.file
         file = Path(self.settings.file)
@@ -115,108 +114,138 @@ class CachedMedium:
 
     @property
     def shown(self) -> IrradianceCache | None:
-        """The cache, or the incomplete batches that stand for it so far."""
+        """The cache to be rendered, or a preview of it while its first batches are incomplete."""
         return self._preview or self.cache
 
     def target(self, samples: int) -> int:
-        """Samples per voxel to build up to where ``samples`` (0: chosen) are wanted, a multiple of
-        the cache's batch.
+        """Samples per voxel to build up to for ``samples`` (0: the default), a multiple of the
+        cache's batch.
         """
         batch = self.cache.batch
-        samples = samples or choose_samples(self.cache, self.solver, self.medium)
+        samples = samples or self.solver.default_samples(
+            self.medium, self.cache.max_depth, self.cache.active_count
+        )
         return max(-(-samples // batch), 2 if self.settings.with_error else 1) * batch
 
     @property
     def is_dark(self) -> bool:
-        """Whether the cache is zero, or there is none: samples change nothing."""
+        """Whether the cache is known to be zero, or there is none: samples change nothing."""
         return self.cache is None or not self.cache.active_count
 
-    def refine(
-        self, scene: mi.Scene, samples: int, early: bool, progress: path_solver.Progress | None
-    ) -> bool:
-        """Fills the cache up to ``samples`` (0: chosen), the first two batches in pieces if
-        ``early``; whether anything may have changed.
+    def refine(self, scene: mi.Scene, samples: int, early: bool, progress: Progress | None) -> bool:
+        """Fills the cache up to ``samples`` (0: the default), the first two batches bit by bit if
+        ``early``; returns whether anything may have changed.
         """
-        if early and self.solver == "path" and not self.is_dark and not self.cache.samples:
+        if early and self.solver.has_preview and not self.is_dark and not self.cache.samples:
             return self._open(scene, samples, progress)
         closed = self._opening is not None and not early and self.close()
         if self.cache is None or self.cache.samples >= self.target(samples):
             return closed
         self._fill(scene, self.target(samples) - self.cache.samples, progress)
         if not self.is_dark and not self.cache.is_finite:
-            self.cache, self._sweep = self._start_cache(scene, edited=False), None
+            self.cache, self._kept_solver = self._start_cache(scene, edited=False), None
             raise IrrcacheError(
-                f"irrcache: {self.label}the light in the medium is not finite in single precision; "
-                "lower the radiance of the emitters, and look through sigma_t and albedo."
+                f"irrcache: {self.label}the irradiance in the medium is not finite in single "
+                "precision; "
+                "lower the radiance of the emitters, and check sigma_t and albedo."
             )
         return True
 
     def close(self) -> bool:
-        """Drops incomplete batches; whether there were any."""
+        """Drops incomplete batches; returns whether there were any."""
         dropped = self._preview is not None
         self._opening = self._preview = None
         return dropped
 
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
-        settings, medium = self.settings, self.medium
-        grid, size_reason = choose_grid(medium, settings.resolution, self.solver)
-        directional = None
-        if medium.phase is not None:
-            directional = AngularBasis(medium.phase, sources_of(scene))
-        moments = directional.count if directional is not None else 0
-        together = sn_solver.swept_together(medium, grid.voxel_count)
-        _check_memory(grid, self.solver, settings.max_depth, settings.with_error, moments, together)
+        """The cache in the file if there is one, else an empty one."""
+        settings, medium, solver, media = (
+            self.settings,
+            self.medium,
+            self.solver,
+            self.description.media,
+        )
+        grid, size_reason = choose_grid(medium, settings.resolution, solver.size_rule)
+        basis = None
+        if not medium.phase.is_isotropic:
+            basis = AngularBasis(medium.phase, sources_of(scene))
+        moments = basis.count if basis is not None else 0
+        self._check_memory(grid, moments)
         warn_of_dense_border(medium, grid)
-        active, survey = active_voxels(medium, grid), None
-        if medium.surroundings is not None and self.solver == "path":  # else nothing is among them
-            survey = medium.surroundings.survey(scene, grid, medium)
-            active = dr.compress(survey.reach & marked(grid, active))
-        dark = not scene.emitters() and medium.emission is None
-        if medium.albedo.maximum == 0 or dark:
+        active = active_voxels(medium, grid)
+        classes = solver.voxel_classes(scene, media, medium, grid)
+        if classes is not None:
+            active = dr.compress(classes.readable & marked(grid, active))
+        if medium.albedo.maximum == 0 or not self._is_lit:
             active = mi.UInt32()
         mi.Log(
             mi.LogLevel.Info,
-            f"irrcache: {self.label}solver {self.solver} ({self._reason}); cache of "
+            f"irrcache: {self.label}solver {solver.name} ({self._reason}); cache of "
             f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {dr.width(active)} "
             f"of {grid.voxel_count} see the medium",
         )
-        channels = 1 if mi.is_monochromatic else 3
-        swept, depth = self.solver == "sweep", settings.max_depth
-        batch = BATCH
-        if swept:
-            wanted = settings.samples or swept_samples(depth, medium)
-            wanted = -(-wanted // 2) if settings.with_error else wanted
-            least = sn_solver.BATCH if directional is None else least_batch(directional.order)
-            batch = sn_solver.batch_of(wanted, least)
-        cache = IrradianceCache(
-            grid, active, channels, depth, batch=batch, correlated=swept, moments=moments
+        samples = settings.samples or solver.default_samples(
+            medium, settings.max_depth, dr.width(active)
         )
-        cache.survey, cache.directional = survey, directional
-        dense = border_error(medium, grid) > SMALL_BORDER_ERROR
-        if swept or follows_straight_ways(scene, medium, grid, active):
-            cache.direct_lights = direct_lights_of(scene, medium, grid, active, dense, survey)
-        cache.falloff = InverseSquareFactor.of(
-            scene, grid, [light.emitter for light in cache.direct_lights]
-        )
+        samples = -(-samples // 2) if settings.with_error else samples
+        direct_lights = []
+        if solver.knows_direct_lights(scene, medium, grid, active):
+            dense = border_error(medium, grid) > SMALL_BORDER_ERROR
+            direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes)
+        falloff = InverseSquareFactor.of(scene, grid, [light.emitter for light in direct_lights])
+        interpolation = Interpolation(basis, falloff, direct_lights, classes)
+
+        def empty(fingerprint: dict[str, str]) -> IrradianceCache:
+            return IrradianceCache(
+                grid,
+                active,
+                1 if mi.is_monochromatic else 3,
+                settings.max_depth,
+                fingerprint,
+                solver.batch_size(medium, settings.max_depth, samples, basis),
+                solver.is_correlated,
+                moments,
+                interpolation,
+            )
+
         self.saved_samples = 0
         if not self.file:
-            return cache
-        cache.fingerprint = self._fingerprint(scene, cache)
-        return self._resume(cache, edited)
+            return empty({})
+        return self._resume(empty(self._fingerprint(scene, grid, moments)), edited) or empty({})
 
-    def _fingerprint(self, scene: mi.Scene, cache: IrradianceCache) -> dict[str, str]:
-        moments = f", moments {cache.moments}" if cache.moments else ""
-        return digests(scene, self.medium) | {
-            "settings": f"solver {self.solver}, max_depth {cache.max_depth}, "
-            f"grid {cache.grid.shape[::-1]}{moments}"
+    @property
+    def _is_lit(self) -> bool:
+        """Whether any radiance may reach the medium."""
+        return bool(self.description.emitters) or self.medium.emission is not None
+
+    def _check_memory(self, grid: Grid, moments: int) -> None:
+        """Refuses a cache that cannot be held, by what it takes to fill it and to look it up; as
+        much again for the field of its errors (experiments/paper/memory).
+        """
+        channels, max_depth = 1 if mi.is_monochromatic else 3, self.settings.max_depth
+        numbers = self.solver.numbers_per_voxel(
+            self.medium, max_depth, moments, grid.voxel_count, channels
+        )
+        needed = 4 * grid.voxel_count * (numbers + 8) * (2 if self.settings.with_error else 1)
+        what = f"irrcache: a cache of {' x '.join(map(str, grid.shape[::-1]))} voxels"
+        require_memory(needed, what, "lower resolution")
+        if grid.voxel_count >= 2**32:
+            raise IrrcacheError(f"{what} has 2^32 of them or more; lower resolution.")
+
+    def _fingerprint(self, scene: mi.Scene, grid: Grid, moments: int) -> dict[str, str]:
+        count = f", moments {moments}" if moments else ""
+        return digests(scene, self.description.media, self.medium) | {
+            "settings": f"solver {self.solver.name}, max_depth {self.settings.max_depth}, "
+            f"grid {grid.shape[::-1]}{count}"
         }
 
-    def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache:
-        """The cache on disk where it is of the same light; a foreign file is refused, never
-        overwritten.
+    def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache | None:
+        """The cache on disk where it is one of the same scene, else the empty ``cache``; None where
+        the file is of the scene before it was ``edited``, and is not to be overwritten. Raises
+        CacheFileError for the file of another scene.
         """
         file = Path(self.file)
-        if not os.path.exists(file):  # says no, where Path.exists may raise
+        if not os.path.exists(file):  # returns False where Path.exists may raise
             if not os.path.isdir(file.parent):
                 raise IrrcacheError(
                     f'irrcache: cache_file "{file}": the folder "{file.parent}" does not exist.'
@@ -227,22 +256,20 @@ class CachedMedium:
                     f'"{file.parent}"; name another one.'
                 )
             return cache
-        stored = IrradianceCache.load(file)
+        stored = IrradianceCache.load(file, cache.interpolation)
         others = differing(cache.fingerprint, stored.fingerprint)
         if not others:
             _check_like(cache, stored, file)
             mi.Log(mi.LogLevel.Info, f'irrcache: {stored.samples} samples per voxel from "{file}"')
             self.saved_samples = stored.samples
-            stored.lie_like(cache)
             return stored
         if edited:
             mi.Log(
                 mi.LogLevel.Warn,
                 f'irrcache: the scene was edited ({", ".join(others)}): "{file}" keeps the '
-                "light of before.",
+                "irradiance of the scene before.",
             )
-            cache.fingerprint = {}
-            return cache
+            return None
         detail = (
             f" ({stored.fingerprint.get('settings')} in the file, {cache.fingerprint['settings']} "
             "here)"
@@ -255,13 +282,11 @@ class CachedMedium:
             "Delete the file, or give this scene a cache_file of its own."
         )
 
-    def _open(self, scene: mi.Scene, samples: int, progress: path_solver.Progress | None) -> bool:
-        """Adds to the first two batches up to ``samples`` in all; whether anything was added."""
-        cache, settings = self.cache, self.settings
+    def _open(self, scene: mi.Scene, samples: int, progress: Progress | None) -> bool:
+        """Adds to the first two batches up to ``samples`` in all; returns whether it added any."""
+        cache = self.cache
         if self._opening is None:
-            self._opening = path_solver.Opening(
-                scene, self.medium, cache, settings.seed, settings.rr_depth
-            )
+            self._opening = self._new_solver(scene).preview()
         size = min(samples // 2, cache.batch)
         if size <= self._opening.size:
             return False
@@ -277,33 +302,40 @@ class CachedMedium:
                 cache.max_depth,
                 batch=size,
                 moments=cache.moments,
+                interpolation=cache.interpolation,
             )
-            self._preview.lie_like(cache)
             self._opening.fill(self._preview)
         return True
 
-    def _fill(self, scene: mi.Scene, missing: int, progress: path_solver.Progress | None) -> None:
-        settings, cache = self.settings, self.cache
-        if self.solver == "sweep":
-            if self._sweep is None:
-                arguments = settings.seed, settings.rr_depth, self._pause
-                kind = Sweep if cache.directional is None else AnisotropicSweep
-                self._sweep = kind(scene, self.medium, cache, *arguments)
-            self._sweep.refine(missing, progress)
-        else:
-            path_solver.refine(
-                scene, self.medium, cache, missing, settings.seed, settings.rr_depth, progress
+    def _fill(self, scene: mi.Scene, missing: int, progress: Progress | None) -> None:
+        solver = self._kept_solver or self._new_solver(scene)
+        if solver.is_kept:
+            self._kept_solver = solver
+        solver.refine(missing, progress)
+        give_back(self.cache.grid.voxel_count)
+
+    def _new_solver(self, scene: mi.Scene) -> Solver:
+        settings = self.settings
+        return self.solver(
+            SolverTask(
+                scene,
+                self.description,
+                self.medium,
+                self.cache,
+                settings.seed,
+                settings.rr_depth,
+                self._pause,
             )
-        give_back(cache.grid.voxel_count)
+        )
 
     def save_as(self, scene: mi.Scene, file: str | Path) -> None:
         """Writes a copy of the cache that fits ``scene`` to a file of any name."""
-        self.cache.fingerprint = self._fingerprint(scene, self.cache)
-        self.cache.save(file)
+        cache = self.cache
+        cache.save(file, self._fingerprint(scene, cache.grid, cache.moments))
 
     def save(self) -> None:
-        """Writes the cache to its file, where it has one that has fewer samples, also by now: other
-        processes may share it. The light is not lost with a file that cannot be written.
+        """Saves the cache to its file unless the file, possibly updated by another process, already
+        holds at least as many samples. Logs a warning where the file cannot be written.
         """
         file, cache = self.file, self.cache
         if not file or cache is None or not cache.fingerprint:
@@ -311,7 +343,7 @@ class CachedMedium:
         if cache.samples <= self.saved_samples:
             return
         try:
-            with _SAVING:  # no other thread writes the file between looking and writing
+            with _SAVING:  # no other thread writes the file between check and writing
                 if not self._is_ahead(file):
                     cache.save(file)
             self.saved_samples = cache.samples
@@ -319,23 +351,23 @@ class CachedMedium:
             mi.Log(
                 mi.LogLevel.Warn,
                 f"irrcache: {self.label}the cache was not saved: {str(error).rstrip('.')}. It is "
-                "used all the same.",
+                "used nevertheless.",
             )
 
     def _is_ahead(self, file: str) -> bool:
-        """Whether another process has written as many samples of the same light meanwhile. Raises
-        CacheFileError if it is other light.
+        """Whether another process has written as many samples of the same scene meanwhile. Raises
+        CacheFileError if the file now belongs to another scene.
         """
         if not Path(file).exists():
             return False
         fingerprint, samples = IrradianceCache.description_of(file)
         if differing(fingerprint, self.cache.fingerprint):
-            raise CacheFileError(f'"{file}" has come to hold the light of another scene')
+            raise CacheFileError(f'"{file}" has been replaced by the cache of another scene')
         return samples >= self.cache.samples
 
 
 def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> None:
-    """Raises CacheFileError if a file says of itself what it is not."""
+    """Raises CacheFileError if the contents of a file contradict its fingerprint."""
     alike = ("active_count", "channels", "correlated", "max_depth", "moments")
     unlike = [name for name in alike if getattr(cache, name) != getattr(stored, name)]
     if stored.grid.shared(cache.grid) is not cache.grid:
@@ -345,33 +377,3 @@ def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> 
             f'irrcache: cache_file "{file}" contradicts itself: {", ".join(unlike)} do not fit '
             "its fingerprint. Delete it."
         )
-
-
-def _check_memory(
-    grid: Grid,
-    solver: str,
-    max_depth: int,
-    with_error: bool,
-    moments: int = 0,
-    together: bool = False,
-) -> None:
-    """Refuses a cache that cannot be held, with what it takes to make it and to look it up; for the
-    field of its errors as much again (experiments/paper/memory). ``together``: all channels are
-    swept at once.
-    """
-    channels = 1 if mi.is_monochromatic else 3
-    if solver == "sweep":
-        # Extinction with its neighbours, the light that lines carry, sums and spreads; and where
-        # light is scattered again, the voxels' own and what is kept between sweeps.
-        sets = channels if together else 1
-        numbers = 5 + 2 * channels + (0 if max_depth == 2 else 5 + 12 * sets + 3 * channels)
-        # Moments of one channel are solved for at a time.
-        numbers += moments * (3 * channels + (4 if max_depth == 2 else 10))
-    else:
-        numbers = channels * (3 * 2 + 3) + 5  # sums in float64
-        numbers += channels * moments * 3
-    needed = 4 * grid.voxel_count * (numbers + 8) * (2 if with_error else 1)
-    what = f"irrcache: a cache of {' x '.join(map(str, grid.shape[::-1]))} voxels"
-    require_memory(needed, what, "lower resolution")
-    if grid.voxel_count >= 2**32:
-        raise IrrcacheError(f"{what} has 2^32 of them or more; lower resolution.")

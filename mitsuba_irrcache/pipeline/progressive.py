@@ -1,10 +1,10 @@
-"""Progressive rendering: a first image soon, then better ones while the cache is refined.
+"""Progressive rendering: an early image, then better ones while the cache is refined.
 
     for frame in render_progressive(scene, seconds=10):
         mi.util.write_bitmap("image.png", frame.image)
 
-Passes refine the cache, images show it. How long a pass is and when an image is due follows from
-what they have taken so far, and from nothing else.
+Passes refine the cache, frames render it. The length of a pass and the time of the next frame
+follow from the measured times of earlier passes and frames alone.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from mitsuba_irrcache.pipeline.builder import CacheBuilder, Progress, Stage
 
 #: Samples per voxel of the first pass: two for each of two batches, for a standard error.
 FIRST = 4
-#: As long as these are incomplete, passes may be smaller than a batch.
+#: Samples up to which passes may be smaller than a batch.
 OPENING = 2 * BATCH
-#: Frames that follow each other as fast as the samples double; those after them are spaced.
+#: First frames, which follow each other as fast as the samples double; later ones are spaced.
 EARLY_FRAMES = 3
-#: Between frames pass at least the time of an image over this share, ...
+#: Interval between frames, at least: the time of an image over this share, ...
 IMAGE_SHARE = 0.2
 #: ... and this part of the time so far: later images differ less.
 GROWTH = 0.25
-#: What a prediction may be exceeded by within a time limit.
+#: Factor by which a prediction may be exceeded within a time limit.
 SAFETY = 1.1
-#: A frame may come early by what a pass is too coarse for: from this part of its time on.
+#: Part of its time from which on a frame may be rendered, since passes have a minimum length.
 REACHED = 0.97
 
 
 @dataclass(frozen=True)
 class Targets:
-    """When a progressive run ends: at the first that is reached of those that are given; if none
-    is, at the integrator's own ``cache_spp``.
+    """When a progressive run ends: at the first target reached of those given; without any, at the
+    integrator's own ``cache_spp``.
 
     Attributes:
         cache_spp: samples per voxel, rounded up to batches; math.inf for a run without end.
         standard_error: of the cache, relative, see `IrradianceCache.relative_error`.
-        seconds: for cache and images; the last image is there by then. The first one is rendered
-            whatever it takes.
-        times: seconds at which frames are wanted, in place of the usual spacing. Each is finished
-            as soon after its time as passes allow; the last one is the end.
+        seconds: for cache and images; the last image is complete by then. The first one is
+            rendered however long it takes.
+        times: seconds at which frames are wanted, instead of the usual spacing. Each is finished
+            as soon after its time as passes allow; the last one ends the run.
     """
 
     cache_spp: float = 0
@@ -66,8 +66,8 @@ class Targets:
             )
         if not 0 <= self.standard_error < math.inf:
             raise IrrcacheError(
-                f"progressive: standard_error is {self.standard_error!r}; it must be a part of the "
-                "mean irradiance, for example 0.01, or 0 (no target)."
+                f"progressive: standard_error is {self.standard_error!r}; it must be a fraction of "
+                "the mean irradiance, for example 0.01, or 0 (no target)."
             )
         for name, values in (("seconds", [self.seconds]), ("times", self.times)):
             for value in values:
@@ -86,10 +86,10 @@ class Frame:
 
     Attributes:
         image: (height, width, channel), as ``mi.render`` gives it.
-        samples: per cache voxel so far; 0 where no light needs caching.
+        samples: per cache voxel so far; 0 where no cache is needed.
         standard_error: of the cache, relative, see `IrradianceCache.relative_error`.
         seconds: since the beginning by stage: "cache", "image" (of all frames), and "filter" where
-            the integrator reports one. What the caller does between frames does not count.
+            the integrator reports one. Time of the caller between frames does not count.
     """
 
     image: mi.TensorXf
@@ -114,14 +114,14 @@ def render_progressive(
     seconds: float = math.inf,
     times: Sequence[float] = (),
 ) -> Iterator[Frame]:
-    """Frames of a ``scene`` with the integrator ``irrcache``, better and better; see `Targets` for
-    when it ends.
+    """Frames of a ``scene`` with the integrator ``irrcache``, of increasing quality; see `Targets`
+    for when the run ends.
 
-    Every frame is rendered afresh with ``spp`` samples per pixel and ``seed``; the last one shows
-    the final cache. A ``cache_file`` is written now and then, and at the end, however that comes;
-    the cache stays with the integrator, and another run goes on with it. ``cancel()`` of the
-    integrator ends it without another frame. Raises IrrcacheError for another integrator, and for
-    targets that make no sense.
+    Every frame is rendered with ``spp`` samples per pixel and ``seed``; the last one uses the final
+    cache. A ``cache_file`` is written at intervals, and at the end, also after an exception; the
+    cache stays with the integrator, and another run continues with it. ``cancel()`` of the
+    integrator ends the run without another frame. Raises IrrcacheError for another integrator and
+    for invalid targets.
     """
     integrator = scene.integrator()
     if not hasattr(integrator, "progressive"):
@@ -145,8 +145,8 @@ def frames(
     targets: Targets,
     progress: Progress | None = None,
 ) -> Iterator[Frame]:
-    """The frames of a run. ``image`` renders one with the cache as it is, and says how many of the
-    seconds it took were spent on a filter.
+    """The frames of a run. ``image`` renders one with the cache as it is; it returns the image and
+    the seconds of it spent on a filter.
     """
     with builder.checkpoints() as checkpoint, builder.stage() as stage:
         try:
@@ -163,7 +163,7 @@ def frames(
 
 
 class _Run:
-    """What the stages of a run do, and how long they take."""
+    """The stages of a run, and their times."""
 
     def __init__(
         self,
@@ -178,14 +178,14 @@ class _Run:
         self.schedule = Schedule(targets.seconds, targets.times)
         self._opening = OPENING  # samples up to which passes may be smaller than a batch
         self.error = math.nan
-        self._is_last = False  # whether the frame before shows what was asked for
+        self._is_last = False  # whether the last frame fulfils the targets
 
     def begin(self) -> None:
-        """Makes the cache, or finds it, with a first pass if it needs one."""
+        """Makes or loads the cache, with a first pass if it needs one."""
         goal = self.targets.cache_spp if self.targets.given else self.builder.samples
         self.stage.early = not 0 < goal < OPENING
         self._update(FIRST if self.stage.early else goal, lambda: None)
-        if self.builder.cache is not None and self.builder.solver != "path":
+        if self.builder.cache is not None and not self.builder.has_preview:
             self._opening = 0
             self.schedule.batch = self.schedule.first = self.builder.cache.batch
         self.goal = self.targets.cache_spp or math.inf
@@ -197,7 +197,7 @@ class _Run:
     def refine(self, samples: int, checkpoint: Callable[[], None]) -> None:
         """A pass of so many samples per voxel."""
         done = self._samples
-        # A pass that is larger than what the opening lacks would be one of a size of its own.
+        # A larger pass than the first two batches lack would have a kernel size of its own.
         self._update(
             done + samples if done >= self._opening else min(done + samples, self._opening),
             checkpoint,
@@ -206,17 +206,17 @@ class _Run:
     def frame(self, image: Callable[[], tuple[mi.TensorXf, float]]) -> Frame:
         """An image of the cache as it is."""
         with self.builder.lock:
-            started = perf_counter()  # waiting for other threads does not count
+            started = perf_counter()  # without the time spent waiting for other threads
             tensor, filtering = image()
             dr.sync_thread()
-            # Another thread may refine the cache as soon as it can.
-            samples, self._is_last = self._samples, self._has_arrived
+            # Another thread may refine the cache once the lock is released.
+            samples, self._is_last = self._samples, self._is_fulfilled
         self.schedule.note_image(perf_counter() - started, filtering)
         return Frame(tensor, samples, self.error, dict(self.schedule.seconds))
 
     def next_pass(self) -> int:
         """Samples per voxel of the next pass; 0 when it is time for an image."""
-        if self._has_arrived:
+        if self._is_fulfilled:
             return 0
         needed = self.goal - self._samples
         if self.targets.standard_error and math.isnan(self.error):
@@ -236,8 +236,8 @@ class _Run:
         return self.builder.done
 
     @property
-    def _has_arrived(self) -> bool:
-        """Whether the cache is what was asked for."""
+    def _is_fulfilled(self) -> bool:
+        """Whether the cache fulfils the targets."""
         wanted = self.targets.standard_error
         exact = wanted > 0 and self.error <= wanted
         return exact or self._samples >= self.goal or self.builder.is_dark
@@ -249,24 +249,24 @@ class _Run:
             self.builder.update(self.scene, self.progress)
             cache = self.builder.cache
             if cache is not old:
-                before = self.builder.saved_samples  # what a new one has, it has from its file
+                before = self.builder.saved_samples  # a new cache begins with those of its file
             self.error = self.builder.relative_error
         checkpoint()
         self.schedule.note_pass(max(self._samples - before, 0), perf_counter() - started)
 
 
 class Schedule:
-    """When to refine and when to render; all times in seconds since the beginning."""
+    """Decides when to refine and when to render; all times in seconds since the beginning."""
 
     def __init__(self, limit: float = math.inf, times: Sequence[float] = ()) -> None:
         self.limit, self.times = limit, sorted(times)
         self.seconds = {"cache": 0.0, "image": 0.0}
         self._passes: list[tuple[int, float]] = []
         self._frames = 0
-        self._last_frame = 0.0  # when it was finished
-        self._image = 0.0  # what it took
-        self._fresh = False  # whether there has been a pass since
-        #: samples of the very first pass, and of a batch, of which later ones are made
+        self._last_frame = 0.0  # time at which it was finished
+        self._image = 0.0  # seconds that it took
+        self._fresh = False  # whether there has been a pass since the last frame
+        #: samples of the first pass, and of a batch; later passes are whole batches
         self.first, self.batch = FIRST, BATCH
         self._grain = FIRST  # samples of the smallest pass
 
@@ -277,19 +277,19 @@ class Schedule:
 
     @property
     def is_over(self) -> bool:
-        """Whether after a frame no better one can follow in time, or is wanted."""
+        """Whether no better frame can follow in time, or none is wanted."""
         wanted = not self.times or self._last_frame < REACHED * self.times[-1]
         return not wanted or self._samples_within(self._left) < self._grain
 
     def note_pass(self, samples: int, seconds: float) -> None:
-        """``samples`` per voxel took so long; 0 samples: the cache was found in a file."""
+        """Records the ``seconds`` of a pass of ``samples`` per voxel; 0: loaded from a file."""
         self.seconds["cache"] += seconds
         if samples:
             self._passes.append((samples, seconds))
         self._fresh = True
 
     def note_image(self, seconds: float, filtering: float = 0.0) -> None:
-        """An image took so long, of this the filter ``filtering``."""
+        """Records the ``seconds`` of an image, of which a filter took ``filtering``."""
         self.seconds["image"] += seconds - filtering
         if filtering:
             self.seconds["filter"] = self.seconds.get("filter", 0.0) + filtering
@@ -297,8 +297,8 @@ class Schedule:
         self._image, self._last_frame, self._fresh = seconds, self.elapsed, False
 
     def next_pass(self, done: int, needed: float) -> int:
-        """Samples per voxel of the next pass, whole batches after the opening, where ``done`` are
-        there and ``needed`` more are asked for; 0 when it is time for an image.
+        """Samples per voxel of the next pass, whole batches after the first two, if there are
+        ``done`` and ``needed`` more are asked for; 0 when it is time for an image.
         """
         self._grain = grain = self.batch if done >= 2 * self.batch else self.first
         possible = self._samples_within(self._left)
@@ -307,7 +307,7 @@ class Schedule:
         soonest = due * (REACHED if self.times else 1)
         if possible < grain or (self._fresh and self.elapsed + self._image >= soonest):
             return 0
-        # Predictions carry no farther than to twice the samples.
+        # Predictions are not extrapolated beyond twice the samples.
         samples = min(needed, possible, done)
         if self._frames >= EARLY_FRAMES or self.times:
             samples = min(samples, self._samples_within(due - self.elapsed - self._image))
@@ -320,7 +320,7 @@ class Schedule:
 
     @property
     def _due(self) -> float:
-        """When the next frame should be finished."""
+        """Time at which the next frame should be finished."""
         if not self._frames:
             return 0.0
         if self.times:
@@ -329,13 +329,13 @@ class Schedule:
         if self._frames < EARLY_FRAMES:
             return self._last_frame
         interval = max(self._image / IMAGE_SHARE, GROWTH * self._last_frame)
-        # What is left after the next frame should suffice for another one.
+        # After the next frame enough time should be left for another one.
         last = self._last_frame + 2 * interval > self.limit
         return math.inf if last else self._last_frame + interval
 
     def _samples_within(self, seconds: float) -> float:
-        """Samples per voxel that take at most so long, by what passes have taken: on the line
-        through the shortest and the longest, beyond that in proportion to the longest.
+        """Samples per voxel that take at most so long, predicted from earlier passes: on the line
+        through the shortest and the longest one, beyond the longest in proportion to it.
         """
         if seconds == math.inf:
             return math.inf

@@ -1,1 +1,1 @@
-"""From caches to an image: ray marching, film, filter."""
+"""From caches to an image: ray marching, surfaces, film and denoising."""

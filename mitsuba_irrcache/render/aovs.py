@@ -1,13 +1,13 @@
-"""The image in layers: colour and illumination apart (paper, section 3), and what goes with them.
+"""Components of the image: colour and illumination (paper, section 3), and further AOVs.
 
     C = int T sigma_s dt                 colour
-    E = int T sigma_s Phi / (4 pi) dt    scattered light
+    E = int T sigma_s Phi / (4 pi) dt    scattered radiance
     I = E / C                            illumination
 
-The film carries C and E, which are linear in the light; I is formed after the film's
-reconstruction, so that C I + background is the image, whatever the film's filter. (Where a filter
-with negative lobes leaves no colour, E passes as it is, and I is 0.) (The paper
-multiplies the averages of two images, which is right only where one of them is constant.)
+The film stores C and E, which are linear in the radiance; I is computed after the film's
+reconstruction, so that C I + background is the image for every reconstruction filter. (Where a
+filter with negative lobes makes C vanish, E is used unchanged and I is 0. The paper multiplies the
+averages of two images, which is correct only if one of them is constant.)
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import mitsuba as mi
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.errors import IrrcacheError
 
-#: Images that can be asked for, with the channels that their names end in, as in Mitsuba's ``aov``.
+#: Supported AOVs and the suffixes of their channels, as in Mitsuba's ``aov``.
 AOVS = {
     "colour": "RGB",
     "illumination": "RGB",
@@ -31,18 +31,20 @@ AOVS = {
     "bias": "Y",
 }
 
-#: Below this colour there is no illumination to speak of: E passes through unfiltered.
+#: Minimum colour for which the illumination is defined; below it, E is used unfiltered.
 LEAST_COLOUR = 1e-6
 
 
 @dataclass
 class Layers:
-    """What a camera sample, or a pixel, sees; one value or one array of pixels each.
+    """Components of a camera sample or pixel; each is one value or an array over pixels.
 
-    ``depth`` is int (-dT/dt) t dt; ``probes`` are random errors as the cache's noise makes them and
-    ``bias`` the expected error of its resolution, both in radiance. Everything is linear: the mean
-    of samples is the pixel.
+    ``depth`` is int (-dT/dt) t dt; ``probes`` are random errors distributed like the cache's noise,
+    and ``bias`` is the expected discretisation error, both in radiance. All components are linear,
+    so that the mean over samples is the value of the pixel.
     """
+
+    # docs/primer, eq. (5.6)
 
     scattered: mi.Spectrum
     colour: mi.Spectrum
@@ -53,13 +55,13 @@ class Layers:
     bias: mi.Float
 
     def channels(self) -> list[mi.Float]:
-        """All values in a row, as a film takes them."""
+        """Return all values as a list, in the order of the film's channels."""
         spectra = (self.scattered, self.colour, self.background, self.transmittance)
         return [*(c for s in spectra for c in s), self.depth, *self.probes, self.bias]
 
     @classmethod
     def of(cls, channels: list[mi.Float]) -> Layers:
-        """The inverse of `channels`."""
+        """Inverse of `channels`."""
         n = dr.size_v(mi.Spectrum)
         spectra = [mi.Spectrum(*channels[i * n : (i + 1) * n]) for i in range(4)]
         depth, *probes, bias = channels[4 * n :]
@@ -67,44 +69,42 @@ class Layers:
 
     @classmethod
     def background_only(cls, radiance: mi.Spectrum) -> Layers:
-        """What is seen where there is no medium."""
+        """Components of rays that do not intersect a medium."""
         dark, zero = dr.zeros(mi.Spectrum, dr.width(radiance)), dr.zeros(mi.Float)
         return cls(dark, dark, radiance, dr.full(mi.Spectrum, 1), zero, [], zero)
 
     @property
     def valid(self) -> list[mi.Bool]:
-        """Where there is an illumination, for every colour channel."""
+        """Where the illumination is defined, for each colour channel."""
         return [c > LEAST_COLOUR for c in self.colour]
 
     @property
     def illumination(self) -> mi.Spectrum:
-        """I = E / C, 0 where there is none: in-scattered radiance Phi / (4 pi), averaged along the
-        ray as the eye does.
-        """
+        """I = E / C: weighted mean of Phi / (4 pi) along the ray; 0 where undefined."""
         pairs = zip(self.scattered, self.colour, self.valid, strict=True)
         return mi.Spectrum(*(dr.select(ok, e / dr.select(ok, c, 1), 0) for e, c, ok in pairs))
 
     @property
     def noise(self) -> mi.Float:
-        """Standard error of the luminance that comes of the cache's noise."""
+        """Standard error of the luminance caused by the noise of the cache."""
         if not self.probes:
             return dr.zeros(mi.Float, dr.width(self.depth))
         return dr.sqrt(sum(dr.square(p) for p in self.probes) / len(self.probes))
 
     def radiance(self, illumination: mi.Spectrum | None = None) -> mi.Spectrum:
-        """The image; with another ``illumination`` in place of its own."""
+        """Compose the image, optionally with another ``illumination``."""
         if illumination is None:
             return self.scattered + self.background
         parts = zip(self.scattered, self.colour, illumination, self.valid, strict=True)
-        lit = mi.Spectrum(*(dr.select(ok, c * i, e) for e, c, i, ok in parts))
-        return lit + self.background
+        scattered = mi.Spectrum(*(dr.select(ok, c * i, e) for e, c, i, ok in parts))
+        return scattered + self.background
 
     def aov(self, kind: str) -> list[mi.Float]:
-        """The channels of one of `AOVS`."""
+        """Return the channels of one of `AOVS`."""
         if kind == "depth":
             opacity = 1 - luminance(self.transmittance)
-            seen = opacity > LEAST_COLOUR
-            return [dr.select(seen, self.depth / dr.select(seen, opacity, 1), 0)]
+            visible = opacity > LEAST_COLOUR
+            return [dr.select(visible, self.depth / dr.select(visible, opacity, 1), 0)]
         value = getattr(self, kind)
         if AOVS[kind] != "RGB":
             return [value]
@@ -112,7 +112,7 @@ class Layers:
 
 
 def parse_aovs(text: str) -> dict[str, str]:
-    """Name and type of each image in a list ``name:type, type, ...`` of `AOVS`."""
+    """Parse a list ``name:type, type, ...`` into a dictionary from names to types of `AOVS`."""
     found: dict[str, str] = {}
     for item in filter(None, (part.strip() for part in text.split(","))):
         name, _, kind = (part.strip() for part in item.rpartition(":"))

@@ -1,12 +1,12 @@
-"""The bilateral filter of the illumination image (paper, section 3), and how it fades.
+"""Bilateral filter of the illumination (paper, section 3), whose strength adapts to the noise.
 
     I'(i) = sum_j w_ij I(j) / sum_j w_ij
     w_ij  = exp(-|i - j|^2 / (2 s^2)) exp(-(I(i) - I(j))^2 / (2 k^2 (e_i^2 + e_j^2)))
 
 (Tomasi and Manduchi 1998), where e is the standard error of the illumination, projected from the
-cache: as the cache converges, the filter becomes the identity. Strength k and reach s are those
-of the least expected error, by Stein's unbiased risk estimate: the noise of an image is enough to
-know how far a filtered one is from the truth, without knowing the truth (Stein 1981).
+cache: as the cache converges, the filter approaches the identity. Strength k and spatial width s
+minimise Stein's unbiased risk estimate (Stein 1981) of the mean squared error, which requires the
+noise of the image but not the true image.
 """
 
 from __future__ import annotations
@@ -22,29 +22,30 @@ from mitsuba_irrcache.core.spectrum import interleaved, luminance
 from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.pixel_filter import pixel_of
 
-#: ``bilateral`` fades; ``fixed`` has one strength, as in the paper.
+#: ``bilateral`` adapts to the noise; ``fixed`` has a constant strength, as in the paper.
 FILTERS = ("none", "bilateral", "fixed")
 
-#: The window has (2 RADIUS + 1)^2 taps, and the spatial kernel a deviation of SPREAD taps.
+#: The window has (2 RADIUS + 1)^2 taps; the spatial kernel has a standard deviation of SPREAD taps.
 RADIUS = 5
 SPREAD = 2.5
-#: Pixels between taps that are tried: noise has the size of voxels, which cover any number of them.
+#: Candidate distances of taps in pixels: noise has the size of voxels, which may cover many pixels.
 STRIDES = (1, 2, 4)
-#: Strengths that are tried: widths of the range kernel in standard errors of a difference.
+#: Candidate strengths: widths of the range kernel in standard errors of a difference.
 STRENGTHS = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0)
-#: Width of the range kernel of ``fixed``, in units of the mean illumination.
+#: Width of the range kernel of ``fixed``, relative to the mean illumination.
 FIXED_WIDTH = 0.2
-#: Pixels from which the risk is estimated.
+#: Number of pixels from which the risk is estimated.
 RISK_PIXELS = 8192
-#: Noise below this part of the signal is left alone.
+#: Relative noise below which the image is not filtered.
 NEGLIGIBLE = 1e-3
-#: Part of a random error that is added to see how the filter responds.
+#: Relative size of the perturbation by which the filter's response is measured.
 PERTURBATION = 0.05
 
 
 def filter_illumination(kind: str, layers: Layers, size: tuple[int, int]) -> mi.Spectrum | None:
-    """The filtered illumination of an image of ``size`` (width, height); None where ``kind`` is
-    "none", or where there is nothing to filter.
+    """Filter the illumination of an image of ``size`` (width, height).
+
+    Returns None if ``kind`` is "none" or no pixel has an illumination.
     """
     if kind == "none":
         return None
@@ -59,12 +60,13 @@ def filter_illumination(kind: str, layers: Layers, size: tuple[int, int]) -> mi.
         return bilateral(_pack([image], error), size, everywhere, 0, stride, strength)
     brightness = dr.select(valid, luminance(layers.colour), 1)
     probes = [dr.select(valid, probe / brightness, 0) for probe in layers.probes]
-    return _fading(image, valid, probes, layers.colour, size)
+    return _adaptive(image, valid, probes, layers.colour, size)
 
 
 def denoise(image: np.ndarray, standard_error: np.ndarray) -> np.ndarray:
-    """The fading filter for any image (height, width, 1 | 3) whose pixels err independently of each
-    other, by ``standard_error`` (height, width).
+    """Apply the adaptive filter to an image (height, width, 1 | 3) with independent pixel errors.
+
+    ``standard_error`` is that of the pixels (height, width).
     """
     height, width, channels = image.shape
     planes = [mi.Float(np.ascontiguousarray(image[..., c]).ravel()) for c in range(channels)]
@@ -75,35 +77,38 @@ def denoise(image: np.ndarray, standard_error: np.ndarray) -> np.ndarray:
     probes = [dr.select(sign == 0, error, -error) for sign in signs]
     everywhere = dr.full(mi.Bool, True, width * height)
     white = dr.full(mi.Spectrum, 1, width * height)
-    filtered = _fading(spectrum, everywhere, probes, white, (width, height))
+    filtered = _adaptive(spectrum, everywhere, probes, white, (width, height))
     if filtered is None:
         return image
     return np.stack([np.array(c) for c in filtered][:channels], axis=1).reshape(image.shape)
 
 
-def _fading(
+def _adaptive(
     image: mi.Spectrum,
     valid: mi.Bool,
     probes: list[mi.Float],
     colour: mi.Spectrum,
     size: tuple[int, int],
 ) -> mi.Spectrum | None:
-    """The filter of the least risk; None where that is the identity. ``probes`` are random errors
-    of the luminance of ``image``; errors count times ``colour``.
+    """Apply the filter with the least risk; None if that is the identity.
+
+    ``probes`` are random errors of the luminance of ``image``; errors are weighted by ``colour``.
     """
     if not probes:
         return None
-    # Not from the first one, which tests the response below: the filter would be made for it.
+    # Exclude the first probe, which measures the response below, to avoid a bias of the risk.
     variance = sum(dr.square(p) for p in probes[1:]) / (len(probes) - 1)
-    seen = dr.square(luminance(colour))
-    noise = dr.sum(dr.select(valid, variance * seen, 0))
-    signal = dr.sum(dr.select(valid, dr.square(luminance(image)) * seen, 0))
+    weight = dr.square(luminance(colour))
+    noise = dr.sum(dr.select(valid, variance * weight, 0))
+    signal = dr.sum(dr.select(valid, dr.square(luminance(image)) * weight, 0))
     if not (noise > NEGLIGIBLE**2 * signal)[0]:
         return None
     error = dr.select(valid, dr.sqrt(variance), -1)
-    # An error changes the channels alike, in proportion to their values.
-    bright = luminance(image)
-    relative = dr.select(valid & (bright > 0), probes[0] / dr.select(bright > 0, bright, 1), 0)
+    # Errors change all channels in proportion to their values.
+    intensity = luminance(image)
+    relative = dr.select(
+        valid & (intensity > 0), probes[0] / dr.select(intensity > 0, intensity, 1), 0
+    )
     change = image * relative
     packed = _pack([image, image + PERTURBATION * change], error)
     best = _least_risk(packed, image, change, valid, colour, size)
@@ -122,22 +127,24 @@ def _least_risk(
     colour: mi.Spectrum,
     size: tuple[int, int],
 ) -> tuple[int, float] | None:
-    """Stride and strength of the least risk; None where no filter is expected to help.
+    """Choose the stride and strength with the least risk; None if no filter is expected to help.
 
-    E |F(I) - truth|^2 = E |F(I) - I|^2 - E |noise|^2 + 2 E <noise, F(I)>, and the last term is the
-    filter's response to a small random error of the same statistics as the noise (Ramani, Blu and
-    Unser 2008), whatever its correlation between pixels.
+    E |F(I) - truth|^2 = E |F(I) - I|^2 - E |noise|^2 + 2 E <noise, F(I)>. The last term is
+    estimated by the filter's response to a small random error with the statistics of the noise,
+    including its correlation between pixels (Ramani, Blu and Unser 2008).
     """
+    # docs/primer, eq. (6.4)
     places = dr.compress(valid)
     available = dr.width(places)
     count = min(available, RISK_PIXELS)
-    # Multiples of the golden ratio visit the pixels evenly.
+    # Select pixels by multiples of the golden ratio, which are uniformly distributed.
     turn = mi.UInt64(golden_words(dr.arange(mi.UInt32, count)))
     nth = mi.UInt32((turn * dr.opaque(mi.UInt64, available)) >> 32)
     chosen = dr.gather(mi.UInt32, places, nth)
     settings = [(stride, strength) for stride in STRIDES for strength in STRENGTHS]
     lane = dr.arange(mi.UInt32, count * len(settings))
-    # How many pixels are valid may change with every image; no kernel may depend on it.
+    # The number of valid pixels may change with every image and must not be a constant of the
+    # kernel.
     setting, place = Divisor(count).split(lane)
     pixel = dr.gather(mi.UInt32, chosen, place)
     stride, strength = (
@@ -149,10 +156,10 @@ def _least_risk(
         dr.gather(mi.Spectrum, interleaved(value), pixel) for value in (image, change, colour)
     )
     response = (perturbed - filtered) / PERTURBATION
-    seen = dr.square(weight)
-    # A sum over the channels: dr.mean would write the number of pixels into the kernel.
-    risk = dr.sum(seen * (dr.square(filtered - before) + 2 * noise * response))
-    unfiltered = dr.sum(seen * (2 * dr.square(noise)))
+    squared_weight = dr.square(weight)
+    # Sum over the channels: dr.mean would make the number of pixels a constant of the kernel.
+    risk = dr.sum(squared_weight * (dr.square(filtered - before) + 2 * noise * response))
+    unfiltered = dr.sum(squared_weight * (2 * dr.square(noise)))
     risks = np.array(dr.block_sum(risk, count))
     least = int(np.argmin(risks))
     if risks[least] >= np.array(dr.block_sum(unfiltered, count))[0]:
@@ -169,9 +176,12 @@ def bilateral(
     stride: mi.Int32,
     strength: mi.Float,
 ):
-    """The filtered value of each ``pixel`` of image number ``which`` in ``packed``; ``stride`` are
-    the pixels between taps.
+    """Filter pixels of the image with index ``which`` in ``packed``.
+
+    ``stride`` is the distance of taps in pixels, ``strength`` the width of the range kernel in
+    standard errors.
     """
+    # docs/primer, eq. (6.3)
     width, height = (dr.opaque(mi.Int32, int(n)) for n in size)
     first = dr.opaque(mi.UInt32, which) * mi.UInt32(width * height)
     image, error = _unpack(packed, first + pixel, True)
@@ -198,9 +208,7 @@ def bilateral(
 
 
 def _pack(images: list[mi.Spectrum], error: mi.Float) -> mi.Float:
-    """Images one after the other, the values of a pixel beside its standard error (-1: not
-    valid).
-    """
+    """Interleave images with the standard error (-1: invalid), one image after the other."""
     rows = [interleaved([*image, error]) for image in images]
     packed = dr.concat(rows) if len(rows) > 1 else rows[0]
     dr.eval(packed)
@@ -214,9 +222,7 @@ def _unpack(packed: mi.Float, pixel: mi.UInt32, active: mi.Bool) -> tuple[mi.Spe
 
 
 def _fill_channels(image: mi.Spectrum, valid: list[mi.Bool]) -> tuple[mi.Spectrum, mi.Bool]:
-    """Gives channels without an illumination (no albedo there) the mean of the others; and where
-    any has one.
-    """
+    """Replace undefined channels by the mean of the others; also return where any is defined."""
     known = sum(dr.select(ok, mi.Float(1), 0) for ok in valid)
     mean = sum(dr.select(ok, c, 0) for c, ok in zip(image, valid, strict=True))
     mean /= dr.maximum(known, 1)

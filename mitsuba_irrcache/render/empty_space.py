@@ -1,4 +1,4 @@
-"""Distances to matter, which let rays skip empty space."""
+"""Distances to matter, by which rays skip empty space."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from mitsuba_irrcache.grids.distance_transform import chebyshev
 from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.media.emission import Emission
 
-#: Macrocells that rays look ahead for matter.
+#: Maximum distance in macrocells that rays skip at once.
 REACH = 8
 
 
 class Clearance:
-    """For each macrocell the Chebyshev distance to the nearest one with extinction or light of its
-    own, in macrocells: 0 where it has some itself, at most `REACH`.
+    """Chebyshev distance of each macrocell to the nearest one with extinction or emission.
+
+    Distances are in macrocells, 0 for occupied cells and at most `REACH`.
     """
 
     def __init__(self, cells: Macrocells, emission: Emission | None = None) -> None:
@@ -27,36 +28,38 @@ class Clearance:
             occupied |= emission.reaches(cells)
         self.distance = chebyshev(occupied, cells.shape, REACH)
 
-    def along(self, ray: mi.Ray3f) -> ClearWay:
-        """What it is along a ray."""
-        return ClearWay(self, ray)
+    def along(self, ray: mi.Ray3f) -> ClearanceAlongRay:
+        """Prepare lookups along a ray."""
+        return ClearanceAlongRay(self, ray)
 
 
-class ClearWay:
-    """The cells along a ray, counted from where it comes from along each axis: it goes forward
-    along all.
+class ClearanceAlongRay:
+    """Lookups along a ray.
+
+    Each axis is mirrored if necessary, such that the ray's direction is positive along all axes.
     """
 
     def __init__(self, clearance: Clearance, ray: mi.Ray3f) -> None:
         self.distance, cells = clearance.distance, clearance.cells
         origin, direction = cells.coordinates.point(ray.o), cells.coordinates.vector(ray.d)
         rcp = safe_rcp(direction)
-        forward = rcp > 0  # also tells 0 from -0, as the reciprocal does
+        forward = rcp > 0  # distinguishes 0 from -0, as the reciprocal does
         self.sides = mi.Vector3f(*cells.sides)
         self.origin = dr.select(forward, origin, self.sides - origin)
         self.direction, self.rcp = dr.abs(direction), dr.abs(rcp)
-        # Flat indices, as floats: there are no more than 2^24 cells.
+        # Flat indices are stored as floats: there are at most 2^24 cells.
         nx, ny, _ = self.sides
         strides = mi.Vector3f(1, nx, nx * ny)
         self.first = dr.sum(dr.select(forward, 0, (self.sides - 1) * strides))
         self.strides = dr.select(forward, strides, -strides)
 
     def exit(self, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Float]:
-        """Whether the place at ``t`` is empty, and the distance along the ray, at least ``t``, up
-        to which it remains so.
+        """Whether the position at ``t`` is empty, and the distance up to which it remains empty.
+
+        The distance is at least ``t``.
         """
         u = dr.fma(self.direction, t, self.origin)
-        # Clipped as floats: one beyond 2^31 has no integer.
+        # Clamp before the conversion: floats beyond 2^31 cannot be converted to integers.
         cell = [clipped(dr.floor(c), 0.0, n - 1) for c, n in zip(u, self.sides, strict=True)]
         index = self.first
         for c, stride in zip(cell, self.strides, strict=True):
@@ -65,6 +68,6 @@ class ClearWay:
         nearest = mi.Float(dr.inf)
         for c, n, origin, rcp in zip(cell, self.sides, self.origin, self.rcp, strict=True):
             wall = c + clearance
-            # Border cells reach to infinity.
+            # Border cells extend to infinity.
             nearest = least(dr.select(wall < n, (wall - origin) * rcp, dr.inf), nearest)
         return clearance > 0, greatest(nearest, t)

@@ -1,8 +1,8 @@
-"""From camera samples to the film, for integrators written in Python.
+"""Sample the sensor and accumulate on the film, for integrators written in Python.
 
-Mitsuba's own loop for this knows only opaque or empty samples; a medium needs fractional alpha.
-And it knows only images that are final once the samples are in: here they may be developed first
-and put on the film afterwards.
+Mitsuba's own render loop supports only masks as alpha, but media need fractional alpha; and it
+supports only images that are final once all samples are accumulated, while here the samples may be
+developed and filtered before they are put on the film.
 """
 
 from __future__ import annotations
@@ -21,25 +21,23 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.render.pixel_filter import pixel_of, reconstructed
 
-#: Camera samples in one kernel launch: bounds the memory that they and the sampler's state take.
+#: Maximum number of camera samples per kernel launch, to limit the memory of samples and sampler.
 LANES = 1 << 22
-#: Samples per pixel from which on their number does not fit in 32 bits, as the sampler has it.
-TOO_MANY = 1 << 32
+#: The sampler stores the number of samples per pixel in 32 bits.
+SPP_LIMIT = 1 << 32
 
-#: (sampler, ray, the sensor's weight of it, active) -> radiance, alpha, values of the further
-#: channels; the weight is in the radiance
+#: (sampler, ray, weight of the sensor, active) -> radiance, alpha, further channels; the radiance
+#: includes the weight
 RadianceFunction = Callable[..., tuple]
 
-#: The films that threads render to or wait for: each with its lock, and with how many there are.
+#: Films in use by threads: the lock of each, and the number of threads that hold or await it.
 _films: dict[mi.Film, tuple[RLock, int]] = {}
 _films_lock = Lock()
 
 
 @contextmanager
 def exclusive(film: mi.Film) -> Iterator[None]:
-    """While this lasts, other threads that ask for the same ``film`` wait: it has room for one
-    image.
-    """
+    """Exclude other threads from the same ``film``, which can store one image only."""
     with _films_lock:
         lock, users = _films.get(film, (None, 0))
         lock = lock or RLock()
@@ -62,9 +60,10 @@ def render_film(
     should_stop: Callable[[], bool] = lambda: False,
     channels: Sequence[str] = (),
 ) -> mi.Film:
-    """Renders ``radiance`` to the sensor's film, ``spp`` samples per pixel (0: the sampler's own
-    count); ``channels`` names those beside radiance and alpha. Raises IrrcacheError for a film
-    without pixels, and for one that memory does not hold.
+    """Render ``radiance`` to the sensor's film with ``spp`` samples per pixel.
+
+    With ``spp`` 0 the sampler's own count is used; ``channels`` names those in addition to radiance
+    and alpha. Raises IrrcacheError for a film without pixels, and for one that exceeds the memory.
     """
     film, sampler = sensor.film(), sensor.sampler().clone()
     check_film(film, spp, len(channels))
@@ -88,7 +87,7 @@ def render_film(
             sampler.advance()
             sampler.schedule_state()
             dr.eval(sums)
-            dr.sync_thread()  # else all passes are queued before anybody can stop them
+            dr.sync_thread()  # otherwise all passes are queued before the rendering can be stopped
         if should_stop():
             break
     *values, weights = sums
@@ -98,8 +97,10 @@ def render_film(
 
 
 def planes(film: mi.Film, count: int) -> tuple[list[mi.Float], mi.Float | None, list[mi.Float]]:
-    """The developed film as arrays of a value for each pixel: colour (or luminance), alpha (None
-    without), and the last ``count`` channels.
+    """Develop the film into arrays over pixels.
+
+    Returns the colour (or luminance), alpha (None if the film has none), and the last ``count``
+    channels.
     """
     image = film.develop()
     height, width, depth = image.shape
@@ -117,7 +118,7 @@ def fill_film(
     alpha: mi.Float | None,
     channels: dict[str, mi.Float],
 ) -> None:
-    """Puts a finished image on a film, in place of what was there."""
+    """Replace the content of a film by a finished image."""
     film.prepare(list(channels))
     rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
     alphas = [] if alpha is None else [alpha]
@@ -126,7 +127,7 @@ def fill_film(
 
 
 def _put(film: mi.Film, values: list[mi.Float]) -> None:
-    """Adds sums of samples, an array for each channel, to a film that is prepared for them."""
+    """Add sums of samples, one array per channel, to a prepared film."""
     width, height = (int(n) for n in film.crop_size())
     flat = interleaved(values, width * height)
     tensor = mi.TensorXf(flat, (height, width, len(values)))
@@ -134,8 +135,10 @@ def _put(film: mi.Film, values: list[mi.Float]) -> None:
 
 
 def check_film(film: mi.Film, spp: int, channels: int, at_once: bool = False) -> None:
-    """Raises IrrcacheError where a film of so many ``channels`` beside radiance and alpha has no
-    pixels, or cannot be rendered in the memory there is; ``at_once``: all ``spp`` in one launch.
+    """Raise IrrcacheError if the film has no pixels or its rendering exceeds the available memory.
+
+    ``channels`` is the number in addition to radiance and alpha; ``at_once`` states that all
+    ``spp`` samples are rendered in one launch.
     """
     width, height = (int(n) for n in film.crop_size())
     if min(width, height) == 0:
@@ -143,15 +146,15 @@ def check_film(film: mi.Film, spp: int, channels: int, at_once: bool = False) ->
             f"irrcache: the crop window of the film is {width} x {height} pixels; crop_width and "
             "crop_height must be at least 1."
         )
-    if not 0 <= spp < TOO_MANY:
+    if not 0 <= spp < SPP_LIMIT:
         raise IrrcacheError(
             f"irrcache: spp is {spp}; it must be 0 (the sampler's) or a number of samples per "
-            f"pixel below {TOO_MANY}."
+            f"pixel below {SPP_LIMIT}."
         )
     pixels, values = width * height, channels + 5  # colour, alpha, weight
     lanes = pixels * max(spp, 1) if at_once else max(pixels, min(LANES, pixels * max(spp, 1)))
-    # The film's sums, those of a pass, and two copies while it is developed; of each sample its
-    # values, its place and the sampler's state.
+    # Memory of the film's sums, those of a pass, and two copies during development; for each sample
+    # its values, position and sampler state.
     needed = 4 * (4 * pixels * values + lanes * (values + 6))
     what = f"irrcache: an image of {width} x {height} pixels"
     what += f" with {channels} further channels" if channels else ""
@@ -165,32 +168,32 @@ def check_film(film: mi.Film, spp: int, channels: int, at_once: bool = False) ->
 
 
 def _divisor(n: int, limit: int) -> int:
-    """The largest divisor of ``n`` that is at most ``limit``."""
+    """Return the largest divisor of ``n`` that is at most ``limit``."""
     return next(d for d in range(min(n, limit), 0, -1) if n % d == 0)
 
 
 class PixelPositions:
-    """Where in their pixels the camera samples lie.
+    """Positions of the camera samples within their pixels.
 
-    Mitsuba's ``independent`` sampler knows nothing of the other samples of a pixel. With noise-free
-    light that is most of an image's noise, so they are spread evenly here: by the two-dimensional
-    golden ratio, shifted at random in every pixel, and in pairs that mirror each other at the
-    pixel's centre. Where the light changes evenly over a pixel, a pair is exact. Each sample of a
-    pair is still uniform. The last of an odd number lies in the centre: one sample per pixel shows
-    pixels as they are there, whatever the seed. Other samplers do it their way.
+    Mitsuba's ``independent`` sampler does not stratify the samples of a pixel. If the radiance is
+    free of noise, this dominates the noise of the image. Positions therefore form a two-dimensional
+    golden-ratio sequence with a random shift per pixel, in antithetic pairs that are symmetric
+    about the pixel's centre, which integrate linear functions exactly. Each sample of a pair is
+    uniformly distributed. The last sample of an odd number is at the centre, so that images with
+    one sample per pixel do not depend on the seed. Other samplers are used unchanged.
     """
 
     def __init__(self, sampler: mi.Sampler, seed: int, spp: int) -> None:
         self.sampler = sampler
         self.independent = sampler.class_name() == "IndependentSampler"
-        # Wrappers hand on a seed that is an array.
+        # Wrapping integrators pass the seed as an array.
         given = isinstance(seed, mi.UInt32)
         self.seed = seed if given else dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self.first = dr.opaque(mi.UInt32, 0)
         self.paired = dr.opaque(mi.UInt32, spp - spp % 2)
 
     def next(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
-        """The position in [0, 1)^2 of a ``sample`` of this pass."""
+        """Position in [0, 1)^2 of a ``sample`` of this pass."""
         if not self.independent:
             return self.sampler.next_2d()
         shifts = mi.sample_tea_32(pixel, self.seed, 8)
@@ -205,7 +208,7 @@ class PixelPositions:
 def camera_ray(
     sensor: mi.Sensor, sampler: mi.Sampler, position: mi.Point2f
 ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-    """A ray through each ``position`` on the film, in pixels, and the sensor's weight of it."""
+    """Sample a ray through each ``position`` on the film [pixels]; also return its weight."""
     film = sensor.film()
     scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / int(n)) for n in film.crop_size()))
     on_film = (position - mi.Vector2f(film.crop_offset())) * scale
@@ -226,7 +229,7 @@ def _sampled(
     spp: int,
     radiance: RadianceFunction,
 ) -> tuple[mi.Point2f, list[mi.Float]]:
-    """The samples of a pass: their places on the film, and the values of their channels."""
+    """Trace the samples of a pass; return their film positions and the values of all channels."""
     film = sensor.film()
     lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
     index, sample = Divisor(per_pass).split(lane)

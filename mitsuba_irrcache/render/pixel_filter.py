@@ -1,7 +1,7 @@
-"""From camera samples to pixels, by the film's reconstruction filter.
+"""Reconstruct pixels from camera samples with the film's reconstruction filter.
 
-Mitsuba adds each sample to the pixels around it, atomically: sums that are other bits each time.
-Here each pixel gathers the samples around it, always in the same order.
+Mitsuba splats samples with atomic additions, whose order and hence rounding is not deterministic.
+Here each pixel gathers the samples around it in a fixed order.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic
 
 
 class Samples:
-    """What camera samples have seen, ``per_pixel`` of each pixel, one after the other, row by row;
-    of the crop window, and of ``border`` pixels around it.
+    """Camera samples, ``per_pixel`` consecutive ones for each pixel in row-major order.
 
-    The place of a sample on the film and its values lie side by side, in packets of four: these are
-    read far faster than single numbers.
+    They cover the crop window and a margin of ``border`` pixels. Position and values of a sample
+    are stored in packets of four, which load much faster than single numbers.
     """
 
     def __init__(
@@ -44,7 +43,7 @@ class Samples:
         dr.eval(self.packets)
 
     def read(self, index: mi.UInt32, active: mi.Bool) -> list[mi.Float]:
-        """The numbers of samples."""
+        """Load position and values of samples."""
         packets = [dr.gather(mi.Vector4f, packet, index, active) for packet in self.packets]
         numbers = [number for packet in packets for number in packet]
         return numbers[: self.channels + 2]
@@ -57,13 +56,14 @@ def reconstructed(
     position: mi.Point2f,
     values: Sequence[mi.Float],
 ) -> list[mi.Float]:
-    """Sums over the samples around each pixel of the crop window, row by row: of the filter's
-    weights times the values, an array for each channel, and of the weights. The samples are told
-    as in `Samples`.
+    """Sum the samples around each pixel of the crop window, weighted by the reconstruction filter.
+
+    Returns one array for each channel, and the sums of the weights. The arguments are those of
+    `Samples`.
     """
     if not film.rfilter().is_box_filter():
         return _gathered(Samples(film, border, per_pixel, position, values))
-    # Samples count for their own pixel, whatever the rounding of their places.
+    # Assign samples to their own pixel, whatever the rounding of their positions.
     pixels = int(film.crop_size().x) * int(film.crop_size().y)
     everywhere = dr.zeros(mi.Float, pixels * per_pixel)
     sums = [value + everywhere for value in values]
@@ -74,13 +74,13 @@ def reconstructed(
 
 
 def pixel_of(index: mi.UInt32, width: int) -> mi.Vector2i:
-    """Column and row of the pixels with these numbers, where rows have ``width`` of them."""
+    """Convert flat pixel indices to column and row for rows of ``width`` pixels."""
     row, column = Divisor(width).split(index)
     return mi.Vector2i(mi.Int32(column), mi.Int32(row))
 
 
 def _gathered(samples: Samples) -> list[mi.Float]:
-    """The sums of `reconstructed`."""
+    """Compute the sums of `reconstructed` in two passes."""
     film, reach = samples.film, int(samples.film.rfilter().border_size())
     parts = _columns(samples, reach)
     dr.eval(parts)
@@ -89,9 +89,9 @@ def _gathered(samples: Samples) -> list[mi.Float]:
     column, row = pixel_of(dr.arange(mi.UInt32, width * height), width)
     sums = [mi.Float(0)] * (samples.channels + 1)
     for part, down in zip(parts, range(-reach, reach + 1), strict=True):
-        of = row + (dr.opaque(mi.Int32, samples.border) - down)
-        inside = (of >= 0) & (of < high)
-        place = mi.UInt32(of * wide + column)
+        source_row = row + (dr.opaque(mi.Int32, samples.border) - down)
+        inside = (source_row >= 0) & (source_row < high)
+        place = mi.UInt32(source_row * wide + column)
         sums = [
             s + dr.gather(mi.Float, values, place, inside)
             for s, values in zip(sums, part, strict=True)
@@ -102,9 +102,10 @@ def _gathered(samples: Samples) -> list[mi.Float]:
 
 @symbolic
 def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
-    """What each row of samples adds to the columns of the rows of pixels from ``reach`` above it to
-    as many below it, in turn: sums as of `reconstructed`, an array over rows of samples and columns
-    of the crop window each.
+    """Sum the contributions of each row of samples to the columns of nearby rows of pixels.
+
+    Returns for each of the 2 ``reach`` + 1 rows the sums of `reconstructed`, over rows of samples
+    and columns of the crop window.
     """
     film = samples.film
     filter_, width = film.rfilter(), int(film.crop_size().x)

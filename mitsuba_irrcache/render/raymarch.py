@@ -1,16 +1,15 @@
-"""Projection of the cache to the screen: ray marching of the radiative transfer equation (paper,
-eq. 1).
+"""Ray marching of the radiative transfer equation with the cached irradiance (paper, eq. 1).
 
     L = int T (sigma_s Phi / (4 pi) + j) dt + T L_background
 
-where j is what the medium sends out itself (`emission`).
+where j is the volumetric emission (`emission`).
 
-One step is as long as the shortest voxel edge, of the medium's grids and the cache's, times
-``step``; steps end on the medium's bounds, never beyond. The lattice of steps is shifted by a
-random offset per ray, so that what is left of the discretisation is noise, not bands. Macrocells
-without extinction are crossed many at a time, and what is hardly seen in longer steps.
+The step length is the shortest voxel edge of the medium's grids and the cache, times ``step``;
+steps end on the medium's bounds. The lattice of steps has a random offset per ray, so that the
+discretisation error becomes noise instead of banding. Empty macrocells are skipped, and steps are
+longer where little radiance remains to be added.
 
-Rays read copies of the fields that are laid out for them, in 16 bits (`packed_fields`).
+Rays read packed 16-bit copies of the fields (`packed_fields`).
 """
 
 from __future__ import annotations
@@ -36,22 +35,22 @@ from mitsuba_irrcache.render.empty_space import Clearance
 from mitsuba_irrcache.render.quadrature import curved, emission_weights, segment
 from mitsuba_irrcache.scene.cut_cells import CutCells
 
-#: A ray ends early once nothing ahead, not even the brightest cache voxel or the background seen
-#: through the transmittance left, can change its radiance by more than this fraction.
+#: A ray ends once the remaining radiance, bounded by the largest in-scattered radiance and by the
+#: background, cannot change its radiance by more than this fraction.
 EARLY_STOP = 1e-4
-#: Where no more than these fractions of a ray's radiance can still be added, steps are twice and
-#: four times as long: what they miss, they miss of a small rest only.
+#: Below these fractions of remaining radiance, steps are two and four times as long: their larger
+#: error affects only a small remainder.
 COARSER, COARSEST = 0.2, 0.03
-#: Optical depth of a step that counts for greater ones, too: what 16 bits tell of thin matter is
-#: measured by the densest.
+#: Maximum optical depth per step of the packed extinction: the 16-bit format has a limited range,
+#: which larger values would waste.
 OPAQUE = 4096.0
 
 
 class Projection:
-    """Everything a camera ray needs: the medium, the cached irradiance, and the quadrature rule.
+    """Ray marching of one medium: its fields, its cached irradiance, and the quadrature rule.
 
-    With ``layered``, rays also gather what `Layers` holds beside the radiance; with an
-    ``uncertainty``, the error of the cache too.
+    With ``layered``, rays also compute the further components of `Layers`; with ``uncertainty``,
+    also the error of the cache.
     """
 
     def __init__(
@@ -68,30 +67,30 @@ class Projection:
         direct_lights: Sequence[DirectLightAlongRays] = (),
     ) -> None:
         self.medium = medium
-        self.lit = irradiance is not None
+        self.has_cache = irradiance is not None
         self._channels = irradiance.channels if irradiance else 1
         self.quadrature = quadrature
         self.layered = layered
         self.uncertainty = uncertainty
         self.directional = directional
-        #: how the light of lamps falls off, which the cache is without
+        #: inverse-square factor of lamps, by which the cached irradiance is divided
         self.falloff = falloff
-        #: spot lights, which are not in the irradiance
+        #: spot lights, which are excluded from the cached irradiance
         self._direct_lights = list(direct_lights)
-        #: surfaces that end the light, where there are any, and the light that they choose from
+        #: surfaces that cut voxels, if any, and the irradiance they select voxels from
         self._edges = (edges, irradiance) if edges is not None else None
-        albedo = _constant_if_it_is(medium.albedo)
+        albedo = _simplified(medium.albedo)
         fields = medium.sigma_t, medium.albedo, irradiance, medium.emission
         grids = [f.grid for f in fields if f and f.grid]
-        # Where nothing varies, one step is exact.
+        # For constant fields, one step is exact.
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
         self.step = dr.opaque(mi.Float, float(length))
-        brightest = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
+        max_radiance = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         if directional is not None:
-            brightest *= directional.directional.phase.peak
-        self.brightest = dr.opaque(mi.Float, brightest)
+            max_radiance *= directional.directional.phase.peak
+        self.max_radiance = dr.opaque(mi.Float, max_radiance)
         emission = medium.emission
-        self.brightest_emission = dr.opaque(mi.Float, emission.maximum if emission else 0.0)
+        self.max_emission = dr.opaque(mi.Float, emission.maximum if emission else 0.0)
         self.clearance = Clearance(medium.macrocells, emission)
         needed = [medium.sigma_t]
         needed += [irradiance] if irradiance else []
@@ -100,25 +99,28 @@ class Projection:
         self.lookups = Lookups(needed, [opaque, *[dr.inf] * (len(needed) - 1)])
 
     def fetch(self, fields: AlongRay, t: mi.Float, view: tuple = ()) -> tuple:
-        """Extinction; albedo Phi / (4 pi), in-scattered radiance per unit of optical depth, without
-        the falloff; and what layers need to know of the point: the albedo, and the relative errors
-        of Phi. ``view`` is what `seen_along` says of the ray.
+        """Evaluate the fields at the distance ``t``.
+
+        Returns the extinction; the source albedo Phi / (4 pi), in-scattered radiance per unit of
+        optical depth, without the inverse-square factor; and the albedo and the relative errors of
+        Phi, as far as layers need them. ``view`` is the result of `angular_terms`.
         """
+        # docs/primer, eq. (1.3)
         p, active = fields.ray(t), mi.Bool(True)
         sigma_t, *rest = fields.at(t, active)
-        known = [rest[-1]] if self.layered else []
-        if not self.lit:
-            return sigma_t, mi.Float(0), known
+        extras = [rest[-1]] if self.layered else []
+        if not self.has_cache:
+            return sigma_t, mi.Float(0), extras
         phi, albedo = rest
-        phi = self._within_edges(p, phi, active)
+        phi = self._exclude_occluded(p, phi, active)
         if self.uncertainty is not None:
-            known += self.uncertainty.at_world(p, phi, active)
+            extras += self.uncertainty.at_world(p, phi, active)
         if self.directional is not None:
             phi = phi * self.directional.factor(p, *view, active)
-        return sigma_t, albedo * phi * dr.inv_four_pi, known
+        return sigma_t, albedo * phi * dr.inv_four_pi, extras
 
-    def seen_along(self, direction: mi.Vector3f) -> tuple:
-        """What `fetch` has to know of a ray: nothing where the medium is isotropic."""
+    def angular_terms(self, direction: mi.Vector3f) -> tuple:
+        """Precompute the terms of `fetch` that depend on the direction; empty if isotropic."""
         if self.directional is None:
             return ()
         return direction, self.directional.directional.basis(direction)
@@ -126,33 +128,36 @@ class Projection:
     def irradiance_at(
         self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
     ) -> mi.Float | mi.Color3f:
-        """The cached irradiance alone, as much as paths from surfaces see along ``direction``."""
+        """Look up the cached irradiance for a path from a surface that arrives along ``direction``.
+
+        Anisotropic media weight it by the phase function, without the forward peak.
+        """
         _, phi, *_ = self.lookups.at_world(p, active)
-        phi = self._within_edges(p, phi, active)
+        phi = self._exclude_occluded(p, phi, active)
         if self.falloff is not None:
             phi = phi * self.falloff.at(p)
         for light in self._direct_lights:
             phi = phi + light.at(p, active)
         if self.directional is None:
             return phi
-        view = self.seen_along(direction)
+        view = self.angular_terms(direction)
         return phi * self.directional.factor(p, *view, active, with_peak=False)
 
     @property
-    def blurs(self) -> bool:
-        """Whether light in a forward peak counts as not scattered (see `delta_m`)."""
+    def truncates_peak(self) -> bool:
+        """Whether scattering into a forward peak is treated as unscattered (see `delta_m`)."""
         return self.directional is not None and self.medium.unscattered_exponent != 1
 
     def unscattered(self, transmittance: mi.Spectrum) -> mi.Spectrum:
-        """What is left of a ``transmittance`` where it counts as scattered."""
-        if not self.blurs:
+        """Convert a ``transmittance`` to that of the original, untruncated medium."""
+        if not self.truncates_peak:
             return transmittance
         return dr.power(transmittance, dr.opaque(mi.Float, self.medium.unscattered_exponent))
 
-    def _within_edges(
+    def _exclude_occluded(
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
     ) -> mi.Float | mi.Color3f:
-        """Irradiance that was looked up, without what is on the other side of surfaces."""
+        """Correct a looked-up irradiance for voxels on the other side of surfaces."""
         if self._edges is None:
             return phi
         edges, irradiance = self._edges
@@ -168,76 +173,77 @@ class Projection:
         offset: mi.Float,
         active: mi.Bool,
     ):
-        """Scattered radiance, transmittance and the radiance that the medium itself sends out,
-        between ``near`` and ``far``, each an ``mi.Spectrum``; between the last two the sums that
-        `aovs` makes `Layers` of.
+        """March from ``near`` to ``far``.
 
-        ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is the
-        radiance behind the medium, which early termination has to know.
+        Returns the scattered radiance, the transmittance, the sums for `Layers`, and the emitted
+        radiance. ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is
+        the radiance behind the medium, required for early termination.
         """
-        clear, fields = self.clearance.along(ray), self.lookups.along(ray)
+        # docs/primer, eqs. (1.1), (5.1)
+        clearance, fields = self.clearance.along(ray), self.lookups.along(ray)
         active = mi.Bool(active) & (near < far)
-        # Points of the lattice are counted from 1; number 0 is ``near``, reached by a first step
-        # of no length that only finds the values there.
+        # Points of the lattice are numbered from 1; number 0 is ``near``, reached by a first step
+        # of length 0 that only evaluates the fields there.
         k, stride = mi.Float(0), mi.Float(1)
         t, step = mi.Float(near), self.step
         per_step = dr.rcp(step)
-        extinction, source, known = self._nowhere()
-        before, before_source, before_length = extinction, source, mi.Float(dr.inf)
+        extinction, source, extras = self._zero_sample()
+        previous, previous_source, previous_length = extinction, source, mi.Float(dr.inf)
         grey = self.medium.sigma_t.channels == 1
-        view = self.seen_along(ray.d)
+        view = self.angular_terms(ray.d)
         lamps = self.falloff.along(ray) if self.falloff is not None else []
         transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
-        radiance, emitted, shine = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
+        radiance, emitted, emission_at_start = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
         emission = self.medium.emission
-        gathered = self.nothing()
+        gathered = self.zero_sums()
         means = [light.mean_extinction(ray(t), active) for light in self._direct_lights]
-        brightest = dr.maximum(self.brightest, dr.max(background))
-        brightest += self.brightest_emission * dr.maximum(far - near, 0)
-        dark = brightest == 0
-        brightest = dr.select(dark, 1, brightest)
-        # A float counts steps exactly up to 2^24; longer lattices are coarser, not endless.
+        max_radiance = dr.maximum(self.max_radiance, dr.max(background))
+        max_radiance += self.max_emission * dr.maximum(far - near, 0)
+        dark = max_radiance == 0
+        max_radiance = dr.select(dark, 1, max_radiance)
+        # Floats represent step numbers exactly up to 2^24; longer lattices have coarser steps.
         limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
         while dr.hint(active, label="ray march"):
-            # In empty space, go on from the last point of the lattice inside it.
-            empty, wall = clear.exit(t, active)
+            # Skip empty space: continue from the last lattice point inside it.
+            empty, wall = clearance.exit(t, active)
             last = dr.floor(dr.fma(least(wall, far) - near, per_step, -offset)) + 1
             skip = empty & (last >= k) & (last >= 1)
             last = least(last, limit)
             k = dr.select(skip, last + 1, k + stride - 1)
             t = dr.select(skip, least(dr.fma(last - 1 + offset, step, near), far), t)
             extinction = dr.select(skip, 0, extinction)
-            before = dr.select(skip, 0, before)
-            before_length = dr.select(skip, step, before_length)
-            shine = dr.select(skip, 0, shine)
+            previous = dr.select(skip, 0, previous)
+            previous_length = dr.select(skip, step, previous_length)
+            emission_at_start = dr.select(skip, 0, emission_at_start)
             end = least(dr.fma(k - 1 + offset, step, near), far)
             end = dr.select(k == 0, near, end)
             end = dr.select(k >= limit, far, end)
-            next_extinction, next_source, next_known = self.fetch(fields, end, view)
-            # The light of a segment that enters or leaves matter comes from its end inside:
-            # where there is none the cache may know nothing.
+            next_extinction, next_source, next_extras = self.fetch(fields, end, view)
+            # Where a segment enters or leaves matter, use the source of the end inside: the cache
+            # may have no value at the other end.
             enters = dr.max(mi.Spectrum(extinction)) == 0
             source = dr.select(enters, next_source, source)
-            before_source = dr.select(enters, next_source, before_source)
-            known = _select(enters, next_known, known)
+            previous_source = dr.select(enters, next_source, previous_source)
+            extras = _select(enters, next_extras, extras)
             leaves = dr.max(mi.Spectrum(next_extinction)) == 0
             next_source = dr.select(leaves, source, next_source)
-            next_known = _select(leaves, known, next_known)
+            next_extras = _select(leaves, extras, next_extras)
             length = end - t
-            ratio = length / before_length
-            ratio = dr.select(ratio < 2, ratio, 0)  # a short first step tells no curvature
+            ratio = length / previous_length
+            # Ignore the curvature behind a short first step.
+            ratio = dr.select(ratio < 2, ratio, 0)
             ends = (extinction, next_extinction), (source, next_source)
             if dr.hint(self.quadrature == "exponential", mode="scalar"):
                 ends = (
-                    curved(before, extinction, next_extinction, ratio),
-                    curved(before_source, source, next_source, ratio),
+                    curved(previous, extinction, next_extinction, ratio),
+                    curved(previous_source, source, next_source, ratio),
                 )
-            weights, passed = segment(self.quadrature, ends[0], length)
-            near_light, far_light = weights[0] * ends[1][0], weights[1] * ends[1][1]
+            weights, segment_transmittance = segment(self.quadrature, ends[0], length)
+            near_radiance, far_radiance = weights[0] * ends[1][0], weights[1] * ends[1][1]
             if dr.hint(self.falloff is not None, mode="scalar"):
                 falloff = self.falloff.means(lamps, t, end)
-                near_light, far_light = near_light * falloff[0], far_light * falloff[1]
-            radiance += transmittance * (near_light + far_light)
+                near_radiance, far_radiance = near_radiance * falloff[0], far_radiance * falloff[1]
+            radiance += transmittance * (near_radiance + far_radiance)
             for i, light in enumerate(self._direct_lights):
                 albedos = self._albedo_at(ray(t)), self._albedo_at(ray(end))
                 mean = dr.select(skip, light.mean_extinction(ray(t), skip), means[i])
@@ -251,24 +257,27 @@ class Projection:
                     transmittance,
                     weights[0] * t + weights[1] * end,
                     weights,
-                    (near_light, far_light),
-                    (known, next_known),
+                    (near_radiance, far_radiance),
+                    (extras, next_extras),
                 )
             if dr.hint(emission is not None, mode="scalar"):
-                next_shine = mi.Spectrum(emission.at_world(ray(end), True))
+                emission_at_end = mi.Spectrum(emission.at_world(ray(end), True))
                 sides = emission_weights(self.quadrature, ends[0], length)
-                emitted += transmittance * (sides[0] * shine + sides[1] * next_shine)
-                shine = next_shine
-            transmittance *= passed
-            before, before_source, before_length = extinction, source, length
-            extinction, source, known = next_extinction, next_source, next_known
-            # The most that can still be added, over what there is (without any light: 1).
-            left = dr.max(mi.Spectrum(transmittance)) * brightest
-            sofar = dr.select(dark, 1, dr.max(radiance + emitted))
-            active &= left > EARLY_STOP * sofar
+                emitted += transmittance * (
+                    sides[0] * emission_at_start + sides[1] * emission_at_end
+                )
+                emission_at_start = emission_at_end
+            transmittance *= segment_transmittance
+            previous, previous_source, previous_length = extinction, source, length
+            extinction, source, extras = next_extinction, next_source, next_extras
+            # Upper bound of the remaining radiance, relative to the accumulated radiance (1 if both
+            # are 0).
+            remaining = dr.max(mi.Spectrum(transmittance)) * max_radiance
+            accumulated = dr.select(dark, 1, dr.max(radiance + emitted))
+            active &= remaining > EARLY_STOP * accumulated
             if dr.hint(self.quadrature == "exponential", mode="scalar"):
-                stride = dr.select(left > COARSER * sofar, mi.Float(1), 2)
-                stride = dr.select(left > COARSEST * sofar, stride, 4)
+                stride = dr.select(remaining > COARSER * accumulated, mi.Float(1), 2)
+                stride = dr.select(remaining > COARSEST * accumulated, stride, 4)
             t = end
             k += 1
             active &= (t < far) & (~empty | (wall < far))
@@ -277,27 +286,27 @@ class Projection:
     def _albedo_at(self, p: mi.Point3f) -> mi.Spectrum:
         return mi.Spectrum(self.medium.albedo.at_world(p))
 
-    def _nowhere(self) -> tuple:
-        """What `fetch` returns, of no place."""
+    def _zero_sample(self) -> tuple:
+        """Return zeros of the same types as `fetch`."""
 
         def zero(*channels: int) -> mi.Float | mi.Color3f:
             return (mi.Color3f if 3 in channels else mi.Float)(0)
 
         albedo = self.medium.albedo.channels
-        source = zero(albedo, self._channels) if self.lit else mi.Float(0)
-        known = [zero(albedo)] if self.layered else []
-        if self.uncertainty is not None and self.lit:
-            known += [mi.Float(0)] * self.uncertainty.count
-        return zero(self.medium.sigma_t.channels), source, known
+        source = zero(albedo, self._channels) if self.has_cache else mi.Float(0)
+        extras = [zero(albedo)] if self.layered else []
+        if self.uncertainty is not None and self.has_cache:
+            extras += [mi.Float(0)] * self.uncertainty.count
+        return zero(self.medium.sigma_t.channels), source, extras
 
     @property
     def channel_count(self) -> int:
-        """Values in `Layers`, 0 without them."""
+        """Number of values in `Layers`, 0 without them."""
         errors = self.uncertainty.count if self.uncertainty is not None else 1
         return 4 * dr.size_v(mi.Spectrum) + 1 + errors if self.layered else 0
 
-    def nothing(self) -> list:
-        """What has been gathered at the start of a ray: colour, depth, errors."""
+    def zero_sums(self) -> list:
+        """Initial sums for `Layers`: colour, depth, errors."""
         if not self.layered:
             return []
         errors = self.uncertainty.count if self.uncertainty is not None else 0
@@ -311,7 +320,9 @@ class Projection:
         background: mi.Spectrum,
         weight: mi.Spectrum,
     ) -> Layers:
-        """What `march` returned, with names; ``weight`` is the sensor's weight of the radiance."""
+        """Convert results of `march` to `Layers`; ``weight`` is the sensor's weight of the
+        radiance.
+        """
         colour, depth, *errors = gathered
         scale = luminance(weight)
         return Layers(
@@ -325,8 +336,8 @@ class Projection:
         )
 
 
-def _constant_if_it_is(field: Field) -> Field:
-    """A grid that holds one value only, as that value."""
+def _simplified(field: Field) -> Field:
+    """Replace a grid with equal values by a constant field."""
     if not isinstance(field, GridField) or _varies(field):
         return field
     index, n = dr.arange(mi.UInt32, field.grid.voxel_count), field.channels
@@ -340,9 +351,7 @@ def _constant_if_it_is(field: Field) -> Field:
 
 
 def _varies(field: GridField) -> bool:
-    """Whether some of its voxels, scattered over the grid, differ: it takes less time to find out
-    than that none does.
-    """
+    """Whether some of 4096 scattered voxels differ, which is faster than testing all of them."""
     voxels, channels = field.grid.voxel_count, field.channels
     count = min(voxels, 4096)
     place = dr.arange(mi.UInt32, count) * dr.opaque(mi.UInt32, voxels // count * channels)
@@ -362,15 +371,17 @@ def _gather(
     transmittance: mi.Float | mi.Color3f,
     distance: mi.Float | mi.Color3f,
     weights: tuple,
-    light: tuple,
-    known: tuple[list, list],
+    radiance: tuple,
+    extras: tuple[list, list],
 ) -> list:
-    """Adds a segment to colour, depth and errors: the sources' weights times the albedo, absorbed
-    light times distance, and the radiance from both ends times its relative errors.
+    """Add a segment to colour, depth and errors.
+
+    The colour is weighted by the albedo, the depth by the absorptance times distance, and the
+    errors are those of the radiance from both ends.
     """
-    (near_albedo, *near_errors), (far_albedo, *far_errors) = known
+    (near_albedo, *near_errors), (far_albedo, *far_errors) = extras
     colour = mi.Spectrum(transmittance * (weights[0] * near_albedo + weights[1] * far_albedo))
-    near, far = (luminance(mi.Spectrum(transmittance * end)) for end in light)
+    near, far = (luminance(mi.Spectrum(transmittance * end)) for end in radiance)
     errors = [near * a + far * b for a, b in zip(near_errors, far_errors, strict=True)]
     added = [colour, luminance(mi.Spectrum(transmittance * distance)), *errors]
     return [old + new for old, new in zip(gathered, added, strict=True)]

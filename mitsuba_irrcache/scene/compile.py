@@ -1,11 +1,13 @@
-"""What irrcache finds in a scene, and what it has to refuse.
+"""From Mitsuba's scene to its description, and which scenes are refused.
 
-A scene is *simple* if all there is to it is one medium in a box or sphere, and light that comes
-from far away or from points: then nothing has to be intersected, and every ray's way is known in
-closed form. In all other scenes Mitsuba's ray tracing says where surfaces and boundaries are.
+A medium is *isolated* if the scene has no other medium and no surface, it fills a box or sphere,
+and all emitters are distant or points: then no ray has to be intersected with shapes. In all other
+scenes Mitsuba's ray tracing finds surfaces and boundaries.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -14,10 +16,10 @@ import numpy as np
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary, boundary_of, rays_through
-from mitsuba_irrcache.lights.emitters import check_placement
+from mitsuba_irrcache.lights.emitters import EmittersByKind, check_placement, kind_of
 from mitsuba_irrcache.media.bake import bake, children
-from mitsuba_irrcache.media.delta_m import take_away_peak
-from mitsuba_irrcache.media.emission import Emission, place_emission
+from mitsuba_irrcache.media.delta_m import without_forward_peak
+from mitsuba_irrcache.media.emission import Emission, check_emission_is_within
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.media.phase import refuse_sharp
 from mitsuba_irrcache.scene.consistency import (
@@ -26,26 +28,27 @@ from mitsuba_irrcache.scene.consistency import (
     check_sensor,
     described,
 )
-from mitsuba_irrcache.scene.context import Surroundings
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
 
-#: The distance at which Mitsuba's rays leave a surface should not exceed this part of the shortest
+#: The offset of Mitsuba's secondary rays from a surface should not exceed this part of the shortest
 #: side of a medium.
 LARGEST_OFFSET = 0.002
-#: Steps between positions in single precision that a side of a medium, and a voxel, must have.
+#: Number of positions in single precision that a side of a medium, and a voxel, must have.
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
 
 
-def bake_media(scene: mi.Scene, emission: Emission | None = None) -> list[MediumGrid]:
-    """The media of a scene that a camera may see other than through a surface, on their grids; none
-    where there are none. They shine with ``emission``.
+def compile_scene(scene: mi.Scene, emission: Emission | None = None) -> SceneDescription:
+    """The description of ``scene``, whose media emit ``emission``.
 
-    Raises UnsupportedSceneError, naming the object, for what would not be rendered right.
+    Raises UnsupportedSceneError, naming the object, for what would be rendered wrongly.
     """
+    emitters = EmittersByKind(scene.emitters())
     media = media_of(scene)
     if not media:
-        place_emission(emission, [])
-        return []
+        if emission is not None:
+            check_emission_is_within(emission, [])
+        return SceneDescription(Media([]), (), emitters)
     for medium, shapes in media.items():
         for shape in shapes:
             lower, upper = (np.array(p) for p in (shape.bbox().min, shape.bbox().max))
@@ -55,31 +58,114 @@ def bake_media(scene: mi.Scene, emission: Emission | None = None) -> list[Medium
         check_placement(emitter)
     for sensor in scene.sensors():
         check_sensor(scene, sensor)
-    boundary = simple_boundary(scene)
-    if boundary is not None and _is_isotropic(*media):
-        grids = [_bake_simple(scene, boundary)]
-        place_emission(emission, grids)
+    boundary = _boundary_without_surfaces(scene, media)
+    is_isolated = boundary is not None
+    if is_isolated and _is_isotropic(*media):
+        (medium,) = media
+        grids = visible = (bake(medium, boundary).replaced(emission=emission),)
+        if emission is not None:
+            check_emission_is_within(emission, [grids[0].frame])
+        brightest = None
     else:
-        grids = bake_general(scene, emission, boundary is not None)
-    for grid in grids:
+        if not is_isolated:
+            _check_general(scene, media)
+        unscaled, names = _baked(scene, media, emission, is_isolated)
+        brightest = dr.opaque(mi.Float, _brightest(scene))
+        if emission is not None:
+            check_emission_is_within(emission, [grid.frame for grid in unscaled])
+        grids = tuple(_among_others(unscaled, number, names) for number in range(len(unscaled)))
+        visible = tuple(grid for grid in grids if grid.name in names)
+        if not visible:
+            _warn_that_none_is_visible(emission)
+        _warn_of_scale(scene, grids)
+    for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
-    return grids
+    return SceneDescription(Media(grids), visible, emitters, brightest)
+
+
+def _check_general(scene: mi.Scene, media: dict[mi.Medium, list[mi.Shape]]) -> None:
+    """Raises UnsupportedSceneError for shapes and media that cannot be traced."""
+    shapes = scene.shapes()
+    for shape in shapes:
+        _check_shape(scene, shape)
+    for medium, filled in media.items():
+        if not filled and medium.class_name() != "HeterogeneousMedium":
+            _refuse_unbounded(medium, shapes)
+    check_media_agree(scene)
+
+
+def _baked(
+    scene: mi.Scene,
+    media: dict[mi.Medium, list[mi.Shape]],
+    emission: Emission | None,
+    is_isolated: bool,
+) -> tuple[list[MediumGrid], set[str]]:
+    """All media on their grids, before delta-M scaling; and the names of the visible ones."""
+    grids: list[MediumGrid] = []
+    visible = set()
+    for medium, filled in media.items():
+        exact = _exact_boundary(scene, filled)
+        pointer = mi.MediumPtr(medium)
+        dr.make_opaque(pointer)
+        grid = bake(medium, exact or Boundary("box", _extent(medium, filled))).replaced(
+            name=_unique_name(medium, [g.name for g in grids]),
+            number=len(grids),
+            pointer=pointer,
+            emission=emission,
+            is_isolated=is_isolated,
+            has_exact_boundary=exact is not None,
+        )
+        grids.append(grid)
+        if _is_visible(scene, medium):
+            visible.add(grid.name)
+            if not grid.phase.has_peak:
+                refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
+    return grids, visible
+
+
+def _is_visible(scene: mi.Scene, medium: mi.Medium) -> bool:
+    """Whether a camera may see a medium other than through a surface."""
+    around = [s for s in scene.shapes() if medium in (s.interior_medium(), s.exterior_medium())]
+    return any(is_null(_flags(s)) for s in around) or any(
+        sensor.get_medium() == medium for sensor in scene.sensors()
+    )
+
+
+def _among_others(grids: list[MediumGrid], number: int, visible: set[str]) -> MediumGrid:
+    """The medium with this number in the list of all, delta-M scaled if a cache holds its radiance
+    and its phase function has a forward peak.
+    """
+    medium = grids[number]
+    others = tuple(grid for grid in grids if grid is not medium)
+    if medium.name in visible and medium.phase.has_peak:
+        medium = without_forward_peak(medium)
+    return medium.replaced(others=others) if others else medium
+
+
+def _warn_that_none_is_visible(emission: Emission | None) -> None:
+    if emission is not None:
+        _refuse("all media are behind surfaces, and the emission in them is unknown to volpath")
+    mi.Log(
+        mi.LogLevel.Warn,
+        "irrcache: all media are behind surfaces, so this scene is rendered as volpath does. A "
+        'shape that only bounds a medium needs <bsdf type="null"/>.',
+    )
 
 
 def _check_distance(name: str, distance: float, finest: float) -> None:
-    """Refuses a medium so far away from the origin that positions in it cannot be told apart."""
+    """Refuses a medium too far from the origin for the resolution of single precision."""
     step = float(np.spacing(np.float32(distance)))
     if step > finest:
         _refuse(
-            f'medium "{name}" is {distance:.2g} away from the origin, where single precision tells '
-            f"positions {step:.1g} apart only",
+            f'medium "{name}" is {distance:.2g} away from the origin, where positions in single '
+            f"precision are {step:.1g} apart",
             " Scale it up, or move it to the origin.",
         )
 
 
 def media_of(scene: mi.Scene) -> dict[mi.Medium, list[mi.Shape]]:
-    """All media of a scene, each with the shapes that it fills."""
+    """All media of a scene, each with the shapes whose interior it is."""
     found: dict[mi.Medium, list[mi.Shape]] = {}
     for shape in scene.shapes():
         interior, exterior = shape.interior_medium(), shape.exterior_medium()
@@ -98,9 +184,10 @@ def _flags(shape: mi.Shape) -> int:
     return int(bsdf.flags()) if bsdf is not None else 0
 
 
-def simple_boundary(scene: mi.Scene) -> Boundary | None:
-    """The boundary of the one medium in a scene that has no surface besides; None for others."""
-    media = media_of(scene)
+def _boundary_without_surfaces(
+    scene: mi.Scene, media: dict[mi.Medium, list[mi.Shape]]
+) -> Boundary | None:
+    """The boundary of the one medium in a scene that has no surfaces; None for other scenes."""
     bounded = [s for s in scene.shapes() if s.interior_medium() is not None]
     if len(media) != 1 or len(bounded) != 1:
         return None
@@ -118,74 +205,15 @@ def _is_isotropic(medium: mi.Medium) -> bool:
     return medium.phase_function().class_name() == "IsotropicPhaseFunction"
 
 
-def bake_scene(scene: mi.Scene) -> MediumGrid | None:
-    """The medium of a simple scene on its grids, or None where there is none."""
-    for shapes in media_of(scene).values():
-        return _bake_simple(scene, boundary_of(scene, shapes[0]))
-    return None
-
-
-def _bake_simple(scene: mi.Scene, boundary: Boundary) -> MediumGrid:
-    (medium,) = media_of(scene)
-    grid = bake(medium, boundary)
-    grid.name = medium.id()
-    return grid
-
-
-def bake_general(
-    scene: mi.Scene, emission: Emission | None = None, alone: bool = False
-) -> list[MediumGrid]:
-    """The media of any scene on grids that know their `Surroundings`; only those that are seen. In
-    a simple scene there is but one, which is ``alone``.
-    """
-    shapes, grids, seen = scene.shapes(), [], []
-    if not alone:
-        for shape in shapes:
-            _check_shape(scene, shape)
-        for medium, filled in media_of(scene).items():
-            if not filled and medium.class_name() != "HeterogeneousMedium":
-                _refuse_unbounded(medium, shapes)
-        check_media_agree(scene)
-    for medium, filled in media_of(scene).items():
-        exact = _exact_boundary(scene, filled)
-        grid = bake(medium, exact or Boundary("box", _extent(medium, filled)))
-        grid.has_exact_boundary, grid.is_isolated = exact is not None, alone
-        grid.pointer, grid.name = mi.MediumPtr(medium), _name(medium, [g.name for g in grids])
-        dr.make_opaque(grid.pointer)
-        grids.append(grid)
-        around = [s for s in shapes if medium in (s.interior_medium(), s.exterior_medium())]
-        if any(is_null(_flags(s)) for s in around) or any(
-            sensor.get_medium() == medium for sensor in scene.sensors()
-        ):
-            seen.append(grid)
-            if grid.phase is not None and not grid.phase.has_peak:
-                refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
-    Surroundings(scene, grids)
-    place_emission(emission, grids)
-    for grid in seen:
-        if grid.phase is not None and grid.phase.has_peak:
-            take_away_peak(grid)
-    if not seen and emission is not None:
-        _refuse("all media are behind surfaces, and the emission in them is unknown to volpath")
-    if not seen:
-        mi.Log(
-            mi.LogLevel.Warn,
-            "irrcache: all media are behind surfaces, so this scene is rendered as volpath does. A "
-            'shape that only bounds a medium needs <bsdf type="null"/>.',
-        )
-    _warn_of_scale(scene, grids)
-    return seen
-
-
 def _exact_boundary(scene: mi.Scene, filled: list[mi.Shape]) -> Boundary | None:
-    """Of the one box or sphere that a medium fills; None where it fills others."""
+    """The one box or sphere that a medium fills; None where it fills other shapes."""
     try:
         return boundary_of(scene, filled[0]) if len(filled) == 1 else None
     except UnsupportedSceneError:
         return None
 
 
-def _name(medium: mi.Medium, taken: list[str]) -> str:
+def _unique_name(medium: mi.Medium, taken: list[str]) -> str:
     """The medium's id; with a number where another one has it too."""
     name, number = medium.id(), 2
     while name in taken:
@@ -194,8 +222,8 @@ def _name(medium: mi.Medium, taken: list[str]) -> str:
 
 
 def _extent(medium: mi.Medium, filled: list[mi.Shape]) -> np.ndarray:
-    """``to_world`` of the cube [-1, 1]^3 over the world box of ``medium``: of the shapes that it
-    fills, and of its own grid.
+    """``to_world`` of the cube [-1, 1]^3 over the world box of ``medium``: the intersection of the
+    boxes of the shapes that it fills and of its own grid.
     """
     boxes = []
     if filled:
@@ -228,25 +256,25 @@ def _refuse_unbounded(medium: mi.Medium, shapes: list[mi.Shape]) -> None:
         more = f" and of {len(around) - 1} more" if len(around) > 1 else ""
         role = f"is the exterior of {described(around[0])}{more}, and "
     _refuse(
-        f'medium "{medium.id()}" ({medium.class_name()}) {role}fills no shape: it would reach to '
-        "infinity, and a cache cannot",
+        f'medium "{medium.id()}" ({medium.class_name()}) {role}fills no shape: it would be '
+        "infinite, and a cache cannot be",
         " Put a closed shape with a null BSDF, such as a cube, around everything that has it as "
         "its interior. Walls and objects within that shape need neither interior nor exterior, "
-        "since rays that they send back stay in the medium; only glass does.",
+        "since rays that they reflect stay in the medium; only glass does.",
     )
 
 
 def _check_shape(scene: mi.Scene, shape: mi.Shape) -> None:
     if shape.class_name() == "Instance" and _has_media(scene, shape):
         _refuse(
-            f"{described(shape)} is an instance of shapes with media, of which there is no "
-            "telling where they are",
+            f"{described(shape)} is an instance of shapes with media, whose positions Mitsuba does "
+            "not report",
             " Place these shapes in the scene themselves.",
         )
 
 
 def _has_media(scene: mi.Scene, instance: mi.Shape) -> bool:
-    """Whether rays through an instance come into a medium there."""
+    """Whether rays through an instance enter a medium there."""
     return bool(dr.any(_meets_media(scene, mi.ShapePtr(instance), rays_through(instance))))
 
 
@@ -265,8 +293,8 @@ def _meets_media(scene: mi.Scene, instance: mi.ShapePtr, ray: mi.Ray3f):
     return inside
 
 
-def _warn_of_scale(scene: mi.Scene, grids: list[MediumGrid]) -> None:
-    """Tells where Mitsuba's rays, which leave a surface at some distance from it, lose light."""
+def _warn_of_scale(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
+    """Warns where the offset of Mitsuba's rays from surfaces is large compared to a medium."""
     corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
     offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
     for grid in grids:
@@ -275,9 +303,28 @@ def _warn_of_scale(scene: mi.Scene, grids: list[MediumGrid]) -> None:
             mi.Log(
                 mi.LogLevel.Warn,
                 f'irrcache: medium "{grid.name}" is {size:.2g} thin, and rays that leave surfaces '
-                f"in this scene skip up to {offset:.1g}, as in volpath: light is lost. Scale the "
-                "scene up, or move it to the origin.",
+                f"in this scene skip up to {offset:.1g}, as in volpath: the image is too dark. "
+                "Scale the scene up, or move it to the origin.",
             )
+
+
+def _brightest(scene: mi.Scene) -> float:
+    """The largest radiance found on emitters that can be seen."""
+    rng = mi.PCG32(1024)
+    si = dr.zeros(mi.SurfaceInteraction3f, 1024)
+    si.uv = mi.Point2f(rng.next_float32(), rng.next_float32())
+    found = [0.0]
+    for emitter in scene.emitters():
+        kind = kind_of(emitter)
+        sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+        si.wi = (
+            mi.warp.square_to_uniform_sphere(sample)
+            if kind.is_environment
+            else mi.Vector3f(0, 0, 1)
+        )
+        value = mi.Spectrum(emitter.eval(si))
+        found.append(float(np.nanmax(np.array(value))))
+    return max(f for f in found if np.isfinite(f))
 
 
 def _refuse(reason: str, hint: str = "") -> None:

@@ -47,7 +47,7 @@ INWARDS = 0.6
 #: Mitsuba's rays leave a surface at (1 + largest coordinate) times this.
 RAY_OFFSET = 9e-5
 
-#: Codes of what a straight ray says of the medium at its start.
+#: Results of a straight ray that looks for the medium at its origin.
 _NOTHING, _CLAIM, _ESCAPE = 0, 1, 2
 
 
@@ -261,7 +261,7 @@ def _walk(
 
 
 def _lets_through(flags: mi.UInt32) -> mi.Bool:
-    """Whether a BSDF of these flags lets some light through."""
+    """Whether a BSDF of these flags transmits."""
     return (flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)) != 0
 
 
@@ -289,8 +289,8 @@ def _examine(
 
 @symbolic
 def _claims(scene: mi.Scene, ray: mi.Ray3f):
-    """The medium at the start of rays as the first shape along them claims that has media, whatever
-    lets light through between; the code says whether there is one, and the shape which.
+    """The medium at the origin of rays according to the first shape along them that has media,
+    behind any that transmit; the code says whether there is one; and that shape.
     """
     ray, code = mi.Ray3f(ray), mi.UInt32(_NOTHING)
     medium, shape = dr.zeros(mi.MediumPtr), dr.zeros(mi.ShapePtr)
@@ -331,7 +331,7 @@ class _Names:
         media = [m for s in shapes for m in (s.interior_medium(), s.exterior_medium())]
         self._media = {_number(mi.MediumPtr(m)): m for m in media if m is not None}
 
-    def is_alone(self, number: int) -> bool:
+    def is_only_shape_of_its_medium(self, number: int) -> bool:
         """Whether no other shape has the interior medium of this one."""
         interior = self.shapes[number].interior_medium()
         others = (s for n, s in self.shapes.items() if n != number)
@@ -367,14 +367,17 @@ def _refuse_dispute(scene: mi.Scene, names: _Names, votes: Counter) -> None:
     if len(known) == 1:
         _refuse_single(scene, names, known[0], {one, other} - {0})
     for side in known:
-        if names.is_alone(side) and max(orientation(scene, names.shapes[side])) > OPEN:
+        if (
+            names.is_only_shape_of_its_medium(side)
+            and max(orientation(scene, names.shapes[side])) > OPEN
+        ):
             _refuse_single(scene, names, side, set())
     first, second = (names.shape(side) for side in sides)
     raise UnsupportedSceneError(
         f"irrcache: {first} and {second} disagree about the medium between them: the one says "
         f"{names.medium(one)}, the other {names.medium(other)}. They overlap, or share a face, or "
         "one is within the other without saying so, or there is a gap between them. The medium "
-        "would depend on the way that light takes. Move them apart by a thousandth of their size; "
+        "would depend on the path of a ray. Move them apart by a thousandth of their size; "
         "where one is within the other, give it the medium around it as its exterior. Otherwise "
         'render this scene with "volpath", which shows the medium that was entered last.'
     )
@@ -416,12 +419,12 @@ def _refuse_infinite(names: _Names, medium: int) -> None:
 
 
 def _refuse_close(scene: mi.Scene, names: _Names, first: int, second: int) -> None:
-    """The error for shapes that Mitsuba's rays cannot tell apart."""
+    """The error for shapes that are closer to each other than the offset of Mitsuba's rays."""
     corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
     offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
     raise UnsupportedSceneError(
         f"irrcache: {names.shape(first)} is closer to {names.shape(second)} than Mitsuba's rays "
-        f"can tell: they leave a surface at a distance of up to {offset:.1g} here, and miss what "
+        f"resolve: they leave a surface at a distance of up to {offset:.1g} here, and miss what "
         "is nearer. Media would be missing, as with volpath. Move the shapes apart by a few times "
         "as much, or scale the scene up."
     )

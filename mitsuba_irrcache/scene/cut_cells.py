@@ -1,8 +1,8 @@
-"""Light that ends at a surface: lookups between voxels that lie on different sides of it.
+"""Lookups between voxels that lie on different sides of a surface.
 
-Interpolation between the voxels of a cell takes light from both sides of a surface that cuts it.
-Where a cell is cut, a plane stands for the surface, and only those voxels count that lie on the
-same side of it as the point looked up.
+Interpolation in a cell, the box between eight voxel centres, would mix the irradiance of both sides
+of a surface that cuts it. Each cut cell has a plane that approximates the surface; a lookup weights
+only those voxels that lie on its own side of the plane.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from mitsuba_irrcache.grids.root_field import Extension, RootField
 from mitsuba_irrcache.transport.path import is_null
 
 CORNERS = list(itertools.product((0, 1), repeat=3))
-#: Segments that look for surfaces in a cell, as pairs of `CORNERS`: its edges and diagonals.
+#: Segments in a cell that are intersected with surfaces, as pairs of `CORNERS`: its edges and
+#: diagonals.
 SEGMENTS = [
     (a, b)
     for a, b in itertools.combinations(range(8), 2)
@@ -27,17 +28,17 @@ SEGMENTS = [
 
 
 class CutCells:
-    """The cells of a cache over ``grid`` that surfaces cut, and the planes that stand for these."""
+    """The cells of a cache over ``grid`` that surfaces cut, and the planes of these."""
 
     def __init__(self, scene: mi.Scene, grid: Grid) -> None:
-        self.grid = Extension(grid).grid  #: that lookups interpolate on
+        self.grid = Extension(grid).grid  #: the grid that lookups interpolate on
         self.cells = tuple(n - 1 for n in self.grid.sides)
         count = int((self.grid.resolution - 1).prod())
         cell = dr.arange(mi.UInt32, count)
         cut, *plane = self._cut(scene, cell)
         dr.eval(cut, plane)
         found = dr.compress(cut)
-        #: how many cells are cut; there are no lookups where none is
+        #: number of cut cells; without any, no lookups are corrected
         self.count = dr.width(found)
         if not self.count:
             return
@@ -51,8 +52,8 @@ class CutCells:
 
     @symbolic
     def _cut(self, scene: mi.Scene, cell: mi.UInt32):
-        """Whether surfaces cut the cells, and the planes g s + c = 0 that are tangent to them where
-        they come nearest to the cells' centres; s are voxels from the first one's centre on.
+        """Whether surfaces cut the cells, and the planes g s + c = 0 tangent to the surfaces at the
+        points nearest to the cells' centres; s is in voxels, 0 at the centre of the first one.
         """
         sides = [Divisor(int(n) - 1) for n in self.grid.resolution[:2]]
         first = mi.Point3f(*unravelled(cell, sides)) + 0.5
@@ -85,10 +86,10 @@ class CutCells:
 
     @symbolic
     def corrected(self, field: RootField, p: mi.Point3f, phi: mi.Float | mi.Color3f, active):
-        """``phi``, what ``field`` says at the world position ``p``; in a cell that is cut, from the
+        """``phi``, the value of ``field`` at the world position ``p``; in a cut cell that of the
         voxels on the side of ``p`` alone.
         """
-        s = self._place(p)
+        s = self._clamped(p)
         cell = self._cell(s)
         lower = mi.Vector3i(cell)
         index = mi.UInt32((lower.z * self.cells[1] + lower.y) * self.cells[0] + lower.x)
@@ -98,14 +99,14 @@ class CutCells:
             phi = self._one_sided(field, plane, s, lower, phi)
         return phi
 
-    def _place(self, p: mi.Point3f) -> mi.Point3f:
-        """Coordinates of a world position from the first voxel's centre on, clamped to the last."""
+    def _clamped(self, p: mi.Point3f) -> mi.Point3f:
+        """Coordinates of a world position in voxels, 0 at the centre of the first, clamped."""
         u = self.grid.coordinates.point(p) - 0.5
         last = mi.Point3f([mi.Float(n) for n in self.cells])
         return dr.minimum(dr.maximum(u, 0), last)
 
     def _cell(self, s: mi.Point3f) -> mi.Vector3f:
-        """The cell around ``s``: on the far border the one before."""
+        """The cell that ``s`` is in; at the far border the last one."""
         return dr.minimum(dr.floor(s), mi.Vector3f([mi.Float(n - 1) for n in self.cells]))
 
     def _one_sided(
@@ -116,8 +117,8 @@ class CutCells:
         lower: mi.Vector3i,
         phi: mi.Float | mi.Color3f,
     ) -> mi.Float | mi.Color3f:
-        """The mean of the voxels on the side of ``s``, weighted as they would be among all; ``phi``
-        where there are none.
+        """The mean of the voxels on the side of ``s`` with trilinear weights; ``phi`` where there
+        are none.
         """
         gradient = mi.Vector3f(plane.x, plane.y, plane.z)
         ahead = dr.dot(gradient, s) + plane.w > 0

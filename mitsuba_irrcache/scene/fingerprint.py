@@ -1,4 +1,4 @@
-"""What a cache depends on: quick identities within a process, digests of the contents for files."""
+"""What a cache depends on: identities of objects within a process, digests for files."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.transport.path import Media
 
 #: Arrays of up to so many bytes are compared by their contents, all of them up to the second number
 #: of bytes in a scene; of larger arrays, so many values are.
@@ -28,8 +29,8 @@ _ELSEWHERE = re.compile(
 
 
 class Snapshot:
-    """The objects and parameters of a scene that its light depends on, as they are now. Comparing
-    two of them launches no kernel unless a parameter was edited in between.
+    """The objects and parameters of a scene that its caches depend on, as they are now. Comparing
+    two snapshots launches no kernel unless a parameter was edited in between.
 
     It holds references of its own to Dr.Jit's variables, not to Mitsuba's members, which change
     with the scene. As long as it does, no other variable can get the index of one of them, and
@@ -160,8 +161,10 @@ def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
     return repr(value) if array.dtype == object else (array.dtype.str, array.tobytes())
 
 
-def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
-    """SHA-256 of the contents of each ingredient of the light in ``medium``."""
+def digests(scene: mi.Scene, media: Media, medium: MediumGrid) -> dict[str, str]:
+    """SHA-256 of the contents of each ingredient of the irradiance in ``medium``, which is one of
+    the ``media`` of the scene.
+    """
     boundary = medium.boundary
     found = {
         "medium": _medium_digest(medium),
@@ -169,9 +172,8 @@ def digests(scene: mi.Scene, medium: MediumGrid) -> dict[str, str]:
         "emitters": digest_of_emitters(scene),
         "variant": "grey" if mi.is_monochromatic else "rgb",
     }
-    if medium.surroundings is not None:
-        media = medium.surroundings.media.grids
-        found["media"] = _digest(*sorted(_medium_digest(grid) for grid in media))
+    if medium.is_traced:
+        found["media"] = _digest(*sorted(_medium_digest(grid) for grid in media.grids))
         found["surfaces"] = digest_of_surfaces(scene)
         found[RESPONSES] = responses(scene)
     return found
@@ -204,7 +206,7 @@ def _agree(name: str, mine: str | None, theirs: str | None) -> bool:
 
 
 def responses(scene: mi.Scene) -> str:
-    """What rays find at the shapes of a scene: numbers in [0, 1] for each of them.
+    """Responses of the shapes of a scene to random rays: numbers in [0, 1] for each shape.
 
     Some options of Mitsuba's plugins are neither parameters nor in their descriptions (the filter
     of a bitmap, the normals of an sdfgrid, invalid normals of a bump map, ...). They show in how
@@ -244,7 +246,7 @@ def responses(scene: mi.Scene) -> str:
         0.5 + 0.5 * dr.dot(axis, sample.wo),
         *(_squashed(value) for value in (reflected, weight, emitted)),
     ]
-    # Weights tell apart what is the same on average.
+    # Random weights distinguish responses that have the same mean.
     sums = [dr.block_sum(dr.select(valid, value, 0) * draws[12], PROBES) for value in found]
     numbers = np.nan_to_num(np.array(sums, dtype=np.float64) / PROBES, nan=1.0)
     return " ".join(f"{number:.6f}" for number in numbers.T.ravel())
@@ -260,7 +262,7 @@ def _squashed(value: mi.Spectrum) -> mi.Float:
 
 def _medium_digest(medium: MediumGrid) -> str:
     parts = [*_field_parts(medium.sigma_t), *_field_parts(medium.albedo), medium.bbox or ()]
-    if medium.phase is not None:
+    if not medium.phase.is_isotropic:
         parts.append(np.float32(medium.phase.moments))
     if medium.emission is not None:
         parts += ["emission", *_field_parts(medium.emission.field)]

@@ -1,7 +1,8 @@
-"""Whether surfaces lie in a box of voxels."""
+"""Shapes that lie in a box of voxels."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -10,11 +11,14 @@ import numpy as np
 
 from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.consistency import described
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
-#: Rays that look for surfaces, per voxel and axis: through the corners and the middle of its face.
+#: Offsets of rays along each axis that look for surfaces: through the corners and the middle of
+#: each voxel's face.
 OFFSETS = ((0.0, 0.0), (0.5, 0.5))
-#: Of a voxel: surfaces may lie on the faces of the box.
+#: Margin in voxels: surfaces may lie on the faces of the box.
 SLACK = 1e-3
 
 _PICK = np.array(list(np.ndindex(2, 2, 2)), dtype=bool)  # corners of a box
@@ -24,24 +28,20 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
     """A shape other than null boundaries that lies in the box of voxels between ``lower`` and
     ``upper`` (x, y, z), by its name; None where there is none.
 
-    Shapes apart from the box, and vertices and small shapes in it, are told for certain; of others,
-    rays find what is about as large as a voxel.
+    Exact for shapes whose bounds do not meet the box, for vertices, and for shapes within the box;
+    of other shapes, rays find parts about as large as a voxel.
     """
     near = [s for s in scene.shapes() if _is_solid(s) and _may_meet(s, grid, lower, upper)]
     for shape in near:
-        if _begins_within(shape, grid, lower, upper):
-            return _name(shape)
+        if _is_partly_within(shape, grid, lower, upper):
+            return described(shape)
     if near:
         for axis in range(3):
             for offset in OFFSETS:
-                found = _met(scene, near, grid, lower, upper, axis, offset)
+                found = _first_hit(scene, near, grid, lower, upper, axis, offset)
                 if found is not None:
-                    return _name(found)
+                    return described(found)
     return None
-
-
-def _name(shape: mi.Shape) -> str:
-    return f'shape "{shape.id()}" ({shape.class_name()})'
 
 
 def _is_solid(shape: mi.Shape) -> bool:
@@ -55,7 +55,7 @@ def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray)
     box = shape.bbox()
     ends = np.array([box.min, box.max], dtype=np.float64)
     if not np.isfinite(ends).all():
-        return True  # meshes that Mitsuba has merged do not know theirs
+        return True  # meshes that Mitsuba has merged have no bounds
     return boxes_meet(grid, lower, upper, np.where(_PICK, ends[1], ends[0]))
 
 
@@ -76,7 +76,7 @@ def boxes_meet(grid: Grid, lower: np.ndarray, upper: np.ndarray, corners: np.nda
 
 
 def corners_of(frame: np.ndarray) -> np.ndarray:
-    """Of the unit cube's image (8, 3)."""
+    """Corners (8, 3) of the image of the unit cube."""
     return _mapped(frame, _PICK)
 
 
@@ -85,7 +85,7 @@ def _mapped(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     return (matrix[:3, :3] * points[:, None, :]).sum(axis=-1) + matrix[:3, 3]
 
 
-def _begins_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
+def _is_partly_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
     """Whether a vertex of a mesh, or all of another shape, is in the box."""
     vertices = mi.traverse(shape).get("vertex_positions")
     if vertices is not None:
@@ -98,18 +98,18 @@ def _begins_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.nda
     return bool((u > lower).all() and (u < upper).all())
 
 
-def _met(scene, near, grid, lower, upper, axis, offset) -> mi.Shape | None:
-    """The first of the shapes that rays along an axis of the grid meet in the box."""
+def _first_hit(scene, near, grid, lower, upper, axis, offset) -> mi.Shape | None:
+    """One of the shapes ``near`` that rays along an axis of the grid hit in the box."""
     across = [k for k in range(3) if k != axis]
     corner, sides = lower + SLACK, upper - lower - 2 * SLACK
     steps = grid.world.matrix[:3, :3]  # a voxel along each axis
     start = steps @ corner + grid.world.matrix[:3, 3]
     count = [int(upper[k] - lower[k]) + 1 for k in across]
-    places = unravelled(dr.arange(mi.UInt32, count[0] * count[1]), [Divisor(count[0])])
+    positions = unravelled(dr.arange(mi.UInt32, count[0] * count[1]), [Divisor(count[0])])
     p = _opaque(start)
-    for k, place, shift in zip(across, places, offset, strict=True):
-        place = dr.minimum(mi.Float(place) + _opaque([shift]).x, _opaque([sides[k]]).x)
-        p = p + _opaque(steps[:, k]) * place
+    for k, position, shift in zip(across, positions, offset, strict=True):
+        position = dr.minimum(mi.Float(position) + _opaque([shift]).x, _opaque([sides[k]]).x)
+        p = p + _opaque(steps[:, k]) * position
     met = _shapes_between(
         scene, mi.Point3f(p), mi.Point3f(p + _opaque(steps[:, axis] * sides[axis]))
     )
@@ -142,3 +142,19 @@ def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
         crossings += 1
         active &= ~solid & (crossings < MOST_CROSSINGS)
     return found
+
+
+def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
+    """A shape behind whose null surface ``medium`` ends, in the ``box`` of voxels of ``grid``; None
+    where there is none.
+    """
+    for shape in scene.shapes():
+        outer = shape.exterior_medium()
+        null = shape.bsdf() is not None and is_null(int(shape.bsdf().flags()))
+        if outer is None or not null or not dr.all(mi.MediumPtr(outer) == medium.pointer):
+            continue
+        ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
+        corners = np.array(list(itertools.product(*ends.T)))
+        if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
+            return described(shape)
+    return None

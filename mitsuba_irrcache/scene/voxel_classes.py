@@ -6,40 +6,59 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.immutable import Immutable
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import fibonacci_direction, kronecker
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.cut_cells import CutCells
+from mitsuba_irrcache.scene.medium_probe import probe
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
+
+#: Rays from each voxel that look for its medium.
+RAYS = 16
 
 
-class VoxelClasses:
-    """Where the voxels of ``grid`` are.
+class VoxelClasses(Immutable):
+    """Where the voxels of ``grid``, that of a cache of ``medium``, lie among ``media``.
 
-    ``place`` is 0 for a voxel whose centre is in no medium, else 1 for the first of the scene's,
-    and so on. ``reach`` are those that a lookup in the cache's medium can read: some of it lies in
-    them (``within``) or in a neighbour. ``enclosed`` are those that see nothing but the backs of
-    surfaces. ``edges`` are the surfaces between voxels, None where there are none.
+    Attributes:
+        medium_number: 0 for a voxel whose centre is in no medium, else 1 for the first of
+            ``media``, and so on (see `Media.pointer_of`).
+        readable: the voxels that a lookup in ``medium`` can read: those with a part in the medium,
+            and their neighbours.
+        enclosed: the voxels from whose centres only backs of surfaces are visible.
+        cut_cells: cells between voxels that surfaces cut; None where there are none.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        place: mi.UInt32,
-        within: mi.Bool,
-        enclosed: mi.Bool,
-        edges: object | None = None,
-    ) -> None:
-        self.grid, self.place, self.enclosed, self.edges = grid, place, enclosed, edges
+    def __init__(self, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid) -> None:
+        self.grid = grid
+        index = dr.arange(mi.UInt32, grid.voxel_count)
+        *votes, within, backs = _probed(scene, media, medium, grid, index)
+        within, enclosed = within > 0, backs == RAYS
+        dr.eval(votes, within, enclosed)
+        best, number = mi.UInt32(0), mi.UInt32(0)
+        for i, count in enumerate(votes):
+            number = dr.select(count > best, i, number)
+            best = dr.maximum(best, count)
+        dr.eval(number)
+        cut_cells = CutCells(scene, grid)
+        self.medium_number, self.enclosed = number, enclosed
+        self.cut_cells = cut_cells if cut_cells.count else None
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
-        self.reach = within | (total > 0)
-        dr.eval(self.reach)
+        self.readable = within | (total > 0)
+        dr.eval(self.readable)
 
     def filled(self, values: mi.Float, channels: int) -> mi.Float:
-        """Values of all voxels, the means of their neighbours' for those inside of opaque things:
-        of a curved surface, `edges` leave a little to be read there.
+        """``values`` of all voxels, where those of enclosed voxels that are 0 become the means of
+        their neighbours: near a curved surface, lookups that `cut_cells` restrict to one side still
+        read a little of them.
         """
         voxel = dr.arange(mi.UInt32, self.grid.voxel_count)
-        lit = mi.Bool(False)
+        positive = mi.Bool(False)
         for c in range(channels):
-            lit |= dr.gather(mi.Float, values, voxel * channels + c) > 0
-        known = lit | ~self.enclosed
+            positive |= dr.gather(mi.Float, values, voxel * channels + c) > 0
+        known = positive | ~self.enclosed
         dr.eval(known)
         total, weights = neighbourhood(self.grid, values, known, channels)
         own = dr.gather(mi.Bool, known, dr.arange(mi.UInt32, dr.width(values)) // channels)
@@ -47,6 +66,46 @@ class VoxelClasses:
         result = dr.select(own, values, total / dr.select(own, 1, weights))
         dr.eval(result)
         return result
+
+
+@symbolic
+def _probed(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index: mi.UInt32):
+    """Numbers of rays from each voxel: those whose origin, the voxel's centre, is in no medium and
+    in each medium; those whose origin, a random position in the voxel, is in ``medium``; those that
+    hit the back of a surface first.
+    """
+    corner = mi.Point3f(*grid.places(index))
+    votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
+    within, backs = mi.UInt32(0), mi.UInt32(0)
+    k, count = mi.UInt32(0), dr.opaque(mi.UInt32, RAYS)
+    while dr.hint(k < count, label="voxel classes"):
+        u, direction = kronecker(k, 3), fibonacci_direction(k, RAYS, azimuth=0.4)
+        pointer = probe(scene, grid.world.point(corner + 0.5), direction)
+        meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction)
+        backs += dr.select(meets_back, mi.UInt32(1), 0)
+        votes[0] += dr.select(pointer == None, mi.UInt32(1), 0)  # noqa: E711
+        for i in range(len(media.grids)):
+            votes[i + 1] += dr.select(pointer == media.grids[i].pointer, mi.UInt32(1), 0)
+        pointer = probe(scene, grid.world.point(corner + mi.Point3f(u)), direction)
+        within += dr.select(pointer == medium.pointer, mi.UInt32(1), 0)
+        k += 1
+    return [*votes, within, backs]
+
+
+@symbolic
+def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
+    """Whether rays hit the back of the first surface that is not null."""
+    ray, back = mi.Ray3f(p, direction), mi.Bool(False)
+    crossings, active = mi.UInt32(0), mi.Bool(True)
+    while dr.hint(active, label="backs"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        solid = active & ~is_null(si.bsdf().flags())
+        back |= solid & (dr.dot(si.n, direction) > 0)
+        ray = si.spawn_ray(direction)
+        crossings += 1
+        active &= ~solid & (crossings < MOST_CROSSINGS)
+    return back
 
 
 def neighbourhood(

@@ -1,1 +1,8 @@
-"""Solvers that compute the cache."""
+"""Solvers, each of which fills caches. Importing a module registers its solver; ``auto`` tries them
+in this order.
+"""
+
+from mitsuba_irrcache.solvers import sweep
+from mitsuba_irrcache.solvers.path import solver as path
+
+__all__ = ["path", "sweep"]

@@ -55,7 +55,8 @@ def series_error(medium: MediumGrid) -> float:
     """
     if not medium.homogeneous or medium.bbox is not None:
         return np.inf
-    if not medium.is_isolated or medium.phase is not None or medium.emission is not None:
+    isotropic = medium.phase.is_isotropic
+    if not medium.is_isolated or not isotropic or medium.emission is not None:
         return np.inf
     edges = np.linalg.norm(medium.frame[:3, :3], axis=0) * medium.sigma_t.minimum
     if not edges.min() > 0:
@@ -77,6 +78,8 @@ class HalfSpace:
 
     ``max_depth`` is the integrator's: 2 for single scattering, -1 for all orders.
     """
+
+    # docs/primer, eq. (2.7)
 
     def __init__(self, scene: mi.Scene, medium: MediumGrid, max_depth: int) -> None:
         self.medium = medium
@@ -200,6 +203,7 @@ def chandrasekhar_h(albedo: float, mu: np.ndarray) -> np.ndarray:
     Iterates 1 / H(mu) = sqrt(1 - omega) + omega / 2 int_0^1 x H(x) / (mu + x) dx, which converges
     also for the albedo 1 (Chandrasekhar 1950, section 38).
     """
+    # docs/primer, eq. (2.8)
     x, weights = _quadrature()
     kernel = 0.5 * albedo * weights * x / (x[:, None] + x)
     h, floor = np.ones(POINTS), np.sqrt(max(1 - albedo, 0))

@@ -1,1 +1,1 @@
-"""Free flights, transmittance and paths through media and between surfaces."""
+"""Free-flight sampling, transmittance estimation and path tracing in media and between surfaces."""

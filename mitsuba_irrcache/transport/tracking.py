@@ -1,8 +1,8 @@
-"""Transmittance and free flights through a medium.
+"""Free-flight sampling and transmittance of a medium.
 
-`optical_depth` is deterministic and exact. `free_flight` and `transmittance` are unbiased estimates
-by null-collision tracking: tentative collisions are drawn with the majorant of the macrocell at
-hand. Functions return the random generator they advanced, since a recorded loop does not update its
+`optical_depth` is deterministic and exact. `free_flight` and `transmittance` are unbiased
+null-collision estimators (Woodcock et al. 1965; Novak et al. 2014) with the majorants of the
+macrocells. Functions return the random number generator, because recorded loops do not update the
 caller's copy.
 """
 
@@ -17,14 +17,14 @@ from mitsuba_irrcache.media.medium import MediumGrid
 
 #: Abscissae of two-point Gauss-Legendre quadrature over [0, 1]: exact for cubic polynomials.
 GAUSS_POINTS = (0.5 - 0.28867513, 0.5 + 0.28867513)
-#: Optical depth whose transmittance is 0 in single precision: nothing behind it matters.
+#: Optical depth whose transmittance underflows to 0 in single precision.
 OPAQUE = 104.0
-#: Ratio tracking continues below this transmittance by Russian roulette only.
+#: Transmittance below which ratio tracking applies Russian roulette.
 ROULETTE_BELOW = 0.1
 
 
-def brightest(value: mi.Float | mi.Color3f) -> mi.Float:
-    """The largest channel."""
+def max_channel(value: mi.Float | mi.Color3f) -> mi.Float:
+    """Return the largest channel."""
     return value if isinstance(value, mi.Float) else dr.max(value)
 
 
@@ -38,14 +38,17 @@ def free_flight(
     rng: mi.PCG32,
     active: mi.Bool,
 ):
-    """Delta tracking from ``near`` to ``far``: whether the ray collides, where, the weight carried
-    on, the generator, and the radiance that the medium itself has added, an unbiased estimate of
-    int T j dt times the weight.
+    """Sample a collision between ``near`` and ``far`` by delta tracking (Woodcock et al. 1965).
 
-    With grey extinction the weight is unchanged. With coloured extinction a collision is accepted
-    with the probability that the current weights give it, and the weights make up for each
-    channel's difference (spectral tracking, Kutz et al. 2017), so that they stay bounded.
+    Returns whether the ray collides, the distance, the path throughput ``weight``, the random
+    number generator, and the weighted radiance of the medium's emission, an unbiased estimate of
+    int T j dt.
+
+    Grey extinction leaves the throughput unchanged. With coloured extinction, collisions are
+    accepted with a probability that depends on the current throughput, which compensates for the
+    difference in each channel and stays bounded (spectral tracking, Kutz et al. 2017).
     """
+    # docs/primer, eq. (3.3)
     walk = medium.macrocells.walk(ray)
     t = mi.Float(near)
     cell = walk.cell(t)
@@ -53,22 +56,22 @@ def free_flight(
     collided = mi.Bool(False)
     grey = medium.sigma_t.channels == 1
     weight, emitted = mi.Spectrum(weight), mi.Spectrum(0)
-    shines_from, shines_to = near, far
+    emission_near, emission_far = near, far
     if dr.hint(medium.emission is not None, mode="scalar"):
-        shines_from, shines_to = medium.emission.interval(ray, near, far)
+        emission_near, emission_far = medium.emission.interval(ray, near, far)
     while dr.hint(active, label="free flight"):
         majorant = walk.majorant(cell, active)
-        wall, following = walk.exit(cell, t)
+        cell_exit, following = walk.exit(cell, t)
         candidate = t - dr.log(1 - rng.next_float32(active)) / majorant
-        leaves = ~(candidate < dr.minimum(wall, far))
-        tentative = active & ~leaves
+        exits_cell = ~(candidate < dr.minimum(cell_exit, far))
+        tentative = active & ~exits_cell
         sigma_t = medium.sigma_t.at_world(ray(candidate), tentative)
         choice = rng.next_float32(active)
         if dr.hint(medium.emission is not None, mode="scalar"):
-            begin = dr.maximum(t, shines_from)
-            end = dr.minimum(dr.select(leaves, wall, candidate), shines_to)
-            light, rng = medium.emission.between(ray, begin, end, rng, active & (begin < end))
-            emitted += weight * light
+            begin = dr.maximum(t, emission_near)
+            end = dr.minimum(dr.select(exits_cell, cell_exit, candidate), emission_far)
+            radiance, rng = medium.emission.between(ray, begin, end, rng, active & (begin < end))
+            emitted += weight * radiance
         if dr.hint(grey, mode="scalar"):
             collides = tentative & (choice * majorant < sigma_t)
         else:
@@ -79,8 +82,8 @@ def free_flight(
             accepted = dr.select(collides, real / probability, (1 - real) / (1 - probability))
             weight = dr.select(tentative, weight * accepted, weight)
         collided |= collides
-        t = dr.select(leaves, wall, candidate)
-        cell = dr.select(leaves, following, cell)
+        t = dr.select(exits_cell, cell_exit, candidate)
+        cell = dr.select(exits_cell, following, cell)
         active &= ~collides & (t < far)
     return collided, t, weight, rng, emitted
 
@@ -94,12 +97,11 @@ def optical_depth(
     active: mi.Bool,
     most: float = OPAQUE,
 ):
-    """Integral of sigma_t along ``ray`` from ``near`` to ``far``, exact up to rounding, for each
-    channel of the extinction; beyond ``most`` in all channels only a lower bound.
+    """Integrate sigma_t from ``near`` to ``far``, exactly up to rounding, for each channel.
 
-    Between the planes through the voxel centres extinction is trilinear, so it is a cubic
-    polynomial of the distance along the ray: two Gauss points between two planes integrate it
-    exactly, whatever the optical depth of a voxel. Macrocells without extinction are skipped.
+    Once all channels exceed ``most`` the result is only a lower bound. Between planes through the
+    voxel centres, trilinear extinction is a cubic polynomial of the distance, which two Gauss
+    points integrate exactly, whatever the optical depth of a voxel. Empty macrocells are skipped.
     """
     depth = medium.sigma_t.at_world(ray.o, False) * 0
     active = mi.Bool(active) & (near < far)
@@ -107,29 +109,29 @@ def optical_depth(
         depth += medium.sigma_t.value * dr.select(active, far - near, 0)
     else:
         grid = medium.sigma_t.grid
-        # Coordinates in which the centre of voxel i is at i: these are the planes.
+        # Coordinates in which voxel centres, and hence the planes, are at integers.
         origin = mi.Vector3f(grid.coordinates.point(ray.o)) - 0.5
         direction = grid.coordinates.vector(ray.d)
         rcp = safe_rcp(direction)
         forward = rcp > 0
         last = mi.Vector3f(*(mi.Float(n) for n in grid.sides)) - 1
         walk = medium.macrocells.walk(ray)
-        # A step that rounding makes shorter than this would not advance at all.
-        least = dr.fma(dr.abs(near) + dr.abs(far), 3e-7, 1e-30)
+        # Minimum step: rounding must not prevent progress.
+        min_step = dr.fma(dr.abs(near) + dr.abs(far), 3e-7, 1e-30)
         t = mi.Float(near)
         while dr.hint(active, label="optical depth"):
-            middle = t + 4 * least
+            middle = t + 4 * min_step
             cell = walk.cell(middle)
             empty = walk.majorant(cell, active) == 0
             wall, _ = walk.exit(cell, middle)
             place = dr.fma(direction, middle, origin)
-            # Outside of the outermost centres values are clamped: there is no plane until these.
+            # Values are clamped beyond the outermost centres: the next plane is the first of these.
             plane = dr.select(forward, dr.floor(place) + 1, dr.ceil(place) - 1)
             plane = dr.select(forward, dr.maximum(plane, 0), dr.minimum(plane, last))
             beyond = dr.select(forward, plane > last, plane < 0)
             crossing = dr.min(dr.select(beyond, dr.inf, (plane - origin) * rcp))
             end = dr.minimum(dr.select(empty, wall, crossing), far)
-            end = dr.minimum(dr.maximum(end, t + least), far)
+            end = dr.minimum(dr.maximum(end, t + min_step), far)
             length = 0.5 * (end - t)
             reads = active & ~empty
             for point in GAUSS_POINTS:
@@ -144,7 +146,7 @@ def optical_depth(
 def medium_transmittance(
     medium: MediumGrid, ray: mi.Ray3f, distance: mi.Float, active: mi.Bool
 ) -> mi.Float | mi.Color3f:
-    """Transmittance of ``medium`` along ``ray`` up to ``distance``, without noise."""
+    """Compute the transmittance of ``medium`` along ``ray`` up to ``distance``, without noise."""
     hit, near, far = medium.intersect(ray)
     near, far = dr.maximum(near, 0), dr.minimum(far, distance)
     return dr.exp(-optical_depth(medium, ray, near, far, active & hit))
@@ -154,15 +156,16 @@ def medium_transmittance(
 def transmittance(
     medium: MediumGrid, ray: mi.Ray3f, near: mi.Float, far: mi.Float, rng: mi.PCG32, active: mi.Bool
 ):
-    """An unbiased estimate of T = exp(-int sigma_t dt) from ``near`` to ``far``.
+    """Estimate T = exp(-int sigma_t dt) from ``near`` to ``far``, unbiased.
 
-    Analytic for a homogeneous medium; otherwise residual ratio tracking (Novak et al. 2014) with
-    each macrocell's smallest extinction as control, so every factor lies in [0, 1].
+    Analytic for homogeneous media; otherwise residual ratio tracking (Novak et al. 2014) with the
+    minorant of each macrocell as control, so that every factor lies in [0, 1].
     """
+    # docs/primer, eq. (3.4)
     if dr.hint(medium.homogeneous, mode="scalar"):
         length = dr.maximum(far - near, 0)
         optical_depth = medium.sigma_t.value * length
-        # 0 * infinity: an emitter infinitely far away, seen through nothing.
+        # Avoid 0 * infinity for a distant emitter behind a medium without extinction.
         result = dr.exp(-dr.select(medium.sigma_t.value > 0, optical_depth, 0))
     else:
         walk = medium.macrocells.walk(ray)
@@ -181,14 +184,14 @@ def transmittance(
             sigma_t = medium.sigma_t.at_world(ray(candidate), tentative)
             stop = dr.select(leaves, end, candidate)
             factor = dr.exp(-control * (stop - t))
-            kept = dr.clip(1 - (sigma_t - control) / residual, 0, 1)
+            null_probability = dr.clip(1 - (sigma_t - control) / residual, 0, 1)
             result = dr.select(active, result * factor, result)
-            result = dr.select(tentative, result * kept, result)
+            result = dr.select(tentative, result * null_probability, result)
             t = dr.select(leaves, wall, candidate)
             cell = dr.select(leaves, following, cell)
             active &= t < far
-            # Russian roulette: what is nearly dark is not worth many lookups.
-            largest = brightest(result)
+            # Russian roulette: a small transmittance is not worth many lookups.
+            largest = max_channel(result)
             faint = active & (largest < ROULETTE_BELOW)
             survives = rng.next_float32(active) * ROULETTE_BELOW < largest
             result = dr.select(

@@ -1,4 +1,4 @@
-"""Who may connect to the viewer: by the host that a request names, a token, and its page."""
+"""Access control of the viewer: the Host header, an access token and the origin of a request."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
 class Access:
-    """Decides about requests to a server that listens on ``host``.
+    """Decide which requests a server that listens on ``host`` answers.
 
-    Every request must name a host that can only be this machine. A page of another site whose name
-    was pointed at this machine (DNS rebinding) names its own. Where other machines can connect,
-    each request needs the ``token`` as well: in the address of the page, which is answered with a
-    cookie that the browser sends along with everything else.
+    Every request must address this machine by an IP address or by one of its own names; this
+    rejects pages of other sites whose name was made to resolve to this machine (DNS rebinding).
+    Where other machines can connect, each request also needs the ``token``: either in the query of
+    the page's address, or in the cookie with which the server answers such a request.
     """
 
     def __init__(self, host: str) -> None:
@@ -35,7 +35,7 @@ class Access:
         self.token = "" if is_local(host) else secrets.token_urlsafe(24)
 
     def refusal(self, path: str, headers: Mapping[str, str]) -> str:
-        """Why a request is refused; "" if it is not."""
+        """Return the reason for which a request is refused, or "" if it is accepted."""
         if not self.is_own_host(headers.get("Host", "")):
             return "The viewer does not answer to this host name. Use the address that it printed."
         if self.token and not (self._has_token(path) or self._has_cookie(headers)):
@@ -43,9 +43,10 @@ class Access:
         return ""
 
     def is_own_host(self, asked: str) -> bool:
-        """Whether the value of a Host header names this machine: it is an IP address, which cannot
-        be rebound, or one of the machine's names. Where only this machine can connect, it must be
-        one of the local names.
+        """Return whether the value of a Host header names this machine.
+
+        Accepted are IP addresses, which DNS rebinding cannot change, and the names of this machine;
+        if only this machine can connect, its local names alone.
         """
         name = _host_name(asked)
         if is_local(self.host):
@@ -57,18 +58,21 @@ class Access:
         return name in {o.lower() for o in own}
 
     def query(self) -> str:
-        """What an address needs after its path."""
+        """Return the query to append to the address of the page; it holds the token."""
         return f"?token={self.token}" if self.token else ""
 
     def cookie(self, path: str) -> str:
-        """The Set-Cookie header that answers a request with the token; "" for others."""
+        """Return the Set-Cookie header for a request that carries the token, and "" for others."""
         if not (self.token and self._has_token(path)):
             return ""
         return f"{self._cookie_name}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
     @property
     def _cookie_name(self) -> str:
-        """One of its own for every viewer: browsers send cookies to all ports of a host."""
+        """Return a cookie name that is unique to this viewer.
+
+        Browsers send cookies to all ports of a host, hence also to other viewers.
+        """
         return f"irrcache_{self.token[:8]}"
 
     def _has_token(self, path: str) -> bool:
@@ -89,9 +93,10 @@ class Access:
 
 @contextlib.contextmanager
 def guarded(access: Access) -> Iterator[None]:
-    """A server of viser that is made in this block asks ``access`` about every request.
+    """Check every request to viser servers that are created within this context.
 
-    Viser takes no handler for requests: the function that starts its server is wrapped meanwhile.
+    Viser offers no hook for requests, so the function with which it starts its web server is
+    replaced in the meantime.
     """
     serve = websockets.asyncio.server.serve
 
@@ -118,8 +123,10 @@ def guarded(access: Access) -> Iterator[None]:
 
 
 def is_own_page(headers: Mapping[str, str], access: Access) -> bool:
-    """Whether a browser's request comes from the page that was served here: its origin is the host
-    that it asks, which is this machine. Programs send no origin.
+    """Return whether a browser sent the request from a page that this server delivered.
+
+    The origin of such a request equals the host that it addresses, which is this machine. Programs
+    that are not browsers send no origin.
     """
     origin = headers.get("Origin")
     if origin is None:
@@ -129,22 +136,23 @@ def is_own_page(headers: Mapping[str, str], access: Access) -> bool:
 
 
 def is_local(host: str) -> bool:
-    """Whether only this machine can connect to ``host``."""
+    """Return whether only this machine can connect to ``host``."""
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
     return host == "localhost"
 
 
 def is_wildcard(host: str) -> bool:
-    """Whether ``host`` stands for all addresses of this machine."""
+    """Return whether ``host`` stands for all addresses of this machine."""
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host).is_unspecified
     return False
 
 
 def check_host(host: str) -> None:
-    """Raises IrrcacheError unless this machine can listen on ``host``: viser would try port after
-    port without end.
+    """Raise IrrcacheError unless this machine can listen on ``host``.
+
+    Viser itself would try one port after another without end.
     """
     try:
         if not host:
@@ -162,7 +170,7 @@ def check_host(host: str) -> None:
 
 
 def _host_name(asked: str) -> str:
-    """The name in a Host header, without the port, in lower case; "" if it is malformed."""
+    """Return the name in a Host header in lower case without the port; "" if it is malformed."""
     try:
         return (urlsplit(f"//{asked}").hostname or "").rstrip(".")
     except ValueError:

@@ -1,4 +1,4 @@
-"""From data to a medium: a volume, and the transfer function that it is seen through."""
+"""A volume together with the transfer function that maps it to a medium."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from mitsuba_irrcache.volumes.scene import (
 )
 from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 
-#: Bars of the histogram.
+#: Number of bins of the histogram.
 BINS = 128
 
 
 class Appearance:
-    """A ``volume`` and the ``mapping`` that makes a medium of it."""
+    """A ``volume`` and the ``mapping`` from its values to extinction and albedo."""
 
     def __init__(self, volume: VolumeData, mapping: TransferFunction | DensityMapping) -> None:
         self.volume = volume
         self.mapping = mapping.fitted_to(volume.values)
         sample = volume.values[:: max(1, volume.values.size // 4_000_000)]
         counts, self.edges = np.histogram(sample, BINS)
-        #: logarithmic, in [0, 1], for each of `BINS` ranges between ``edges``
+        #: logarithmic histogram in [0, 1] of `BINS` ranges between ``edges``
         self.histogram = np.log1p(counts) / max(np.log1p(counts).max(), 1e-9)
 
     @property
     def is_editable(self) -> bool:
-        """Whether there is a transfer function; densities have none."""
+        """Return whether there is a transfer function to edit; volumes of densities have none."""
         return isinstance(self.mapping, TransferFunction)
 
     def grids(self, mapping: TransferFunction | DensityMapping) -> dict[str, np.ndarray]:
-        """Extinction (z, y, x) and albedo (z, y, x, 3), by the names of their files."""
+        """Return extinction (z, y, x) and albedo (z, y, x, 3), keyed by their file names."""
         sigma_t, albedo = mapping.apply(self.volume.values)
         if not sigma_t.any():
             raise IrrcacheError("all of the volume would be transparent; raise an opacity.")
@@ -51,8 +51,10 @@ class Appearance:
         parameters: dict[str, str] | None = None,
         integrator: str | None = None,
     ) -> Document:
-        """The scene around the medium, as ``irrcache import`` makes it, with its ``parameters``,
-        and an ``integrator`` such as ``irrcache{step=0.5}``.
+        """Return the scene around the medium, as ``irrcache import`` writes it.
+
+        ``parameters`` are those of the scene; ``integrator`` is a specification such as
+        ``irrcache{step=0.5}``.
         """
         grids = self.grids(self.mapping)
         view = camera(self.volume, grids[SIGMA_T_FILE], settings.up)
@@ -63,7 +65,7 @@ class Appearance:
 def with_opacity(
     function: TransferFunction, index: int, value: float, opacity: float
 ) -> TransferFunction:
-    """An opacity point moved, between its neighbours."""
+    """Return a copy in which one opacity point is moved between its neighbours."""
     values, opacities = function.opacity_values.copy(), function.opacities.copy()
     values[index], opacities[index] = value, opacity
     _check_order(values, index)
@@ -73,7 +75,7 @@ def with_opacity(
 def with_colour(
     function: TransferFunction, index: int, value: float, colour: tuple[float, float, float]
 ) -> TransferFunction:
-    """A colour point moved, between its neighbours."""
+    """Return a copy in which one colour point is moved between its neighbours."""
     values, colours = function.colour_values.copy(), function.colours.copy()
     values[index], colours[index] = value, colour
     _check_order(values, index)
@@ -81,8 +83,10 @@ def with_colour(
 
 
 def with_point_after(function: TransferFunction, curve: str, index: int) -> TransferFunction:
-    """Another point of the ``curve`` ("opacity" or "colour") half-way to the next one, or to the
-    one before where there is no next; the curve stays as it is.
+    """Return a copy in which ``curve`` ("opacity" or "colour") has one more point.
+
+    The point lies half-way to the next one, or to the previous one after the last. The shape of the
+    curve does not change.
     """
     values, heights = _points(function, curve)
     left = min(index, len(values) - 2)
@@ -92,7 +96,7 @@ def with_point_after(function: TransferFunction, curve: str, index: int) -> Tran
 
 
 def without_point(function: TransferFunction, curve: str, index: int) -> TransferFunction:
-    """A point less."""
+    """Return a copy without one point of a curve."""
     values, heights = _points(function, curve)
     return _with_points(
         function, curve, np.delete(values, index), np.delete(heights, index, axis=0)

@@ -1,4 +1,4 @@
-"""Cameras that orbit: how they see, and how they lie in the scene and in a browser."""
+"""Orbiting cameras: their rays, and the mapping between scene and browser coordinates."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: Sensors of scenes that an orbiting camera can stand for.
+#: Sensor plugins that an orbiting camera can represent.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
-#: Fields of view that make sense, in degrees.
+#: Accepted fields of view in degrees.
 NARROWEST, WIDEST = 1.0, 150.0
-#: Of a sensor's own upward direction and a world axis: above this they are taken as one.
+#: Minimum cosine between a sensor's up vector and a world axis to use the axis instead.
 UPRIGHT = 0.2
 
 
@@ -33,24 +33,24 @@ class Camera:
 
     @property
     def axes(self) -> np.ndarray:
-        """Unit vectors (3, 3): rows point right, up and forward in the picture."""
+        """Return the unit vectors (3, 3) that point right, up and forward in the image, as rows."""
         forward = _unit(np.subtract(self.target, self.position))
         side = np.cross(forward, self.up)
-        if np.linalg.norm(side) < 1e-6 * np.linalg.norm(self.up):  # it looks straight up or down
+        if np.linalg.norm(side) < 1e-6 * np.linalg.norm(self.up):  # looking straight up or down
             side = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
         right = _unit(side)
         return np.stack([right, np.cross(right, forward), forward])
 
     @property
     def distance(self) -> float:
-        """From the position to the target."""
+        """Return the distance from the position to the target."""
         return float(np.linalg.norm(np.subtract(self.target, self.position)))
 
     def rays(self, place: mi.Point2f, aspect: float) -> mi.Ray3f:
-        """Rays through each ``place`` of the picture: (0, 0) is its upper left corner, (1, 1) the
-        lower right one; ``aspect`` is width over height.
+        """Return the rays through each ``place`` of the image.
 
-        All numbers are opaque, so that one kernel serves all cameras and sizes.
+        (0, 0) is the upper left corner and (1, 1) the lower right one; ``aspect`` is width over
+        height. All numbers are opaque, so that one kernel serves all cameras and image sizes.
         """
         height = np.tan(np.radians(self.fov) / 2)
         right, up, forward = self.axes
@@ -69,16 +69,18 @@ class Camera:
 
 
 def camera_of(sensor: mi.Sensor, centre: np.ndarray) -> Camera:
-    """The camera at the place of a scene's ``sensor`` that orbits about the point of its line of
-    sight next to ``centre``. What a lens or a shutter adds is left out.
+    """Return the orbiting camera at the position of a scene's ``sensor``.
+
+    It orbits about the point on its optical axis that is nearest to ``centre``. Depth of field and
+    shutter are ignored.
     """
     matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
     position, forward, up = matrix[:3, 3], _unit(matrix[:3, 2]), _unit(matrix[:3, 1])
     distance = float(np.dot(centre - position, forward))
-    if distance <= 1e-3 * np.linalg.norm(centre - position):  # it looks elsewhere
+    if distance <= 1e-3 * np.linalg.norm(centre - position):  # the scene lies behind the sensor
         distance = max(float(np.linalg.norm(centre - position)), 1e-3)
     size = sensor.film().size()
-    # Mitsuba tells the horizontal field of view, whatever the scene gave.
+    # Mitsuba exposes the horizontal field of view, whichever axis the scene specifies.
     width = np.tan(np.radians(float(mi.traverse(sensor)["x_fov"][0])) / 2)
     fov = float(np.degrees(2 * np.arctan(width * size[1] / size[0])))
     return Camera(
@@ -90,7 +92,7 @@ def camera_of(sensor: mi.Sensor, centre: np.ndarray) -> Camera:
 
 
 def sensors_of(scene: mi.Scene) -> dict[str, mi.Sensor]:
-    """The sensors of a scene that a camera can stand for, by name, in their order."""
+    """Return the sensors that an orbiting camera can represent, by name, in scene order."""
     found: dict[str, mi.Sensor] = {}
     for number, sensor in enumerate(scene.sensors()):
         if sensor.class_name() in SENSORS:
@@ -102,8 +104,9 @@ def sensors_of(scene: mi.Scene) -> dict[str, mi.Sensor]:
 
 @dataclass(frozen=True)
 class Placement:
-    """How a scene lies in the browser: its ``centre`` in the origin, its ``radius`` as 1. So zoom,
-    pan and near planes fit scenes of all sizes.
+    """The mapping of a scene to browser coordinates: ``centre`` to the origin, ``radius`` to 1.
+
+    The browser's zoom, pan and near planes then suit scenes of all sizes.
     """
 
     centre: np.ndarray
@@ -111,25 +114,23 @@ class Placement:
 
     @classmethod
     def around(cls, frame: np.ndarray) -> Placement:
-        """Of the unit cube that ``frame`` (4, 4) places."""
+        """Return the mapping for the unit cube transformed by ``frame`` (4, 4)."""
         corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
         world = frame[:3, :3] @ corners + frame[:3, 3:]
         centre = world.mean(axis=1)
         return cls(centre, float(np.linalg.norm(world - centre[:, None], axis=0).max()))
 
     def to_browser(self, point: np.ndarray) -> np.ndarray:
-        """Of a point in scene units."""
+        """Map a point from scene to browser coordinates."""
         return (np.asarray(point) - self.centre) / self.radius
 
     def to_scene(self, point: np.ndarray) -> np.ndarray:
-        """The inverse of `to_browser`."""
+        """Map a point from browser to scene coordinates."""
         return np.asarray(point, dtype=np.float64) * self.radius + self.centre
 
 
 def cameras_of(scene: mi.Scene, placement: Placement) -> dict[str, Camera]:
-    """The cameras at the places of the scene's sensors, by name; one in front where there are
-    none.
-    """
+    """Return cameras at the scene's sensors, by name; a default camera if there is none."""
     centre = placement.centre
     found = {name: camera_of(sensor, centre) for name, sensor in sensors_of(scene).items()}
     if found:
@@ -139,8 +140,9 @@ def cameras_of(scene: mi.Scene, placement: Placement) -> dict[str, Camera]:
 
 
 def _upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """The world axis that a camera is upright by, else its own upward direction: one orbits about
-    it.
+    """Return the world axis nearest to the sensor's up vector, or that vector if no axis is near.
+
+    The camera orbits about this direction.
     """
     axis = np.zeros(3)
     axis[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])

@@ -1,4 +1,4 @@
-"""``irrcache view``: look at a scene or a volume in the browser."""
+"""``irrcache view``: display a scene or a volume in the browser."""
 
 from __future__ import annotations
 
@@ -23,17 +23,15 @@ from mitsuba_irrcache.volumes.scene import SceneSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``irrcache view``: those of ``render`` for a scene, of ``import`` for a
-    volume.
-    """
-    importer.add_input(parser, "scene XML, or what irrcache import reads: ")
+    """Declare the options: those of ``render`` for a scene and of ``import`` for a volume."""
+    importer.add_input(parser, "scene XML, or any volume that irrcache import reads: ")
     add_scene_options(parser)
     parser.add_argument(
         "-i", "--integrator", metavar="irrcache{KEY=VALUE,...}", help="properties of irrcache"
     )
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FOLDER",
-        help="where files are saved, made if it is not there (default: in the browser)",
+        help="folder for saved files, created if missing (default: download)",
     )  # fmt: skip
     parser.add_argument(
         "--host", default="127.0.0.1",
@@ -41,7 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "address that is printed (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--port", type=whole(1, 65535), default=8080, help="or the next one that is free"
+        "--port",
+        type=whole(1, 65535),
+        default=8080,
+        help="port; the next free one is used if it is taken",
     )
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Shows it until Ctrl-C."""
+    """Run the viewer until Ctrl-C."""
     require("viser", "view", "irrcache view")
     if args.mode.startswith("llvm"):
         require_llvm()
@@ -70,7 +71,7 @@ def _show(args: argparse.Namespace) -> None:
     free_at_once()
     document, appearance = _document(args)
     session, server = Session(document), None
-    gc.freeze()  # collections look through what the viewer makes, not through all modules
+    gc.freeze()  # collections then scan the objects created below only
     try:
         session.start()
         server = Server(session, args.host, args.port, args.output, appearance)
@@ -88,18 +89,20 @@ def _show(args: argparse.Namespace) -> None:
         if server is not None:
             server.stop()
         session.stop()
-        gc.unfreeze()  # what is left then, modules find and report at the end
+        gc.unfreeze()  # so that the libraries report no leaked objects at exit
 
 
 def _document(args: argparse.Namespace) -> tuple:
-    """The scene as a document, and where it is made of data, these."""
+    """Return the scene as a document and, if it is made from a volume, the volume's appearance."""
     from mitsuba_irrcache.view.appearance import Appearance
     from mitsuba_irrcache.view.document import Document
 
     path, parameters = Path(args.input[0]), parse_parameters(args.define)
     if path.suffix.lower() == ".xml":
         if importer.has_appearance(args):
-            raise IrrcacheError("a scene has its medium: --preset and the like are for volumes.")
+            raise IrrcacheError(
+                "--preset, --transfer-function and --density are for volumes, not for scenes."
+            )
         integrator = args.integrator
         if integrator is None and integrator_of(path, parameters) in REPLACED:
             integrator = "irrcache"
@@ -113,7 +116,7 @@ def _document(args: argparse.Namespace) -> tuple:
 
 
 def _wait() -> None:
-    """Until Ctrl-C, or a request to terminate."""
+    """Wait for Ctrl-C or a request to terminate."""
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())

@@ -1,4 +1,4 @@
-"""The scene that is looked at, as its XML: what is edited is rendered, and saved."""
+"""The displayed scene as XML: what the user edits is also what is rendered and saved."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seeing
 
-#: What the viewer calls things that have no name.
+#: Prefix of the names that the viewer gives to unnamed objects.
 SUN_ID, MEDIUM_ID = "sun", "medium"
-#: Samples per pixel of a scene that is saved.
+#: Samples per pixel in saved scenes.
 SAVED_SAMPLES = 16
 _ENVIRONMENTS = ("constant", "envmap")
 _TRUE = ("true", "True")
@@ -27,13 +27,13 @@ _TRUE = ("true", "True")
 
 @dataclass(frozen=True)
 class Lighting:
-    """What of the light can be changed.
+    """The illumination parameters that a user can change.
 
     Attributes:
         environment: factor of the radiance that the scene gives its environment.
         rotation: of the environment about the upward axis, in degrees, added to the scene's.
-        sun: irradiance of a sun across its direction; 0 for none.
-        azimuth, elevation: where the sun stands, in degrees: about the upward axis, above the
+        sun: irradiance of a sun on a surface that faces it; 0 for none.
+        azimuth, elevation: direction to the sun in degrees: about the upward axis, and above the
             horizon.
     """
 
@@ -45,8 +45,10 @@ class Lighting:
 
 
 class Document:
-    """A scene XML in ``folder``, whose parts can be changed. ``volumes`` are the arrays (z, y, x[,
-    channel]) of volumes, by the names of the files that they have once they are saved.
+    """An editable scene XML whose relative file names refer to ``folder``.
+
+    ``volumes`` holds the arrays (z, y, x[, channel]) of volumes that are not on disk, keyed by the
+    names of the files to which `save` writes them.
     """
 
     def __init__(
@@ -66,7 +68,7 @@ class Document:
     def load(
         cls, path: Path, parameters: dict[str, str] | None = None, integrator: str | None = None
     ) -> Document:
-        """Of a scene file; as `scene_files.load_scene`."""
+        """Load a scene file; the arguments are those of `scene_files.load_scene`."""
         return cls(scene_text(path, parameters, integrator), path.parent)
 
     @classmethod
@@ -77,18 +79,18 @@ class Document:
         parameters: dict[str, str] | None = None,
         integrator: str = "irrcache",
     ) -> Document:
-        """Of the XML of a scene with $parameters, whose only files are ``volumes``."""
+        """Parse the XML of a scene with $parameters that refers to no files but ``volumes``."""
         return cls(filled(text, integrator, parameters), ".", volumes)
 
-    # ------------------------------------------------------------------ what it says
+    # ------------------------------------------------------------------ contents
 
     def scene(self) -> mi.Scene:
-        """Mitsuba's scene of it."""
+        """Return the Mitsuba scene of the current XML."""
         return scene_of_text(self._text(self._root), self.folder, self._grids)
 
     @property
     def settings(self) -> CacheSettings:
-        """What its integrator says of the cache."""
+        """Return the integrator's properties that affect the cache."""
         read = self._read
         return CacheSettings(
             max_depth=int(read("max_depth", -1)),
@@ -100,7 +102,7 @@ class Document:
 
     @property
     def seeing(self) -> Seeing:
-        """What its integrator says of the image."""
+        """Return the integrator's properties that affect only the ray march."""
         return Seeing(
             self._read("hide_emitters", "false") in _TRUE,
             str(self._read("quadrature", "exponential")),
@@ -113,16 +115,16 @@ class Document:
 
     @property
     def density(self) -> float:
-        """Factor of the extinction of all media."""
+        """Return the factor of the extinction of all media."""
         scales = [float(m.find("float[@name='scale']").get("value")) for m in self._scaled()]
         return scales[0] / self._original_scale(0) if scales else 1.0
 
     def state(self) -> tuple:
-        """All that can be changed, to `restore` it."""
+        """Return everything that a user can change, as an argument for `restore`."""
         return self._text(self._root), dict(self._volumes), dict(self._grids), self.lighting
 
     def restore(self, state: tuple) -> None:
-        """Undoes all changes since `state`."""
+        """Restore the state that `state` returned."""
         text, volumes, grids, self.lighting = state
         self._root = ElementTree.fromstring(text)
         self._volumes, self._grids = dict(volumes), dict(grids)
@@ -130,7 +132,7 @@ class Document:
     # ------------------------------------------------------------------ changes
 
     def set_volumes(self, volumes: dict[str, np.ndarray]) -> None:
-        """Other values for the volumes of these names."""
+        """Replace the values of the volumes of these names."""
         for name, values in volumes.items():
             self._volumes[name] = values
             self._grids[name] = mi.VolumeGrid(values.reshape(*values.shape[:3], -1))
@@ -141,21 +143,21 @@ class Document:
         _set(self._integrator, "integer", "max_depth", str(depth))
 
     def set_density(self, factor: float) -> None:
-        """Multiplies the extinction that the scene gives its media."""
+        """Multiply the extinction that the scene gives its media by a factor."""
         if not 0 < factor < 1e6:
             raise IrrcacheError(f"the density is {factor:g}; it must be above 0, and below 1e6.")
         for number, medium in enumerate(self._scaled()):
             _set(medium, "float", "scale", repr(self._original_scale(number) * factor))
 
     def orient(self, up: Sequence[float]) -> None:
-        """Tells the upward axis, which angles of the light are about; undoes its changes."""
+        """Set the upward axis to which illumination angles refer; resets the illumination."""
         self.up = _unit(up)
         self.lighting = self._lighting()
 
     def set_lighting(self, lighting: Lighting) -> None:
-        """Changes environment and sun."""
+        """Change the environment and the sun."""
         if not lighting.environment >= 0 or not lighting.sun >= 0:
-            raise IrrcacheError("light cannot be negative; give 0 for none.")
+            raise IrrcacheError("a light source cannot be negative; give 0 for none.")
         self._set_environment(lighting)
         self._set_sun(lighting)
         self.lighting = lighting
@@ -171,11 +173,11 @@ class Document:
         integrator: dict[str, tuple[str, str]],
         note: str,
     ) -> list[Path]:
-        """Writes the scene as ``camera`` sees it, with pictures of ``size`` (width, height), and
-        beside it the volumes that are in no file yet.
+        """Save the scene as seen by ``camera``, with a film of ``size`` (width, height).
 
-        ``medium`` tells whether the camera is inside the medium; ``integrator`` are properties to
-        be set, as (kind, value) by name; ``note`` becomes a comment. Returns all files written.
+        Volumes are written if they are not on disk yet. ``medium`` says whether the camera is
+        inside the medium; ``integrator`` holds properties to set, as (kind, value) by name;
+        ``note`` becomes a comment. Returns all files that were written.
         """
         root = ElementTree.fromstring(self._text(self._root))
         for default in root.findall("default"):
@@ -201,7 +203,7 @@ class Document:
             inside = next(root.iter("medium"))
             inside.set("id", inside.get("id") or MEDIUM_ID)
             ElementTree.SubElement(sensor, "ref", name="medium", id=inside.get("id"))
-        root.append(sensor)  # after the medium that it may refer to
+        root.append(sensor)  # after the medium, which the sensor may refer to
         root.insert(0, ElementTree.Comment(f" {note} "))
         path.write_text(self._text(root), encoding="utf-8")
         return written
@@ -222,7 +224,7 @@ class Document:
         return ElementTree.tostring(root, encoding="unicode") + "\n"
 
     def _scaled(self) -> list[ElementTree.Element]:
-        """All media, each with its ``scale`` told."""
+        """Return all media, each with an explicit ``scale``."""
         media = list(self._root.iter("medium"))
         for number, medium in enumerate(media):
             if medium.find("float[@name='scale']") is None:
@@ -243,7 +245,7 @@ class Document:
         return next((e for e in root.findall("emitter") if e.get("type") == "directional"), None)
 
     def _lighting(self) -> Lighting:
-        """As the scene has it; a sun of its own is told by the mean of its colour."""
+        """Return the illumination of the original scene; the sun's is the mean of its channels."""
         sun = self._sun(self._root)
         if sun is None:
             return Lighting()
@@ -257,7 +259,7 @@ class Document:
         elif matrix is not None:
             direction = np.reshape(_numbers(matrix, ()), (4, 4))[:3, 2]
         else:
-            direction = (0.0, 0.0, 1.0)  # Mitsuba's own
+            direction = (0.0, 0.0, 1.0)  # Mitsuba's default
         towards = -_unit(direction)
         x, y = (np.dot(towards, axis) for axis in _horizon(self.up))
         return {
@@ -306,7 +308,7 @@ class Document:
 
 
 def _set(parent: ElementTree.Element, kind: str, name: str, value: str) -> None:
-    """A property of a plugin, in place of one of the same name."""
+    """Set a property of a plugin, replacing one of the same name."""
     for child in parent.findall(f"*[@name='{name}']"):
         parent.remove(child)
     ElementTree.SubElement(parent, kind, name=name, value=value)
@@ -323,21 +325,21 @@ def _numbers(element: ElementTree.Element | None, default: tuple) -> tuple[float
 def _scale_colour(
     node: ElementTree.Element, original: ElementTree.Element | None, name: str, factor: float
 ) -> None:
-    """A colour of an emitter, as it was in the ``original`` times ``factor``."""
+    """Set a colour of an emitter to its value in the ``original`` times ``factor``."""
     given = None if original is None else original.find(f"*[@name='{name}']")
     colour = _numbers(given, (1.0, 1.0, 1.0))
     _set(node, "rgb", name, " ".join(repr(c * factor) for c in colour))
 
 
 def _horizon(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions at azimuth 0 and 90 degrees; 0 is along x, or along y where x is up."""
+    """Return the directions at azimuth 0 and 90 degrees; 0 is along x, or along y if x is up."""
     start = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
     first = _unit(start - np.dot(start, up) * up)
     return first, np.cross(up, first)
 
 
 def _towards(azimuth: float, elevation: float, up: np.ndarray) -> np.ndarray:
-    """The direction in which a sun stands."""
+    """Return the direction towards the sun."""
     a, e = np.radians((azimuth, elevation))
     first, second = _horizon(up)
     return np.cos(e) * (np.cos(a) * first + np.sin(a) * second) + np.sin(e) * up
@@ -348,7 +350,7 @@ def _unit(vector: Sequence[float]) -> np.ndarray:
 
 
 def _sensor(camera: Camera, size: tuple[int, int]) -> ElementTree.Element:
-    """A ``perspective`` sensor with a box filter, as the viewer has."""
+    """Return a ``perspective`` sensor with a box filter, as the viewer uses."""
     sensor = ElementTree.Element("sensor", type="perspective")
     _set(sensor, "float", "fov", repr(camera.fov))
     _set(sensor, "string", "fov_axis", "y")

@@ -1,4 +1,4 @@
-"""Controls whose changes are applied in turn, the newest of each control only."""
+"""Controls whose changes are applied one after the other, only the newest of each control."""
 
 from __future__ import annotations
 
@@ -16,16 +16,19 @@ LOG = logging.getLogger(__name__)
 
 
 def plain(text: str) -> str:
-    """Markdown that shows ``text`` as it is: part of it may come from any window, and browsers run
-    what is HTML.
+    """Escape ``text`` so that Markdown displays it literally.
+
+    Part of the text may come from any client, and browsers would interpret HTML in it.
     """
     return re.sub(r"([\\`*_{}\[\]()#+\-!|~.:])", r"\\\1", html.escape(text))
 
 
 class Editing:
-    """Applies changes one after the other in a thread of its own; while one is being applied, only
-    the newest of each control is kept. A control whose change is refused gets its old value back,
-    and ``tell`` the reason ("" once there is none).
+    """Apply changes one after the other in a thread of its own.
+
+    While one change is applied, only the newest change of each control stays in the queue. If a
+    change is refused, its control is reset to the previous value, and ``tell`` receives the reason,
+    or "" after a change that succeeds.
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
@@ -35,7 +38,7 @@ class Editing:
         self._busy = False
 
     def submit(self, key: str, change: Callable[[], None]) -> None:
-        """Applies ``change`` soon; an earlier one of the same ``key`` that still waits never."""
+        """Queue ``change``; it replaces a queued change of the same ``key``."""
         with self._lock:
             self._waiting[key] = change
             if self._busy:
@@ -44,7 +47,7 @@ class Editing:
         threading.Thread(target=self._work, daemon=True).start()
 
     def bind(self, handle: GuiInputHandle, apply: Callable[[object], None]) -> None:
-        """Calls ``apply`` with the value of a control whenever a user has changed it."""
+        """Call ``apply`` with the value of a control whenever a user has changed it."""
         good = [handle.value]
 
         def change() -> None:
@@ -57,7 +60,7 @@ class Editing:
             good[0] = value
 
         def updated(event: GuiEvent) -> None:
-            if event.client is None:  # set by us
+            if event.client is None:  # changed by the program, not by a user
                 good[0] = handle.value
             else:
                 self.submit(str(id(handle)), change)

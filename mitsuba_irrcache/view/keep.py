@@ -1,4 +1,4 @@
-"""What is kept of a view: pictures, light, and a scene that shows the same."""
+"""Saving a view: images, caches, and a scene that renders the same image."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mitsuba_irrcache.view.picture import Samples
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import SAMPLES, View
 
-#: Layers in the EXR beside the image.
+#: Layers in the EXR besides the image.
 LAYERS = ("colour", "illumination", "background", "transmittance", "depth", "noise", "bias")
-#: Names that files may have: no folders, nothing hidden.
+#: Pattern of accepted file names: no folders, no hidden files.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 
 
 def checked_name(name: str) -> str:
-    """A name for files that cannot lead out of their folder; raises IrrcacheError for others."""
+    """Return a file name that cannot lead out of its folder; raise IrrcacheError for others."""
     if not NAME.fullmatch(name):
         raise IrrcacheError(
             f"{name!r} is no name for a file: use letters, digits, dots, - and _, up to 80, a "
@@ -31,10 +31,11 @@ def checked_name(name: str) -> str:
 def keep(
     session: Session, view: View, folder: Path, name: str, with_cache: bool = False
 ) -> list[Path]:
-    """Writes ``name``.png (what is shown), .exr (radiance and layers) and .xml, which ``irrcache
-    render`` makes the same image of, with all that it needs; ``with_cache`` the light too.
+    """Write ``name``.png (the displayed image), .exr (radiance and layers) and .xml.
 
-    Blocks, but the session goes on showing pictures meanwhile. Returns the files.
+    The XML is a scene of which ``irrcache render`` makes the same image. With ``with_cache`` the
+    caches are written too. Returns the files. Blocks until they are written, while the session goes
+    on displaying images.
     """
     path = Path(folder) / checked_name(name)
     if not path.parent.is_dir():
@@ -62,8 +63,10 @@ def keep(
 
 
 def _samples(session: Session, view: View, layered: bool) -> Samples:
-    """As many samples as a picture at rest has, those that are shown if they will do; else one by
-    one: others may be shown in between.
+    """Return samples of the view, at least as many as an image at rest has.
+
+    The displayed samples are used if they suffice. Otherwise samples are added one by one, so that
+    other views can be displayed in between.
     """
 
     def begin() -> Samples:
@@ -77,7 +80,7 @@ def _samples(session: Session, view: View, layered: bool) -> Samples:
 
 
 def _write_caches(session: Session, path: Path) -> dict[str, Path]:
-    """The caches of all media, named as the integrator's ``cache_file`` names them."""
+    """Write the caches of all media under names derived from the integrator's ``cache_file``."""
     light, files = session.light, {}
     for part in light.parts:
         if part.is_dark or not part.cache.samples:

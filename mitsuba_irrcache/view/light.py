@@ -1,4 +1,4 @@
-"""The light of the scene that is looked at, and how it improves."""
+"""The irradiance caches of the displayed scene and their progressive refinement."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.progressive import FIRST, OPENING
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays, camera_rays_of
-from mitsuba_irrcache.scene.context import medium_at
+from mitsuba_irrcache.scene.medium_probe import medium_at
 
 #: Caches with more voxels than this are preceded by one of `COARSE` voxels along its longest side,
-#: so that new light is there at once.
+#: so that changed illumination is displayed at once.
 MANY_VOXELS, COARSE = 48**3, 32
-#: Directions of the first batch, and so of all; more would make it late.
+#: Directions per batch of `sweep`; larger batches would delay the first image.
 DIRECTIONS = 32
 
 
 @dataclass(frozen=True)
 class Seeing:
-    """How the light is shown: as the plugin's properties of these names."""
+    """Ray-marching settings, named as the plugin's properties."""
 
     hide_emitters: bool = False
     quadrature: str = "exponential"
@@ -34,9 +34,7 @@ class Seeing:
 
 
 class Seen:
-    """The light of a scene at one time, for camera rays. It stays as it is while the cache goes on
-    growing.
-    """
+    """An immutable copy of the caches for camera rays, unaffected by further refinement."""
 
     def __init__(
         self,
@@ -52,13 +50,13 @@ class Seen:
         self._steps = [p.step for p in self._projections]
 
     def stride(self, factor: float) -> None:
-        """Makes the steps along rays so many times as long as they should be."""
+        """Set the factor by which steps along rays are longer than the integrator's setting."""
         for projection, step in zip(self._projections, self._steps, strict=True):
             projection.step = step * dr.opaque(mi.Float, factor)
             dr.eval(projection.step)
 
     def medium_at(self, position: np.ndarray) -> object | None:
-        """What a camera at ``position`` (3) is in, None for nothing."""
+        """Return the medium that contains a camera at ``position`` (3), or None."""
         medium = self._parts[0].medium
         if medium.is_isolated:
             return medium if medium.boundary.contains(position) else None
@@ -67,7 +65,10 @@ class Seen:
 
 
 class Light:
-    """The caches of a ``scene``, better with every `refine`; ``pause`` is called while they are."""
+    """The irradiance caches of a ``scene``; each `refine` improves them.
+
+    ``pause`` is called repeatedly during refinement and may raise an exception to interrupt it.
+    """
 
     def __init__(
         self,
@@ -81,22 +82,22 @@ class Light:
         self._builder.pause.action = pause
         self._builder.early = True
         self._coarse: CachedMedium | None = None
-        #: goes up whenever there is better light to be seen
+        #: incremented whenever better caches are available
         self.revision = 0
-        #: seconds that the solver took
+        #: seconds spent in the solver
         self.seconds = 0.0
-        #: whether the last pass has raised something
+        #: whether the last refinement raised an exception
         self.failed = False
         self._seen: dict[tuple[bool, bool], tuple[int, Seen]] = {}
 
     @property
     def parts(self) -> list[CachedMedium]:
-        """The media with their caches; empty before `prepare`."""
+        """Return the media with their caches; empty before `prepare`."""
         return self._builder.parts
 
     @property
     def samples(self) -> int:
-        """Per voxel."""
+        """Return the samples per voxel."""
         return self._builder.done
 
     @property
@@ -105,17 +106,18 @@ class Light:
 
     @property
     def error(self) -> float:
-        """Relative standard error of the caches, NaN before it is known."""
+        """Return the relative standard error of the caches, or NaN if it is not known yet."""
         return self._builder.relative_error
 
     @property
     def is_dark(self) -> bool:
-        """Whether there is nothing to improve."""
+        """Return whether the caches are zero and need no refinement."""
         return bool(self.parts) and self._builder.is_dark
 
     def prepare(self) -> None:
-        """Finds the media. Raises IrrcacheError for scenes that cannot be rendered, or that have no
-        medium to see.
+        """Find the media of the scene.
+
+        Raises IrrcacheError for scenes that cannot be rendered and for scenes without a medium.
         """
         self._builder.fit(self.scene)
         if not self.parts:
@@ -124,7 +126,7 @@ class Light:
             )
 
     def refine(self) -> None:
-        """A pass of the solver; the first one may be on a coarse grid."""
+        """Refine the caches once; the first refinement may use a coarse grid."""
         started = perf_counter()
         self.failed = True
         try:
@@ -137,11 +139,11 @@ class Light:
         builder, first = self._builder, not self.revision
         done, batch = builder.done, self.parts[0].cache.batch if self.parts[0].cache else 0
         if builder.is_dark:
-            pass  # without light there is still something to see
+            pass  # an image without emitters still shows emission and transmittance
         elif first and self._is_slow:
             self._coarse = self._at_once()
         else:
-            if builder.solver == "path" and done < OPENING:
+            if builder.has_preview and done < OPENING:
                 builder.samples = max(2 * done, FIRST)
             else:
                 builder.samples = done + batch
@@ -151,21 +153,29 @@ class Light:
 
     @property
     def _is_slow(self) -> bool:
-        """Whether a coarse grid would be much quicker."""
+        """Return whether a coarse grid would be much faster."""
         voxels = self.parts[0].cache.grid.voxel_count
-        return self._builder.solver == "sweep" and voxels > MANY_VOXELS
+        return not self._builder.has_preview and voxels > MANY_VOXELS
 
     def _at_once(self) -> CachedMedium:
-        """The medium with a first light on a coarse grid."""
+        """Return the medium with a first estimate on a coarse grid."""
         builder, first = self._builder, self.parts[0]
         settings = replace(builder.settings, resolution=COARSE)
-        told = first.solver, "a first look"
-        coarse = CachedMedium(self.scene, first.medium, settings, told, "", False, builder.pause)
+        coarse = CachedMedium(
+            self.scene,
+            first.description,
+            first.medium,
+            settings,
+            (first.solver, "a first look"),
+            "",
+            False,
+            builder.pause,
+        )
         coarse.refine(self.scene, coarse.cache.batch, False, None)
         return coarse
 
     def seen(self, layered: bool, with_error: bool) -> Seen:
-        """The light as it is now; more of it, see `camera_rays_of`, if wanted."""
+        """Return a copy of the current caches; `camera_rays_of` computes the requested layers."""
         key = layered, with_error
         known = self._seen.get(key)
         if known is None or known[0] != self.revision:
@@ -175,7 +185,7 @@ class Light:
                 parts, self.settings, s.hide_emitters, s.quadrature, s.step, layered, with_error
             )
             known = self.revision, Seen(self.scene, parts, sight, layered)
-            # Of the light before, fields as large as the cache would stay.
+            # Release the fields of the previous caches: they are as large as the cache itself.
             self._seen = {k: v for k, v in self._seen.items() if v[0] == self.revision}
             self._seen[key] = known
         return known[1]
@@ -183,7 +193,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Status:
-    """How far a light is."""
+    """The progress of the cache refinement."""
 
     samples: int = 0
     error: float = float("nan")
@@ -194,7 +204,7 @@ class Status:
 
     @classmethod
     def of(cls, light: Light | None, improving: bool, message: str) -> Status:
-        """Of ``light``, if there is one."""
+        """Return the status of ``light``, which may be None."""
         if light is None:
             return cls(improving=improving, message=message)
         error = light.error if light.samples else float("nan")

@@ -1,4 +1,4 @@
-"""The controls that all windows share: the light, and the density of the medium."""
+"""The controls that all windows share: illumination, and density of the medium."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mitsuba_irrcache.view.session import Session
 
 
 class LightPanel:
-    """Shows how far the light of ``session`` is, and changes it."""
+    """Display the progress of the caches of ``session``, and edit its illumination and density."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
@@ -27,7 +27,7 @@ class LightPanel:
             self.editing = Editing(self.refuse)
             target = gui.add_number(
                 "target error %", 100 * session.target_error, min=0.01, max=100.0, step=0.01,
-                hint="standard error of the light, relative to its mean, at which it is done",
+                hint="relative standard error of the caches at which refinement stops",
             )  # fmt: skip
             depth = gui.add_number(
                 "max_depth", document.settings.max_depth, min=-1, step=1,
@@ -49,7 +49,7 @@ class LightPanel:
             self.editing.bind(density, self._set_density)
 
     def show(self, status: Status) -> None:
-        """Tells of the light; called in the session's thread."""
+        """Display the progress of the cache refinement; called in the session's thread."""
         error = "" if math.isnan(status.error) else f", standard error {status.error:.2%}"
         state = "improving" if status.improving else "done"
         self._status.content = (
@@ -60,7 +60,7 @@ class LightPanel:
             self.refuse(status.message)
 
     def refuse(self, reason: str) -> None:
-        """Says why a change was not made."""
+        """Display why a change was refused."""
         self._refusal.content = f"**Refused:** {plain(reason)}" if reason else ""
         self._refusal.visible = bool(reason)
 
@@ -106,7 +106,7 @@ class LightPanel:
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:
-    """What a browser sent, if it is a number between ``low`` and ``high``."""
+    """Return a value that a browser sent if it is a number between ``low`` and ``high``."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise IrrcacheError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}.")
     return value

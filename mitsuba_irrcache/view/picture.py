@@ -1,4 +1,4 @@
-"""From the light to the pixels of a window."""
+"""From the caches to the pixels of a window."""
 
 from __future__ import annotations
 
@@ -17,26 +17,29 @@ from mitsuba_irrcache.render.pixel_filter import pixel_of
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seen
 
-#: What can be shown of a view.
+#: Quantities that a window can display.
 KINDS = ("image", "colour", "illumination", "error bar", "transmittance", "depth")
-#: The error bar is shown so many times as bright.
+#: Scale factor with which the standard error is displayed.
 ERROR_SCALE = 10.0
-#: Curves from radiance to display, all followed by the one of sRGB.
+#: Tone curves; all are followed by the sRGB transfer function.
 TONES: dict[str, Callable] = {
     "sRGB": lambda c: c,
     "Reinhard": lambda c: c / (1 + dr.maximum(c, 0)),
     "filmic": lambda c: _filmic(dr.maximum(c, 0)),
 }
-#: Pixels that are traced at once. All of their random numbers depend on it: it is the same for all.
+#: Pixels traced in one launch. It is the same for all images, since all random numbers depend on
+#: it.
 BAND = 1 << 16
-#: Luminance is enough of one random number per sample: streams of passes are this far apart.
+#: Distance between the random streams of successive passes: one number per sample selects the
+#: luminance channel.
 STREAM = 0x9E3779B9
 
 
 @dataclass(frozen=True)
 class Look:
-    """What of a view is shown, and how: one of `KINDS`, ``exposure`` in stops, one of `TONES`, and
-    whether the illumination is ``filtered``.
+    """What to display and how: one of `KINDS`, ``exposure`` in stops, and one of `TONES`.
+
+    ``filtered`` says whether the illumination is filtered.
     """
 
     kind: str = "image"
@@ -46,7 +49,7 @@ class Look:
 
     @property
     def layered(self) -> bool:
-        """Whether it needs more than radiance."""
+        """Return whether layers other than radiance are needed."""
         return self.kind != "image" or self.filtered
 
     @property
@@ -55,7 +58,10 @@ class Look:
 
 
 class Samples:
-    """Camera samples of one view of one light, added up: ``size`` is (width, height)."""
+    """The sum of camera samples of one view of one state of the caches.
+
+    ``size`` is (width, height).
+    """
 
     def __init__(self, seen: Seen, camera: Camera, size: tuple[int, int], seed: int = 0) -> None:
         self.seen, self.camera, self.size, self.seed = seen, camera, size, seed
@@ -63,8 +69,10 @@ class Samples:
         self._sums: list[mi.Float] = []
 
     def add(self, total: int, pause: Callable[[], None] | None = None) -> None:
-        """One sample more for each pixel, where there are to be ``total``. It is traced in bands
-        with a ``pause`` between them, which may raise something: then there is no more sample.
+        """Add one sample per pixel, of ``total`` planned.
+
+        The image is traced in bands. ``pause`` is called between bands; if it raises an exception,
+        the sample is discarded.
         """
         pixels, first, found = self.size[0] * self.size[1], 0, []
         while first < pixels:
@@ -84,7 +92,7 @@ class Samples:
 
     @property
     def layers(self) -> Layers:
-        """Means over the samples; of plain radiance all is background."""
+        """Return the layers as means over the samples; without layers, all is background."""
         scale = dr.opaque(mi.Float, 1 / self.count)
         means = [s * scale for s in self._sums]
         if not self.seen.layered:
@@ -92,26 +100,27 @@ class Samples:
         return Layers.of(means)
 
     def radiance(self, filtered: bool = False) -> mi.Spectrum:
-        """The image, with its illumination ``filtered`` if asked."""
+        """Return the image, with filtered illumination if ``filtered``."""
         layers = self.layers
         dr.eval(layers)
         kind = "bilateral" if filtered and self.seen.layered else "none"
         return layers.radiance(filter_illumination(kind, layers, self.size))
 
     def image(self, filtered: bool = False) -> np.ndarray:
-        """`radiance` as float32 (height, width, 3)."""
+        """Return `radiance` as float32 (height, width, 3)."""
         radiance = self.radiance(filtered)
         rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
         return self._array(list(rgb))
 
     def picture(self, look: Look, extent: tuple[float, float]) -> np.ndarray:
-        """What a display shows, uint8 (height, width, 3). ``extent`` are the distances at which a
-        depth image is black and white.
+        """Return the displayed image, uint8 (height, width, 3).
+
+        ``extent`` holds the distances that a depth image shows as black and white.
         """
         return _display(self._shown(look, extent), look, self.size)
 
     def channels(self, aovs: tuple[str, ...], filtered: bool = False) -> tuple[np.ndarray, list]:
-        """The image with further layers, float32 (height, width, channel), and their names."""
+        """Return image and layers as float32 (height, width, channel), and the channel names."""
         image, layers = self.image(filtered), self.layers
         planes, names = [], []
         for kind in aovs:
@@ -120,10 +129,10 @@ class Samples:
         return np.concatenate([image, self._array(planes)], axis=-1), names
 
     def _trace(self, band: range, total: int) -> list[mi.Float]:
-        """The next sample of some pixels: radiance, or all of its layers."""
+        """Return the next sample of some pixels: radiance, or all layers."""
         seen, (width, height) = self.seen, self.size
         sampler = mi.load_dict({"type": "independent"})
-        # Lanes of all bands and passes have streams of their own.
+        # Each pixel has a random stream of its own, whichever band and pass it is traced in.
         sampler.seed((self.seed + self.count * STREAM + band.start) & 0xFFFFFFFF, len(band))
         spread = PixelPositions(sampler, self.seed, total)
         spread.first = dr.opaque(mi.UInt32, self.count)
@@ -132,7 +141,7 @@ class Samples:
         scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in self.size))
         ray = self.camera.rays(at * scale, width / height)
         medium = seen.medium_at(np.array(self.camera.position))
-        view = seen.sight.look(seen.scene, sampler, ray, medium, mi.Bool(True))
+        view = seen.sight.sample(seen.scene, sampler, ray, medium, mi.Bool(True))
         if seen.layered:
             parts = view.scattered, view.transmittance, view.gathered, view.background
             values = seen.sight.projection.layers(*parts, mi.Spectrum(1)).channels()
@@ -141,7 +150,7 @@ class Samples:
         return [value + dr.zeros(mi.Float, len(band)) for value in values]
 
     def _array(self, planes: list[mi.Float]) -> np.ndarray:
-        """Float32 (height, width, plane)."""
+        """Convert to float32 (height, width, plane)."""
         width, height = self.size
         flat = [np.broadcast_to(np.array(p), width * height) for p in planes]
         return np.stack(flat, axis=-1).reshape(height, width, len(flat))
@@ -166,13 +175,13 @@ class Samples:
 
 
 def displayed(image: np.ndarray, look: Look) -> np.ndarray:
-    """What a display shows, uint8 (height, width, 3), of radiance of this shape."""
+    """Tone map radiance for display, as uint8 (height, width, 3)."""
     planes = (mi.Float(p) for p in image.reshape(-1, 3).T.astype(np.float32))
     return _display(mi.Color3f(*planes), look, image.shape[1::-1])
 
 
 def _display(colour: mi.Color3f, look: Look, size: tuple[int, int]) -> np.ndarray:
-    """Pixels in sRGB; transmittance and depth are shown as they are, whatever the exposure."""
+    """Return pixels in sRGB; transmittance and depth ignore the exposure."""
     if look.kind not in ("transmittance", "depth", "colour"):
         colour = TONES[look.tone](colour * dr.opaque(mi.Float, 2.0**look.exposure))
     width, height = size
@@ -184,5 +193,5 @@ def _display(colour: mi.Color3f, look: Look, size: tuple[int, int]) -> np.ndarra
 
 
 def _filmic(c: mi.Color3f) -> mi.Color3f:
-    """A curve with a toe and a shoulder (K. Narkowicz's fit of ACES)."""
+    """Apply a tone curve with a toe and a shoulder (K. Narkowicz's fit of ACES)."""
     return c * (2.51 * c + 0.03) / (c * (2.43 * c + 0.59) + 0.14)

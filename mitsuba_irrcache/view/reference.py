@@ -1,8 +1,8 @@
-"""What ``volpath`` makes of the view of a window, slowly, and how far ours is from it.
+"""A progressive ``volpath`` reference of a window's view, and the error of our image against it.
 
 The samples go to two halves in turn. With ``x`` our image and ``a``, ``b`` the means of the halves,
-whose noise is independent, the mean of ``(x - a) (x - b)`` is the mean squared error of ``x``
-without the reference's own noise.
+whose noise is independent, the mean of ``(x - a) (x - b)`` is an estimate of the mean squared error
+of ``x`` without the noise of the reference.
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.render.pixel_filter import pixel_of
-from mitsuba_irrcache.scene.context import medium_at
+from mitsuba_irrcache.scene.medium_probe import medium_at
 from mitsuba_irrcache.view.bands import Bands
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Light
 
-#: Samples per pixel at which it is good enough.
+#: Samples per pixel at which the reference is complete.
 MOST_SAMPLES = 4096
 
 
 class Reference:
-    """Samples by ``volpath`` of the scene of a ``light``, with its depth and seen by ``camera``:
+    """Samples by ``volpath`` of the scene of a ``light``, at its maximum depth, from ``camera``.
+
     ``size`` is (width, height).
     """
 
@@ -42,12 +43,12 @@ class Reference:
         self._sums = np.zeros((2, self._pixels, 3))
         self._counts = np.zeros((2, self._pixels), dtype=np.int64)
         self._bands = Bands()
-        self._first = 0  # pixel that is next
+        self._first = 0  # next pixel to render
         self._passes = 0
 
     @property
     def samples(self) -> int:
-        """Per pixel, all over the picture."""
+        """Return the samples per pixel that all pixels have."""
         return self._passes
 
     @property
@@ -55,7 +56,7 @@ class Reference:
         return self._passes >= MOST_SAMPLES
 
     def refine(self) -> bool:
-        """A sample more for each pixel of a band; whether all pixels have as many now."""
+        """Add one sample per pixel to a band; return whether all pixels have equally many."""
         band = self._bands.at(self._first, self._pixels)
         half, place = self._passes % 2, slice(band.start, band.stop)
         with self._bands.timed(band):
@@ -67,14 +68,15 @@ class Reference:
         return complete
 
     def radiance(self) -> np.ndarray:
-        """What is known (height, width, 3); black where nothing is."""
+        """Return the current estimate (height, width, 3); pixels without samples are black."""
         counts = np.maximum(self._counts.sum(axis=0), 1)
         return (self._sums.sum(axis=0) / counts[:, None]).reshape(*self.size[::-1], 3)
 
     def error_of(self, image: np.ndarray) -> tuple[float, float] | None:
-        """RMSE of ``image`` (height, width, 3) in units of the mean radiance, without the noise of
-        the reference, and the least of it that could be told from none yet; None before both halves
-        have samples all over, and where all is black.
+        """Return the relative RMSE of ``image`` (height, width, 3) and the smallest detectable one.
+
+        Both are in units of the mean radiance, and exclude the noise of the reference. Returns None
+        until both halves cover the image, and if the reference is black.
         """
         if self._passes < 2:
             return None
@@ -84,13 +86,13 @@ class Reference:
             return None
         apart = image.reshape(-1, 3)
         square = float(((apart - a) * (apart - b)).mean())
-        # The mean of products of independent noise is off by about its variance over root n.
+        # The mean of products of independent noise has a standard error of variance / sqrt(n).
         noise = float(((a - b) ** 2).mean()) / 2
         resolved = np.sqrt(noise * np.sqrt(2 / a.size))
         return float(np.sqrt(max(square, 0.0))) / mean, float(resolved) / mean
 
     def comparison(self, image: np.ndarray) -> str:
-        """How far ``image`` (height, width, 3) is from it, in words."""
+        """Describe the difference of ``image`` (height, width, 3) from the reference in words."""
         found = self.error_of(image)
         told = f"volpath, {self.samples} samples per pixel"
         if found is None:
@@ -100,7 +102,7 @@ class Reference:
         return f"{told}; RMSE {amount} of the mean, its noise taken out"
 
     def _trace(self, band: range) -> np.ndarray:
-        """Colours (pixels of the band, 3)."""
+        """Render the colours of a band, (pixels, 3)."""
         count = len(band)
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(_seed(self._passes, band.start), count)
@@ -115,5 +117,5 @@ class Reference:
 
 
 def _seed(number: int, first: int) -> int:
-    """Of a band's random numbers: hashed, since neighbouring seeds are correlated."""
+    """Return the seed of a band, hashed because neighbouring seeds give correlated numbers."""
     return mi.sample_tea_32(mi.UInt32(number), mi.UInt32(first))[0][0]

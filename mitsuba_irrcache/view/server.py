@@ -1,4 +1,4 @@
-"""The viewer in the browser: a local server, and a visitor for every window."""
+"""The viewer's local web server, with one visitor per browser window."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LOG = logging.getLogger(__name__)
 
 
 class Server:
-    """Shows ``session`` (started) on ``host`` and ``port`` (or the next free one)."""
+    """Display a started ``session`` on ``host`` and ``port``, or on the next free port."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class Server:
         check_host(host)
         ignore_closed_connections()
         self._access = Access(host)
-        # It greets; so do we.
+        # Viser prints a greeting of its own; `command` prints ours.
         with contextlib.redirect_stdout(io.StringIO()), guarded(self._access):
             self._server = viser.ViserServer(host, port, label="irrcache", verbose=False)
         self.port = self._server.get_port()
@@ -51,7 +51,7 @@ class Server:
         server.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, control_width="medium"
         )
-        # There is nothing in the browser's own scene: no light has to be computed for it.
+        # The browser's own 3-D scene is empty and needs no lights.
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
         self._set_first_camera()
@@ -65,14 +65,14 @@ class Server:
 
     @property
     def address(self) -> str:
-        """To be opened in a browser on this machine."""
+        """Return the address to open in a browser on this machine."""
         if is_wildcard(self.host):
             return self._address_at("::1" if ":" in self.host else "127.0.0.1")
         return self._address_at(self.host)
 
     @property
     def address_from_elsewhere(self) -> str:
-        """To be opened in a browser on another machine."""
+        """Return the address to open in a browser on another machine."""
         return self._address_at(socket.gethostname() if is_wildcard(self.host) else self.host)
 
     def _address_at(self, host: str) -> str:
@@ -80,7 +80,7 @@ class Server:
         return f"http://{host}:{self.port}/{self._access.query()}"
 
     def stop(self) -> None:
-        """Closes all windows."""
+        """Close all windows and the server."""
         self.session.on_status = lambda status: None
         for client in list(self._visitors):
             self._forget(client)
@@ -109,8 +109,10 @@ class Server:
             visitor.close()
 
     def _keep_to_ourselves(self) -> None:
-        """Refuses what viser would offer to the world: tunnels to its relay, which any window could
-        ask for, and windows that belong to pages of other sites.
+        """Disable what viser offers to other hosts.
+
+        These are tunnels to its relay, which any window could request, and windows of pages of
+        other sites.
         """
         websockets = self._server._websock_server
         for message in (messages.ShareUrlRequest, messages.ShareUrlDisconnect):
@@ -126,7 +128,8 @@ class Server:
 
 
 def ignore_closed_connections() -> None:
-    """Ends viser's warnings of messages for a browser that has gone: it may go at any time, and
-    until the server hears of it, pictures are sent.
+    """Suppress viser's warnings of messages to a closed connection.
+
+    Images are sent until the server notices that a browser has closed its window.
     """
     warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)

@@ -1,9 +1,9 @@
-"""One scene, its light, and those who look at it; nothing of the web is in here.
+"""A viewer session: one scene, its caches and the windows that display it, independent of the web.
 
-All computing is done by one thread, the session's. What others want of it they leave with it:
-windows their newest view, edits a function. The thread shows moving cameras first, then pictures at
-rest, and improves the light in the time that is left; a solver that is at work stops between its
-launches as long as a camera moves.
+All computation happens in the session's own thread. Other threads submit work to it: windows their
+newest view, controls an edit as a function. The thread renders moving cameras first, then images at
+rest, and refines the caches in the remaining time. While a camera moves, the solver is interrupted
+between two launches.
 """
 
 from __future__ import annotations
@@ -29,44 +29,44 @@ from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 
 LOG = logging.getLogger(__name__)
 
-#: Samples per voxel that make new pictures worth while, over those that are shown.
+#: Images are rendered anew once the samples per voxel exceed those displayed by this factor.
 GROWTH = 1.25
-#: Relative standard error of the light at which it is good enough, unless told otherwise.
+#: Default relative standard error of the caches at which refinement stops.
 TARGET_ERROR = 0.005
-#: Seconds between two checks for cameras that have moved, while a solver is at work.
+#: Seconds between two checks for moved cameras while the solver runs.
 CHECK_SECONDS = 0.02
 
 
-class Superseded(Exception):  # noqa: N818 (no error: the user wants it)
-    """Ends a pass of the solver, or a picture, that nobody will see."""
+class Superseded(Exception):  # noqa: N818 (not an error: the user caused it)
+    """Raised to abort a solver pass or an image that has become obsolete."""
 
 
 class Session:
-    """Shows ``document`` to windows. `start` it, and `stop` it in the end."""
+    """Render ``document`` for windows. Call `start` first and `stop` in the end."""
 
     def __init__(self, document: Document, variant: str | None = None) -> None:
         self.document = document
         self.target_error = TARGET_ERROR
-        #: called with a `Status` whenever there is news, in the session's thread
+        #: called in the session's thread with each new `Status`
         self.on_status: Callable[[Status], None] = lambda status: None
-        #: the scene's own cameras by name, and how the scene lies in a browser; once started
+        #: the scene's sensors by name, and its mapping to browser coordinates; set by `start`
         self.cameras: dict[str, Camera] = {}
         self.placement = Placement(np.zeros(3), 1.0)
         self.status = Status()
-        #: of what the thread did, (what, when it began, when it ended), the newest last
+        #: log of the thread: (activity, start time, end time), the newest last
         self.history: deque[tuple[str, float, float]] = deque(maxlen=20000)
         self._variant = variant or mi.variant()
         self._windows: list[Window] = []
-        self._closed: list[Window] = []  # and not forgotten yet
+        self._closed: list[Window] = []  # windows whose memory the thread still has to release
         self._tasks: deque[Callable[[], None]] = deque()
         self._news = threading.Condition()
         self._stopped = False
-        self._light: Light | None = None  # what is being improved
-        self._shown: Light | None = None  # what is seen: the one before, until there is better
+        self._light: Light | None = None  # the caches under refinement
+        self._shown: Light | None = None  # displayed; the previous caches until new ones exist
         self._shown_samples = 0
-        self._revision = 0  # of all that is shown, across lights
+        self._revision = 0  # number of the displayed state, counted across edits
         self._checked = 0.0
-        # what there is to do while no camera moves, in turn
+        # tasks while no camera moves, in turn
         self._chores = deque((self._refine_picture, self._improve, self._compare))
         self._comparisons = self._reserved = 0
         self._pass_seconds = 0.0
@@ -77,14 +77,14 @@ class Session:
     # ------------------------------------------------------------------ for other threads
 
     def start(self) -> None:
-        """Loads the scene and begins; raises what goes wrong with that."""
+        """Load the scene and start the thread; raise the exception if that fails."""
         self._thread.start()
         self._ready.wait()
         if self._failure is not None:
             raise self._failure
 
     def stop(self) -> None:
-        """Ends the thread, and waits for it."""
+        """Stop the thread and wait for it."""
         with self._news:
             self._stopped = True
             self._news.notify_all()
@@ -92,31 +92,31 @@ class Session:
             self._thread.join()
 
     def open(self, show: Callable[[Picture], None]) -> Window:
-        """A new window; it shows nothing before it has a view."""
+        """Open a window; it displays nothing before `look` sets a view."""
         window = Window(show)
         with self._news:
             self._windows.append(window)
         return window
 
     def close(self, window: Window) -> None:
-        """Forgets a window, and lets go of what was computed for it, whoever still holds it."""
+        """Close a window and release the memory of its images, even if others still refer to it."""
         with self._news, suppress(ValueError):
             self._windows.remove(window)
             self._closed.append(window)
             self._news.notify_all()
 
     def look(self, window: Window, view: View) -> None:
-        """What ``window`` wants to see from now on. Another camera or size moves it."""
+        """Set the view of ``window``. A different camera or size marks its camera as moving."""
         with self._news:
             if window.want(view):
                 self._news.notify_all()
 
     def edit(self, change: Callable[[Document], None]) -> None:
-        """Changes the document, and with it the light; raises IrrcacheError if it cannot be."""
+        """Change the document and rebuild the caches; raise IrrcacheError if that is refused."""
         self.call(lambda: self._edit(change))
 
     def call(self, action: Callable[[], object]) -> object:
-        """Runs ``action`` in the session's thread, and returns or raises what it does."""
+        """Run ``action`` in the session's thread, and return its result or raise its exception."""
         done, result = threading.Event(), {}
 
         def task() -> None:
@@ -141,7 +141,7 @@ class Session:
 
     @contextmanager
     def reserved(self) -> Iterator[None]:
-        """Within, the thread does what it is called for, and shows new views, but nothing else."""
+        """Suspend refinement within this context; calls and new views are still processed."""
         self.call(lambda: self._reserve(1))
         try:
             yield
@@ -150,11 +150,11 @@ class Session:
 
     @property
     def light(self) -> Light:
-        """The light that is seen; in the session's thread only."""
+        """Return the displayed caches; for the session's thread only."""
         return self._shown
 
     def complete(self, seen: Seen, view: View) -> Samples | None:
-        """All samples of ``view`` that a window has of ``seen``; in the session's thread only."""
+        """Return all samples of ``view`` if a window has them; for the session's thread only."""
         return next((w.samples for w in self._windows if w.is_complete(seen, view)), None)
 
     # ------------------------------------------------------------------ the thread
@@ -179,13 +179,13 @@ class Session:
             except Superseded:
                 continue
             except Exception as error:
-                LOG.exception("the viewer could not show or improve something")
+                LOG.exception("the viewer failed to render an image or to refine the caches")
                 self._give_up(error)
         self._light = self._shown = None
         self._windows.clear()
 
     def _give_up(self, error: Exception) -> None:
-        """What failed once is not tried again before it is asked for anew."""
+        """Cancel what failed; it is retried only after a new edit or view."""
         self._light = self._shown
         if self._light is not None and self._light.failed:
             self._light = None
@@ -221,7 +221,7 @@ class Session:
 
     @property
     def _is_called(self) -> bool:
-        """Whether somebody waits for it, or for its end."""
+        """Return whether a task waits for the thread, or the thread has to end."""
         return bool(self._tasks) or self._stopped
 
     @property
@@ -230,7 +230,7 @@ class Session:
 
     @property
     def _until_rest(self) -> float | None:
-        """Seconds until a camera that moves may have come to rest; None where none moves."""
+        """Return the seconds until a moving camera may count as resting; None if none moves."""
         windows = list(self._windows)
         waits = [w.moved + REST_SECONDS - monotonic() for w in windows if w.is_moving]
         return max(min(waits), 1e-3) if waits else None
@@ -239,7 +239,7 @@ class Session:
         self._reserved += change
 
     def _step(self) -> bool:
-        """Does what is most urgent; whether there was anything to do."""
+        """Do the most urgent work; return whether there was any."""
         while self._closed:
             self._closed.pop().forget()
         while self._tasks:
@@ -253,7 +253,7 @@ class Session:
         if self._reserved:
             return False
         if self._light is not None and self._light is not self._shown:
-            return self._improve()  # somebody waits for it
+            return self._improve()  # an edit is displayed only after its first refinement
         for _ in range(len(self._chores)):
             self._chores.rotate()
             if self._chores[0]():
@@ -272,7 +272,7 @@ class Session:
         return light.samples < 1 or not light.error <= self.target_error
 
     def _improve(self) -> bool:
-        """A pass of the solver, if it is wanted; light that is new is shown, be it dark."""
+        """Refine the caches if needed and display new ones, even if they are zero."""
         if self._light in (None, self._shown) and not self._wants_light:
             return False
         with self._noted("solver"):
@@ -283,7 +283,7 @@ class Session:
         return True
 
     def _adopt(self) -> None:
-        """Shows the light that has improved, if that is worth new pictures."""
+        """Display the refined caches if they justify rendering the images anew."""
         light = self._light
         other = light is not self._shown
         if other or not light.samples or light.samples >= GROWTH * self._shown_samples:
@@ -296,10 +296,10 @@ class Session:
         self._say()
 
     def _let_go(self) -> None:
-        """Frees the light before, arrays as large as those of the one that is shown."""
+        """Release the previous caches, whose arrays are as large as the displayed ones."""
         for window in list(self._windows):
             window.let_go(self._shown)
-        gc.collect()  # media among surfaces are in a cycle of references
+        gc.collect()  # media with surfaces are part of reference cycles
         dr.flush_malloc_cache()
 
     def _say(self, message: str = "") -> None:
@@ -307,7 +307,7 @@ class Session:
         self.on_status(self.status)
 
     def _pause(self) -> None:
-        """Between launches of the solver: whoever looks comes first."""
+        """Render waiting views between two launches of the solver."""
         if perf_counter() - self._checked < CHECK_SECONDS:
             return
         dr.sync_thread()
@@ -332,7 +332,7 @@ class Session:
     # ------------------------------------------------------------------ pictures
 
     def _show_moving(self) -> bool:
-        """A quick picture for a window whose camera moves and was not shown yet."""
+        """Render a low-cost image for a window whose moving camera has a view not rendered yet."""
         waiting = [w for w in self._windows if w.fresh and w.is_moving]
         if not waiting or self._shown is None:
             return False
@@ -344,8 +344,9 @@ class Session:
         return True
 
     def _show_resting(self, first: bool) -> bool:
-        """A sample more for the picture of a window at rest that lacks most; only pictures that
-        are not there at all where ``first``.
+        """Add one sample per pixel to the image at rest that has the fewest.
+
+        If ``first``, only images without any sample are considered.
         """
         light, revision = self._shown, self._revision
         lacking = [w for w in self._windows if w.lacks(light, revision, first)]
@@ -358,13 +359,13 @@ class Session:
             wanted, pause = self._wants_light, self._give_way
             try:
                 picture = window.refined(light, revision, view, extent, wanted, pause)
-            except Superseded:  # the picture is, not the solver's pass that it may interrupt
+            except Superseded:  # raised by this image's own check, not by the interrupted solver
                 return True
         window.show(picture)
         return True
 
     def _give_way(self) -> None:
-        """Between bands of a picture at rest: cameras that move come first."""
+        """Abort an image at rest between two bands if a camera has moved."""
         if self._stopped or any(w.fresh and w.is_moving for w in self._windows):
             raise Superseded
 
@@ -372,14 +373,14 @@ class Session:
         return self._show_resting(first=False)
 
     def _compare(self) -> bool:
-        """Some more of the reference of one window, in turn."""
+        """Add samples to the reference of one window, in turn."""
         light, revision = self._shown, self._revision
         comparing = [w for w in self._windows if w.is_comparing(light, revision)]
         if not comparing:
             return False
         self._comparisons += 1
         window = comparing[self._comparisons % len(comparing)]
-        view, until = window.view, monotonic() + self._pass_seconds  # as long as the solver
+        view, until = window.view, monotonic() + self._pass_seconds  # as long as one solver pass
         with self._noted("reference"):
             extent = self.extent(view.camera)
             while True:
@@ -390,20 +391,20 @@ class Session:
                     return True
 
     def _taken(self, window: Window) -> View:
-        """What a window wants to see, which is not new any more."""
+        """Return the view of a window and mark it as processed."""
         with self._news:
             window.fresh = False
             return window.view
 
     def extent(self, camera: Camera) -> tuple[float, float]:
-        """Distances between which a camera may see the medium."""
+        """Return the interval of distances from the camera in which the medium may lie."""
         distance = float(np.linalg.norm(self.placement.centre - camera.position))
         radius = self.placement.radius
         return max(distance - radius, 0.0), distance + radius
 
     @contextmanager
     def _noted(self, what: str) -> Iterator[None]:
-        """Notes when a block began and ended."""
+        """Record the start and end time of a block in the history."""
         started = monotonic()
         try:
             yield

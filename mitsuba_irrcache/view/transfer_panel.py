@@ -25,14 +25,14 @@ from mitsuba_irrcache.volumes.transfer import (
     preset_names,
 )
 
-#: Uploaded files may be so large, in bytes.
+#: Maximum size of uploaded files in bytes.
 LARGEST_FILE = 1 << 20
 _OWN = "(own)"
 _CURVES = ("opacity", "colour")
 
 
 class TransferPanel:
-    """Shows the histogram of the data below the opacities, and edits both curves point by point."""
+    """Display histogram and opacities as a chart, and edit both curves point by point."""
 
     def __init__(
         self,
@@ -99,14 +99,14 @@ class TransferPanel:
         return mapping.opacity_values if self._curve.value == "opacity" else mapping.colour_values
 
     def _curves(self, mapping: TransferFunction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values, histogram and opacities, for the chart."""
+        """Return values, histogram and opacities for the chart."""
         edges = self._appearance.edges
         values = 0.5 * (edges[1:] + edges[:-1])
         opacity = np.interp(values, mapping.opacity_values, mapping.opacities)
         return values, self._appearance.histogram, opacity
 
     def _fill(self, points: bool = True) -> None:
-        """Shows the point that is chosen."""
+        """Display the selected point."""
         if points:
             labels = tuple(f"{i + 1}: {v:g}" for i, v in enumerate(self._values))
             old = self._point.value.split(":")[0]
@@ -156,7 +156,7 @@ class TransferPanel:
         self._apply(function.fitted_to(self._appearance.volume.values))
 
     def _apply(self, function: TransferFunction, preset: str = _OWN) -> None:
-        """Makes it the one that is seen; as if nothing had happened if that cannot be."""
+        """Apply a transfer function; restore the previous one if it is refused."""
         grids = self._appearance.grids(function)
         self._session.edit(lambda document: document.set_volumes(grids))
         self._appearance.mapping = function

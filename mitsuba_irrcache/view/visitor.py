@@ -1,4 +1,4 @@
-"""One browser window: its camera, what it shows, and what it saves."""
+"""One browser window: its camera, its controls, and the files that it saves."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ from mitsuba_irrcache.view.picture import KINDS, TONES, Look
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 
-#: Quality of JPEGs of moving cameras, and of pictures that better ones will follow.
+#: JPEG quality for moving cameras and for images that better ones will replace.
 MOVING_QUALITY, RESTING_QUALITY = 80, 95
-#: Seconds between two notes on what is seen.
+#: Seconds between two updates of the text below the image.
 NOTE_SECONDS = 0.25
 
 
 class Visitor:
-    """Connects a ``client`` with a window of the session. Saved files go to ``folder``, or without
-    one to the browser.
+    """Connect a browser ``client`` with a window of the session.
+
+    Files are saved in ``folder``, or downloaded by the browser if it is None.
     """
 
     def __init__(self, client: viser.ClientHandle, session: Session, folder: Path | None) -> None:
@@ -50,7 +51,7 @@ class Visitor:
         self._look_again()
 
     def close(self) -> None:
-        """The browser has gone."""
+        """Release the window after the browser has disconnected."""
         self._gone = True
         self.session.close(self.window)
         self._encoder.shutdown(wait=False, cancel_futures=True)
@@ -73,12 +74,12 @@ class Visitor:
             self._exposure = gui.add_slider("exposure", -8.0, 8.0, 0.1, 0.0, hint="stops")
             self._tone = gui.add_dropdown("tone mapping", tuple(TONES))
             self._filter = gui.add_checkbox(
-                "filter", False, hint="of the illumination; fades as the light improves"
+                "filter", False, hint="of the illumination; weaker as the caches converge"
             )
             self._compare = gui.add_checkbox(
-                "compare with volpath", False, hint="beside it, slowly, while nothing moves"
+                "compare with volpath", False, hint="side by side, refined while no camera moves"
             )
-        with gui.add_folder("Keep", order=5, expand_by_default=False):
+        with gui.add_folder("Save", order=5, expand_by_default=False):
             self._name = gui.add_text("name", "view")
             self._cache = gui.add_checkbox("with the cache", False)
             self._save = gui.add_button(
@@ -124,7 +125,7 @@ class Visitor:
         self._refusal.content = f"**Refused:** {plain(reason)}" if reason else ""
         self._refusal.visible = bool(reason)
 
-    # ------------------------------------------------------------------ to the session and back
+    # ------------------------------------------------------------------ to and from the session
 
     async def _camera_moved(self, _: viser.CameraHandle) -> None:
         self._look_again()
@@ -142,21 +143,21 @@ class Visitor:
         )
         numbers = (*seen.position, *seen.target, *seen.up)
         if not np.isfinite(numbers).all() or seen.distance == 0 or not any(seen.up):
-            return  # nothing that a camera could be
+            return  # the browser sent values that are no camera
         size = camera.image_width, camera.image_height
         self._view = View(seen, size, self._look, bool(self._compare.value))
         self.session.look(self.window, self._view)
 
     def _show(self, picture: Picture) -> None:
-        """In the session's thread: hands on, so that it can go on rendering."""
+        """Queue an image for sending; called in the session's thread, which must not block."""
         with self._lock:
             busy, self._waiting = self._waiting is not None, picture
         if not busy:
-            with suppress(RuntimeError):  # the browser has just gone
+            with suppress(RuntimeError):  # the browser has just disconnected
                 self._encoder.submit(self._send)
 
     def _send(self) -> None:
-        """Sends the newest picture; older ones that were not sent yet never are."""
+        """Send the newest image, and drop older ones that were not sent yet."""
         with self._lock:
             picture, self._waiting = self._waiting, None
         if self._gone:
@@ -174,7 +175,7 @@ class Visitor:
                 self._note.content += f"; on the right {picture.comparison}"
         self.client.flush()
 
-    # ------------------------------------------------------------------ keeping
+    # ------------------------------------------------------------------ saving
 
     def _keep(self) -> None:
         name = checked_name(self._name.value)

@@ -1,4 +1,4 @@
-"""One who looks: what it wants to see, and the pictures that it gets."""
+"""The state of one window: the view that it requests and the images rendered for it."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from mitsuba_irrcache.view.light import Light, Seen
 from mitsuba_irrcache.view.picture import Look, Samples, displayed
 from mitsuba_irrcache.view.reference import Reference
 
-#: A camera rests when it has not moved for so long.
+#: Seconds without a movement after which a camera counts as resting.
 REST_SECONDS = 0.15
-#: A picture of a moving camera should take so long.
+#: Target duration in seconds of an image of a moving camera.
 MOVING_SECONDS = 0.05
-#: Side of the pictures of moving cameras, as a part of the window's, and length of their steps: the
-#: one that is quick enough is taken.
+#: Levels of detail for moving cameras: image size relative to the window, and factor of the
+#: ray-marching step; the best level within `MOVING_SECONDS` is used.
 LEVELS = ((1.0, 1.0), (0.71, 1.0), (0.5, 1.0), (0.5, 2.0), (0.35, 2.0), (0.25, 2.0), (0.18, 3.0))
-#: Samples per pixel of a picture at rest.
+#: Samples per pixel of a complete image at rest.
 SAMPLES = 16
-#: Windows are not rendered larger than this.
+#: Upper limit of the number of pixels per image.
 MOST_PIXELS = 1 << 22
 
 
 @dataclass(frozen=True)
 class View:
-    """What a window wants to see: a camera, and the window's (width, height) in pixels, of which
-    half is for volpath's picture where that is ``compared``.
+    """A requested view: a camera, and the window's ``size`` (width, height) in pixels.
+
+    If ``compared``, half of the window shows the image by ``volpath``.
     """
 
     camera: Camera
@@ -39,25 +40,31 @@ class View:
 
     @property
     def part(self) -> tuple[int, int]:
-        """(width, height) of the picture by irrcache."""
+        """Return the (width, height) of the image by irrcache."""
         return (max(self.size[0] // 2, 1), self.size[1]) if self.compared else self.size
 
     def bounded(self) -> View:
-        """The same with at least one pixel, and at most `MOST_PIXELS`."""
+        """Return the view with a size of at least one pixel and at most `MOST_PIXELS`."""
         width, height = (max(int(n), 1) for n in self.size)
         shrunk = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5)
         return replace(self, size=(int(width * shrunk) or 1, int(height * shrunk) or 1))
 
     def shows_place_of(self, other: View | None) -> bool:
-        """Whether ``other`` is seen by the same camera, at the same size."""
+        """Return whether ``other`` has the same camera and the same size."""
         return other is not None and (self.camera, self.part) == (other.camera, other.part)
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a window gets: ``pixels`` uint8 (height, width, 3), of which ``view``, with how many
-    samples per pixel; whether the camera is ``moving``, and whether nothing better will follow.
-    What is on its right by volpath, and how far it is from that, is told by ``comparison``.
+    """An image for a window.
+
+    Attributes:
+        pixels: uint8 (height, width, 3).
+        view: the view that it shows.
+        samples: per pixel.
+        moving: whether the camera moves.
+        final: whether no better image will follow.
+        comparison: how far the image is from the one by ``volpath`` on its right.
     """
 
     pixels: np.ndarray
@@ -69,17 +76,17 @@ class Picture:
 
 
 class Window:
-    """``show`` is called with every `Picture`, in the session's thread."""
+    """One window; ``show`` receives every `Picture`, in the session's thread."""
 
     def __init__(self, show: Callable[[Picture], None]) -> None:
         self.show = show
         self.view: View | None = None
-        self.moved = -np.inf  # when the camera moved last
-        self.fresh = False  # whether the view has not been shown at all
+        self.moved = -np.inf  # time of the camera's last movement
+        self.fresh = False  # whether the view has not been rendered yet
         self.level = len(LEVELS) // 2
         self.samples: Samples | None = None
-        self._resting: View | None = None  # what `samples` are of
-        self._light: Light | None = None  # and of which light
+        self._resting: View | None = None  # the view of `samples`
+        self._light: Light | None = None  # the caches of `samples`
         self._revision = -1
         self._reference: Reference | None = None
 
@@ -88,8 +95,9 @@ class Window:
         return monotonic() - self.moved < REST_SECONDS
 
     def want(self, view: View) -> bool:
-        """Another view from now on, which moves the camera unless only its look is another; whether
-        there is anything new.
+        """Set the view; return whether it differs from the previous one.
+
+        The camera counts as moving unless only what the view displays has changed.
         """
         old, view = self.view, view.bounded()
         if view == old:
@@ -100,19 +108,19 @@ class Window:
         return True
 
     def forget(self) -> None:
-        """Shows nothing until there is another view, and holds nothing that was computed."""
+        """Reset the window to the state without a view, and release its images."""
         self.view, self.fresh, self._resting = None, False, None
         self.samples = self._light = self._reference = None
 
     def let_go(self, light: Light) -> None:
-        """Holds nothing any more that was computed of any other ``light``."""
+        """Release images of caches other than ``light``."""
         if self._light is not light:
             self.samples = self._light = None
         if self._reference is not None and self._reference.light is not light:
             self._reference = None
 
     def lacks(self, light: Light, revision: int, first: bool) -> bool:
-        """Whether a picture at rest could be better; or where ``first``, whether there is none."""
+        """Return whether an image at rest lacks samples, or has none at all if ``first``."""
         if self.view is None:
             return False
         if self.fresh or not self.view.shows_place_of(self._resting) or self._light is not light:
@@ -120,7 +128,7 @@ class Window:
         return not first and (self._revision != revision or self.samples.count < SAMPLES)
 
     def is_complete(self, seen: Seen, view: View) -> bool:
-        """Whether it has all samples of ``seen`` that a picture of ``view`` at rest has."""
+        """Return whether all samples of an image at rest of ``view`` from ``seen`` are there."""
         had = self.samples
         return (
             had is not None
@@ -129,11 +137,11 @@ class Window:
         )
 
     def quick(self, light: Light, view: View, extent: tuple[float, float]) -> Picture:
-        """Of a camera that moves: as coarse as time wants it."""
+        """Render an image of a moving camera at the level of detail that is fast enough."""
         share, stride = LEVELS[self.level]
         size = tuple(max(round(n * share), 1) for n in view.part)
         started, look = perf_counter(), view.look
-        # Errors are not projected, nor is anything filtered, while there is no time for it.
+        # Without error propagation and filter, for which there is no time.
         seen = light.seen(look.kind != "image", look.kind == "error bar")
         seen.stride(stride)
         try:
@@ -156,9 +164,10 @@ class Window:
         improving: bool,
         pause: Callable[[], None],
     ) -> Picture:
-        """Of a camera at rest: a sample per pixel more than before, of the ``light`` as it is at
-        this ``revision``, which may be ``improving`` still. Where ``pause`` raises something, all
-        is as it was.
+        """Render one more sample per pixel of an image at rest.
+
+        ``light`` and its ``revision`` identify the caches; ``improving`` says whether they are
+        still refined. If ``pause`` raises an exception, the window's state is unchanged.
         """
         look = view.look
         seen = light.seen(look.layered, look.with_error)
@@ -167,8 +176,8 @@ class Window:
         if not (known and view.shows_place_of(self._resting) and samples.seen is seen):
             samples = Samples(seen, view.camera, view.part)
             samples.add(1, pause)
-        elif self._resting == view:  # not only another look at the same samples
-            if samples.count == 1:  # the one in the pixel's centre is not one of many
+        elif self._resting == view:  # unless only the display of the same samples changes
+            if samples.count == 1:  # the centre sample is not random
                 samples = Samples(seen, view.camera, view.part)
                 samples.add(SAMPLES, pause)
             samples.add(SAMPLES, pause)
@@ -177,7 +186,7 @@ class Window:
         return self._picture(view, extent, improving)
 
     def is_comparing(self, light: Light, revision: int) -> bool:
-        """Whether there is something to compare with, that could be better."""
+        """Return whether the image is compared with a reference that is not complete."""
         if self.view is None or not self.view.compared or self.lacks(light, revision, True):
             return False
         known = self._reference_of(light, self.view)
@@ -186,14 +195,14 @@ class Window:
     def compared(
         self, light: Light, view: View, extent: tuple[float, float], improving: bool
     ) -> Picture | None:
-        """Some more of the reference; a picture if all of it has changed, or it is new."""
+        """Add samples to the reference; return an image if each of its pixels has a new sample."""
         known = self._reference_of(light, view)
         if known is None:
             self._reference = known = Reference(light, view.camera, view.part)
         return self._picture(view, extent, improving) if known.refine() else None
 
     def _reference_of(self, light: Light, view: View) -> Reference | None:
-        """The reference for this scene as it is and this view, if there is one."""
+        """Return the reference of this scene and view if it exists."""
         known = self._reference
         if known is None or (known.light, known.camera, known.size) != (
             light,
@@ -204,7 +213,7 @@ class Window:
         return known
 
     def _picture(self, view: View, extent: tuple[float, float], improving: bool) -> Picture:
-        """What `samples` show."""
+        """Return the image that `samples` give."""
         count = self.samples.count
         pixels = self.samples.picture(view.look, extent)
         final = count >= SAMPLES and not improving
@@ -220,7 +229,7 @@ class Window:
 
 
 def _adapted(level: int, seconds: float) -> int:
-    """The level for the next picture, where this one took so long."""
+    """Return the level of detail for the next image, given the time of this one."""
     if seconds > MOVING_SECONDS:
         return min(level + 1, len(LEVELS) - 1)
     if level == 0:

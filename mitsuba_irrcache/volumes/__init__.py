@@ -1,1 +1,1 @@
-"""Getting volumes in: readers, transfer functions, presets, scene folders and phantoms."""
+"""Import of volumes: readers, transfer functions, presets, scene folders and phantoms."""

@@ -18,11 +18,11 @@ class VolumeData:
         spacing: distance between voxel centres along x, y, z in world units (mm for medical data).
         origin: world position of the centre of voxel ``(0, 0, 0)``.
         direction: 3x3, columns are the world directions of the grid's x, y and z axes.
-        unit: what the values measure, e.g. ``"HU"``; empty where it is not known.
-        source: where the values come from, for summaries and messages.
+        unit: the unit of the values, e.g. ``"HU"``; empty if it is unknown.
+        source: description of the origin of the values, for summaries and messages.
 
     Raises:
-        IrrcacheError: a shape, spacing, origin or direction that places no grid.
+        IrrcacheError: a shape, spacing, origin or direction that does not define a grid.
     """
 
     values: np.ndarray
@@ -45,19 +45,22 @@ class VolumeData:
 
     @property
     def size(self) -> tuple[int, int, int]:
-        """Voxel counts along x, y, z."""
+        """Return the voxel counts along x, y, z."""
         z, y, x = self.values.shape
         return x, y, z
 
     @property
     def physical_size(self) -> tuple[float, float, float]:
-        """Edge lengths of the whole grid, voxel faces included, along its x, y, z axes."""
+        """Return the edge lengths of the grid, outer half voxels included, along x, y, z."""
         x, y, z = (n * s for n, s in zip(self.size, self.spacing, strict=True))
         return x, y, z
 
     @property
     def index_to_world(self) -> np.ndarray:
-        """4x4: continuous index ``(x, y, z)`` (integers at voxel centres) to world position."""
+        """Return the 4x4 matrix from continuous index ``(x, y, z)`` to world position.
+
+        Integer indices are voxel centres.
+        """
         matrix = np.eye(4)
         matrix[:3, :3] = self.direction * np.asarray(self.spacing)
         matrix[:3, 3] = self.origin
@@ -65,7 +68,7 @@ class VolumeData:
 
     @property
     def to_world(self) -> np.ndarray:
-        """4x4: the unit cube to the world, as ``gridvolume`` wants it.
+        """Return the 4x4 matrix from the unit cube to the world, as in ``gridvolume``.
 
         Voxel centres lie at ``(i + 0.5) / n``, so the cube begins half a voxel before the first.
         """
@@ -75,7 +78,7 @@ class VolumeData:
 
 
 def _check_placement(volume: VolumeData) -> None:
-    """Refuse a placement that is no invertible affine map, naming the value at fault."""
+    """Raise an error for a placement that is not an invertible affine map."""
     if len(volume.spacing) != 3 or not all(np.isfinite(s) and s > 0 for s in volume.spacing):
         raise IrrcacheError(
             f"volume {volume.source!r} has voxel spacing {volume.spacing}; "

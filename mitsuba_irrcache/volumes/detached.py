@@ -1,8 +1,8 @@
-"""Data files that a header names: NRRD and MetaImage may keep their voxels in other files.
+"""Detached data files: NRRD and MetaImage headers may name other files that hold the voxels.
 
-A header comes from somebody else, and could name any file of this machine: its contents would then
-be in a picture or a scene that is passed on. So a header may name files of its own folder only, and
-of folders that the user has allowed.
+A header from an untrusted source could name any file of this machine, whose contents would then be
+part of an image or a scene that is passed on. So a header may name files in its own folder only,
+and in folders that the user has allowed.
 """
 
 from __future__ import annotations
@@ -16,38 +16,39 @@ from pathlib import Path
 from mitsuba_irrcache.errors import IrrcacheError
 
 OPTION = "--data-folder"
-#: Bytes that MetaIO has for a word of a list or a pattern. It writes longer ones over other memory.
+#: Buffer size in bytes of MetaIO for a word of a list or a pattern; longer words overflow it.
 _LONGEST_WORD = 79
-#: More files than any volume has slices.
+#: Upper limit of the number of files, larger than the number of slices of any volume.
 _MOST_FILES = 1 << 16
 _FIELDS = {
     "nrrd": re.compile(rb"^[ \t]*data[ \t]*file[ \t]*:[ \t]*([^\r\n]*)", re.I | re.M),
-    # Not at the start of a line alone: MetaIO does not read line by line.
+    # Fields anywhere in a line are matched, because MetaIO does not parse line by line.
     "meta": re.compile(rb"ElementDataFile\s*[=:][ \t]*([^\r\n]*)"),
 }
 _PATTERN = re.compile(r"(?P<name>.*%0?\d{0,2}d.*?)\s+(?P<numbers>-?\d+(?:\s+-?\d+){2,3})\s*")
 
 
 def data_files(path: Path, allowed: Sequence[str | os.PathLike] = ()) -> list[Path]:
-    """The files in which ``path``, an NRRD or MetaImage, has its voxels; ``path`` itself if these
-    follow the header.
+    """Return the files with the voxels of ``path``, an NRRD or MetaImage.
+
+    This is ``path`` itself if the voxels follow the header.
 
     Args:
         path: the image file.
-        allowed: folders, beside that of ``path``, in which data files may lie, at any depth.
+        allowed: folders, besides that of ``path``, in which data files may lie, at any depth.
 
     Raises:
-        IrrcacheError: a data file that is missing or lies elsewhere, links and ``..`` followed; or
-            a list or pattern whose words are too long for MetaIO.
+        IrrcacheError: a data file that is missing or, after resolving links and ``..``, lies in
+            another folder; or a list or pattern whose words are too long for MetaIO.
     """
     kind = "meta" if path.suffix.lower() in (".mha", ".mhd") else "nrrd"
     files: list[Path] = []
-    # All names in all of the file: one that its reader passes over must not hide another.
+    # All occurrences in the file are checked: one that the reader ignores must not mask another.
     with (
         path.open("rb") as stream,
         mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as contents,
     ):
-        end = contents.find(b"\n\n") if kind == "nrrd" else -1  # the voxels of an NRRD follow
+        end = contents.find(b"\n\n") if kind == "nrrd" else -1  # where an NRRD's voxels begin
         header = contents[:end] if end >= 0 else contents
         for field in _FIELDS[kind].finditer(header):
             if kind == "meta":
@@ -59,14 +60,16 @@ def data_files(path: Path, allowed: Sequence[str | os.PathLike] = ()) -> list[Pa
 
 
 def _check_words(path: Path, value: bytes) -> None:
-    """Refuses what MetaIO would split into words if one of them has more bytes than it has places
-    for: it does not look. Single names, and those in the lines after a list, have no such limit.
+    """Refuse words that overflow a buffer of MetaIO, which does not check their length.
+
+    Only fields that MetaIO splits into words are concerned: not single names, and not the lines
+    after a list.
     """
     if b"%" not in value and value[:4].upper() != b"LIST":
         return
-    if b"\t" in value:  # to MetaIO a part of a word; it divides by the number that it misses then
+    if b"\t" in value:  # MetaIO does not split at tabs, lacks a number and divides by 0
         raise IrrcacheError(f"{path} names its data files with a tab; put a space in its place")
-    # Spaces do not end a word that is quoted.
+    # Spaces do not end a quoted word.
     words = [value] if b'"' in value else value.split(b" ")
     longest = max(words, key=len)
     if len(longest) > _LONGEST_WORD:
@@ -78,7 +81,7 @@ def _check_words(path: Path, value: bytes) -> None:
 
 
 def _names(path: Path, value: str, following: bytes) -> list[str | None]:
-    """The names that one field stands for; None for the header's own file."""
+    """Return the names that one field stands for; None for the header's own file."""
     if value.upper() == "LOCAL":
         return [None]
     if value.upper().split(" ")[0] == "LIST":
@@ -99,14 +102,14 @@ def _names(path: Path, value: str, following: bytes) -> list[str | None]:
 
 
 def _checked(path: Path, name: str, allowed: Sequence[str | os.PathLike]) -> Path:
-    """The data file of this ``name``, which exists and lies where it may."""
+    """Return the path of the data file ``name``, which must exist in an accepted folder."""
     file = path.parent / name
     try:
         real = file.resolve()
         folders = [Path(folder).resolve() for folder in (path.parent, *allowed)]
-    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, or no name at all
+    except (OSError, RuntimeError, ValueError) as error:  # a circular link, or an empty name
         raise IrrcacheError(f"{path} names a data file {name!r}, which is none: {error}") from None
-    # "~" begins a full path for MetaIO.
+    # MetaIO takes a name that starts with "~" for a full path.
     if name.startswith("~") or not any(real.is_relative_to(folder) for folder in folders):
         raise IrrcacheError(
             f"{path} names a data file {file} outside of its own folder, which is not read; if you "

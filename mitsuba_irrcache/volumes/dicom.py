@@ -1,4 +1,4 @@
-"""A folder with one CT or MR series as DICOM files, one per slice, through SimpleITK."""
+"""Reader of a folder with one CT or MR series as DICOM files, one per slice, through SimpleITK."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mitsuba_irrcache.volumes.dicom_lengths import check_lengths
 _POSITION = "0020|0032"
 _ORIENTATION = "0020|0037"
 _MODALITY = "0008|0060"
-# Scanners round positions to about 0.01 mm; anything beyond this share of a slice is no rounding.
+# Scanners round positions to about 0.01 mm; a larger share of the slice distance is no rounding.
 _UNEVEN = 0.05
 
 
@@ -24,15 +24,15 @@ def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> V
     """Read the series in ``folder``, sorted by position, rescaled (Hounsfield units for CT).
 
     Placement is LPS (x to the patient's left, y to the back, z to the head), in mm. The third
-    direction is that from the first slice to the last, so a tilted gantry is placed as it was.
+    direction is that from the first slice to the last, so the tilt of a gantry is preserved.
 
     Args:
-        folder: the files of one series; of several where ``series`` names one.
+        folder: the files of one series, or of several if ``series`` selects one.
         series: SeriesInstanceUID.
 
     Raises:
-        IrrcacheError: no DICOM files, a truncated one, several series and none named, a single
-            slice, or slices missing, doubled or unevenly spaced.
+        IrrcacheError: no DICOM files, a truncated one, several series and none selected, a single
+            slice, or slices missing, duplicated or unevenly spaced.
     """
     folder = Path(folder)
     for file in sorted(folder.iterdir()):
@@ -62,7 +62,7 @@ def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> V
 
 
 def _choose_series(folder: Path, series: str | None) -> str:
-    """The UID of the one series there is, or of the one asked for."""
+    """Return the UID of the only series, or of the requested one."""
     found = SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     if not found:
         raise IrrcacheError(
@@ -82,7 +82,7 @@ def _series_files(folder: Path, uid: str) -> tuple[str, ...]:
 
 
 def _slice_placement(files: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Positions ``(slice, 3)``, the orientation common to all (6,), and the modality."""
+    """Return positions ``(slice, 3)``, the common orientation (6,), and the modality."""
     reader = SimpleITK.ImageFileReader()
     positions, orientations, modality = [], [], ""
     for file in tqdm(files, "reading DICOM headers", delay=1, disable=None):
@@ -110,7 +110,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _check_gaps(folder: Path, positions: np.ndarray, normal: np.ndarray) -> None:
-    """Refuse doubled, missing or uneven slices: the volume's one z spacing would be a lie."""
+    """Refuse duplicate, missing or unevenly spaced slices, which one z spacing cannot represent."""
     depth = positions @ normal
     steps = np.diff(depth)
     usual = float(np.median(steps))

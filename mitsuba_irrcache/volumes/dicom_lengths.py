@@ -1,7 +1,7 @@
-"""Whether the elements of a DICOM file are where they say they are.
+"""Consistency check of the element lengths in a DICOM file.
 
-A file of a kilobyte can say that one of its elements is 4 GB long. GDCM believes it, and takes the
-memory before it finds out. So lengths are looked at before.
+A file of a kilobyte can declare an element of 4 GB, for which GDCM allocates memory before it reads
+the data. So lengths are checked before.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _IMPLICIT, _BIG, _DEFLATED = (
     "1.2.840.10008.1.2.2",
     "1.2.840.10008.1.2.1.99",
 )
-#: Written by some instead of a value representation.
+#: Some writers put this in place of a value representation.
 _UNKNOWN = {b"??", b"  ", b"\0\0"}
 _META, _ITEM = 0x0002, 0xFFFE
 _TRANSFER_SYNTAX = (0x0002, 0x0010)
@@ -29,11 +29,12 @@ _UNDEFINED = 0xFFFFFFFF
 
 
 def check_lengths(path: str | os.PathLike) -> None:
-    """Walks over the elements of a DICOM file; other files, and what cannot be followed, are left
-    to the reader.
+    """Check all elements of a DICOM file.
+
+    Other files, and elements of unknown form, are left to the reader.
 
     Raises:
-        IrrcacheError: an element reaches beyond the end of the file, or is none.
+        IrrcacheError: an element reaches beyond the end of the file, or is malformed.
     """
     path = Path(path)
     size = path.stat().st_size
@@ -46,7 +47,7 @@ def check_lengths(path: str | os.PathLike) -> None:
             if length is None or (syntax == _DEFLATED and tag[0] != _META):
                 return
             if length == _UNDEFINED:
-                continue  # its items follow, each with a header of its own
+                continue  # the items of a sequence follow, each with a header of its own
             end = stream.tell() + length
             if end > size:
                 raise IrrcacheError(
@@ -60,9 +61,9 @@ def check_lengths(path: str | os.PathLike) -> None:
 
 
 def _header(stream: BinaryIO, syntax: str) -> tuple[tuple[int, int], int | None]:
-    """Tag and length of the next element; no length where it has no known form."""
+    """Return tag and length of the next element; the length is None if its form is unknown."""
     start = stream.read(8)
-    # The part about the file itself is always explicit and little endian.
+    # The file meta information is always explicit VR little endian.
     meta = struct.unpack("<H", start[:2])[0] == _META
     order = ">" if syntax == _BIG and not meta else "<"
     tag = struct.unpack(order + "HH", start[:4])

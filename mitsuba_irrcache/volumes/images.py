@@ -27,7 +27,7 @@ _READERS = {
     ".dcm": "GDCMImageIO",
 }
 EXTENSIONS = tuple(_READERS)
-# Deflate cannot shrink anything further than this (zlib.net/zlib_tech.html).
+# Maximum compression ratio of deflate (zlib.net/zlib_tech.html).
 _BEST_DEFLATE_RATIO = 1032
 _COMPRESSED = re.compile(
     rb"^(?:encoding:\s*(?:gz|gzip|bz2|bzip2)|CompressedData\s*=\s*True)\s*$", re.I | re.M
@@ -51,16 +51,16 @@ _COMPONENT_BYTES = {
 def read_image(
     path: str | os.PathLike, data_folders: Sequence[str | os.PathLike] = ()
 ) -> VolumeData:
-    """Read one image file; spacing, origin and direction are kept (LPS, mm).
+    """Read one image file with its spacing, origin and direction (LPS, mm).
 
     Args:
         path: the image file.
-        data_folders: where voxels may lie that a header keeps in other files, beside its folder.
+        data_folders: folders, besides that of the header, for voxels in other files.
 
     Raises:
-        IrrcacheError: missing or truncated file, a header that promises more than the file can
-            hold (found before anything is allocated), one that names a data file elsewhere, or an
-            image that is no scalar volume.
+        IrrcacheError: missing or truncated file, a header that declares more than the file can
+            hold (found before memory is allocated), one that names a data file in another folder,
+            or an image that is no scalar volume.
     """
     path = Path(path)
     if not path.is_file():
@@ -74,7 +74,7 @@ def read_image(
     formats = (".nrrd", ".nhdr", ".mha", ".mhd")
     data = data_files(path, data_folders) if path.suffix.lower() in formats else [path]
     reader = SimpleITK.ImageFileReader()
-    # The contents do not choose another format, whose data files were not looked for.
+    # The reader is fixed: one selected by the contents could read unchecked data files.
     reader.SetImageIO(_reader_of(path))
     reader.SetFileName(str(path))
     try:
@@ -99,7 +99,7 @@ def read_image(
 
 
 def _check_dimensions(path: Path) -> None:
-    """Refuses a MetaImage of more dimensions than MetaIO has places for: it does not look."""
+    """Refuse a MetaImage with more dimensions than fit in MetaIO's unchecked buffer."""
     with path.open("rb") as stream:
         found = _DIMENSIONS.search(stream.read(64 * 1024))
     if found is not None and not 1 <= float(found[1]) <= _MOST_DIMENSIONS:
@@ -123,7 +123,10 @@ def _check_scalar_volume(path: Path, reader: SimpleITK.ImageFileReader) -> None:
 
 
 def _image_bytes(path: Path, reader: SimpleITK.ImageFileReader) -> int:
-    """Bytes of the voxels as stored; SimpleITK reports the type after rescaling, so ask NIfTI."""
+    """Return the bytes of the stored voxels; NIfTI's own header is read for the type.
+
+    SimpleITK reports the type after rescaling.
+    """
     count = int(np.prod(reader.GetSize(), dtype=object))
     if reader.HasMetaDataKey("bitpix"):
         return count * int(reader.GetMetaData("bitpix")) // 8
@@ -131,15 +134,15 @@ def _image_bytes(path: Path, reader: SimpleITK.ImageFileReader) -> int:
 
 
 def _reader_of(path: Path) -> str:
-    """The name of SimpleITK's reader of a format."""
+    """Return the name of SimpleITK's reader of a format."""
     name = path.name.lower()
     return next(reader for extension, reader in _READERS.items() if name.endswith(extension))
 
 
 def _check_file_holds(path: Path, data: Sequence[Path], image_bytes: int) -> None:
-    """Compare what the header promises with the file, and unpack a ``.gz`` once to its end."""
+    """Compare the size declared in the header with the file, and decompress a ``.gz`` once."""
     if path.suffix == ".dcm":
-        # The pixel data may be compressed by any codec.
+        # Pixel data may be compressed by any codec.
         _check_ratio(path, path.stat().st_size, image_bytes)
         return
     if path.suffix == ".gz":
@@ -164,7 +167,7 @@ def _check_ratio(path: Path, stored: int, image_bytes: int) -> None:
 
 
 def _check_gzip(path: Path, image_bytes: int) -> None:
-    """Unpack to the end: the NIfTI reader fills what is missing with zeros and says nothing."""
+    """Decompress to the end, because the NIfTI reader silently replaces missing data by zeros."""
     unpacked = 0
     try:
         with gzip.open(path) as stream:

@@ -1,4 +1,4 @@
-"""The subcommand ``irrcache import``: from a volume file to a Mitsuba scene."""
+"""The subcommand ``irrcache import``: convert a volume file to a Mitsuba scene."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mitsuba_irrcache.volumes.transfer import (
 )
 
 _PHANTOMS = ("thorax", "cloud")
-# Air is -1000 HU; data in Hounsfield units without any would be rare.
+# Air is -1000 HU; data in Hounsfield units without air are rare.
 _AIR_LIKE = -200
 
 
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_input(parser: argparse.ArgumentParser, besides: str = "") -> None:
-    """Declare what is read; ``besides`` names what else may be."""
+    """Declare the argument for the input; ``besides`` describes other accepted inputs."""
     parser.add_argument(
         "input",
         nargs="+",
@@ -53,7 +53,10 @@ def add_input(parser: argparse.ArgumentParser, besides: str = "") -> None:
 
 
 def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
-    """Declare how a volume is read and seen; whether it is a volume at all may be open."""
+    """Declare the options for reading a volume and for its appearance.
+
+    They are also declared where the input may be a scene.
+    """
     needed = "one is needed" if required else "for volumes: one is needed"
     _add_appearance(parser.add_argument_group(f"appearance ({needed})"), required)
     _add_processing(parser.add_argument_group("processing, in this order"))
@@ -63,12 +66,14 @@ def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
         action="append",
         default=[],
         metavar="FOLDER",
-        help="where a header (NRRD, MetaImage) may name data files, beside its own folder; "
-        "repeatable",
+        help="other folder in which a header (NRRD, MetaImage) may name data files; repeatable",
     )
     parser.add_argument("--series", metavar="UID", help="which series of a DICOM folder")
     parser.add_argument(
-        "--replace-nan", type=finite, metavar="VALUE", help="put VALUE for NaN and infinite values"
+        "--replace-nan",
+        type=finite,
+        metavar="VALUE",
+        help="replace NaN and infinite values by VALUE",
     )
     parser.add_argument(
         "--max-depth", type=whole(-1), default=2, help="default of the scene (2: single scattering)"
@@ -79,10 +84,10 @@ def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import as ``args`` say and print a summary; returns the exit status 0.
+    """Import as specified by ``args`` and print a summary; return the exit status 0.
 
     Raises:
-        IrrcacheError: input that cannot be used; nothing is left behind.
+        IrrcacheError: invalid input; no files are written then.
     """
     volume, mapping = _volume(args)
     resampled, sigma_t, albedo = processing.bake(
@@ -97,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def read(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | DensityMapping]:
-    """The volume that ``args`` name, at the resolution that they want, and how it is seen."""
+    """Read the volume given by ``args`` at the requested resolution, and its appearance."""
     volume, mapping = _volume(args)
     size = _target_size(volume, args)
     return volume if size == volume.size else processing.resample(volume, size), mapping
@@ -105,9 +110,7 @@ def read(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | Densi
 
 def _volume(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | DensityMapping]:
     if not has_appearance(args):
-        raise IrrcacheError(
-            f"{args.input[0]}: say how it is seen: --preset, --transfer-function or --density."
-        )
+        raise IrrcacheError(f"{args.input[0]}: give --preset, --transfer-function or --density.")
     mapping = _mapping(args)
     volume = _process(_read(args), args)
     _warn_about_unit(volume, mapping)
@@ -115,7 +118,7 @@ def _volume(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | De
 
 
 def has_appearance(args: argparse.Namespace) -> bool:
-    """Whether ``args`` say how a volume is seen."""
+    """Return whether ``args`` specify the appearance of a volume."""
     return any(v is not None for v in (args.preset, args.transfer_function, args.density))
 
 
@@ -142,10 +145,13 @@ def _add_appearance(group: argparse._ArgumentGroup, required: bool) -> None:
 def _add_processing(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--flip", metavar="AXES", type=_axes, default="", help="mirror, e.g. z, xz")
     group.add_argument(
-        "--crop", type=_ranges, metavar="X0:X1,Y0:Y1,Z0:Z1", help="keep these voxels"
+        "--crop", type=_ranges, metavar="X0:X1,Y0:Y1,Z0:Z1", help="crop to these voxels"
     )
     group.add_argument(
-        "--rescale", type=_numbers, metavar="SLOPE,INTERCEPT", help="to Hounsfield units, say"
+        "--rescale",
+        type=_numbers,
+        metavar="SLOPE,INTERCEPT",
+        help="for example to Hounsfield units",
     )
     group.add_argument(
         "--clip",
@@ -157,7 +163,7 @@ def _add_processing(group: argparse._ArgumentGroup) -> None:
         "--isolate",
         type=finite,
         metavar="VALUE",
-        help="keep the largest object above VALUE; -300 frees a patient of the table",
+        help="keep the largest object above VALUE; -300 removes the table below a patient",
     )
     size = group.add_mutually_exclusive_group()
     size.add_argument("--voxel-size", type=finite, metavar="MM", help="resample to cubic voxels")
@@ -169,7 +175,7 @@ def _add_processing(group: argparse._ArgumentGroup) -> None:
         type=int,
         default=1,
         metavar="K",
-        help="apply the transfer function at K times the resolution; keeps thin bone thin",
+        help="apply the transfer function at K times the resolution; preserves thin bone",
     )
 
 
@@ -211,8 +217,8 @@ def _read(args: argparse.Namespace) -> VolumeData:
 
 
 def _phantom(source: str) -> VolumeData:
-    """``phantom:NAME``, or ``phantom:NAME:X,Y,Z`` with the number of voxels."""
-    # Phantoms are needed for this one input only.
+    """Create ``phantom:NAME``, or ``phantom:NAME:X,Y,Z`` with the number of voxels."""
+    # Imported here because no other input needs it.
     from mitsuba_irrcache.volumes import phantom
 
     name, _, size = source.removeprefix("phantom:").partition(":")
@@ -254,7 +260,7 @@ def _target_size(volume: VolumeData, args: argparse.Namespace) -> processing.Siz
 
 
 def up_axis(args: argparse.Namespace) -> str:
-    """Graphics volumes have y up, medical ones the patient's head at +z."""
+    """Return the up axis: y for graphics volumes, z (to the patient's head) for medical ones."""
     if args.up is not None:
         return args.up
     return "y" if Path(args.input[0]).suffix == ".vol" else "z"
@@ -275,7 +281,7 @@ def _warn_about_unit(volume: VolumeData, mapping: TransferFunction | DensityMapp
 def _summary(
     volume: VolumeData, sigma_t: np.ndarray, albedo: np.ndarray, written: int, output: str
 ) -> str:
-    """What was imported, in a few lines that show a wrong unit or spacing at a glance."""
+    """Summarise the import in a few lines that make a wrong unit or spacing obvious."""
     depths = [
         float((sigma_t.sum(axis=2 - axis, dtype=np.float64) * spacing).max())
         for axis, spacing in enumerate(volume.spacing)

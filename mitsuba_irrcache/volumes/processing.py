@@ -1,6 +1,6 @@
 """Operations on volumes before they become a medium: crop, clip, rescale, resample, bake.
 
-SciPy belongs to an extra and is imported where it is used: the options of a command can be shown
+SciPy belongs to an extra and is imported where it is used, so that a command can print its help
 without it.
 """
 
@@ -18,18 +18,18 @@ from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 
 Size = tuple[int, int, int]
-# Voxels eroded before objects are told apart: a mattress is thicker than that, noise is not.
+# Voxels eroded before objects are labelled: thicker than noise, thinner than a mattress.
 _BRIDGE = 2
-#: Bytes per voxel, at most about: values, smoothed and interpolated; and with them extinction,
-#: albedo and what a transfer function computes them from.
+#: Estimated bytes per voxel: of values, smoothed and interpolated values; and of these with
+#: extinction, albedo and the temporaries of a transfer function.
 RESAMPLED, BAKED = 12, 60
 
 
 def crop(volume: VolumeData, ranges: Sequence[tuple[int | None, int | None]]) -> VolumeData:
-    """Keep the voxels with ``start <= index < stop`` along x, y, z; what is kept does not move.
+    """Keep the voxels with ``start <= index < stop`` along x, y, z, at their world positions.
 
     Args:
-        volume: what to crop; the result shares its memory.
+        volume: the volume to crop; the result shares its memory.
         ranges: three pairs ``(start, stop)``; None means from the first, or to the last voxel.
 
     Raises:
@@ -64,7 +64,7 @@ def clip(volume: VolumeData, low: float, high: float) -> VolumeData:
 
 
 def rescale(volume: VolumeData, slope: float, intercept: float) -> VolumeData:
-    """``slope * value + intercept``, float32; brings stored values to Hounsfield units, say.
+    """Return ``slope * value + intercept``, float32, for example to obtain Hounsfield units.
 
     Raises:
         IrrcacheError: a slope of 0, or either not finite.
@@ -76,20 +76,20 @@ def rescale(volume: VolumeData, slope: float, intercept: float) -> VolumeData:
 
 
 def flip(volume: VolumeData, axes: str) -> VolumeData:
-    """Mirror the values along the axes named, e.g. ``"xz"``, inside the same box.
+    """Mirror the values along the named axes, e.g. ``"xz"``, inside the same box.
 
-    Raw slices do not say which way they run; a head may come in upside down.
+    Raw slices have no orientation, so an imported head may be upside down.
     """
     order = tuple(slice(None, None, -1 if axis in axes else 1) for axis in "zyx")
     return replace(volume, values=volume.values[order])
 
 
 def isolate(volume: VolumeData, threshold: float) -> VolumeData:
-    """Keep the largest connected object above ``threshold``, all else becomes the least value.
+    """Keep the largest connected object above ``threshold``; set all else to the minimum value.
 
-    Takes the table and the tubes away from a patient. Bridges up to four voxels thick are cut, but
-    for stubs of four; cavities of the object that are closed within a slice, such as lungs, stay,
-    and so does a rim of one voxel, in which the surface fades.
+    Removes the table and the tubes around a patient. Bridges up to four voxels thick are cut,
+    except for stubs of four voxels. Cavities that the object encloses within a slice, such as
+    lungs, are preserved, and so is a rim of one voxel, in which the surface is blurred.
 
     Raises:
         IrrcacheError: nothing thicker than four voxels lies above ``threshold``.
@@ -98,7 +98,7 @@ def isolate(volume: VolumeData, threshold: float) -> VolumeData:
 
     values = np.asarray(volume.values)
     above = values > threshold
-    # What goes on beyond the border of the volume is not thin there.
+    # The object is assumed to continue beyond the border of the volume.
     cores = ndimage.binary_erosion(above, iterations=_BRIDGE, border_value=1)
     labels, count = ndimage.label(cores)
     if count == 0:
@@ -107,7 +107,7 @@ def isolate(volume: VolumeData, threshold: float) -> VolumeData:
             f"{values.min():g} .. {values.max():g}); give a lower threshold"
         )
     core = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
-    # Twice as far as was eroded: ears and other edges that the erosion rounded off come back.
+    # Dilated twice as far as eroded, to restore ears and other edges that the erosion rounded off.
     kept = ndimage.binary_dilation(core, iterations=2 * _BRIDGE, mask=above)
     for part in tqdm(kept, "isolating", delay=1, disable=None):
         ndimage.binary_dilation(ndimage.binary_fill_holes(part), output=part)
@@ -115,7 +115,7 @@ def isolate(volume: VolumeData, threshold: float) -> VolumeData:
 
 
 def size_for_voxel(volume: VolumeData, voxel_size: float) -> Size:
-    """Counts along x, y, z for near-cubic voxels of ``voxel_size`` (world units).
+    """Return counts along x, y, z for near-cubic voxels of ``voxel_size`` (world units).
 
     Raises:
         IrrcacheError: a voxel size that is not positive.
@@ -128,7 +128,7 @@ def size_for_voxel(volume: VolumeData, voxel_size: float) -> Size:
 
 
 def size_for_longest(volume: VolumeData, longest: int) -> Size:
-    """Counts along x, y, z with ``longest`` near-cubic voxels along the longest physical side.
+    """Return counts along x, y, z with ``longest`` near-cubic voxels along the longest side.
 
     Raises:
         IrrcacheError: ``longest`` below 1.
@@ -139,20 +139,20 @@ def size_for_longest(volume: VolumeData, longest: int) -> Size:
 
 
 def resample(volume: VolumeData, size: Size) -> VolumeData:
-    """Linear interpolation to ``size`` voxels (x, y, z) in the same box, float32.
+    """Interpolate linearly to ``size`` voxels (x, y, z) in the same box, float32.
 
-    Axes that lose resolution are smoothed first, so that thin structures fade instead of breaking
-    up. (Cubic interpolation would ring below zero next to bone.)
+    Axes that lose resolution are smoothed first, so that thin structures are blurred instead of
+    aliased. (Cubic interpolation would ring below zero next to bone.)
 
     Raises:
-        IrrcacheError: a size with a side below 1, or of more voxels than memory holds.
+        IrrcacheError: a size with a side below 1, or more voxels than fit in memory.
     """
     if min(size) < 1:
         raise IrrcacheError(f"size {size}: give at least 1 voxel along x, y and z")
     _check_memory(size, RESAMPLED)
     smooth = _antialiased(volume.values, size)
     spacing = np.array(volume.physical_size) / size
-    # The box stays; the centre of its first voxel is half a new voxel from the corner.
+    # The box is unchanged; the centre of its first voxel is half a new voxel from the corner.
     first_centre = volume.to_world @ (*(0.5 / np.array(size)), 1.0)
     return replace(
         volume,
@@ -181,7 +181,7 @@ def bake(
         float32 ``(z, y, x)`` in 1/world unit, and albedo float32 ``(z, y, x, 3)``.
 
     Raises:
-        IrrcacheError: ``supersample`` below 1, or more voxels than memory holds.
+        IrrcacheError: ``supersample`` below 1, or more voxels than fit in memory.
     """
     if supersample < 1:
         raise IrrcacheError(f"supersample {supersample}: give at least 1")
@@ -202,7 +202,7 @@ def bake(
 
 
 def _check_memory(size: Size, bytes_per_voxel: int, supersample: int = 1) -> None:
-    """Refuses grids of so many voxels before they are made, with the slab that is finer."""
+    """Refuse grids that do not fit in memory together with the finer slab."""
     x, y, z = size
     slab = x * y * supersample**3 if supersample > 1 else 0
     finer = f" in blocks of {supersample}^3" if slab else ""
@@ -214,7 +214,7 @@ def _check_memory(size: Size, bytes_per_voxel: int, supersample: int = 1) -> Non
 
 
 def _antialiased(values: np.ndarray, size: Size) -> np.ndarray:
-    """Values smoothed along the axes that lose resolution; a half-width of half the new voxel."""
+    """Smooth values along the axes that lose resolution, with half a new voxel as half-width."""
     from scipy import ndimage
 
     factors = np.array(values.shape) / np.array(size[::-1])
@@ -225,9 +225,9 @@ def _antialiased(values: np.ndarray, size: Size) -> np.ndarray:
 
 
 def _sample_slices(values: np.ndarray, size: Size, first: int, last: int) -> np.ndarray:
-    """Slices ``first .. last - 1`` of ``values`` seen as ``size`` voxels in the same box.
+    """Resample slices ``first .. last - 1`` of a grid of ``size`` voxels in the same box.
 
-    Only the source slices that they touch are read; float32 ``(last - first, y, x)``.
+    Only the source slices that they need are read; float32 ``(last - first, y, x)``.
     """
     from scipy import ndimage
 
@@ -244,7 +244,7 @@ def _sample_slices(values: np.ndarray, size: Size, first: int, last: int) -> np.
 
 
 def _average_blocks(sigma_t: np.ndarray, albedo: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
-    """Means over blocks of a slab ``k`` thick: extinction ``(y, x)``, albedo ``(y, x, 3)``."""
+    """Average blocks of a slab ``k`` thick: extinction ``(y, x)``, albedo ``(y, x, 3)``."""
     y, x = sigma_t.shape[1] // k, sigma_t.shape[2] // k
     blocks = (k, y, k, x, k)
     axes = (0, 2, 4)
@@ -253,4 +253,4 @@ def _average_blocks(sigma_t: np.ndarray, albedo: np.ndarray, k: int) -> tuple[np
     plain = albedo.reshape(*blocks, 3).mean(axis=axes)
     divisor = np.where(extinction > 0, extinction, 1.0)[..., None]
     mean_albedo = np.where(extinction[..., None] > 0, scattering / divisor, plain)
-    return extinction, np.minimum(mean_albedo, 1.0)  # rounding may exceed 1 in the last place
+    return extinction, np.minimum(mean_albedo, 1.0)  # rounding errors may slightly exceed 1

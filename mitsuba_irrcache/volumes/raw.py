@@ -19,7 +19,7 @@ _BYTE_ORDER = {"little": "<", "big": ">"}
 
 @dataclass(frozen=True)
 class RawLayout:
-    """What a raw file holds, since it cannot say so itself.
+    """The layout of a raw file, which has no header.
 
     Attributes:
         shape: voxel counts along x, y, z (x fastest); of the whole volume, also for slice files.
@@ -50,15 +50,15 @@ class RawLayout:
 
     @property
     def numpy_dtype(self) -> np.dtype:
-        """Type and byte order together."""
+        """Return the NumPy type including its byte order."""
         return np.dtype(self.dtype).newbyteorder(_BYTE_ORDER[self.endian])
 
 
 def read_raw(path: str | os.PathLike, layout: RawLayout) -> VolumeData:
-    """Map one raw file into memory (nothing is read until it is used).
+    """Map one raw file into memory; values are read on first use.
 
     Raises:
-        IrrcacheError: the file is missing, or its size is not what ``layout`` says.
+        IrrcacheError: the file is missing, or its size is not that of ``layout``.
     """
     path = Path(path)
     shape = layout.shape[::-1]
@@ -111,15 +111,15 @@ def _check_bytes(path: Path, layout: RawLayout, shape: tuple[int, ...]) -> None:
 
 
 def _natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Digits compare as numbers, so that slices sort by number without leading zeros."""
+    """Return a sort key that compares digits as numbers, without leading zeros, too."""
     parts = re.split(r"(\d+)", name)
     return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
 
 
 def _check_numbering(ordered: Sequence[Path]) -> None:
-    """Refuse a run of numbered names with a hole: a slice is missing and all after it would shift.
+    """Refuse numbered names with a gap: after a missing slice, all others would be shifted.
 
-    Names whose only difference is one number count as numbered; other lists are taken as given.
+    Names whose only difference is one number count as numbered; other lists are used as given.
     """
     keys = [_natural_key(path.name) for path in ordered]
     if len(keys) < 3 or len({len(key) for key in keys}) != 1:

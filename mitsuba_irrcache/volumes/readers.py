@@ -1,4 +1,4 @@
-"""One way in for all volume files: ``read_volume``."""
+"""The entry point for all volume files: ``read_volume``."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def read_volume(
             ``raw``, a raw file, or a list or glob pattern of raw slice files.
         raw: the layout of raw files.
         series: SeriesInstanceUID, for DICOM folders with several.
-        replace_nan: value to put in the place of NaN and infinite ones.
-        data_folders: where voxels may lie that a header (NRRD, MetaImage) keeps in other files,
-            beside its own folder.
+        replace_nan: value that replaces NaN and infinite values.
+        data_folders: folders, besides that of a header (NRRD, MetaImage), for voxels that it keeps
+            in other files.
 
     Raises:
         IrrcacheError: anything that cannot be read as a finite scalar volume.
@@ -66,7 +66,7 @@ def _read(
     name = single.name.lower()
     if name.endswith(".vol"):
         return _read_mitsuba(single)
-    # SimpleITK is needed for these formats only.
+    # Imported here because only these formats need SimpleITK.
     from mitsuba_irrcache.volumes import images
 
     if name.endswith(images.EXTENSIONS):
@@ -78,7 +78,7 @@ def _read(
 
 
 def _expand(path: PathLike | Sequence[PathLike]) -> list[Path]:
-    """The files that a path, a glob pattern or a list of paths stands for."""
+    """Return the files that a path, a glob pattern or a list of paths stands for."""
     if not isinstance(path, (str, os.PathLike)):
         if not path:
             raise IrrcacheError("an empty list of files; name at least one")
@@ -94,14 +94,14 @@ def _expand(path: PathLike | Sequence[PathLike]) -> list[Path]:
 def _read_folder(folder: Path, series: str | None) -> VolumeData:
     if not any(folder.iterdir()):
         raise IrrcacheError(f"folder {folder} is empty; give a folder with a DICOM series")
-    # SimpleITK is needed for these formats only.
+    # Imported here because only these formats need SimpleITK.
     from mitsuba_irrcache.volumes.dicom import read_dicom_series
 
     return read_dicom_series(folder, series)
 
 
 def _read_mitsuba(path: Path) -> VolumeData:
-    """A one-channel ``.vol``, placed by the bounding box in its header."""
+    """Read a one-channel ``.vol``, placed by the bounding box in its header."""
     values, (low, high) = read_vol(path)
     if values.shape[3] != 1:
         raise IrrcacheError(
@@ -113,7 +113,7 @@ def _read_mitsuba(path: Path) -> VolumeData:
 
 
 def _finite(volume: VolumeData, replacement: float | None) -> np.ndarray:
-    """The values, all finite: replaced, or refused with their number and first index."""
+    """Return finite values; others are replaced, or refused with their number and first index."""
     values = volume.values
     if values.dtype.kind != "f":
         return values

@@ -1,4 +1,4 @@
-"""A folder with a Mitsuba scene around a volume: any Mitsuba 3 renders it as it is."""
+"""Export of a volume as a Mitsuba scene in a folder, for use with any Mitsuba 3."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ VIEWS = {
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """Defaults that ``scene.xml`` exposes as parameters (``-D name=value``), and its view.
+    """The parameters of ``scene.xml`` (``-D name=value``) with their defaults, and its view.
 
     Attributes:
         up: the world axis that points up in the picture, ``"z"`` (medical) or ``"y"``.
@@ -57,11 +57,11 @@ def write_scene(
     """Write ``scene.xml``, ``sigma_t.vol``, ``albedo.vol`` and ``transfer_function.json``.
 
     Args:
-        target: a folder, which appears as a whole and replaces an earlier import on success only;
-            or a file ending in ``.xml``, beside which the other files go, in a folder that exists
-            and keeps what else it holds.
+        target: a folder, created atomically; it replaces an earlier import on success only. Or a
+            file ending in ``.xml`` in an existing folder, which also receives the other files and
+            whose unrelated files are not changed.
         volume: gives the placement; scene units are its world units.
-        mapping: how the grids were made, kept as a record.
+        mapping: how the grids were made, saved as a record.
         sigma_t: shape ``(z, y, x)``, extinction in 1/world unit.
         albedo: shape ``(z, y, x, 3)``; stored as one channel where it is grey.
         settings: defaults of the scene's parameters.
@@ -72,7 +72,7 @@ def write_scene(
 
     Raises:
         IrrcacheError: shapes that disagree, values outside their range, an empty medium, or a
-            target that may not be replaced. Nothing is left behind then.
+            target that may not be replaced. No files are written then.
     """
     settings = settings or SceneSettings()
     _check_medium(volume, sigma_t, albedo)
@@ -95,7 +95,7 @@ def write_scene(
 
 
 def camera(volume: VolumeData, sigma_t: np.ndarray, up: str = "z") -> tuple[np.ndarray, ...]:
-    """Origin, target and up vector of a camera that frames the occupied part of the volume.
+    """Return origin, target and up vector of a camera that frames the nonempty voxels.
 
     Raises:
         IrrcacheError: ``up`` is neither "z" nor "y".
@@ -116,7 +116,7 @@ def camera(volume: VolumeData, sigma_t: np.ndarray, up: str = "z") -> tuple[np.n
 
 
 def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: SceneSettings) -> str:
-    """The scene; ``to_world`` places the unit cube of the grids, ``view`` is as from ``camera``."""
+    """Return the scene; ``to_world`` is of the grids' unit cube, ``view`` as from ``camera``."""
     grid, boundary = _text(to_world), _text(_boundary_to_world(to_world))
     origin, target, up = (_text(vector) for vector in view)
     far = 10 * float(np.linalg.norm(np.subtract(view[0], view[1])))
@@ -186,10 +186,10 @@ def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: Scen
 
 
 def _boundary_to_world(to_world: np.ndarray) -> np.ndarray:
-    """Placement of Mitsuba's ``cube``, which is ``[-1, 1]^3``, around a grid in ``[0, 1]^3``.
+    """Return the transformation of Mitsuba's ``cube`` ``[-1, 1]^3`` to a grid's box.
 
-    A mirrored cube has its normals inside, and Mitsuba then takes the outside for the medium. The
-    cube is symmetric, so a mirrored grid gets a boundary mirrored once more.
+    Mitsuba takes the outside of a mirrored cube for the medium, because its normals point inwards.
+    The cube is symmetric, so the boundary of a mirrored grid is mirrored once more.
     """
     handedness = np.sign(np.linalg.det(to_world[:3, :3]))
     cube_to_unit = np.diag([0.5 * handedness, 0.5, 0.5, 1.0])
@@ -209,7 +209,7 @@ def _text(numbers: np.ndarray) -> str:
 
 
 def _occupied_ends(volume: VolumeData, sigma_t: np.ndarray) -> np.ndarray:
-    """World positions ``(n, 3)`` of the first and last voxel with extinction in every row."""
+    """Return world positions ``(n, 3)`` of the first and last nonzero voxel of each row."""
     occupied = sigma_t > 0
     z, y = np.nonzero(occupied.any(axis=2))
     rows = occupied[z, y]

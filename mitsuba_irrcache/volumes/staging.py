@@ -1,4 +1,4 @@
-"""Folders appear whole or not at all: they are built under a temporary name and then renamed."""
+"""Atomic creation of folders: they are built under a temporary name and then renamed."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mitsuba_irrcache.errors import IrrcacheError
 
 @contextmanager
 def staged_folder(folder: str | os.PathLike, names: set[str], overwrite: bool) -> Iterator[Path]:
-    """A temporary folder that becomes ``folder`` when the block ends without an exception.
+    """Create a temporary folder that becomes ``folder`` if the block ends without an exception.
 
     Args:
-        folder: where the result goes; an empty folder may exist there.
-        names: the files that the result consists of. Only a folder with no others is replaced, so
-            that ``overwrite`` can never delete what somebody else put there.
+        folder: the final folder; it may exist if it is empty.
+        names: the files of the result. Only a folder without other files is replaced, so that
+            ``overwrite`` can never delete unrelated files.
         overwrite: replace an earlier result, and only on success.
 
     Raises:
@@ -44,16 +44,16 @@ def staged_folder(folder: str | os.PathLike, names: set[str], overwrite: bool) -
 
 @contextmanager
 def staged_files(folder: str | os.PathLike, names: set[str], overwrite: bool) -> Iterator[Path]:
-    """A temporary folder whose files move into the existing ``folder`` when the block succeeds.
+    """Create a temporary folder whose files move into the existing ``folder`` on success.
 
     Args:
-        folder: an existing folder, whose other files stay as they are.
-        names: the files that the result consists of.
-        overwrite: replace files of these names; on a failure the old ones are put back.
+        folder: an existing folder, whose other files are not changed.
+        names: the files of the result.
+        overwrite: replace files of these names; on a failure the old ones are restored.
 
     Raises:
         IrrcacheError: ``folder`` does not exist, or holds one of ``names`` already; or one of these
-            is a folder, which is never replaced, since it may hold anything.
+            is a folder, which is never replaced, since it may hold unrelated files.
     """
     folder = Path(folder).absolute()
     if not folder.is_dir():
@@ -74,7 +74,7 @@ def staged_files(folder: str | os.PathLike, names: set[str], overwrite: bool) ->
 
 
 def _move_into(folder: Path, built: Path, backup: Path) -> None:
-    """Move every file of ``built`` into ``folder``; undo all of it if one cannot be moved."""
+    """Move every file of ``built`` into ``folder``; undo all moves if one fails."""
     moved: list[str] = []
     names = sorted(path.name for path in built.iterdir())
     try:
@@ -110,7 +110,7 @@ def _check_replaceable(folder: Path, names: set[str], overwrite: bool) -> None:
 
 @contextmanager
 def _temporary_beside(path: Path) -> Iterator[Path]:
-    """A folder on the same file system as ``path`` (renames stay atomic), removed in any case."""
+    """Create a folder on the file system of ``path``, for atomic renames; it is always removed."""
     try:
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     except OSError as error:

@@ -51,13 +51,13 @@ class TransferFunction:
         opacities: shape ``(n,)``, in ``[0, 1)``, per ``length``.
         colour_values: shape ``(m,)``, increasing.
         colours: shape ``(m, 3)``, in ``[0, 1]``: the albedo.
-        length: mm over which the opacities are stated.
-        unit: what the values measure, e.g. ``"HU"``.
+        length: mm to which the opacities refer.
+        unit: the unit of the values, e.g. ``"HU"``.
         percentiles: for values relative to the data, the percentiles that 0 and 1 stand for.
-        description: for people.
+        description: free text.
 
     Raises:
-        IrrcacheError: points that no medium can have; the first one at fault is named.
+        IrrcacheError: points that define no medium; the first invalid one is named.
     """
 
     opacity_values: np.ndarray
@@ -86,7 +86,7 @@ class TransferFunction:
                 )
 
     def fitted_to(self, values: np.ndarray) -> TransferFunction:
-        """The same function with absolute point values, its percentiles taken from ``values``.
+        """Return the function with absolute point values, given the percentiles of ``values``.
 
         Of large volumes every n-th slice is read, about ten million voxels in all.
 
@@ -111,12 +111,12 @@ class TransferFunction:
         )
 
     def sigma_t(self, values: np.ndarray) -> np.ndarray:
-        """Extinction in 1/mm, float32, for absolute values of any shape."""
+        """Return the extinction in 1/mm, float32, for absolute values of any shape."""
         opacity = np.interp(values, self.opacity_values, self.opacities)
         return (-np.log1p(-opacity) / self.length).astype(np.float32)
 
     def albedo(self, values: np.ndarray) -> np.ndarray:
-        """Single-scattering albedo, float32 ``(..., 3)``, for absolute values of any shape."""
+        """Return the albedo, float32 ``(..., 3)``, for absolute values of any shape."""
         albedo = np.empty((*values.shape, 3), dtype=np.float32)
         for channel in range(3):
             albedo[..., channel] = np.interp(values, self.colour_values, self.colours[:, channel])
@@ -137,11 +137,11 @@ class TransferFunction:
         return sigma_t, albedo
 
     def map(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Extinction and albedo of absolute values of any shape, see ``apply``."""
+        """Return extinction and albedo of absolute values of any shape, see ``apply``."""
         return self.sigma_t(values), self.albedo(values)
 
     def to_json(self) -> str:
-        """The function in the format of this module."""
+        """Return the function in the format of this module."""
         document = {"format": FORMAT, "version": VERSION}
         if self.description:
             document["description"] = self.description
@@ -157,14 +157,14 @@ class TransferFunction:
         return json.dumps(document, indent=2) + "\n"
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the JSON file, atomically."""
+        """Write the JSON file atomically."""
         with atomic_write(path) as stream:
             stream.write(self.to_json().encode())
 
 
 @dataclass(frozen=True)
 class _IntegerTable:
-    """A transfer function tabulated over every integer that a volume holds: exact, and fast."""
+    """A transfer function tabulated over all integers that a volume contains; exact and fast."""
 
     first: int
     sigma_t: np.ndarray
@@ -172,7 +172,7 @@ class _IntegerTable:
 
     @classmethod
     def of(cls, function: TransferFunction, values: np.ndarray) -> _IntegerTable | None:
-        """The table, or None for real values and for ranges wider than the table may be."""
+        """Create the table; None for real values and for ranges wider than the table may be."""
         if values.dtype.kind not in "iu":
             return None
         first, last = int(values.min()), int(values.max())
@@ -187,7 +187,7 @@ class _IntegerTable:
 
 @dataclass(frozen=True)
 class DensityMapping:
-    """For volumes that are densities already: ``sigma_t = scale * density``, constant albedo.
+    """The mapping for volumes of densities: ``sigma_t = scale * density``, constant albedo.
 
     Attributes:
         scale: extinction per unit of density, in 1/scene unit.
@@ -207,7 +207,7 @@ class DensityMapping:
             raise IrrcacheError(f"albedo {self.albedo}: give 1 or 3 values between 0 and 1")
 
     def fitted_to(self, values: np.ndarray) -> DensityMapping:
-        """Itself, once no density of ``values`` is found to be negative.
+        """Return this mapping after checking that ``values`` has no negative densities.
 
         Raises:
             IrrcacheError: negative densities; their number and the least one are named.
@@ -221,7 +221,7 @@ class DensityMapping:
         return self
 
     def map(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Extinction, float32 like ``values``, and albedo, float32 ``(..., 3)``, read-only."""
+        """Return extinction, float32 like ``values``, and read-only albedo ``(..., 3)``."""
         albedo = np.broadcast_to(np.float32(self.albedo), (*values.shape, 3))
         return np.asarray(values * np.float32(self.scale), dtype=np.float32), albedo
 
@@ -230,7 +230,7 @@ class DensityMapping:
         return self.fitted_to(values).map(values)
 
     def to_json(self) -> str:
-        """A record of the mapping, to lie beside the scene."""
+        """Return a record of the mapping, which is saved with the scene."""
         document = {
             "format": "irrcache density mapping",
             "version": VERSION,
@@ -258,10 +258,10 @@ def load_transfer_function(path: str | os.PathLike) -> TransferFunction:
 
 
 def parse_transfer_function(text: str) -> TransferFunction:
-    """The transfer function that a JSON text describes.
+    """Parse the JSON text of a transfer function.
 
     Raises:
-        IrrcacheError: the key and index at fault are named.
+        IrrcacheError: the invalid key and index are named.
     """
     try:
         document = json.loads(text)
@@ -283,12 +283,12 @@ def parse_transfer_function(text: str) -> TransferFunction:
 
 
 def preset_names() -> list[str]:
-    """Names of the presets that come with the package, sorted."""
+    """Return the sorted names of the presets that the package contains."""
     return sorted(p.stem for p in _PRESETS.glob("*.json"))
 
 
 def load_preset(name: str) -> TransferFunction:
-    """A preset by name.
+    """Return a preset by name.
 
     Raises:
         IrrcacheError: no preset of that name; the names are listed.
@@ -315,7 +315,7 @@ def _check_keys(document: object) -> None:
 
 
 def _points(document: dict, key: str, components: int) -> tuple[np.ndarray, np.ndarray]:
-    """Values ``(n,)`` and what is given at them ``(n, components)``."""
+    """Return values ``(n,)`` and the components at them ``(n, components)``."""
     points = document[key]
     if not isinstance(points, list):
         raise IrrcacheError(f'"{key}" is {points!r}; give a list of points [value, {key}]')
@@ -354,7 +354,7 @@ def _percentiles(document: dict) -> tuple[float, float] | None:
 
 
 def _check_values(key: str, values: np.ndarray) -> None:
-    """Two points at least, finite and strictly increasing."""
+    """Check that there are at least two points, finite and strictly increasing."""
     if len(values) < 2:
         raise IrrcacheError(f'"{key}" has {len(values)} point(s); give at least two')
     if not np.isfinite(values).all():

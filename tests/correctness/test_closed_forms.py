@@ -1,5 +1,6 @@
-"""The cache and the picture against closed forms and published tables; no renderer made the
-reference values.
+"""Cache and image against closed forms and published tables; no reference was rendered.
+
+`correctness.md` is docs/correctness.md.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.render.raymarch import Projection
-from mitsuba_irrcache.scene.compile import bake_media, bake_scene
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.solvers.base import SolverTask
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, least_batch
-from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.solvers.path.solver import PathSolver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -26,7 +29,7 @@ SKY = {"type": "constant", "radiance": 1.0}
 
 
 def prepared(scenes, integrator: dict, shape: dict, **objects):
-    """The cache of a scene."""
+    """Return the cache of a scene."""
     scene = scenes.load(
         {"type": "irrcache", "solver": "path", **integrator}, shape, size=4, **objects
     )
@@ -35,7 +38,7 @@ def prepared(scenes, integrator: dict, shape: dict, **objects):
 
 
 def voxel_positions(cache) -> np.ndarray:
-    """World positions of all voxels, (z, y, x, 3)."""
+    """Return the world positions of all voxels, (z, y, x, 3)."""
     shape = cache.grid.shape
     z, y, x = np.indices(shape)
     local = (np.stack([x, y, z], axis=-1) + 0.5) / np.array(shape)[::-1]
@@ -43,8 +46,9 @@ def voxel_positions(cache) -> np.ndarray:
 
 
 def uncollided_in_sphere(r: np.ndarray, radius: float) -> np.ndarray:
-    """phi / (4 pi) at distance ``r`` from the centre, sigma_t = 1: half the integral of e^-s over
-    the cosine.
+    """Return phi / (4 pi) at distance ``r`` from the centre, for sigma_t = 1.
+
+    It is half the integral of e^-s over the cosine.
     """
     cosine, weight = np.polynomial.legendre.leggauss(400)
     r = np.asarray(r)[..., None]
@@ -63,9 +67,8 @@ SPHERES = [
 
 
 @pytest.mark.parametrize(("radius", "centre", "half", "mean"), SPHERES)
-def test_uncollided_light_in_a_sphere(scenes, radius, centre, half, mean):
-    """Every voxel inside a homogeneous sphere under a white sky, at its own distance from the
-    centre.
+def test_uncollided_fluence_in_a_sphere(scenes, radius, centre, half, mean):
+    """Uncollided fluence in a homogeneous sphere under a white sky agrees at every voxel.
 
     Transmittance is analytic, so only the directions are random: the pooled mean is known to 0.1 %,
     the voxels to 2 %; a centre, R/2 and volume mean off by 0.5 % fail through the formula, which is
@@ -94,13 +97,13 @@ def test_uncollided_light_in_a_sphere(scenes, radius, centre, half, mean):
     pooled = np.sqrt((error**2).sum()) / expected.sum()
     assert pooled < 1.2e-3
     assert abs(measured.sum() / expected.sum() - 1) < 4 * pooled
-    # At the centre the transmittance is the same in all directions: no noise at all.
+    # At the centre all directions have the same transmittance, so there is no noise.
     assert measured[distance[inside] < 1e-6] == pytest.approx(centre, rel=1e-5)
 
 
 @pytest.mark.parametrize("scale", [0.5, 20.0])
 def test_white_furnace(scenes, scale):
-    """Albedo 1 under a unit sky: Phi = 4 pi at every voxel and every pixel 1, whatever the density.
+    """With albedo 1 under a unit sky, Phi is 4 pi at every voxel and every pixel is 1.
 
     rr_depth is beyond every path here (optical depth 20 and more would need thousands of orders
     with Russian roulette at full weight); the mean over all voxels is known to 0.2 %, the pixels to
@@ -115,7 +118,7 @@ def test_white_furnace(scenes, scale):
     cache = scene.integrator().cache
     phi = np.array(cache.irradiance) / (4 * np.pi)
     error = np.array(cache.standard_error) / (4 * np.pi)
-    # The layers are drawn apart, so their sum has noise even where the light has none.
+    # The layers are sampled independently, so their sum is noisy even in a constant field.
     z = (phi - 1) / np.maximum(error, 1e-6)
     assert np.abs(phi.mean() - 1) < 0.003
     assert np.abs(z).max() < 5.5
@@ -124,20 +127,26 @@ def test_white_furnace(scenes, scale):
 
 
 def column(scene, depths: tuple[float, float], voxels: int, samples: int, max_depth: int):
-    """The medium of a wide slab below z = 0, and a cache on the z axis from depths[0] to depths[1]:
-    where the light varies with depth only, a grid one voxel wide holds all of it.
+    """Return the medium of a wide slab below z = 0, and a cache on the z axis.
+
+    The cache extends from depths[0] to depths[1]. The radiance depends on depth only, so a grid of
+    one voxel across suffices.
     """
-    medium = bake_scene(scene)
+    description = compile_scene(scene)
+    (medium,) = description.visible
     place = np.diag([1.0, 1.0, depths[1] - depths[0], 1.0])
     place[:3, 3] = -0.5, -0.5, -depths[1]
     grid = Grid((voxels, 1, 1), place)
     cache = IrradianceCache(grid, dr.arange(mi.UInt32, voxels), 3, max_depth)
-    path_solver.refine(scene, medium, cache, samples, seed=1, rr_depth=1000)
+    task = SolverTask(scene, description, medium, cache, seed=1, rr_depth=1000)
+    PathSolver(task).refine(samples)
     return medium, cache
 
 
 def radiance(medium, cache, cosine: float, step: float) -> float:
-    """Light that leaves the slab at the origin at this cosine, without what is behind the slab."""
+    """Return the radiance that leaves the slab at the origin at this cosine, without the
+    background.
+    """
     direction = mi.Vector3f(-math.sqrt(1 - cosine**2), 0, -cosine)
     ray = mi.Ray3f(mi.Point3f(-direction), direction)
     _, near, far = medium.intersect(ray)
@@ -148,14 +157,14 @@ def radiance(medium, cache, cosine: float, step: float) -> float:
     return float(result.x[0])
 
 
-#: Width of slabs, in mean free paths.
+#: Width of slabs in mean free paths.
 WIDTH = 200.0
 
 
 def slab(
     scenes, sigma_t, albedo, depth: float, phase=None, width: float = WIDTH, **objects
 ) -> mi.Scene:
-    """A slab below z = 0."""
+    """Return a slab below z = 0."""
     to_world = scenes.placement((width, width, depth), center=(0, 0, -depth / 2))
     medium = scenes.medium(sigma_t, albedo) | ({"phase": phase} if phase else {})
     shape = scenes.boundary(medium, to_world)
@@ -168,12 +177,12 @@ HALF_SPACES = [(0.5, 0.585786, 0.115226, 0.160144), (0.9, 0.759747, 0.414947, 0.
 
 @pytest.mark.parametrize(("albedo", "surface", "normal", "oblique"), HALF_SPACES)
 def test_half_space(scenes, albedo, surface, normal, oblique):
-    """A slab 200 wide and 24 deep stands in for the half-space: what it lacks is below e^-10 of the
-    light (albedo 0.9 has a diffusion length of 1.9).
+    """A slab 200 wide and 24 deep reproduces the tabulated half-space.
 
-    The surface irradiance is one point, without any grid: known to 0.12 %, asserted to 4 standard
-    errors. The radiances have noise of about 0.1 % and the discretisation of voxels of 0.1 mean
-    free paths: asserted to 0.7 %.
+    Its truncation error is below e^-10 (albedo 0.9 has a diffusion length of 1.9). The surface
+    irradiance is one point, without any grid: known to 0.12 %, asserted to 4 standard errors. The
+    radiances have noise of about 0.1 % and the discretisation of voxels of 0.1 mean free paths:
+    asserted to 0.7 %.
     """
     scene = slab(scenes, 1.0, albedo, 24.0, emitter=SKY)
     _, top = column(scene, (-1e-4, 1e-4), 1, 1 << 18, -1)
@@ -187,27 +196,31 @@ def test_half_space(scenes, albedo, surface, normal, oblique):
 
 
 def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, width: float = WIDTH):
-    """The medium of a slab of ``depth``, and its light by the solver ``sweep``, in so many layers,
-    each of ``columns`` x ``columns`` voxels, by so many ``samples``, directions.
+    """Return the medium of a slab of ``depth`` and its cache by the solver ``sweep``.
+
+    The grid has ``layers`` of ``columns`` x ``columns`` voxels; ``samples`` is the number of
+    directions.
     """
-    (medium,) = bake_media(scene)
+    (medium,) = compile_scene(scene).visible
     place = np.diag([width, width, depth, 1.0])
     place[:3, 3] = -width / 2, -width / 2, -depth
     grid = Grid((layers, columns, columns), place)
     index, moments = dr.arange(mi.UInt32, grid.voxel_count), None
     solver, least = sn_solver.Sweep, sn_solver.BATCH
-    if medium.phase is not None:
+    if not medium.phase.is_isotropic:
         moments = AngularBasis(medium.phase, sources_of(scene))
         solver, least = AnisotropicSweep, least_batch(moments.order)
     batch = sn_solver.batch_of(samples, least)
     count = moments.count if moments else 0
-    cache = IrradianceCache(grid, index, 3, -1, batch=batch, correlated=True, moments=count)
-    cache.directional = moments
+    cache = IrradianceCache(
+        grid, index, 3, -1, batch=batch, correlated=True, moments=count,
+        interpolation=Interpolation(moments),
+    )  # fmt: skip
     solver(scene, medium, cache, 1).refine(max(samples, batch))
     return medium, cache
 
 
-# correctness.md table C: albedo, radiance leaving at the cosines 0.1, 0.5, 1; depth that is enough
+# correctness.md table C: albedo, radiance leaving at the cosines 0.1, 0.5, 1; sufficient depth
 SWEPT_HALF_SPACES = [
     (0.5, (0.241721, 0.160144, 0.115226), 16.0),
     (0.8, (0.490710, 0.367970, 0.285255), 16.0),
@@ -223,13 +236,14 @@ SWEPT_HALF_SPACES = [
         for row in SWEPT_HALF_SPACES
     ],
 )
-def test_half_space_by_sweeps(scenes, albedo, leaving, depth):
-    """Under a white sky, by the solver ``sweep`` in a slab 11 diffusion lengths deep or more, in
-    128 layers of voxels (of 0.5 mean free paths at an albedo of 0.99, correctness.md A, 1f).
+def test_half_space_by_sweep(scenes, albedo, leaving, depth):
+    """``sweep`` reproduces half-spaces under a white sky with slabs 11 diffusion lengths deep or
+    more.
 
-    Of the 1.5 % asserted, 0.7 are the discretisation at a cosine of 0.1, where light comes from a
-    fifth of a voxel's depth (0.25 at the others). The noise of 512 directions is 0.1 % in the
-    lightest matter and 0.4 in the darkest.
+    The slabs have 128 layers (of 0.5 mean free paths at an albedo of 0.99, correctness.md A, 1f).
+    Of the 1.5 % asserted, 0.7 are the discretisation at a cosine of 0.1, for which the radiance
+    comes from a fifth of a voxel's depth (0.25 at the others). The noise of 512 directions is 0.1 %
+    at the lowest albedo and 0.4 at the highest.
     """
     scene = slab(scenes, 1.0, albedo, depth, emitter=SKY)
     medium, cache = swept(scene, depth, 128, 41, 512)
@@ -238,7 +252,7 @@ def test_half_space_by_sweeps(scenes, albedo, leaving, depth):
 
 
 # correctness.md table A, a sun at cosine 0.1 with a flux of pi on the slab: name, depth, albedo,
-# radiance leaving the lit side at the `COSINES`.
+# reflected radiance at the `COSINES`.
 SUNLIT_SLABS = [
     ("1a", 0.03125, 0.2, (0.117771, 0.0264170, 0.0134041)),
     ("1b", 0.03125, 1.0, (0.622884, 0.139763, 0.0709192)),
@@ -248,17 +262,17 @@ SUNLIT_SLABS = [
 #: Layers, columns and directions of thin slabs by ``sweep``. Up to 20 voxels a side are solved for
 #: without coarser grids, which take twelve times as long and change nothing in five digits.
 THIN = 16, 19, 512
-#: Layers, columns, directions and width of deep ones. A low sun shines on their sides ten times as
-#: brightly as on their top. In white matter that light goes on from column to column, of some
-#: mean free paths, where it should not: with 21 columns of 10, 3 % of the light in the middle.
+#: Layers, columns, directions and width of deep slabs. A low sun irradiates their sides ten times
+#: as much as their top. At albedo 1 this radiance diffuses across columns, which are some mean free
+#: paths wide, further than it should: with 21 columns of 10, 3 % of the fluence in the middle.
 DEEP = {0.2: (1024, 21, 32, WIDTH), 1.0: (1024, 45, 256, 1600.0)}
-# 1c: a sky on one side, radiance leaving that side and the other one, where the sky shows through.
+# 1c: a sky on one side, radiance leaving that side, and the other one including the sky behind.
 SKYLIT_SLAB = 0.03125, 0.99, (0.133177, 0.0299879, 0.0152233), (0.863946, 0.969363, 0.984447)
 COSINES = (0.1, 0.5, 1.0)
 
 
 def sunlit(scenes, depth: float, albedo: float, width: float = WIDTH):
-    """The slab of DISORT's first problem: a sun that is low in the sky."""
+    """Return the slab of DISORT's first problem, with a sun near the horizon."""
     sun = {
         "type": "directional",
         "direction": [math.sqrt(1 - 0.01), 0, -0.1],
@@ -269,9 +283,11 @@ def sunlit(scenes, depth: float, albedo: float, width: float = WIDTH):
 
 @pytest.mark.parametrize(("name", "depth", "albedo", "leaving"), SUNLIT_SLABS)
 def test_sunlit_slabs(scenes, name, depth, albedo, leaving):
-    """DISORT 1a, 1b, 1d, 1e by ``path``, in 256 layers of the uppermost 6 mean free paths (what is
-    below adds e^-6), or 64 of a thin slab: 1 %. The sun's light falls off by 1/e in 4 layers: 0.3 %
-    of discretisation. Noise is 0.15 % (some 10 layers matter, of 4096 samples each), 4 times: 0.6.
+    """DISORT 1a, 1b, 1d, 1e by ``path``, to 1 %.
+
+    The grid has 256 layers in the uppermost 6 mean free paths (the rest contributes e^-6), or 64 in
+    a thin slab. The sun's irradiance decays by 1/e in 4 layers: 0.3 % of discretisation. Noise is
+    0.15 % (some 10 layers contribute, of 4096 samples each), 4 times: 0.6.
     """
     seen = min(depth, 6.0)
     layers = 256 if depth > 1 else 64
@@ -284,10 +300,11 @@ def test_sunlit_slabs(scenes, name, depth, albedo, leaving):
     ("name", "depth", "albedo", "leaving"),
     [*SUNLIT_SLABS[:3], pytest.param(*SUNLIT_SLABS[3], marks=pytest.mark.slow)],
 )
-def test_sunlit_slabs_by_sweeps(scenes, name, depth, albedo, leaving):
-    """1a, 1b, 1d, 1e by ``sweep``: 1 %, of which 0.4 are the discretisation of layers of 1/32
-    (1/512 of the thin slabs), and 0.5 the noise of directions: in thin slabs, where the light along
-    the layer counts most, of 512.
+def test_sunlit_slabs_by_sweep(scenes, name, depth, albedo, leaving):
+    """DISORT 1a, 1b, 1d, 1e by ``sweep``, to 1 %.
+
+    Of these 0.4 are the discretisation of layers of 1/32 (1/512 of the thin slabs), and 0.5 the
+    noise of 512 directions in thin slabs, where radiance along the layer dominates.
     """
     *grid, width = (*THIN, WIDTH) if depth < 1 else DEEP[albedo]
     medium, cache = swept(sunlit(scenes, depth, albedo, width), depth, *grid, width)
@@ -296,7 +313,7 @@ def test_sunlit_slabs_by_sweeps(scenes, name, depth, albedo, leaving):
 
 
 # Forward scattering, hg with g = 0.75, albedo 1, a sun at the zenith, of flux pi: name, depth,
-# layers, flux that leaves the lit side, radiance there at the `COSINES`.
+# layers, reflected flux, reflected radiance at the `COSINES`.
 FORWARD_SLABS = [
     ("3a", 1.0, 20, 0.247374, (0.151159, 0.101103, 0.0395460)),
     ("3b", 8.0, 64, 1.59096, (0.379740, 0.519598, 0.493302)),
@@ -305,9 +322,10 @@ FORWARD_SLABS = [
 
 @pytest.mark.parametrize(("name", "depth", "layers", "flux", "leaving"), FORWARD_SLABS)
 def test_forward_scattering_slabs(scenes, name, depth, layers, flux, leaving):
-    """DISORT 3a and 3b by ``sweep``, which lets the 24 % of the light in a forward peak go on. Flux
-    to 1.5 %. The little light that comes straight back was scattered forward before: five moments
-    tell its directions to a tenth.
+    """DISORT 3a and 3b by ``sweep``: the reflected flux agrees to 1.5 %.
+
+    Delta scaling treats 24 % of the scattered radiance as unscattered. The small reflected radiance
+    has been scattered forward before: five moments resolve its directions to a tenth.
     """
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": math.pi}
     scene = slab(scenes, 1.0, 1.0, depth, {"type": "hg", "g": 0.75}, emitter=sun)
@@ -322,8 +340,10 @@ def test_forward_scattering_slabs(scenes, name, depth, layers, flux, leaving):
 
 @pytest.mark.parametrize("solver", ["path", "sweep"])
 def test_skylit_slab(scenes, solver):
-    """DISORT 1c. The sky is on both sides here, so what leaves is what 1c has on both: without what
-    of the sky shows through, e^-depth/cosine. To 1 %.
+    """DISORT 1c to 1 %.
+
+    Here the sky is on both sides, so the radiance that leaves is the sum of both sides of 1c,
+    without the directly transmitted sky, e^-depth/cosine.
     """
     depth, albedo, reflected, passed = SKYLIT_SLAB
     scene = slab(scenes, 1.0, albedo, depth, emitter=SKY)
@@ -338,8 +358,11 @@ def test_skylit_slab(scenes, solver):
 
 @pytest.mark.parametrize("solver", ["path", "sweep"])
 def test_point_light(scenes, solver):
-    """correctness.md J: I e^-sigma_t r / r^2, r of it in the matter, at every voxel of a box that
-    absorbs, a lamp of intensity I right above. Nothing is random: to rounding.
+    """correctness.md J: the direct irradiance of a point light is I e^-sigma_t r / r^2 to
+    rounding.
+
+    r is the path length in the medium, an absorbing box with the emitter of intensity I above it;
+    all voxels are compared, and nothing is random.
     """
     lamp = np.array([0.1, -0.2, 1.0 + 1e-3])
     light = {"type": "point", "position": lamp.tolist(), "intensity": 7.0}
@@ -354,9 +377,11 @@ def test_point_light(scenes, solver):
 
 
 @pytest.mark.parametrize(("radius", "centre", "half", "mean"), SPHERES[:4])
-def test_uncollided_light_in_a_sphere_by_sweeps(scenes, radius, centre, half, mean):
-    """The volume mean, 24 voxels across. The boundary cuts voxels, whose matter is spread over all
-    of them: 1 % up to a radius of 2 (voxels of 1/6 mean free path), 4 % at 5 (2/5 of one).
+def test_uncollided_fluence_in_a_sphere_by_sweep(scenes, radius, centre, half, mean):
+    """The volume mean of the uncollided fluence in a sphere agrees with 24 voxels across.
+
+    Boundary voxels are cut, and the medium in them is spread over the whole voxel: 1 % up to a
+    radius of 2 (voxels of 1/6 mean free path), 4 % at 5 (2/5 of one).
     """
     to_world = scenes.placement((2 * radius,) * 3)
     shape = scenes.boundary(scenes.medium(1.0, 0.5), to_world, "sphere")
@@ -372,8 +397,9 @@ def test_uncollided_light_in_a_sphere_by_sweeps(scenes, radius, centre, half, me
 @pytest.mark.parametrize("mu0", [0.4, 1.0])
 @pytest.mark.parametrize("mu", [0.5, 1.0])
 def test_single_scattering_in_a_thin_slab(scenes, mu0, mu):
-    """correctness.md I: nothing is random for a sun over a homogeneous slab, so 0.1 % is the
-    discretisation.
+    """correctness.md I: single scattering of a sun in a homogeneous slab agrees to 0.1 %.
+
+    Nothing is random, so this is the discretisation.
     """
     depth, albedo, flux = 0.7, 0.8, 3.0
     sun = {"type": "directional", "direction": [math.sqrt(1 - mu0**2), 0, -mu0], "irradiance": flux}
@@ -386,7 +412,7 @@ def test_single_scattering_in_a_thin_slab(scenes, mu0, mu):
 
 
 def test_beer_lambert(scenes):
-    """max_depth 1 through a homogeneous RGB box along its axis: exp(-sigma_t d) to float32."""
+    """max_depth 1 along the axis of a homogeneous RGB box is exp(-sigma_t d) to float32."""
     shape = scenes.boundary(scenes.medium((0.3, 1.0, 4.0), 0.9), scenes.placement((2.0, 2.0, 1.5)))
     sensor = {
         "type": "orthographic",

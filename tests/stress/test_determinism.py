@@ -1,4 +1,4 @@
-"""The same scene again: in another process, by other numbers of threads, and in other pieces."""
+"""Determinism: identical results in other processes, with other thread counts and pass sizes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mitsuba_irrcache.solvers.path import solver as path_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
-#: A sweep of all orders in one launch, in one for each pair of directions, one order of scattering;
-#: and paths.
+#: A sweep of all orders in one launch; one launch per pair of directions for one order of
+#: scattering; and paths.
 KINDS = {
     "sweep": {"solver": "sweep", "resolution": 24},
     "large sweep": {"solver": "sweep", "resolution": 42, "cache_spp": 32, "max_depth": 3},
@@ -28,7 +28,7 @@ assert 24**3 < SMALL_GRID < 42**3
 
 
 def look(kind: str, **settings) -> tuple[np.ndarray, np.ndarray]:
-    """Image and irradiance of a cloud."""
+    """Return image and irradiance of a cloud."""
     integrator = {"cache_spp": 64} | KINDS[kind] | settings
     built = scene(integrator, Matter(blob(12, 6.0), 0.9, turn=20))
     return seen(built)
@@ -36,39 +36,39 @@ def look(kind: str, **settings) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def once(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """The look that others are compared with."""
+    """Return the result with which others are compared."""
     return look(kind)
 
 
 def seen(built: mi.Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Image and irradiance of any scene."""
+    """Return image and irradiance of any scene."""
     image = np.array(mi.render(built, spp=16, seed=5))
     return image, np.array(built.integrator().cache.irradiance)
 
 
 @pytest.fixture
 def threads():
-    """The number of threads; it is restored."""
+    """Set the number of threads, and restore it."""
     count = dr.thread_count()
     yield count
     dr.set_thread_count(count)
 
 
 def assert_same(found: tuple, expected: tuple) -> None:
-    """The same bits."""
+    """Assert that arrays are equal bit by bit."""
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_again_and_by_other_threads(kind, threads):
+def test_repeated_and_with_other_thread_counts(kind, threads):
     for count in (threads, 7):
         dr.set_thread_count(count)
         assert_same(look(kind), once(kind))
 
 
-def test_among_surfaces(threads):
-    """By `sweep`: light along the lines, and from a lamp at each voxel."""
+def test_with_surfaces(threads):
+    """`sweep` with surfaces is deterministic: along tracks and for emitters sampled at voxels."""
 
     def again() -> tuple[np.ndarray, np.ndarray]:
         place = mi.ScalarTransform4f().translate
@@ -104,7 +104,9 @@ def test_with_error_bars_and_filter(threads):
 
 @pytest.mark.parametrize("name", ["box", "gaussian", "lanczos"])
 def test_films(name, threads):
-    """Five samples per pixel, an odd number: blocks of lanes end within pixels."""
+    """Films are deterministic with five samples per pixel, where thread blocks end within
+    pixels.
+    """
     film = {"width": 250, "height": 250, "rfilter": {"type": name}}
     settings = {"type": "irrcache", "solver": "sweep", "resolution": 4, "cache_spp": 32}
     built = scene(settings, Matter(), camera=Camera(film=film))
@@ -131,8 +133,9 @@ def test_in_another_process():
 
 
 def test_in_other_passes(monkeypatch):
-    """A cache in blocks of voxels, and in passes of fewer samples: the same bits, since sums are in
-    double precision.
+    """Splitting a cache build into blocks of voxels or smaller passes does not change a bit.
+
+    The sums are accumulated in double precision.
     """
     expected = once("path")
     monkeypatch.setattr(path_solver, "LANES", 1 << 12)
@@ -140,7 +143,7 @@ def test_in_other_passes(monkeypatch):
 
 
 def test_another_seed_is_another_picture():
-    """Else the tests above would say nothing."""
+    """Another seed gives another image; otherwise the tests above would prove nothing."""
     for kind in KINDS:
         (image, phi), (other, other_phi) = once(kind), look(kind, cache_seed=1)
         assert np.abs(image - other).max() > 1e-4 and np.abs(phi - other_phi).max() > 1e-3

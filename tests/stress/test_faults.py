@@ -1,6 +1,6 @@
-"""What happens to a cache when the world around it fails.
+"""Behaviour of cache files, properties and commands under failures and invalid input.
 
-Many more kills and damaged files: ``make stress``.
+``make stress`` runs many more killed processes and damaged files.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SETTINGS = {"solver": "path", "resolution": 4, "cache_spp": 8, "max_depth": 2}
 
 
 def filled(file: Path, samples: int, sigma_t: float = 1.0) -> mi.Scene:
-    """A scene with a cache of so many samples, which is in the file."""
+    """Return a scene whose cache of this many samples is in the file."""
     settings = SETTINGS | {"cache_file": str(file), "cache_spp": samples}
     built = scene(settings, Matter(sigma_t))
     built.integrator().prepare(built)
@@ -53,8 +53,9 @@ for n in range(10**6):
 
 
 def test_killed_while_writing(tmp_path):
-    """A process that writes nothing but one file of 4 MB, killed at 6 moments: it is always whole,
-    and the next one clears away what was left, once that is old enough.
+    """A file of 4 MB is whole whenever its writer is killed, here at 6 moments.
+
+    The next writer removes the temporary file once that is old enough.
     """
     file, rng = tmp_path / "light.cache", np.random.default_rng(3)
     for _ in range(6):
@@ -66,10 +67,10 @@ def test_killed_while_writing(tmp_path):
         process.wait()
         content = np.fromfile(file, np.uint8)
         assert content.size == 1 << 22 and (content == content[0]).all()
-    assert any(tmp_path.glob(".light.cache.*.tmp"))  # some were hit in the middle
+    assert any(tmp_path.glob(".light.cache.*.tmp"))  # some were killed while writing
 
 
-def test_what_killed_processes_left_is_removed(tmp_path):
+def test_temporary_files_of_killed_processes_are_removed(tmp_path):
     old, new = tmp_path / ".a.bin.x.tmp", tmp_path / ".a.bin.y.tmp"
     for path in (old, new, tmp_path / ".b.bin.x.tmp"):
         path.write_bytes(b"half")
@@ -102,10 +103,11 @@ except Exception as error:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of this kind")
 def test_a_full_disk_and_a_folder_that_is_read_only():
-    """Full disk: the image is there, with a warning, and no half of a file. Read-only folder: that
-    is said before any work is done. (It takes root to become a user who may not write there.)
+    """With a full disk the image is rendered with a warning, and no partial file remains.
+
+    A read-only folder raises an error before any work. (Dropping privileges needs root.)
     """
-    with tempfile.TemporaryDirectory() as folder:  # pytest's are out of reach for others
+    with tempfile.TemporaryDirectory() as folder:  # other users cannot access pytest's folders
         os.chmod(folder, 0o755)
         command = [sys.executable, "-c", CROWDED, folder]
         said = subprocess.run(
@@ -128,8 +130,8 @@ print(sum(mi.render(scene(settings, Matter()), spp=1).array))
 
 @pytest.mark.slow
 def test_a_corrupted_kernel_cache(tmp_path):
-    """Dr.Jit's files of compiled kernels, cut short or with 20 wrong bytes: they are compiled again
-    and the picture is the same.
+    """Truncated or modified files in Dr.Jit's kernel cache are recompiled; the image is the
+    same.
     """
     rng, pictures = np.random.default_rng(1), []
     for _ in range(2):
@@ -149,7 +151,7 @@ def test_a_corrupted_kernel_cache(tmp_path):
 
 
 def test_a_file_that_another_process_has_filled_further(tmp_path):
-    """Two processes share a file: the one that has fewer samples does not overwrite the other's."""
+    """A process with fewer samples does not overwrite the cache file of one with more."""
     file = tmp_path / "light.cache"
     slow = filled(file, 8)
     filled(file, 64)
@@ -160,19 +162,19 @@ def test_a_file_that_another_process_has_filled_further(tmp_path):
 
 
 def test_a_file_that_another_scene_has_taken_meanwhile(tmp_path):
-    """Both began without a file; the second to end finds it taken, and leaves it alone."""
+    """A cache file that another scene has created meanwhile is not overwritten."""
     file = tmp_path / "light.cache"
     settings = SETTINGS | {"cache_file": str(file)}
     slow = scene(settings, Matter(2.0))
     slow.integrator().progress = lambda *_: file.exists() or filled(file, 8)
     slow.integrator().prepare(slow)
     assert slow.integrator().cache.samples == 8
-    again = filled(file, 8)  # still the first one's: it would be refused else
+    again = filled(file, 8)  # of the first scene; it would be refused otherwise
     assert again.integrator().cache.samples == 8
 
 
 def rewritten(file: Path, **changes) -> None:
-    """Changes what a cache file says of itself."""
+    """Change an entry of a cache file."""
     arrays = dict(np.load(file))
     description = json.loads(arrays["description"].tobytes()) | changes
     arrays["description"] = np.frombuffer(json.dumps(description).encode(), np.uint8)
@@ -193,8 +195,8 @@ def rewritten(file: Path, **changes) -> None:
     ],
     ids=str,
 )
-def test_files_that_lie_are_refused(tmp_path, lie):
-    """Their fingerprint is that of the scene, but for one thing that they say."""
+def test_inconsistent_cache_files_are_refused(tmp_path, lie):
+    """Cache files with the scene's fingerprint but one inconsistent entry are refused."""
     file = tmp_path / "light.cache"
     filled(file, 8)
     rewritten(file, **lie)
@@ -205,8 +207,8 @@ def test_files_that_lie_are_refused(tmp_path, lie):
 @pytest.mark.parametrize(
     ("value", "said"), [(-1e-3, "negative"), (1e300, "not finite"), (np.nan, "not finite")]
 )
-def test_impossible_light_is_refused(tmp_path, value, said):
-    """Negative, or finite in double precision only."""
+def test_invalid_irradiance_is_refused(tmp_path, value, said):
+    """Irradiance that is negative, or beyond single precision, is refused."""
     file = tmp_path / "light.cache"
     filled(file, 8)
     arrays = dict(np.load(file))
@@ -217,15 +219,18 @@ def test_impossible_light_is_refused(tmp_path, value, said):
         IrradianceCache.load(file)
 
 
-def test_volumes_that_were_tampered_with():
-    """20 mutants of a file, read in a process of its own; all formats: ``make stress``."""
+def test_damaged_volumes():
+    """20 damaged volume files are read or refused, in a process of its own.
+
+    ``make stress`` tries all formats.
+    """
     (nrrd,) = (f for f in formats.FORMATS if f.name == "a.nrrd")
     tally = run.fuzz(nrrd, 20)
     assert tally.tried == 20 and not tally.failed, tally
 
 
-def test_caches_that_were_tampered_with(tmp_path):
-    """60 mutants and lies: refused by name, or read and finite."""
+def test_damaged_caches(tmp_path):
+    """60 damaged caches are refused by name, or read with finite values."""
     (cache_format,) = (f for f in formats.FORMATS if f.name == "light.cache")
     file = tmp_path / "light.cache"
     cache_format.make(file)
@@ -240,7 +245,7 @@ def test_caches_that_were_tampered_with(tmp_path):
 
 
 def tried(case: Path, run_case, mutate, count: int) -> int:
-    """Tries so many mutants of a case in this process; how many of them are refused by name."""
+    """Run this many mutants of a case in this process; return how many are refused by name."""
     content, refused = case.read_bytes(), 0
     for index in range(count):
         case.write_bytes(mutate(content, np.random.default_rng((3, index))))
@@ -251,9 +256,11 @@ def tried(case: Path, run_case, mutate, count: int) -> int:
     return refused
 
 
-def test_properties_that_nobody_should_write(tmp_path, monkeypatch):
-    """Each of 50 scenes is rendered, or refused by a message that names what is wrong; a cache file
-    of any name stays in the folder of its case.
+def test_random_properties(tmp_path, monkeypatch):
+    """50 scenes with random properties are rendered, or refused by a message that names the
+    fault.
+
+    A cache file of any name stays in the folder of its case.
     """
     here, case = tmp_path / "here", tmp_path / "properties.json"
     here.mkdir()
@@ -269,8 +276,8 @@ def test_properties_that_nobody_should_write(tmp_path, monkeypatch):
     assert not any(here.iterdir())
 
 
-def test_command_lines_that_nobody_should_type(tmp_path):
-    """Each of 30 does its work, or prints an error and leaves nothing behind."""
+def test_random_command_lines(tmp_path):
+    """30 random command lines succeed, or print an error and leave no files."""
     case = tmp_path / "command.json"
     commands.write_valid(case)
     commands.run_case(case)
@@ -283,8 +290,11 @@ def test_command_lines_that_nobody_should_type(tmp_path):
     [["render", "none.xml", "-o", "\udc80.exr"], ["import", "\udc80", "--density", "-o", "x"]],
     ids=["render", "import"],
 )
-def test_arguments_that_are_no_text_are_refused_without_a_traceback(tmp_path, arguments):
-    """In a process of its own: what is printed has to be encoded."""
+def test_undecodable_arguments_are_refused_without_a_traceback(tmp_path, arguments):
+    """Arguments that are no valid text are refused without a traceback.
+
+    Runs in a process of its own, because the message has to be encoded.
+    """
     command = [sys.executable, "-m", "mitsuba_irrcache", *arguments]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=60)
     assert done.returncode == 1 and b"Traceback" not in done.stderr
@@ -307,8 +317,10 @@ def test_arguments_that_are_no_text_are_refused_without_a_traceback(tmp_path, ar
     ],
 )
 def test_properties_of_another_type_are_refused(name, value):
-    """Python makes something of most of them: "false" is true, and 3 the name of a file. What
-    Mitsuba reads itself it refuses in its own words.
+    """Properties of a wrong type are refused instead of converted.
+
+    Python would convert most of them: "false" is true, and 3 is a file descriptor. Properties that
+    Mitsuba reads itself are refused by Mitsuba's messages.
     """
     said = rf'(?s)irrcache: {name} is .*; it must be|"{name}" has the wrong type'
     with pytest.raises((IrrcacheError, RuntimeError), match=said):
@@ -318,8 +330,8 @@ def test_properties_of_another_type_are_refused(name, value):
 
 @pytest.mark.parametrize("solver", ["sweep", "path"])
 @pytest.mark.parametrize("depth", [2, -1])
-def test_light_beyond_single_precision_is_refused_by_name(solver, depth):
-    """Each time, not only the first."""
+def test_radiance_beyond_single_precision_is_refused(solver, depth):
+    """Radiance beyond single precision is refused by name, every time."""
     sky = {"type": "constant", "radiance": 1e38}
     built = scene(SETTINGS | {"solver": solver, "max_depth": depth}, Matter(2.0), sky)
     for _ in range(2):
@@ -327,9 +339,10 @@ def test_light_beyond_single_precision_is_refused_by_name(solver, depth):
             built.integrator().prepare(built)
 
 
-def test_any_number_of_orders_ends():
-    """2^31 - 1 orders by `sweep`: as soon as there is no light in them; on average the same as all
-    orders, to the error that these are solved for with.
+def test_any_max_depth_terminates():
+    """2^31 - 1 orders by `sweep` end as soon as the next order is negligible.
+
+    The mean equals that of all orders within the tolerance of the iteration.
     """
 
     def light(depth: int) -> np.ndarray:
@@ -342,8 +355,10 @@ def test_any_number_of_orders_ends():
     assert light(12).mean() < 0.997 * found.mean()
 
 
-def test_memory_is_predicted(tmp_path):
-    """What a cache takes is said before it is taken, in bytes, with the remedy."""
+def test_memory_is_checked_before_allocation(tmp_path):
+    """A cache beyond the memory limit is refused before allocation, with its bytes and the
+    remedy.
+    """
     too_large = scene({"solver": "sweep", "resolution": 5000}, Matter())
     with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB.*are free; lower resolution"):
         too_large.integrator().prepare(too_large)
@@ -371,14 +386,17 @@ def test_absurd_images_are_refused_before_anything_is_computed(matter, film, spp
 
 
 def test_absurd_numbers_of_samples_of_an_empty_scene_are_refused():
-    """They would all be in one launch; with a medium they are rendered in passes."""
+    """Numbers of samples that exceed one launch are refused for empty scenes.
+
+    With a medium they are rendered in passes.
+    """
     empty = scene(SETTINGS, None, camera=Camera(film={"width": 4096, "height": 4096}))
     with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB.*lower width, height or spp"):
         empty.integrator().render(empty, spp=1 << 20)
 
 
-def test_another_variant_in_the_middle():
-    """A scene belongs to the variant that it was loaded in; back in that one, all is as before."""
+def test_switching_the_variant_and_back():
+    """After switching to another variant and back, a scene renders as before."""
     built = scene(SETTINGS, Matter())
     before = np.array(mi.render(built, spp=1))
     try:

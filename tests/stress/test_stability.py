@@ -1,5 +1,6 @@
-"""Hazards from `experiments.robustness.stability`, a quick choice of them; all of them: ``make
-stress``."""
+"""A quick selection of the hazards in `experiments.robustness.stability`; ``make stress`` runs
+all.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from experiments.robustness.stability.worlds import Camera, Matter, World, scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
-#: One or two of each hazard: those that failed once, and those that are most extreme.
+#: One or two cases of each hazard: those that failed once, and the most extreme ones.
 CHOSEN = {
     "optical depth": ("1e+30, white", "1000, white"),
     "extinction": ("1e-45 and 1e-40",),
@@ -36,18 +37,19 @@ CHOSEN = {
 
 
 def chosen() -> list[Case]:
-    """The cases of `CHOSEN`."""
+    """Return the cases of `CHOSEN`."""
     return [case for case in cases() if case.name in CHOSEN.get(case.hazard, ())]
 
 
-def test_the_choice_names_cases_that_there_are(rgb):
+def test_selected_cases_exist(rgb):
     assert len(chosen()) == sum(map(len, CHOSEN.values()))
 
 
 @pytest.mark.parametrize("hazard", CHOSEN)
 def test_hazards(hazard):
-    """The properties of `experiments.robustness.stability.properties`, both solvers, each with its
-    bound."""
+    """Both solvers satisfy all of `experiments.robustness.stability.properties` within their
+    bounds.
+    """
     rows = []
     for case in (c for c in chosen() if c.hazard == hazard):
         rows += run_case(case, "llvm_ad_rgb", quadratures=("exponential",))
@@ -55,9 +57,11 @@ def test_hazards(hazard):
     assert not [described(row) for row in rows if not row["held"]]
 
 
-def test_no_segment_makes_light():
-    """The trapezoid's weights were half the optical depth of a segment, however opaque: a wall
-    shone 20 times brighter than the sky.
+def test_segments_conserve_energy():
+    """The weights of the trapezoid rule do not exceed the opacity of a segment.
+
+    They once were half the optical depth, so that an opaque wall was 20 times brighter than the
+    sky.
     """
     wall = Matter(np.full((4, 4, 4), 80.0, np.float32), 1.0)
     settings = SETTINGS | {"solver": "sweep", "quadrature": "trapezoid"}
@@ -71,7 +75,7 @@ EXTREME = [0.0, 1e-45, 1e-38, 1e-12, 1e-3, 0.1, 1.0, 10.0, 100.0]
 
 @st.composite
 def matters(draw) -> Matter:
-    """Media of any voxels, edges and placement."""
+    """Generate media of any voxels, edges and placement."""
     shape = tuple(draw(st.integers(1, 7)) for _ in range(3))
     values = draw(st.lists(st.sampled_from(EXTREME), min_size=1, max_size=8))
     sigma_t = np.resize(np.float32(values), shape)
@@ -90,7 +94,9 @@ def matters(draw) -> Matter:
     quadrature=st.sampled_from(["riemann", "trapezoid", "exponential"]),
 )
 def test_any_medium_under_a_white_sky(matter, scale, origin, quadrature):
-    """Finite, not negative, no brighter than the sky, at any scale and from anywhere."""
+    """Under a white sky, images are finite, nonnegative and at most 1, at any scale and from any
+    side.
+    """
     camera = Camera(origin, (0.3, 0.2, 0.1), 60.0)
     options = SETTINGS | {"solver": "sweep", "quadrature": quadrature, "resolution": 6}
     built = scene(options, matter, camera=camera, world=World(scale))

@@ -20,8 +20,10 @@ SUN = {
 def placement(
     edges=(2.0, 2.0, 2.0), turn: float = 0.0, mirror: bool = False, center=(0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """``to_world`` of the unit cube: a box with these edges about ``center``, turned by ``turn``
-    degrees about an oblique axis, and mirrored in its own x axis if asked.
+    """Return the ``to_world`` of the unit cube for a box with these edges around ``center``.
+
+    The box is rotated by ``turn`` degrees about an oblique axis, and mirrored in its own x axis if
+    requested.
     """
     axis = np.array([0.48, 0.64, 0.6])
     cross = np.cross(np.eye(3), axis)
@@ -34,12 +36,14 @@ def placement(
 
 
 def texture(shape: tuple[int, ...], low: float, high: float, seed: int) -> np.ndarray:
-    """Random voxels in [low, high], float32, (z, y, x[, channel])."""
+    """Return random voxels in [low, high], float32, (z, y, x[, channel])."""
     return np.random.default_rng(seed).uniform(low, high, shape).astype(np.float32)
 
 
 def volume(values, to_world: np.ndarray | None = None, **properties) -> dict:
-    """A gridvolume of an array (z, y, x[, channel]), or a constvolume of a number or a colour."""
+    """Return a gridvolume of an array (z, y, x[, channel]), or a constvolume of a number or a
+    colour.
+    """
     if isinstance(values, np.ndarray) and values.ndim >= 3:
         grid = mi.VolumeGrid(values.astype(np.float32).reshape(*values.shape[:3], -1))
         place = mi.ScalarTransform4f(np.eye(4) if to_world is None else to_world)
@@ -51,7 +55,7 @@ def volume(values, to_world: np.ndarray | None = None, **properties) -> dict:
 
 
 def medium(sigma_t, albedo, to_world: np.ndarray | None = None, **properties) -> dict:
-    """A heterogeneous medium where ``sigma_t`` is an array, else a homogeneous one."""
+    """Return a heterogeneous medium if ``sigma_t`` is an array, else a homogeneous one."""
     varies = isinstance(sigma_t, np.ndarray) and sigma_t.ndim >= 3
     return {
         "type": "heterogeneous" if varies else "homogeneous",
@@ -61,8 +65,10 @@ def medium(sigma_t, albedo, to_world: np.ndarray | None = None, **properties) ->
 
 
 def boundary(interior: dict, to_world: np.ndarray | None = None, kind: str = "cube") -> dict:
-    """A shape around the unit cube's image under ``to_world`` that bounds a medium; its normals
-    point outwards.
+    """Return a shape that encloses the unit cube transformed by ``to_world`` and bounds a
+    medium.
+
+    Its normals point outwards.
     """
     to_world = placement() if to_world is None else to_world
     outwards = np.sign(np.linalg.det(to_world[:3, :3]))
@@ -84,8 +90,10 @@ def description(
     default_solver: str | None = None,
     **objects,
 ) -> dict:
-    """A scene seen from (1, 1.5, -5), under a coloured sky and a sun unless ``objects`` names other
-    emitters. The integrator ``irrcache`` has to name its solver, unless ``default_solver`` does.
+    """Return a scene seen from (1, 1.5, -5).
+
+    It has a coloured environment and a sun unless ``objects`` contains other emitters. The
+    integrator ``irrcache`` must specify its solver unless ``default_solver`` is set.
     """
     look = mi.ScalarTransform4f().look_at([1.0, 1.5, -5.0], [0, 0, 0], [0, 1, 0])
     film = {
@@ -113,10 +121,10 @@ def load(
     default_solver: str | None = None,
     **objects,
 ) -> mi.Scene:
-    """The scene of ``description``."""
+    """Load the scene of ``description``."""
     return mi.load_dict(description(integrator, shape, size, default_solver, **objects))
 
 
 def image(scene: mi.Scene, **options) -> np.ndarray:
-    """The rendered image, float64."""
+    """Return the rendered image, float64."""
     return np.array(mi.render(scene, **options), dtype=np.float64)

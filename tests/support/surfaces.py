@@ -8,8 +8,8 @@ import numpy as np
 SIZE, BLOCK = 24, 6
 
 
-#: Error allowed in the mean of a block, relative to the mean radiance, beside 4.5 standard errors,
-#: which must not be larger than a few times that: what coarse caches leave.
+#: Error allowed in the mean of a block, relative to the mean radiance, in addition to 4.5 standard
+#: errors, which may be at most a few times as large. It accounts for the bias of coarse caches.
 TOLERANCE, NOISE = 0.02, 0.02
 
 
@@ -37,7 +37,7 @@ def placed(center=(0, 0, 0), scale=(1, 1, 1), towards=None):
 
 
 def bound(kind="cube", interior=None, center=(0, 0, 0), scale=(1, 1, 1), **more) -> dict:
-    """A null boundary."""
+    """Return a null boundary."""
     place = placed(center, scale)
     return {"type": kind, "to_world": place, "bsdf": {"type": "null"}, "interior": interior} | more
 
@@ -62,14 +62,14 @@ def ground(height=-1.1, bsdf=None) -> dict:
 
 
 def images(scenes, objects: dict, settings: dict, depth: dict, spp: tuple) -> list[np.ndarray]:
-    """Two by irrcache, two by volpath."""
+    """Return two images by irrcache and two by volpath."""
     own = {"type": "irrcache", "resolution": 20, "cache_spp": 64} | depth | settings
     theirs = {"type": "volpath"} | depth
     return pair(scenes, objects, own, spp[0]) + pair(scenes, objects, theirs, spp[1])
 
 
 def pair(scenes, objects: dict, integrator: dict, spp: int) -> list[np.ndarray]:
-    """Images of two seeds."""
+    """Return images of two seeds."""
     objects = {"emitter": scenes.sky, "sun": scenes.sun} | objects
     scene = scenes.load(integrator, None, SIZE, **objects, default_solver="path")
     return [scenes.image(scene, spp=spp, seed=seed) for seed in (1, 2)]

@@ -1,4 +1,4 @@
-"""A scene file for the viewer, cameras around it, and a screen that keeps its pictures."""
+"""A scene file for the viewer, cameras around it, and a recorder of displayed images."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SIZE = (48, 40)
 
 
 class Screen:
-    """Keeps the pictures that a window gets."""
+    """Record the images that a window receives."""
 
     def __init__(self) -> None:
         self.pictures: list[Picture] = []
@@ -54,7 +54,7 @@ class Screen:
             self._news.notify_all()
 
     def wait(self, condition, seconds: float = 20) -> Picture:
-        """The first picture from now on that fulfils ``condition``, or the last one if it does."""
+        """Wait for an image that fulfils ``condition``; the last recorded one counts, too."""
         with self._news:
             found = self._news.wait_for(
                 lambda: self.pictures and condition(self.pictures[-1]) and self.pictures[-1],

@@ -1,4 +1,4 @@
-"""What a window of the viewer shows once it has settled."""
+"""Screenshots of a viewer window whose image is final."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from experiments.performance.viewer.browser import Window
 SIZE = (700, 260)
 
 
-#: The part of a window, in pixels from the left, that the panel never covers.
+#: Width in pixels, from the left, that the control panel never covers.
 CLEAR = 340
 
 
 def settled(window: Window) -> np.ndarray:
-    """What is on the screen once nothing better will follow: float (height, width, 3), without
-    what the panel may cover.
+    """Wait for the final image; return the screenshot (height, width, 3) as float.
+
+    The columns that the panel may cover are cropped.
     """
     count = -1
     while count != len(window.shown()) or not window.note().startswith("final"):
@@ -31,7 +32,7 @@ def settled(window: Window) -> np.ndarray:
 
 
 def after(window: Window, act: Callable[[], None]) -> np.ndarray:
-    """What is on the screen in the end, once ``act`` has changed it."""
+    """Call ``act`` and return the final screenshot that differs from the previous one."""
     count = len(window.shown())
     act()
     window.wait_for_picture(count, SIZE[0])
@@ -39,7 +40,7 @@ def after(window: Window, act: Callable[[], None]) -> np.ndarray:
 
 
 def screen(window: Window, width: int = CLEAR) -> np.ndarray:
-    """So many columns of what is on the screen."""
+    """Return the left columns of a screenshot."""
     shot = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
     return np.asarray(shot, dtype=float)[:, :width]
 

@@ -1,6 +1,4 @@
-"""The command line, and bad input through the doors that users take: a clear error, and nothing
-left behind.
-"""
+"""The commands from end to end, and invalid input: a clear error, and no files written."""
 
 from __future__ import annotations
 
@@ -59,7 +57,7 @@ SCENE = """<scene version="3.0.0">
 
 @pytest.fixture(autouse=True)
 def _variant(rgb):
-    """The command sets a variant for the process; every other test expects this one."""
+    """Restore the variant, which a command sets for the whole process."""
     yield
     mi.set_variant("llvm_ad_rgb")
 
@@ -79,11 +77,11 @@ def read(path) -> np.ndarray:
     return np.array(OpenImageIO.ImageBuf(str(path)).get_pixels(OpenImageIO.FLOAT))
 
 
-# Pictures
+# Images
 
 
 def test_render(folder, capsys):
-    """An EXR with what made it in its header, a PNG beside it, and where the time went."""
+    """``render`` writes an EXR with its settings in the header and a PNG, and prints the times."""
     assert run("render", folder / "scene.xml", "-o", folder / "out.exr", "--spp", 16) == 0
     printed = capsys.readouterr().out
     assert "out.exr" in printed and "out.png" in printed and "cache" in printed
@@ -102,8 +100,8 @@ def test_render(folder, capsys):
     assert set(os.listdir(folder)) == {"scene.xml", "density.vol", "out.exr", "out.png"}
 
 
-def test_a_process_ends_with_all_that_it_had_to_say(folder):
-    """At once, with the image, the status and both outputs; nothing is found to be leaked."""
+def test_process_ends_with_complete_output(folder):
+    """The process exits at once with image, status and both outputs, and reports no leaks."""
 
     def process(scene: str) -> subprocess.CompletedProcess:
         arguments = ["render", scene, "--spp", "2", "-o", "x.exr"]
@@ -118,7 +116,7 @@ def test_a_process_ends_with_all_that_it_had_to_say(folder):
     assert failed.returncode == 1 and "there is no scene file" in failed.stderr
 
 
-def test_the_picture_is_mi_renders(folder):
+def test_image_equals_mi_render(folder):
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", "--spp", 8, "--seed", 3) == 0
     scene = mi.load_file(str(folder / "scene.xml"), integrator="irrcache")
     expected = np.array(mi.render(scene, spp=8, seed=3))
@@ -128,7 +126,7 @@ def test_the_picture_is_mi_renders(folder):
 
 
 def test_flags(folder):
-    """Another sensor, variant, integrator and parameter."""
+    """Sensor, variant, integrator and parameter can be chosen by options."""
     mi.VolumeGrid(np.zeros((2, 2, 2, 1), np.float32)).write(str(folder / "empty.vol"))
     flags = ["-s", 1, "-m", "llvm_ad_mono", "-i", "irrcache{max_depth=1,hide_emitters=true}"]
     assert (
@@ -189,8 +187,8 @@ BAD_CALLS = {
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD_CALLS.values(), ids=BAD_CALLS)
-def test_bad_calls(folder, capsys, monkeypatch, arguments, message):
-    """Status 1, one line that names the thing, no traceback, no file."""
+def test_invalid_calls(folder, capsys, monkeypatch, arguments, message):
+    """Invalid calls exit with status 1 and one line that names the fault; no traceback, no file."""
     monkeypatch.chdir(folder)
     before = set(os.listdir(folder))
     assert run("render", *arguments) == 1
@@ -238,7 +236,7 @@ EXTRAS = {
 
 @pytest.mark.parametrize(("extra", "message"), EXTRAS.values(), ids=EXTRAS)
 def test_unsupported_scenes(folder, capsys, extra, message):
-    """The object is named, and volpath offered."""
+    """Unsupported scenes raise an error that names the object and suggests volpath."""
     (folder / "odd.xml").write_text(SCENE.replace("EXTRA", extra))
     before = set(os.listdir(folder))
     assert run("render", folder / "odd.xml") == 1
@@ -262,7 +260,9 @@ def test_bad_voxels(folder, capsys, value):
 
 
 def test_cache_file(folder, capsys):
-    """Made once, read the second time, and refused for another scene without being touched."""
+    """A cache file is created once, read the second time, and refused for another scene
+    unchanged.
+    """
     flags = ["-i", f"irrcache{{cache_file={folder / 'light.npz'},cache_spp=16}}", "--spp", 4]
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 0
     content = (folder / "light.npz").read_bytes()
@@ -287,7 +287,7 @@ def test_damaged_cache_file(folder, capsys):
 
 
 def test_interrupted(folder, capsys, monkeypatch):
-    """Ctrl-C while the cache is built: status 130, no picture, no cache file, no traceback."""
+    """Ctrl-C during the cache build: status 130, no image, no cache file, no traceback."""
     from mitsuba_irrcache.solvers.path import solver as path
 
     monkeypatch.setattr(path, "refine", interrupt)
@@ -299,7 +299,9 @@ def test_interrupted(folder, capsys, monkeypatch):
 
 
 def test_interrupted_image(folder, capsys, monkeypatch):
-    """Ctrl-C while the image is rendered, which Mitsuba wraps in an error of its own."""
+    """Ctrl-C during rendering, which Mitsuba wraps in an error, is reported as an interrupt,
+    too.
+    """
     from mitsuba_irrcache.integrators import irrcache
 
     monkeypatch.setattr(irrcache, "render_film", interrupt)
@@ -316,7 +318,7 @@ def interrupt(*args, **kwargs):
 
 
 def test_budget(folder, capsys):
-    """However small it is there is an image; what it shows is in its header."""
+    """Any budget gives an image; its header holds the samples and the error."""
     flags = ["--budget", 0.01, "--spp", 2, "-i", "irrcache{solver=path,resolution=8}"]
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr", *flags) == 0
     printed = capsys.readouterr().out
@@ -327,8 +329,10 @@ def test_budget(folder, capsys):
     assert header.getattribute("irrcache:seconds_image") > 0
 
 
-def test_an_integrator_with_another_prepare(folder):
-    """Mitsuba's differentiable ones have a method of this name that builds no cache."""
+def test_integrator_whose_prepare_builds_no_cache(folder):
+    """``render`` accepts Mitsuba's differentiable integrators, whose ``prepare`` builds no
+    cache.
+    """
     assert run("render", folder / "scene.xml", "-i", "prbvolpath", "--spp", 1) == 0
 
 
@@ -341,8 +345,9 @@ def test_wanted_error(folder, capsys):
 
 @pytest.mark.parametrize("how", ["interrupt", "terminate"])
 def test_a_stopped_progressive_render(folder, capsys, monkeypatch, request, how):
-    """Ctrl-C or SIGTERM in the pass after the opening: status 130, the last finished image, and a
-    cache file of the samples that it shows; what was reached is printed.
+    """Ctrl-C or SIGTERM in a later pass: status 130, the last complete image and its cache file.
+
+    The cache file has the samples of the image, and the message reports them.
     """
     from mitsuba_irrcache.solvers.path import solver as path
 
@@ -355,7 +360,7 @@ def test_a_stopped_progressive_render(folder, capsys, monkeypatch, request, how)
         refine(*args, **kwargs)
 
     monkeypatch.setattr(path, "refine", stopped)
-    # What a shell starts in the background would not hear of Ctrl-C.
+    # Background processes of a shell ignore Ctrl-C.
     interrupted = signal.signal(signal.SIGINT, signal.default_int_handler)
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, interrupted))
     before = signal.getsignal(signal.SIGTERM)
@@ -379,10 +384,8 @@ def test_stopped_before_the_first_image(folder, capsys, monkeypatch):
     assert set(os.listdir(folder)) == before
 
 
-def test_errors_reach_a_script_too(folder, scenes):
-    """mi.render wraps what an integrator raises in a RuntimeError; its cause is ours, with the
-    remedy.
-    """
+def test_errors_have_their_cause_in_scripts(folder, scenes):
+    """The RuntimeError of mi.render has the package's error with its remedy as its cause."""
     (folder / "odd.xml").write_text(SCENE.replace("EXTRA", EXTRAS["medium without bounds"][0]))
     scene = mi.load_file(str(folder / "odd.xml"), integrator="irrcache")
     with pytest.raises((RuntimeError, ValueError)) as caught:

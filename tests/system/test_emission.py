@@ -1,6 +1,4 @@
-"""Light that media send out themselves, which Mitsuba's have not: against closed forms, and in
-enclosures where everything has to be as bright as everything else.
-"""
+"""Emissive media, which Mitsuba does not have: closed forms, and enclosures in equilibrium."""
 
 from __future__ import annotations
 
@@ -19,7 +17,7 @@ SOLVERS = ["path", "sweep"]
 
 
 def straight_ahead(scenes, size: int = 8) -> dict:
-    """A sensor that looks along z at the square [-0.5, 0.5]^2, by parallel rays."""
+    """Return an orthographic sensor that looks along z at the square [-0.5, 0.5]^2."""
     look = mi.ScalarTransform4f().look_at([0, 0, -5], [0, 0, 0], [0, 1, 0])
     film = scenes.description({}, None, size)["sensor"]["film"]
     half = mi.ScalarTransform4f().scale([0.5, 0.5, 1])
@@ -27,7 +25,7 @@ def straight_ahead(scenes, size: int = 8) -> dict:
 
 
 def rendered(scenes, shape, emission, spp: int = 4, size: int = 8, objects=None, **settings):
-    """The image, in parallel rays unless ``objects`` has a sensor, and the scene."""
+    """Return image and scene, with the orthographic sensor unless ``objects`` has one."""
     integrator = {"type": "irrcache", "emission": emission, "resolution": 16} | settings
     objects = {"sensor": straight_ahead(scenes, size)} | DARK | (objects or {})
     scene = scenes.load(integrator, shape, **objects, default_solver="path")
@@ -35,7 +33,7 @@ def rendered(scenes, shape, emission, spp: int = 4, size: int = 8, objects=None,
 
 
 def prepare(scenes, shape, emission, **settings) -> None:
-    """As far as the cache: what it raises is not wrapped by Mitsuba."""
+    """Build the cache; its exceptions are not wrapped by Mitsuba, unlike those of rendering."""
     scene = scenes.load(
         {"type": "irrcache", "solver": "path", "emission": emission} | settings, shape, **DARK
     )
@@ -45,7 +43,7 @@ def prepare(scenes, shape, emission, **settings) -> None:
 @pytest.mark.parametrize("sigma", [0.0, 1e-3, 0.7, 40.0])
 @pytest.mark.parametrize("emission", [2.0, {"type": "rgb", "value": [1.0, 2.0, 0.0]}])
 def test_homogeneous_slab(scenes, sigma, emission):
-    """Two units of j that absorbs: j / sigma (1 - exp(-sigma s)), j s where nothing is absorbed."""
+    """Two units of emission j: j / sigma (1 - exp(-sigma s)), or j s without absorption."""
     shape = scenes.boundary(scenes.medium(sigma, 0.0))
     found, _ = rendered(scenes, shape, emission, emission_scale=1.5)
     j = 1.5 * np.array([1.0, 2.0, 0.0] if isinstance(emission, dict) else [2.0] * 3)
@@ -55,7 +53,7 @@ def test_homogeneous_slab(scenes, sigma, emission):
 
 @pytest.mark.parametrize("quadrature", ["riemann", "trapezoid", "exponential"])
 def test_heterogeneous_slab(scenes, quadrature):
-    """Coloured extinction and emission that both vary along the ray, against fine quadrature."""
+    """A slab whose coloured extinction and emission vary along the ray agrees with quadrature."""
     z = (np.arange(24) + 0.5) / 24
     column = np.ones((24, 1, 1, 1))
     sigma_t = (6 * z**2)[:, None, None, None] * [1.0, 0.5, 2.0] * column
@@ -73,8 +71,8 @@ def test_heterogeneous_slab(scenes, quadrature):
         assert found[..., c].mean() == pytest.approx(expected, rel=tolerance)
 
 
-def test_flame_in_empty_space(scenes):
-    """A block of light where the medium is empty, in front of matter that shades its back half."""
+def test_emission_in_empty_voxels(scenes):
+    """Emission in empty voxels is rendered, and attenuated by the medium in front of it."""
     sigma_t = np.zeros((32, 8, 8), np.float32)
     sigma_t[28:] = 1.0
     place = scenes.placement()
@@ -83,7 +81,8 @@ def test_flame_in_empty_space(scenes):
     found, _ = rendered(scenes, shape, scenes.volume(np.full((2, 2, 2), 3.0), flame), spp=64)
     np.testing.assert_allclose(found.mean(), 3.0 * 0.5, rtol=5e-3)
     np.testing.assert_allclose(found, 3.0 * 0.5, rtol=0.03)  # the block's faces cut steps
-    behind = scenes.placement((2.0, 2.0, 0.2), center=(0, 0, 1.0))  # all in matter, half outside
+    # Where the emission lies inside of the grid, the medium is there; half of it lies outside.
+    behind = scenes.placement((2.0, 2.0, 0.2), center=(0, 0, 1.0))
     light = scenes.volume(np.full((2, 2, 2), 3.0), behind)
     found, _ = rendered(scenes, shape, light, spp=64, step=0.2)
     t = np.linspace(0.9, 1.0, 2001)
@@ -93,13 +92,13 @@ def test_flame_in_empty_space(scenes):
 
 
 def _profile(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres in [-1, 1] and values of voxels in a row."""
+    """Return the centres in [-1, 1] and the values of a row of voxels."""
     return (np.arange(len(values)) + 0.5) / len(values) * 2 - 1, values
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_uncollided_light_in_a_sphere(scenes, solver):
-    """Phi = int_S2 j / sigma (1 - e^(-sigma s)) dw at every voxel, s the way out."""
+def test_uncollided_fluence_in_a_sphere(scenes, solver):
+    """In an emitting sphere Phi = int_S2 j / sigma (1 - e^(-sigma s)) dw, with s the way out."""
     shape = scenes.boundary(scenes.medium(1.0, 0.5), scenes.placement(), "sphere")
     settings = {"solver": solver, "max_depth": 2, "resolution": 15, "cache_spp": 512}
     _, scene = rendered(scenes, shape, 0.7, size=2, **settings)
@@ -120,8 +119,9 @@ def test_uncollided_light_in_a_sphere(scenes, solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_equilibrium(scenes, solver):
-    """Matter that emits what it absorbs, (1 - albedo) sigma_t, under a sky of 1: all is 1, in every
-    colour, with all orders of scattering; with fewer there is less of it.
+    """In equilibrium with a sky of radiance 1, all radiance is 1; with finite orders it is less.
+
+    The emission equals the absorption, (1 - albedo) sigma_t, in each colour channel.
     """
     place = scenes.placement(turn=25)
     density, albedo = scenes.texture(DENSITY, 0.0, 3.0, 4), np.array([0.9, 0.6, 0.2])
@@ -136,9 +136,11 @@ def test_equilibrium(scenes, solver):
     assert less.mean() < found.mean() - 1e-3
 
 
-def test_equilibrium_among_surfaces(scenes):
-    """The same with grey balls that shine as much as they do not reflect, one in the medium, one
-    beside it, and two media, one of them with coloured extinction.
+def test_equilibrium_with_surfaces(scenes):
+    """Equilibrium holds with grey spheres that emit what they do not reflect, and with two
+    media.
+
+    One sphere is in the medium, one is outside; one of the media has coloured extinction.
     """
     density, albedo = scenes.texture(DENSITY, 0.5, 2.0, 4), 0.7
     place = scenes.placement()
@@ -156,7 +158,7 @@ def test_equilibrium_among_surfaces(scenes):
         "sensor": scenes.description({}, None, 24)["sensor"],
     }
     shape = scenes.boundary({"type": "ref", "id": "fog"}, place)
-    # The clean medium absorbs nothing, and the volume ends before it.
+    # The clear medium absorbs nothing, and the emission volume ends before it.
     j = scenes.volume((1 - albedo) * density, place)
     settings = {"resolution": 16, "cache_spp": 64, "rr_depth": 1000}
     found, _ = rendered(scenes, shape, j, 32, objects=objects, **settings)
@@ -165,16 +167,17 @@ def test_equilibrium_among_surfaces(scenes):
 
 
 def glowing(bsdf: dict, radiance: float, center, radius: float = 0.5) -> dict:
-    """A ball that shines."""
+    """Return an emissive sphere."""
     emitter = {"type": "area", "radiance": radiance}
     ball = {"type": "sphere", "center": list(center), "radius": radius}
     return ball | {"bsdf": bsdf, "emitter": emitter}
 
 
 @pytest.mark.parametrize("phase", [{"type": "isotropic"}, {"type": "hg", "g": 0.6}])
-def test_equilibrium_around(scenes, phase):
-    """By lines: two media, each with light of the other and of a grey ball beside them, which
-    shines as much as it does not reflect.
+def test_equilibrium_by_sweep_with_surfaces(scenes, phase):
+    """``sweep`` preserves equilibrium with two media and a grey sphere outside of both.
+
+    The sphere emits what it does not reflect.
     """
     place, beside = scenes.placement(), scenes.placement((0.8, 1, 1), center=(2.0, 0, 0))
     fog = scenes.medium(1.5, 0.6) | {"phase": phase}
@@ -193,9 +196,11 @@ def test_equilibrium_around(scenes, phase):
 
 
 @pytest.mark.parametrize(("max_depth", "samples"), [(2, 512), (-1, 64)])
-def test_fire_in_a_room(scenes, max_depth, samples):
-    """Light that goes by the walls, and that of another medium: as ``path`` has it at the voxels of
-    both, on average, in every colour.
+def test_emission_in_a_room(scenes, max_depth, samples):
+    """``sweep`` agrees with ``path`` on emission that reaches a medium by walls and another
+    medium.
+
+    The means over the voxels of both media are compared in each colour channel.
     """
     wall = {"type": "sphere", "radius": 4.0, "flip_normals": True}
     wall["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.6, 0.4]}}
@@ -215,7 +220,7 @@ def test_fire_in_a_room(scenes, max_depth, samples):
 
 
 def flame(scenes) -> tuple[dict, dict]:
-    """Coloured light in a corner of a cloud, some of it in an empty part."""
+    """Return coloured emission in a corner of a cloud, partly in empty voxels."""
     place = scenes.placement()
     density = scenes.texture((8, 8, 8), 0.5, 3.0, 4)
     density[:4, :4] = 0
@@ -227,7 +232,7 @@ def flame(scenes) -> tuple[dict, dict]:
 
 @pytest.mark.parametrize("max_depth", [2, 3, -1])
 def test_solvers_agree(scenes, max_depth):
-    """Order by order, in every colour; with rays from outside of all planes of symmetry."""
+    """Both solvers agree for each order and colour; the rays lie outside of all symmetry planes."""
     shape, light = flame(scenes)
     objects = {"sensor": scenes.description({}, None, 24)["sensor"]}
     settings = {"max_depth": max_depth, "resolution": 32, "cache_spp": 384, "rr_depth": 1000}
@@ -239,7 +244,7 @@ def test_solvers_agree(scenes, max_depth):
 
 
 def test_orders(scenes):
-    """Nothing of depth 0; at depth 1 what reaches the camera unscattered, which is background."""
+    """Depth 0 has no emission; depth 1 has the unscattered emission, as background."""
     shape, light = flame(scenes)
     assert not rendered(scenes, shape, light, max_depth=0)[0].any()
     settings = {"aovs": "colour,illumination,background", "solver": "sweep"}
@@ -247,7 +252,7 @@ def test_orders(scenes):
     image, colour, illumination, background = np.split(values, 4, axis=-1)
     np.testing.assert_allclose(colour * illumination + background, image, rtol=1e-4, atol=1e-5)
     seen = rendered(scenes, shape, light, max_depth=1)[0]
-    assert background.mean() == pytest.approx(seen.mean(), rel=0.02)  # in steps of other lengths
+    assert background.mean() == pytest.approx(seen.mean(), rel=0.02)  # with other steps
     assert seen.mean() > 0.1 and image.mean() > 1.05 * seen.mean()
 
 
@@ -285,7 +290,7 @@ BAD = {
 
 @pytest.mark.parametrize(("emission", "settings", "message"), BAD.values(), ids=BAD)
 def test_bad_values_are_refused(scenes, emission, settings, message):
-    """Mitsuba wraps what is raised while it loads a scene."""
+    """Invalid emission raises an error while the scene is loaded, which Mitsuba wraps."""
     with pytest.raises((IrrcacheError, RuntimeError), match=message):
         prepare(scenes, scenes.boundary(scenes.medium(1.0, 0.5)), emission, **settings)
 

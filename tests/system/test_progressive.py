@@ -1,6 +1,4 @@
-"""Progressive rendering: what is refined is what one go would have built, whenever and however a
-run ends.
-"""
+"""Progressive rendering gives the cache of a single build, whenever and however a run ends."""
 
 from __future__ import annotations
 
@@ -15,13 +13,14 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline import builder, progressive
 from mitsuba_irrcache.pipeline.progressive import render_progressive
+from mitsuba_irrcache.solvers.path import solver as path_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
 @pytest.fixture
 def cloud(scenes):
-    """A function: the scene of a small cloud with the integrator ``irrcache``."""
+    """Return a function that loads a small cloud with the integrator ``irrcache``."""
     to_world = scenes.placement(turn=20)
     medium = scenes.medium(scenes.texture((6, 5, 7), 0.2, 2.0, 1), 0.8, to_world)
 
@@ -41,15 +40,17 @@ def statistics(cache: IrradianceCache) -> list[np.ndarray]:
 
 
 def assert_same(a: IrradianceCache, b: IrradianceCache) -> None:
-    """To the last bit."""
+    """Assert equality bit by bit."""
     assert a.streams == b.streams
     for mine, theirs in zip(statistics(a), statistics(b), strict=True):
         np.testing.assert_array_equal(mine, theirs)
 
 
-def test_the_end_is_what_one_go_builds(scenes, cloud):
-    """Cache and image to the last bit, though the passes were others; the first frame comes after
-    a few samples of two batches, and every frame has more samples and a smaller error.
+def test_final_cache_equals_a_single_build(scenes, cloud):
+    """The final cache and image equal those of a single build bit by bit, with other passes.
+
+    The first frame has a few samples of two batches; each further frame has more samples and a
+    smaller error.
     """
     scene, plain = cloud(), cloud()
     frames = list(render_progressive(scene, spp=2, seed=3))
@@ -78,8 +79,8 @@ def test_the_relative_error_is_that_of_the_voxels(cloud):
     assert cache.relative_error == pytest.approx(expected, rel=1e-4)
 
 
-def test_images_meanwhile_show_the_cache_as_it_is(scenes, cloud, refine_calls):
-    """While a run is suspended other views cost no samples, and show its samples."""
+def test_images_between_frames_use_the_current_cache(scenes, cloud, refine_calls):
+    """Rendering other views between frames takes no cache samples, and shows the current cache."""
     scene = cloud()
     run = render_progressive(scene, spp=2, seed=3, cache_spp=math.inf)
     frame = next(run)
@@ -94,7 +95,7 @@ def test_images_meanwhile_show_the_cache_as_it_is(scenes, cloud, refine_calls):
     [({"cache_spp": 8}, [8]), ({"cache_spp": 12}, [16]), ({"cache_spp": 24}, [4, 8, 16, 24])],
 )
 def test_few_samples(cloud, targets, samples):
-    """One batch has no error yet; targets are rounded up to batches."""
+    """A single batch has no error estimate; requested samples are rounded up to batches."""
     frames = list(render_progressive(cloud(), spp=1, **targets))
     assert [f.samples for f in frames] == samples
     assert math.isnan(frames[0].standard_error) == (samples == [8])
@@ -109,32 +110,32 @@ def test_a_wanted_error_ends_it(cloud):
 
 
 def test_without_an_end(cloud):
-    """It goes on beyond the integrator's own number of samples, for as long as frames are taken."""
+    """Without a limit, frames continue beyond the integrator's own number of samples."""
     frames = list(islice(render_progressive(cloud(cache_spp=16), spp=1, cache_spp=math.inf), 6))
     assert frames[5].samples > frames[4].samples > 16
 
 
 class Clock:
-    """Stands for the time: seconds pass with samples and images only."""
+    """A simulated clock, advanced by samples and images only."""
 
     def __init__(self, monkeypatch, sample: float, image: float) -> None:
         self.now = 0.0
         monkeypatch.setattr(progressive, "perf_counter", lambda: self.now)
         monkeypatch.setattr(builder, "perf_counter", lambda: self.now)
-        refine = builder.path_solver.refine
+        refine = path_solver.PathSolver.refine
 
-        def slow_refine(scene, medium, cache, samples, *args, **kwargs):
-            refine(scene, medium, cache, samples, *args, **kwargs)
+        def slow_refine(solver, samples, *args):
+            refine(solver, samples, *args)
             self.now += sample * samples
 
-        grow = builder.path_solver.Opening.grow
+        grow = path_solver.Opening.grow
 
         def slow_grow(opening, size, *args):
             self.now += sample * 2 * (size - opening.size)
             grow(opening, size, *args)
 
-        monkeypatch.setattr(builder.path_solver, "refine", slow_refine)
-        monkeypatch.setattr(builder.path_solver.Opening, "grow", slow_grow)
+        monkeypatch.setattr(path_solver.PathSolver, "refine", slow_refine)
+        monkeypatch.setattr(path_solver.Opening, "grow", slow_grow)
         self.image = image
 
     def slow_images(self, scene: mi.Scene) -> None:
@@ -150,7 +151,10 @@ class Clock:
 
 @pytest.mark.parametrize("seconds", [0.5, 3.0, 7.0])
 def test_a_budget_is_kept(cloud, monkeypatch, seconds):
-    """The last image is there in time, most of which is used; the first one comes in any case."""
+    """The last image is complete within the budget, most of which is used.
+
+    The first image is always rendered.
+    """
     clock, scene = Clock(monkeypatch, sample=0.05, image=0.1), cloud()
     clock.slow_images(scene)
     *_, last = render_progressive(scene, spp=1, seconds=seconds)
@@ -159,7 +163,7 @@ def test_a_budget_is_kept(cloud, monkeypatch, seconds):
 
 
 def test_a_budget_is_kept_with_a_cache_from_a_file(cloud, monkeypatch, tmp_path):
-    """Samples that were found there took no time, and say nothing of what more will take."""
+    """Samples loaded from a file do not affect the estimated time per sample."""
     file = str(tmp_path / "light.npz")
     list(render_progressive(cloud(cache_file=file), spp=1, cache_spp=256))
     clock, scene = Clock(monkeypatch, sample=0.05, image=0.1), cloud(cache_file=file)
@@ -170,14 +174,16 @@ def test_a_budget_is_kept_with_a_cache_from_a_file(cloud, monkeypatch, tmp_path)
 
 
 def test_wanted_times(cloud, monkeypatch):
-    """Frames at 2 s and 4 s, after the first one; none else."""
+    """Frames are rendered at the requested times of 2 s and 4 s after the first one, and no
+    others.
+    """
     clock, scene = Clock(monkeypatch, sample=0.01, image=0.1), cloud()
     clock.slow_images(scene)
     frames = list(render_progressive(scene, spp=1, times=[4, 2]))
     assert [round(f.elapsed, 1) for f in frames] == pytest.approx([0.1, 2, 4], abs=0.15)
 
 
-def test_what_the_caller_does_does_not_count(cloud, monkeypatch):
+def test_time_of_the_caller_does_not_count(cloud, monkeypatch):
     clock, scene = Clock(monkeypatch, sample=0.01, image=0.1), cloud()
     clock.slow_images(scene)
     elapsed = []
@@ -191,8 +197,11 @@ def test_what_the_caller_does_does_not_count(cloud, monkeypatch):
 
 
 def test_stopped_and_continued(cloud, tmp_path):
-    """Closed after the third frame, and taken up from the file by another process's scene: to the
-    last bit the cache of an uninterrupted run. Before that there is no batch to keep.
+    """A run closed after its third frame and continued from the file equals an uninterrupted
+    one.
+
+    It is continued by another process; the equality is bit by bit. Before the third frame there is
+    no complete batch to save.
     """
     file = str(tmp_path / "light.npz")
     run = render_progressive(cloud(cache_file=file), spp=1)
@@ -209,10 +218,12 @@ def test_stopped_and_continued(cloud, tmp_path):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
 def test_stopped_within_a_pass(cloud, tmp_path, monkeypatch, error):
-    """The launches that were complete are in cache and file, the one that was not is in neither;
-    the rest makes it the cache of one go.
+    """When a pass is interrupted, its complete launches are in cache and file, and no incomplete
+    one.
+
+    The remaining samples complete it to the cache of a single build.
     """
-    monkeypatch.setattr(builder.path_solver, "LANES", 1 << 12)
+    monkeypatch.setattr(path_solver, "LANES", 1 << 12)
     file = tmp_path / "light.npz"
     scene, whole = cloud(cache_file=str(file)), cloud()
     integrator, frames = scene.integrator(), []
@@ -233,9 +244,10 @@ def test_stopped_within_a_pass(cloud, tmp_path, monkeypatch, error):
     assert_same(integrator.cache, whole.integrator().cache)
 
 
-def test_the_file_is_written_now_and_then(cloud, tmp_path, monkeypatch):
-    """Of passes that take 8 s or more, those after at least 30 s, and the end; a render that is not
-    progressive saves at its end.
+def test_file_is_written_at_intervals(cloud, tmp_path, monkeypatch):
+    """Files are written at most every 30 s and at the end, after passes of 8 s or more.
+
+    A render that is not progressive saves at its end only.
     """
     saved = []
     save = IrradianceCache.save
@@ -258,7 +270,7 @@ def test_the_file_is_written_now_and_then(cloud, tmp_path, monkeypatch):
 
 
 def test_writing_takes_a_tenth_at_most(cloud, tmp_path, monkeypatch):
-    """A disk on which saving takes 10 s is written to after 100 s of passes."""
+    """Saving takes at most a tenth of the time: with 10 s per save, after 100 s of passes."""
     clock = Clock(monkeypatch, sample=1.0, image=0.0)
     ended = []
 
@@ -275,11 +287,11 @@ def test_writing_takes_a_tenth_at_most(cloud, tmp_path, monkeypatch):
     assert min(np.diff(regular)[1:]) >= 110
 
 
-# The living integrator
+# Changes of the integrator
 
 
 def test_a_raised_target_refines(scenes, cloud, refine_calls):
-    """Only what is missing is computed; a lowered target computes nothing."""
+    """Raising the target computes only the missing samples; lowering it computes none."""
     scene, whole = cloud(cache_spp=32), cloud(cache_spp=64)
     before = scenes.image(scene, spp=2)
     scene.integrator().cache_spp = 64
@@ -293,7 +305,7 @@ def test_a_raised_target_refines(scenes, cloud, refine_calls):
 
 
 @pytest.mark.parametrize("samples", [-8, 2.5, True, math.inf])
-def test_a_target_that_makes_no_sense(cloud, samples):
+def test_invalid_target(cloud, samples):
     integrator = cloud().integrator()
     with pytest.raises(IrrcacheError, match="cache_spp is"):
         integrator.cache_spp = samples
@@ -301,7 +313,7 @@ def test_a_target_that_makes_no_sense(cloud, samples):
 
 
 def test_passes_and_frames_compile_nothing(cloud, kernels):
-    """Passes of one batch or many, and the images after them, run the kernels of the first two
+    """All passes, of one or many batches, and their images use the kernels of the first two
     frames.
     """
     scene = cloud()
@@ -314,12 +326,12 @@ def test_passes_and_frames_compile_nothing(cloud, kernels):
     assert later and {k["hash"] for k in later} <= known
 
 
-# Where there is nothing to refine
+# Scenes without a cache
 
 
 @pytest.mark.parametrize("why", ["no scattering", "no paths", "no medium", "black", "no light"])
 def test_one_frame_where_nothing_is_cached(scenes, cloud, why):
-    """The image of mi.render, even if no end was given."""
+    """Without a cache there is one frame, the image of mi.render, even without a limit."""
     if why in ("black", "no light"):
         shape = scenes.boundary(scenes.medium(1.0, 0.0 if why == "black" else 0.5))
         lights = {} if why == "black" else {"emitter": None}
@@ -334,7 +346,7 @@ def test_one_frame_where_nothing_is_cached(scenes, cloud, why):
 
 
 def test_other_integrators_are_named(cloud):
-    """At the call, not at the first frame."""
+    """Other integrators are refused by name when the function is called, not at the first frame."""
     with pytest.raises(IrrcacheError, match=r"VolumetricPathIntegrator.*irrcache"):
         render_progressive(cloud("volpath"))
 
@@ -346,8 +358,8 @@ def test_other_integrators_are_named(cloud):
         {"standard_error": math.inf}, {"seconds": 0}, {"seconds": math.nan}, {"times": [1, -1]},
     ],
 )  # fmt: skip
-def test_targets_that_make_no_sense(cloud, targets):
-    """At the call; the value and the remedy are in the message."""
+def test_invalid_targets(cloud, targets):
+    """Invalid targets are refused when the function is called, with their value and the remedy."""
     (name,) = targets
     with pytest.raises(IrrcacheError, match=f"{name} is .*must be"):
         render_progressive(cloud(), **targets)

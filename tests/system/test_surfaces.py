@@ -1,7 +1,7 @@
 """Scenes with surfaces, area emitters and several media against ``volpath``.
 
-Block means of two images by each integrator, within what coarse caches may err plus the statistical
-error that the two images of each tell; see `check`.
+Block means of two images by each integrator agree within the allowed bias of coarse caches and the
+statistical error estimated from the two images; see `check`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def tetrahedron(folder, interior: dict) -> dict:
-    """A closed mesh, from a file."""
+    """Load a closed mesh from a file."""
     corners = [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]]
     faces = [[1, 3, 2], [1, 2, 4], [1, 4, 3], [2, 3, 4]]
     rows = [("v", *c) for c in corners] + [("f", *f) for f in faces]
@@ -40,7 +40,9 @@ def tetrahedron(folder, interior: dict) -> dict:
 
 
 def scene_ground(scenes, folder) -> dict:
-    """A cloud over the ground, which it shades, and which lights it, before a mirror."""
+    """Return a cloud over the ground, which it shadows and which illuminates it, before a
+    mirror.
+    """
     to_world = scenes.placement(turn=20)
     cloud = scenes.medium(scenes.texture((5, 6, 7), 0, 3, 4), 0.9, to_world)
     mirror = {"type": "rectangle", "to_world": placed((-0.5, 0, 2.0), (2, 2, 1), (0, 0.2, 0))}
@@ -49,13 +51,13 @@ def scene_ground(scenes, folder) -> dict:
 
 
 def scene_ball(scenes, folder) -> dict:
-    """An opaque ball in fog: its shadow, and the light it reflects."""
+    """Return an opaque sphere in fog: its shadow and its reflected radiance."""
     red = diffuse(0.9, 0.2, 0.1)
     return {"fog": fog(), "box": bound(interior=ref("fog")), "ball": ball(bsdf=red)}
 
 
 def scene_glass(scenes, folder) -> dict:
-    """Glass behind a medium, and glass in it, which the medium fills too."""
+    """Return glass behind a medium, and glass inside the medium, filled by it."""
     glass = {"bsdf": {"type": "dielectric"}}
     return {
         "box": bound(interior=fog((0.7, 0.7, 0.7))),
@@ -66,7 +68,7 @@ def scene_glass(scenes, folder) -> dict:
 
 
 def scene_lamp_outside(scenes, folder) -> dict:
-    """A mesh lit by a lamp, over the ground."""
+    """Return a mesh under an area light, over the ground."""
     return {
         "mesh": tetrahedron(folder, fog((2, 2, 2))), "ground": ground(),
         "lamp": lamp((0.5, 2.2, -0.5), (0, 0, 0)), "emitter": None, "sun": None,
@@ -74,7 +76,7 @@ def scene_lamp_outside(scenes, folder) -> dict:
 
 
 def scene_lamp_inside(scenes, folder) -> dict:
-    """A lamp in the medium: bright on one side, dark on the other, the one that is seen."""
+    """Return an area light in the medium; the camera faces its black back."""
     return {
         "box": bound(interior=fog()), "lamp": lamp((0, 0.2, 0), (0, -1, 0.3), 0.4),
         "emitter": {"type": "constant", "radiance": 0.1}, "sun": None,
@@ -82,7 +84,7 @@ def scene_lamp_inside(scenes, folder) -> dict:
 
 
 def scene_bulb(scenes, folder) -> dict:
-    """A bare bulb in fog over the ground, and a ball in its light."""
+    """Return an emissive sphere in fog over the ground, and a diffuse sphere."""
     bulb = {"type": "point", "position": [0.1, 0.4, 0.2], "intensity": 3.0}
     return {
         "box": bound(interior=fog((0.6, 0.6, 0.6))), "ground": ground(),
@@ -91,7 +93,7 @@ def scene_bulb(scenes, folder) -> dict:
 
 
 def scene_two(scenes, folder) -> dict:
-    """A medium beside another, whose extinction is coloured, and a third in that."""
+    """Return a medium beside another one with coloured extinction, which contains a third."""
     inner = bound("sphere", fog((1, 2, 4)), (0.55, 0, 0), (0.3, 0.3, 0.3), exterior=ref("right"))
     return {
         "right": fog((3, 1, 0.5)),
@@ -102,7 +104,7 @@ def scene_two(scenes, folder) -> dict:
 
 
 def scene_camera_inside(scenes, folder) -> dict:
-    """Between the camera and a ball, all in one medium."""
+    """Return camera and sphere in one medium."""
     sensor = scenes.description({}, None, SIZE)["sensor"]
     look = mi.ScalarTransform4f().look_at([0.3, 0.4, -1.5], [0, 0, 0], [0, 1, 0])
     return {
@@ -113,7 +115,9 @@ def scene_camera_inside(scenes, folder) -> dict:
 
 
 def scene_glass_boundary(scenes, folder) -> dict:
-    """A medium in glass has no cache, and is lit and seen by paths; one behind a veil has one."""
+    """Return a medium in glass, which is path traced, and one behind a null surface, with a
+    cache.
+    """
     glass = {"bsdf": {"type": "dielectric"}, "interior": fog((1, 1, 1))}
     half = {"type": "mask", "opacity": 0.5}
     half["nested"] = {"type": "twosided", "nested": diffuse(0.7, 0.5, 0.3)}
@@ -144,7 +148,7 @@ def test_scenes(scenes, tmp_path, build, settings, bounds):
 
 
 def everything(scenes) -> dict:
-    """Surfaces, an area light and two media, one of them with coloured extinction."""
+    """Return surfaces, an area light and two media, one with coloured extinction."""
     return {
         "fog": fog((0.5, 0.5, 0.5)), "box": bound(interior=ref("fog")),
         "inner": bound("sphere", fog((1, 2, 3)), (-0.4, 0, 0), [0.4] * 3, exterior=ref("fog")),
@@ -154,7 +158,7 @@ def everything(scenes) -> dict:
 
 
 def alone(scenes) -> dict:
-    """One medium under a sky and a sun."""
+    """Return one medium under a sky and a sun."""
     place = scenes.placement()
     medium = scenes.medium(scenes.texture((5, 6, 7), 0.0, 3.0, 4), (0.95, 0.9, 0.8), place)
     return {"box": scenes.boundary(medium, place)}
@@ -169,16 +173,17 @@ ORDERS = {
 
 @pytest.fixture(scope="module")
 def volpaths() -> dict:
-    """Its images, by scene and depth: both solvers are compared with the same ones."""
+    """Cache volpath's images by scene and depth, for both solvers."""
     return {}
 
 
 @pytest.mark.parametrize(("build", "solver", "samples"), ORDERS.values(), ids=ORDERS)
 def test_every_order_of_scattering_is_counted_once(scenes, volpaths, build, solver, samples):
-    """The image at ``max_depth`` k less that at k - 1 is what it is with volpath, for k = 1 to 5:
-    the mean within 3 % and four standard errors, and the means of a quarter of the image each
-    within 6 % of the mean and as many. Images of one seed share their paths: their difference has
-    little noise.
+    """The image at ``max_depth`` k less that at k - 1 agrees with volpath for k = 1 to 5.
+
+    So every order is counted once. The mean agrees within 3 % and four standard errors, and the
+    means of quarters of the image within 6 % of the mean and as many. Images of one seed share
+    their paths, so their difference has little noise.
     """
     pictures = []
     for max_depth in range(1, 6):
@@ -191,7 +196,7 @@ def test_every_order_of_scattering_is_counted_once(scenes, volpaths, build, solv
         pictures.append(ours + volpaths[build, max_depth])
     for x, y, p, q in np.diff(np.array(pictures), axis=0, prepend=0):
         theirs, apart = 0.5 * (p + q), 0.5 * (x + y - p - q)
-        if not theirs.any():  # no lamp in view
+        if not theirs.any():  # without visible emitters
             assert not x.any() and not y.any()
             continue
         error = np.sqrt((((x - y) ** 2) + (p - q) ** 2).mean()) / 2
@@ -205,7 +210,7 @@ def test_every_order_of_scattering_is_counted_once(scenes, volpaths, build, solv
 
 @pytest.mark.parametrize("hide", [False, True])
 def test_hidden_emitters_and_alpha(scenes, hide):
-    """A lamp in view, before and in the fog, with the sky behind: what is seen, and alpha."""
+    """With visible and hidden emitters in front of and in the fog, image and alpha agree."""
     sensor = scenes.description({}, None, SIZE)["sensor"]
     sensor["film"] = sensor["film"] | {"pixel_format": "rgba"}
     objects = {
@@ -232,7 +237,7 @@ def loaded(scenes, objects: dict, **settings) -> mi.Scene:
 
 
 def test_each_medium_has_a_cache(scenes, tmp_path):
-    """By the medium's id, in a file of its own, which another scene is refused."""
+    """Each medium has a cache under its id and in its own file, which another scene cannot load."""
     file = str(tmp_path / "light.npz")
     scene = loaded(scenes, everything(scenes), cache_file=file)
     scenes.image(scene, spp=1)
@@ -268,7 +273,9 @@ def test_edits_of_surfaces_renew_the_caches(scenes):
 
 
 def test_layers_add_up(scenes):
-    """Surfaces and emitters are background: colour times illumination plus that is the image."""
+    """Colour times illumination plus background is the image; surfaces and emitters are
+    background.
+    """
     scene = loaded(scenes, everything(scenes), aovs="colour,illumination,background,noise")
     values = scenes.image(scene, spp=8)
     image, colours, illumination, background = (values[..., i : i + 3] for i in (0, 3, 6, 9))
@@ -276,7 +283,7 @@ def test_layers_add_up(scenes):
     assert background.mean() > 0.1 * image.mean() and values[..., 12].mean() > 0
 
 
-def test_media_that_only_glass_shows_are_volpaths(scenes):
+def test_media_behind_glass_only_are_path_traced(scenes):
     glass = {"bsdf": {"type": "dielectric"}, "interior": fog()}
     pictures = []
     for name in ("irrcache", "volpath"):
@@ -288,7 +295,7 @@ def test_media_that_only_glass_shows_are_volpaths(scenes):
     np.testing.assert_array_equal(*pictures)
 
 
-def test_sweep_is_refused_among_surfaces(scenes):
+def test_sweep_is_refused_with_surfaces(scenes):
     scene = loaded(scenes, scene_ball(scenes, None), solver="sweep")
     with pytest.raises(IrrcacheError, match=r"sweep.*path.*auto"):
         scene.integrator().prepare(scene)

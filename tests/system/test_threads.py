@@ -1,4 +1,4 @@
-"""Threads that share scenes, caches, films and files see what one thread alone sees."""
+"""Threads that share scenes, caches, films and files get the results of a single thread."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SOLVERS = ("sweep", "path")
 
 @pytest.fixture(autouse=True)
 def impatient():
-    """Threads take turns a thousand times as often as usual."""
+    """Switch threads a thousand times as often as usual."""
     interval = sys.getswitchinterval()
     sys.setswitchinterval(5e-6)
     yield
@@ -32,7 +32,7 @@ def impatient():
 
 
 def together(*actions) -> list:
-    """Results of functions that begin at once, each in a thread of its own."""
+    """Start functions at once, each in a thread of its own; return their results."""
     barrier = Barrier(len(actions))
 
     def begin(action):
@@ -46,13 +46,13 @@ def together(*actions) -> list:
 
 @pytest.fixture
 def make(scenes):
-    """A function: a scene with a cloud of its own for each ``seed``."""
+    """Return a function that loads a scene with a different cloud for each ``seed``."""
 
     def scene(solver="path", seed=1, **settings) -> mi.Scene:
         settings = {"solver": solver, "resolution": 3, "cache_spp": 32} | settings
         cloud = scenes.medium(scenes.texture((3, 3, 3), 0, 2, seed), 0.8, scenes.placement())
         shape = scenes.boundary(cloud)
-        # Films of different sizes: Mitsuba makes one object of equal ones.
+        # Different film sizes, because Mitsuba shares one object between equal films.
         others = {
             f"sensor{i}": scenes.description({}, None, size=6 + i)["sensor"]
             for i in range(1, THREADS)
@@ -66,7 +66,7 @@ def make(scenes):
 
 @pytest.fixture
 def slow_sums(monkeypatch):
-    """Between what a solver has computed and its addition to a cache, other threads have time."""
+    """Delay the addition of samples to a cache, so that other threads can interfere."""
     add = IrradianceCache.add
 
     def slowly(cache: IrradianceCache, *args: object) -> None:
@@ -83,7 +83,7 @@ def image(scene: mi.Scene, **options) -> np.ndarray:
 @pytest.mark.parametrize("films", ["one film", "several films"])
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_one_scene_in_several_threads(make, slow_sums, solver, films):
-    """A fresh cache, each time: it is built once, of one random stream."""
+    """Concurrent renderings of one scene build one cache, of a single random stream."""
     sensors = range(THREADS) if films == "several films" else [0] * THREADS
     alone = make(solver)
     assert len({sensor.film() for sensor in alone.sensors()}) == THREADS
@@ -120,7 +120,7 @@ def test_two_integrators_that_render_to_one_film(make):
 
 
 def test_two_scenes_with_one_integrator(make):
-    """The integrator has one cache, which belongs to one scene after the other."""
+    """One integrator rendering two scenes concurrently has a valid cache for each in turn."""
     made = [make(seed=seed) for seed in (1, 2)]
     expected = [image(scene) for scene in made]
     integrator = made[0].integrator()
@@ -130,8 +130,9 @@ def test_two_scenes_with_one_integrator(make):
 
 
 def test_a_progressive_run_beside_renderings(make):
-    """Frames of the run, and images of others meanwhile, show whole batches of one stream; what
-    both leave is the cache of one thread alone.
+    """Concurrent renderings during a progressive run show whole batches of one random stream.
+
+    The final cache is that of a single thread.
     """
     expected = make()
     last = image(expected)
@@ -145,8 +146,10 @@ def test_a_progressive_run_beside_renderings(make):
         assert scene.integrator().cache.streams == {0: 32}
 
 
-def test_the_cache_is_whole_whenever_it_is_asked_for(make):
-    """While others refine it: the sums belong to the number of samples."""
+def test_cache_is_consistent_while_refined(make):
+    """A cache that is read while other threads refine it has sums that match its number of
+    samples.
+    """
     exact = make(cache_spp=4096)
     exact.integrator().prepare(exact)
     mean = np.array(exact.integrator().cache.irradiance).mean()
@@ -175,7 +178,7 @@ def test_the_cache_is_whole_whenever_it_is_asked_for(make):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_scenes_that_share_a_cache_file(make, tmp_path, solver):
-    """Each renders its image, whoever writes first; the file is whole, and of one stream."""
+    """Scenes that share a cache file render correctly; the file is complete and of one stream."""
     expected = image(make(solver))
     for number in range(REPETITIONS):
         file = tmp_path / f"{number}.cache"
@@ -201,8 +204,8 @@ def test_a_failure_in_one_thread_leaves_the_others_their_cache(make):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_the_umask_is_what_it_was(tmp_path):
-    """Reading it means writing it, for all threads."""
+def test_umask_is_unchanged(tmp_path):
+    """The umask is unchanged by concurrent saves, although reading it requires setting it."""
     before = os.umask(0o027)
     try:
 

@@ -1,5 +1,6 @@
-"""The viewer as a user has it: ``irrcache view`` in a process of its own, and a real browser,
-headless. Skipped where there is no Chromium.
+"""``irrcache view`` in a process of its own with a real headless browser.
+
+Skipped if there is no Chromium.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def started(tmp_path_factory):
-    """The address of a viewer that shows a chest of few voxels, and the folder of its files."""
+    """Start a viewer of a chest with few voxels; return its address and the folder of its files."""
     folder = tmp_path_factory.mktemp("viewer")
     volume = ("phantom:thorax:40,28,36", "--preset", "ct-chest")
     arguments = (*volume, "-o", str(folder / "kept"), "--port", "8700")
@@ -40,9 +41,10 @@ def started(tmp_path_factory):
     assert not re.search("Traceback|rror|leaked|Warning", log), log
 
 
-def test_looking_around(browser, started):
-    """Drag, wheel, edit, save, reload, second window: pictures change as they should, and are those
-    of ``irrcache render``.
+def test_edit_save_reload_and_second_window(browser, started):
+    """Drag, wheel, edit, save, reload and a second window change the image as expected.
+
+    Saved scenes render to the displayed image.
     """
     address, folder = started
     window = browser.open(address, SIZE)
@@ -51,7 +53,7 @@ def test_looking_around(browser, started):
     first = settled(window)
     assert first.std() > 20
 
-    # A drag turns the camera, the wheel brings it closer; both show smaller pictures meanwhile.
+    # Dragging rotates the camera, the wheel moves it closer; meanwhile images have low resolution.
     count = len(window.shown())
     turned = after(window, lambda: window.orbit(12, 8, 0.02))
     assert difference(turned, first) > 3
@@ -61,8 +63,8 @@ def test_looking_around(browser, started):
     closer = after(window, lambda: window.zoom(-3))
     assert difference(closer, turned) > 3
 
-    # What is kept renders to what is on the screen.
-    window.page.get_by_text("Keep", exact=True).click()
+    # A saved scene renders to the displayed image.
+    window.page.get_by_text("Save", exact=True).click()
     window.page.get_by_role("button", name="save", exact=True).click()
     window.page.get_by_text("saved view").wait_for(timeout=20000)
     kept = folder / "kept" / "view.xml"
@@ -73,24 +75,24 @@ def test_looking_around(browser, started):
     shown = np.rint(255 * read_image(folder / "kept" / "view.png"))[:, :CLEAR]
     assert difference(shown, closer) < 1
 
-    # An edit of the transfer function: other matter, and it is saved as such.
+    # An edit of the transfer function changes the medium, and is saved.
     window.choose("point", "4")
     denser = after(window, lambda: window.enter("opacity", 0.6))
     assert difference(denser, closer) > 2
 
-    # A second window has its own camera, the first one's stays; bad input is refused in place.
+    # A second window has a camera of its own; invalid input is refused where it was entered.
     other = browser.open(address, SIZE)
     other.page.add_style_tag(content="[class*=Notification] {display: none !important}")
     elsewhere = settled(other)
     assert difference(elsewhere, denser) > 3
     assert difference(screen(window), denser) < 0.5
-    other.page.get_by_text("Keep", exact=True).click()
+    other.page.get_by_text("Save", exact=True).click()
     other.enter("name", "../escaped")
     other.page.get_by_role("button", name="save", exact=True).click()
     other.page.get_by_text("is no name for a file").first.wait_for()
     assert not list(folder.parent.glob("escaped*")) and not list(folder.glob("escaped*"))
 
-    # A reload loses nothing of what is shared.
+    # A reload preserves the shared state.
     other.page.reload()
     other.page.add_style_tag(content="[class*=Notification] {display: none !important}")
     assert difference(settled(other), elsewhere) < 0.5
@@ -98,7 +100,9 @@ def test_looking_around(browser, started):
 
 
 def test_pages_of_other_sites_are_refused(started):
-    """And so is a name that another site may have given to this machine."""
+    """Requests from pages of other sites are refused, also under a name that resolves to this
+    host.
+    """
     from viser import __version__
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect

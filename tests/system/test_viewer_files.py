@@ -1,5 +1,6 @@
-"""Files that go between the viewer and a real browser, and some of everything at random. Skipped
-where there is no Chromium.
+"""File transfer between the viewer and a real browser, and random interactions.
+
+Skipped if there is no Chromium.
 """
 
 from __future__ import annotations
@@ -62,9 +63,11 @@ def browser():
         yield browser
 
 
-def test_transfer_functions_and_archives_come_and_go(browser, tmp_path):
-    """The JSON that is saved is what ``irrcache import`` reads, and one that is loaded is seen; the
-    archive without an output folder holds a scene that renders to what is seen.
+def test_transfer_functions_and_archives_are_exchanged(browser, tmp_path):
+    """Transfer functions and scenes are exchanged through the browser.
+
+    A saved JSON is accepted by ``irrcache import``, and a loaded one changes the image. Without an
+    output folder, the downloaded archive holds a scene that renders to the displayed image.
     """
     with viewer((*CHEST, "--port", "8710"), tmp_path / "log.txt") as address:
         window = browser.open(address, SIZE)
@@ -95,7 +98,7 @@ def test_transfer_functions_and_archives_come_and_go(browser, tmp_path):
         page.get_by_text("Refused:").first.wait_for(state="hidden")
         assert difference(back, first) < 1.5
 
-        page.get_by_text("Keep", exact=True).click()
+        page.get_by_text("Save", exact=True).click()
         with page.expect_download(timeout=90_000) as download:
             page.get_by_role("button", name="download", exact=True).click()
             page.get_by_text("downloaded view.zip").wait_for(timeout=80_000)
@@ -111,9 +114,10 @@ def test_transfer_functions_and_archives_come_and_go(browser, tmp_path):
     assert difference(again, back) < 1.5
 
 
-def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
-    """A scene's cameras can be chosen, also one in the medium; its environment can be turned; and
-    volpath is beside it on demand.
+def test_cameras_and_environment_of_a_scene_with_surfaces(browser, tmp_path, scenes):
+    """The viewer offers a scene's cameras, rotates its environment and compares with volpath.
+
+    One of the cameras is in the medium.
     """
     density = scenes.texture((12, 12, 12, 1), 0.2, 4, 1)
     mi.VolumeGrid(density).write(str(tmp_path / "density.vol"))
@@ -137,7 +141,8 @@ def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
         window.tick("compare with volpath")
         window.wait_for(r"volpath, \d{2,} samples per pixel; RMSE", 90)
         window.page.add_style_tag(content=".mantine-Paper-root {visibility: hidden}")
-        latest = time.monotonic() + 30  # the picture comes behind the text; in sRGB noise is bias
+        # The image follows the text, and the sRGB curve biases its noise, so samples are awaited.
+        latest = time.monotonic() + 30
         apart = np.inf
         while not apart < 3 and time.monotonic() < latest:
             ours, theirs = np.split(screen(window, SIZE[0]), 2, axis=1)
@@ -149,8 +154,8 @@ def test_cameras_and_skies_of_a_scene_with_surfaces(browser, tmp_path, scenes):
 
 
 @pytest.mark.slow
-def test_half_a_minute_of_everything(browser, tmp_path):
-    """At random: nothing goes wrong. How much there is time for is the machine's affair."""
+def test_random_interactions(browser, tmp_path):
+    """Half a minute of random interactions causes no error, however many the machine completes."""
     usage = use(browser, [*CHEST, "--port", "8730"], 30, 5, tmp_path / "log.txt")
     assert usage.errors == []
     assert sum(usage.done.values()) >= 3 and usage.pictures > 3

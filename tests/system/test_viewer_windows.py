@@ -1,5 +1,6 @@
-"""Windows of the viewer in a real browser: resized, closed while a picture is on its way, and let
-in by the token. Skipped where there is no Chromium.
+"""Viewer windows in a real browser: resized, closed during an update, and with an access token.
+
+Skipped if there is no Chromium.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ pytestmark = [
 
 
 def test_windows_that_are_resized_and_closed(tmp_path):
-    """Where other machines can connect. After every resize there is a picture at rest of the new
-    size; closing windows prints nothing.
+    """Every resize gives a final image of the new size, and closing windows prints nothing.
+
+    The server accepts other machines, so it requires the token.
     """
     volume = ("phantom:thorax:24,16,20", "--preset", "ct-chest")
     arguments = (*volume, "--host", "0.0.0.0", "--port", "8710")

@@ -2,9 +2,8 @@
 
 Two images x, y from one cache and two independent volpath images a, b give the error without the
 noise of camera samples, mean((x - a)(y - b)), and the bias, mean(x + y - a - b) / 2, with a
-standard error from the pixels of the differences. What is left is the noise of the cache and the
-discretisation. Every scene keeps to what volpath itself renders right: sizes of about 1, near the
-origin.
+standard error from the pixels of the differences. The remainder is the noise of the cache and the
+discretisation. All scenes have sizes of about 1 near the origin, where volpath itself is accurate.
 """
 
 from __future__ import annotations
@@ -16,15 +15,15 @@ import pytest
 pytestmark = pytest.mark.usefixtures("rgb")
 
 SPP = 256
-#: Mean and root mean square error allowed, relative to the mean radiance: what coarse voxels and
-#: the noise of the cache may add.
+#: Allowed mean and root mean square error relative to the mean radiance, due to coarse voxels and
+#: the noise of the cache.
 BIAS, RMSE = 0.01, 0.02
 DENSITY = (5, 6, 7)
 SHARP = {"resolution": 64, "cache_spp": 8, "step": 0.2}
 
 
 class Comparison:
-    """Two irrcache images x, y and two volpath images a, b of a scene; relative to the mean of all
+    """Two irrcache images x, y and two volpath images a, b, relative to the mean of all
     channels.
     """
 
@@ -36,8 +35,8 @@ class Comparison:
         self.rmse = np.sqrt(max(((x - a) * (y - b)).mean(), 0)) / self.scale
 
     def check(self, bias: float = BIAS, rmse: float = RMSE) -> None:
-        """Fails where a channel's bias exceeds ``bias`` by more than 4 standard errors, or the RMSE
-        ``rmse``.
+        """Assert that the bias per channel is within ``bias`` plus 4 standard errors, and the
+        RMSE in ``rmse``.
         """
         assert self.scale > 0
         assert self.error.max() < 0.3 * bias, "the reference is too noisy to say"
@@ -47,7 +46,7 @@ class Comparison:
 
 @pytest.fixture
 def compare(scenes):
-    """A function: renders a scene with both integrators."""
+    """Return a function that renders a scene with both integrators."""
 
     def run(
         shape, max_depth=-1, irrcache=None, spp=SPP, hide=False, stock="volpath", **objects
@@ -66,7 +65,7 @@ def compare(scenes):
 
 
 def cloud(scenes, to_world, shape=DENSITY, **properties) -> dict:
-    """A grey heterogeneous medium, optical depth about 3 across."""
+    """Return a grey heterogeneous medium with an optical depth of about 3."""
     sigma_t = scenes.texture(shape, 0.0, 3.0, 4)
     return scenes.medium(sigma_t, scenes.texture(shape, 0.5, 1.0, 5), to_world, **properties)
 
@@ -82,8 +81,8 @@ def test_heterogeneous_cube(scenes, compare, max_depth):
         compare(shape, max_depth).check()
 
 
-def test_prbvolpath_sees_the_same(scenes, compare):
-    """The stock integrator whose derivatives users of images by ``irrcache`` are referred to."""
+def test_prbvolpath_renders_the_same(scenes, compare):
+    """prbvolpath, to which errors about gradients refer, renders the same image."""
     to_world = scenes.placement()
     compare(scenes.boundary(cloud(scenes, to_world), to_world), stock="prbvolpath").check()
 
@@ -105,7 +104,7 @@ def test_placement_of_the_grid(scenes, compare, placement):
 
 
 def test_voxels_of_one_to_five(scenes, compare):
-    """The same box filled by voxels five times longer in z."""
+    """A box with voxels five times longer in z agrees with volpath."""
     to_world = scenes.placement((2, 2, 2), turn=20)
     compare(scenes.boundary(cloud(scenes, to_world, (2, 10, 10)), to_world)).check()
 
@@ -125,8 +124,10 @@ def test_homogeneous_rgb(scenes, compare, max_depth):
 
 @pytest.mark.parametrize("max_depth", [2, -1])
 def test_chromatic_extinction(scenes, compare, max_depth):
-    """1 : 4 : 12, at default settings, against ``volpathmis``: volpath, which samples the mean of
-    the channels, has 250 times its variance in the thin one here. Measured: 0.4 to 0.6 %.
+    """Extinction of 1 : 4 : 12 at default settings agrees with ``volpathmis`` (measured: 0.4 to
+    0.6 %).
+
+    volpath samples the mean of the channels, and has 250 times its variance in the thin channel.
     """
     medium = scenes.medium((0.5, 2.0, 6.0), (0.95, 0.9, 0.8))
     settings = {"resolution": 0, "cache_spp": 0, "solver": "auto"}
@@ -149,13 +150,15 @@ def test_sphere(scenes, compare, kind):
 @pytest.mark.parametrize("turn", [0.0, 30.0])
 @pytest.mark.parametrize("grid", [1.4, 2.8])
 def test_grid_smaller_or_larger_than_its_boundary(scenes, compare, grid, turn):
-    """The medium ends at the world box of its grid; its values are clamped between the two."""
+    """The medium ends at the world bounding box of its grid; its values are clamped between the
+    two.
+    """
     medium = cloud(scenes, scenes.placement((grid, grid, grid), turn=turn))
     compare(scenes.boundary(medium, scenes.placement((2.0, 2.0, 2.0), turn=0.5 * turn))).check()
 
 
 def test_empty_space_around_a_core(scenes, compare):
-    """Most macrocells are empty: rays skip, and voxels without a medium have no samples."""
+    """Most macrocells are empty: rays skip them, and voxels without a medium have no samples."""
     density = np.zeros((20, 24, 22), np.float32)
     density[8:12, 9:15, 7:13] = scenes.texture((4, 6, 6), 2.0, 8.0, 9)
     to_world = scenes.placement(turn=15)
@@ -186,8 +189,8 @@ def _bright_window() -> np.ndarray:
 
 @pytest.mark.parametrize("emitter", EMITTERS.values(), ids=EMITTERS)
 def test_emitters(scenes, compare, emitter):
-    """Light with sharp shadows asks for more voxels than the soft light of a sky does, and for
-    shorter steps.
+    """Each kind of emitter agrees; sharp shadows require more voxels and shorter steps than a
+    sky.
     """
     to_world = scenes.placement()
     density = scenes.texture(DENSITY, 0.6, 1.4, 4)
@@ -197,7 +200,9 @@ def test_emitters(scenes, compare, emitter):
 
 @pytest.mark.parametrize("hide", [False, True])
 def test_camera_in_the_medium(scenes, compare, hide):
-    """The few voxels before the lens weigh most, so their noise has to be small."""
+    """A camera in the medium agrees; it needs a low-noise cache, as few voxels have most of the
+    weight.
+    """
     to_world = scenes.placement((4.0, 4.0, 4.0))
     sensor = {
         "type": "perspective",
@@ -213,7 +218,7 @@ def test_camera_in_the_medium(scenes, compare, hide):
 
 
 def test_camera_within_the_boundary_but_not_in_the_medium(scenes):
-    """A sensor without a medium sees none from inside the boundary, as in volpath: only the sky."""
+    """A sensor without a medium inside the boundary renders only the sky, as with volpath."""
     fog = cloud(scenes, scenes.placement((1.0, 1.0, 1.0)))
     shape = scenes.boundary(fog, scenes.placement((4.0, 4.0, 4.0)))
     look = mi.ScalarTransform4f().look_at([0, 0.2, -1.5], [0, 0, 0], [0, 1, 0])
@@ -229,9 +234,7 @@ def test_camera_within_the_boundary_but_not_in_the_medium(scenes):
 
 
 def test_hidden_emitters_leave_alpha(scenes):
-    """The film's alpha is the chance that a ray meets the medium; volpath's is the mean of a 0/1
-    decision.
-    """
+    """Alpha with hidden emitters is the opacity; volpath's is the mean of binary decisions."""
     to_world = scenes.placement()
     shape = scenes.boundary(cloud(scenes, to_world), to_world)
     film = scenes.description({}, None)["sensor"]["film"] | {"pixel_format": "rgba"}
@@ -247,9 +250,7 @@ def test_hidden_emitters_leave_alpha(scenes):
 
 
 def test_crop_window(scenes):
-    """A crop shows the same part of the picture as the whole film does, with a filter wider than a
-    pixel.
-    """
+    """A crop window equals the same part of the whole image, with a filter wider than a pixel."""
     to_world = scenes.placement(turn=10)
     shape = scenes.boundary(cloud(scenes, to_world), to_world)
     whole = scenes.description({}, None, size=24)["sensor"]
@@ -271,7 +272,7 @@ def test_mono_variant(mono, scenes, compare):
 
 
 def test_scene_without_a_medium_is_volpaths(scenes):
-    """Rendered by volpath itself: the same numbers, not only the same picture."""
+    """A scene without a medium is rendered by volpath itself, with identical values."""
     ball = {"type": "sphere", "bsdf": {"type": "diffuse"}}
     images = []
     for name in ("irrcache", "volpath"):

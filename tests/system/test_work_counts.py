@@ -1,4 +1,4 @@
-"""What is not needed is not done: counted in calls of the solver, samples, and kernels."""
+"""Unnecessary work is skipped, as counted by solver calls, samples and kernels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.fixture
 def scene(scenes):
-    """A cloud with a second sensor."""
+    """Return a cloud with a second sensor."""
     return cloud_scene(scenes)
 
 
@@ -39,9 +39,7 @@ def edit(scene: mi.Scene, ending: str, change) -> None:
 
 
 def test_the_cache_is_built_once(scenes, scene, refine_calls):
-    """Another seed, another sensor, more samples, and a moved camera: one call of the solver in
-    all.
-    """
+    """Changing seed, sensor, samples or camera does not call the solver again."""
     scenes.image(scene, spp=2)
     scenes.image(scene, spp=2, seed=1)
     scenes.image(scene, spp=5, sensor=1)
@@ -50,10 +48,8 @@ def test_the_cache_is_built_once(scenes, scene, refine_calls):
     assert refine_calls == [32]
 
 
-def test_a_second_picture_runs_the_projection_only(scenes, scene, kernels):
-    """By its kernels: as many as there are passes, none of them of the size of the solver's, none
-    compiled anew.
-    """
+def test_second_image_runs_the_ray_march_only(scenes, scene, kernels):
+    """A second image launches one kernel per pass, no solver kernel, and compiles none."""
     first = kernels(lambda: scenes.image(scene, spp=2))
     second = kernels(lambda: scenes.image(scene, spp=2, seed=1))
     voxels = scene.integrator().cache.active_count
@@ -64,8 +60,9 @@ def test_a_second_picture_runs_the_projection_only(scenes, scene, kernels):
 
 
 def test_a_second_scene_compiles_nothing(scenes, kernels):
-    """Other densities, placements, lights and seeds of the same kind of scene: the kernels of the
-    first one.
+    """A second scene of the same kind reuses all kernels.
+
+    Its densities, placements, emitters and seeds differ.
     """
     scenes.image(cloud_scene(scenes), spp=2)
     other = cloud_scene(scenes, scenes.texture((6, 5, 7), 0.1, 3.0, 9), cache_seed=5)
@@ -75,7 +72,7 @@ def test_a_second_scene_compiles_nothing(scenes, kernels):
 
 
 def test_passes_compile_nothing(scenes, kernels, monkeypatch):
-    """A cache filled in many launches runs the same kernels in each (the last may be shorter)."""
+    """All launches of a cache build use the same kernels, including a shorter last one."""
     from mitsuba_irrcache.solvers.path import solver as path_solver
 
     monkeypatch.setattr(path_solver, "LANES", 1 << 11)
@@ -86,8 +83,9 @@ def test_passes_compile_nothing(scenes, kernels, monkeypatch):
 
 
 def test_a_scene_is_freed_with_all_its_arrays(scenes):
-    """The integrator belongs to the scene, so it may not own it: scenes rendered in a loop would
-    pile up.
+    """A scene that is no longer referenced is freed with all its arrays.
+
+    The integrator belongs to the scene, so it must not own the scene.
     """
     scene = cloud_scene(scenes)
     scenes.image(scene, spp=1)
@@ -108,8 +106,8 @@ EDITS = {
 
 @pytest.mark.parametrize("ending", EDITS)
 def test_edits_renew_the_cache(scenes, scene, refine_calls, ending):
-    """The picture after params.update() is that of the edited scene, to the last bits of a rebuilt
-    cache.
+    """After params.update() the image equals, bit by bit, that of a cache built for the edited
+    scene.
     """
     before = scenes.image(scene, spp=8)
     edit(scene, ending, EDITS[ending])
@@ -122,7 +120,7 @@ def test_edits_renew_the_cache(scenes, scene, refine_calls, ending):
 
 
 def test_another_scene_renews_the_cache(scenes, scene, refine_calls):
-    """One integrator for two scenes, in turn."""
+    """One integrator renders two scenes in turn."""
     integrator = scene.integrator()
     other = cloud_scene(scenes, albedo=0.2)
     own = np.array(mi.render(scene, integrator=integrator, spp=4))
@@ -141,7 +139,9 @@ def test_no_cache_for_direct_views(scenes, refine_calls, max_depth):
 
 
 def test_no_samples_where_nothing_scatters(scenes, kernels):
-    """Albedo 0 and an empty medium: a cache without voxels, and the picture of max_depth 1."""
+    """With albedo 0 or an empty medium, no voxels are sampled, and the image is that of
+    max_depth 1.
+    """
     for density, albedo in ((None, 0.0), (np.zeros((6, 6, 6), np.float32), 0.9)):
         scene = cloud_scene(scenes, density, albedo)
         history = kernels(lambda scene=scene: scene.integrator().prepare(scene))
@@ -154,20 +154,20 @@ def test_no_samples_where_nothing_scatters(scenes, kernels):
 
 
 def test_empty_voxels_are_not_sampled(scenes, kernels):
-    """A core in a large empty grid: the largest launch is that of the voxels near the core."""
+    """In a large empty grid, only voxels near the medium are sampled."""
     density = np.zeros((40, 40, 40), np.float32)
     density[16:22, 16:22, 16:22] = 1.0
     scene = cloud_scene(scenes, density, resolution=40, cache_spp=8)
     history = kernels(lambda: scene.integrator().prepare(scene))
     cache = scene.integrator().cache
     assert cache.active_count < 0.08 * cache.grid.voxel_count
-    # One lane per voxel of the grid marks and lists them, and one per value of the field, which
-    # has a voxel more on each side; 8 lanes per sampled voxel.
+    # One lane per voxel marks and lists occupied voxels, and one per value of the padded field,
+    # which has a voxel more on each side; then 8 lanes per sampled voxel.
     assert max(k["size"] for k in history) <= max(42**3 * 3, cache.active_count * 8)
 
 
 def test_single_scattering_traces_no_paths(scenes):
-    """max_depth 2: the scattered layer is exactly zero."""
+    """With max_depth 2 the scattered layer is exactly zero."""
     scene = cloud_scene(scenes, max_depth=2)
     scene.integrator().prepare(scene)
     assert not np.array(scene.integrator().cache.scattered).any()
@@ -175,7 +175,7 @@ def test_single_scattering_traces_no_paths(scenes):
 
 
 def test_more_samples_continue_a_file(scenes, refine_calls, tmp_path):
-    """A cache of 32 samples on disk, asked for 64: 32 more, and the same light as 64 in one go."""
+    """A file of 32 samples is continued to 64, with the result of 64 at once."""
     file = str(tmp_path / "light.npz")
     cloud_scene(scenes, cache_file=file, cache_spp=32).integrator()
     for spp in (32, 64, 64):
@@ -192,8 +192,9 @@ def test_more_samples_continue_a_file(scenes, refine_calls, tmp_path):
 
 
 def test_an_interrupted_build_goes_on(scenes, tmp_path, monkeypatch):
-    """Ctrl-C from the progress callback: the next render completes the cache, and no file is left
-    before that.
+    """After Ctrl-C in the progress callback, the next render completes the cache.
+
+    No file is written before that.
     """
     from mitsuba_irrcache.solvers.path import solver as path_solver
 
@@ -223,7 +224,7 @@ def test_an_interrupted_build_goes_on(scenes, tmp_path, monkeypatch):
 
 
 def test_wrappers_use_the_cache(scenes, refine_calls):
-    """Nested in ``aov``, as ``sample``: the same picture and one build."""
+    """Nested in ``aov`` as ``sample``, the image is the same, with one cache build."""
     to_world = scenes.placement()
     shape = scenes.boundary(
         scenes.medium(scenes.texture((6, 5, 7), 0.2, 2.0, 1), 0.8, to_world), to_world
@@ -239,8 +240,8 @@ def test_wrappers_use_the_cache(scenes, refine_calls):
     assert image[..., :3].mean() == pytest.approx(plain.mean(), rel=0.01)
 
 
-def test_gradients_do_not_leak_into_the_cache(scenes, scene):
-    """A medium with gradients enabled renders as one without."""
+def test_gradients_do_not_change_the_cache(scenes, scene):
+    """A medium with gradients enabled renders like one without."""
     expected = scenes.image(scene, spp=4)
     params = mi.traverse(scene)
     (key,) = [k for k in params.keys() if k.endswith("sigma_t.data")]
@@ -249,11 +250,11 @@ def test_gradients_do_not_leak_into_the_cache(scenes, scene):
     np.testing.assert_allclose(scenes.image(scene, spp=4), expected, rtol=1e-4, atol=1e-5)
 
 
-# What a picture reads, and how often it is launched
+# Memory reads and launches of an image
 
 
 def reads(kernels, scene) -> tuple[int, int]:
-    """Loads from arrays and ray intersections in the kernel that makes most of a second picture."""
+    """Count array loads and ray intersections in the largest kernel of a second image."""
     mi.render(scene, spp=4)
     history = kernels(lambda: mi.render(scene, spp=4, seed=1))
     largest = max(history, key=lambda k: k["operation_count"])["ir"].getvalue()
@@ -270,8 +271,10 @@ def plain_scene(scenes, sigma_t, albedo, **more) -> mi.Scene:
 
 
 def test_constants_are_not_looked_up(scenes, kernels):
-    """By loads in the march: fewer where the albedo is constant, fewest where the extinction is,
-    and no ray is intersected with the scene.
+    """Constant parameters are not looked up during the ray march.
+
+    A constant albedo takes fewer loads, a constant extinction the fewest, and no ray is intersected
+    with the scene.
     """
     values = scenes.texture((8, 8, 8), 0.2, 2.0, 1)
     albedos = scenes.texture((8, 8, 8, 3), 0.2, 0.9, 2)
@@ -283,9 +286,10 @@ def test_constants_are_not_looked_up(scenes, kernels):
     assert varied[1] == constant[1] == homogeneous[1] == 0
 
 
-def test_grey_light_is_swept_once(scenes, kernels):
-    """In RGB a grey medium under a coloured sky takes the launches of a grey one: its channels
-    differ by a factor. A coloured medium takes three times as many lines.
+def test_grey_media_are_solved_in_one_channel(scenes, kernels):
+    """A grey medium in RGB takes the launches of one channel, a coloured one three times as many.
+
+    The channels of a grey medium under a coloured sky differ by a factor.
     """
 
     def launches(sigma_t, radiance) -> int:
@@ -306,9 +310,7 @@ def test_grey_light_is_swept_once(scenes, kernels):
 
 
 def test_no_filter_no_layers(scenes, kernels):
-    """Without a filter and further images nothing but the picture is projected: fewer channels on
-    the film, and fewer launches.
-    """
+    """Without filter and AOVs, the film has fewer channels and there are fewer launches."""
     values = scenes.texture((8, 8, 8), 0.2, 2.0, 1)
     counts = []
     for settings in ({}, {"filter": "fixed"}):
@@ -319,9 +321,9 @@ def test_no_filter_no_layers(scenes, kernels):
     assert counts[0][0] < counts[1][0] and counts[0][1] < counts[1][1]
 
 
-def test_only_single_scattering_keeps_one_number_per_voxel(scenes, kernels):
-    """max_depth 2 by sweeps: launches for 16 pairs of directions and nothing solved; max_depth 3
-    solves, and sweeps again.
+def test_single_scattering_takes_no_solution(scenes, kernels):
+    """max_depth 2 takes launches for 16 pairs of directions without a solution; max_depth 3
+    takes more.
     """
     launches = []
     for max_depth in (2, 3):
@@ -334,7 +336,7 @@ def test_only_single_scattering_keeps_one_number_per_voxel(scenes, kernels):
 
 
 def stored() -> float:
-    """MiB of all arrays that are there."""
+    """Return the MiB of all live arrays."""
     gc.collect()
     dr.eval()
     size, unit = re.search(
@@ -343,10 +345,11 @@ def stored() -> float:
     return float(size) * {"B": 2**-20, "KiB": 2**-10, "MiB": 1, "GiB": 2**10}[unit]
 
 
-def test_few_numbers_per_voxel_are_kept(scenes):
-    """Of single scattering in grey, beside the medium's own: two words that rays read, the light,
-    the numbers of the voxels that have some, and half a word of extinction that lines read: no more
-    than four.
+def test_few_numbers_per_voxel_are_stored(scenes):
+    """Grey single scattering stores at most four numbers per voxel besides the medium's own.
+
+    These are two words for the ray march, the irradiance, the indices of occupied voxels, and half
+    a word of extinction for tracks.
     """
     to_world = scenes.placement()
     density = scenes.texture((64, 64, 64), 0.2, 2.0, 1)
@@ -357,4 +360,4 @@ def test_few_numbers_per_voxel_are_kept(scenes):
     scenes.image(scene, spp=1)
     assert scene.integrator().cache.grid.voxel_count == 64**3
     kept = stored() - before
-    assert 2.5 < kept < 5  # in MiB, as a volume is; the copy for rays has a tenth more voxels
+    assert 2.5 < kept < 5  # in MiB, as a volume; the copy for rays has a tenth more voxels

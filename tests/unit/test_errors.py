@@ -1,4 +1,4 @@
-"""What a caller may rely on to catch."""
+"""The class hierarchy of exceptions for callers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Imports point down only: a folder of the package imports those of lower levels, and itself."""
+"""Imports point down only: a folder of the package imports lower levels and itself."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ LEVELS = (
     {"integrators", "cli", "compare"},
     {"view"},
 )
-#: Folders that import less than their level admits.
+#: Folders that import less than their level permits.
 ONLY = {"volumes": {"errors", "core", "io", "machine"}}
-#: Modules that make the package what it is, and so import what they hand on.
+#: Modules that re-export names of the package.
 TOP = {"__init__", "__main__", "_register"}
 
 ALLOWED = ONLY | {
@@ -38,7 +38,7 @@ ALLOWED = ONLY | {
 
 
 def modules() -> dict[str, Path]:
-    """All modules of the package by their names within it."""
+    """Return all modules of the package by their names within it."""
     found = {
         ".".join(p.relative_to(PACKAGE).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")
     }
@@ -47,11 +47,13 @@ def modules() -> dict[str, Path]:
 
 
 def imported(module: str, path: Path) -> set[str]:
-    """Modules of the package that a module imports, anywhere in it: at its top, in functions, and
-    for type checkers; ``""`` is the package itself.
+    """Return the modules of the package that a module imports anywhere; ``""`` is the package
+    itself.
+
+    This includes imports in functions and for type checkers.
     """
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -108,6 +110,6 @@ def test_modules_do_not_import_each_other_in_a_circle():
 
 
 def targets(module: str, path: Path) -> set[str]:
-    """Modules that a module imports: a name of it may be a module or be defined in one."""
+    """Return the imported modules; an imported name may be a module or be defined in one."""
     names = imported(module, path)
     return {m for name in names for m in (name, name.rpartition(".")[0]) if m in MODULES}

@@ -1,4 +1,6 @@
-"""The plugin is there in every order of imports and variants, each in a process of its own."""
+"""The plugin is registered for every order of imports and variants, each tested in a new
+process.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,10 @@ REFUSED = {
 
 @pytest.mark.parametrize(("variant", "reason"), REFUSED.items())
 def test_other_variants_are_refused_when_used(variant, reason):
-    """Importing is fine; loading the integrator says why not, and what works."""
+    """Importing with an unsupported variant works; loading the integrator raises an error.
+
+    The error names the supported variants.
+    """
     program = (
         f'import mitsuba as mi, mitsuba_irrcache; mi.set_variant("{variant}"); print("imported");'
         'mi.load_dict({"type": "irrcache"})'

@@ -16,7 +16,7 @@ LABELS = {"unfiltered": "no filter", "fixed": "fixed strength", "fading": "fadin
 
 
 def plot(options: Options) -> Section:
-    """Three curves, and a row of the table for each number of samples."""
+    """Plot three curves, and tabulate a row for each number of samples."""
     folder = options.folder("fading")
     rows = read_json(folder / "results.json")["chest"]["rows"]
     table = verdict(rows)
@@ -42,7 +42,7 @@ def plot(options: Options) -> Section:
 
 
 def verdict(rows: list[dict]) -> Table:
-    """Errors of the same cache and what they say."""
+    """Tabulate the errors of the same cache and the verdict."""
     cells = [
         [str(row["samples"]), *(percent(row[key]) for key in LABELS),
          f"{row['difference'] / row['uncertainty']:+.1f} σ", f"{row['ratio']:.2f}",

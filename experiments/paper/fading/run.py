@@ -1,11 +1,11 @@
-"""Does the filter fade as it should: never worse than none, and close to the better of none and a
-filter of fixed strength?
+"""Test that the filter fades out: never worse than no filter, and close to the better of none
+and a filter of fixed strength.
 
     python -m experiments.paper.fading.run [--full] [--force]
 
 One cache of the chest is refined; after each pass it is rendered without a filter, with one of
-fixed strength and with the fading one, all with the same samples of the pixels, so that nothing but
-the filter differs. Figure 2 has the same methods against time. Writes output/fading/results.json.
+fixed strength and with the fading one, all with the same camera samples, so that only the filter
+differs. Figure 2 has the same methods against time. Writes output/fading/results.json.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from mitsuba_irrcache.io.scene_files import load_scene
 
 #: Samples per cache voxel: 1, 4, 16 and 64 passes.
 SAMPLES = (16, 64, 256, 1024)
-#: A coarse cache has little enough voxels for so many samples, and the same noise in each.
+#: A coarse cache has few enough voxels for this many samples, and equal noise in each.
 RESOLUTION = 48
 PIXEL_SAMPLES = 64
 
 
 def run(options: Options) -> None:
-    """Measures all numbers of samples, unless that is done."""
+    """Measure all numbers of samples unless that is done."""
     folder = options.folder("fading")
     subject = Subject.of("chest", options)
     truth = subject.reference(options.output, options.size.reference)
@@ -43,7 +43,7 @@ def run(options: Options) -> None:
 
 
 def refine(subject: Subject, truth: Reference, file: Path) -> dict:
-    """A row for each number of samples of a cache that is kept in ``file`` meanwhile."""
+    """Compute a row for each number of samples of a cache that is stored in ``file``."""
     file.unlink(missing_ok=True)
     rows = []
     for count in SAMPLES:
@@ -59,13 +59,13 @@ def refine(subject: Subject, truth: Reference, file: Path) -> dict:
 
 
 def render(subject: Subject, integrator: str) -> np.ndarray:
-    """An image with `PIXEL_SAMPLES` samples, always the same ones."""
+    """Render an image with `PIXEL_SAMPLES` samples, always the same ones."""
     scene = load_scene(subject.scene, subject.parameters, integrator)
     return np.array(mi.render(scene, spp=PIXEL_SAMPLES), dtype=np.float64)
 
 
 def judged(images: list[np.ndarray], truth: Reference) -> dict:
-    """Errors in units of the mean radiance, and the verdict on them."""
+    """Return errors in units of the mean radiance, and the verdict on them."""
     a, b = metrics.colours(truth.a), metrics.colours(truth.b)
     mean = float(truth.mean.mean())
     unfiltered, fixed, fading = (metrics.net_rmse(image, a, b) / mean for image in images)

@@ -12,7 +12,7 @@ from mitsuba_irrcache.compare.report import Figure, Section
 
 
 def plot(options: Options) -> Section:
-    """The images in one row."""
+    """Draw the images in one row."""
     folder = options.folder("figure1")
     results = read_json(folder / "results.json")
     images = [*map(read, results["methods"]), read({"image": results["reference"]})]

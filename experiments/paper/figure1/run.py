@@ -1,9 +1,9 @@
-"""Figure 1: what the methods show after the same time, beside the reference.
+"""Figure 1: images of all methods after the same time, and the reference.
 
     python -m experiments.paper.figure1.run [--full] [--force]
 
-Takes the images from the recorded runs (`experiments.support.recording`), which are made if they
-are not there, and writes output/figure1/results.json.
+Takes the images from the recorded runs (`experiments.support.recording`), which are rendered if
+they do not exist, and writes output/figure1/results.json.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SHARE = 1 / 3
 
 
 def run(options: Options) -> None:
-    """Picks the images and measures them."""
+    """Select the images and compute their errors."""
     chest = Session.of("chest", options, methods.PAPER)
     seconds = SHARE * options.size.horizon
     results = {

@@ -20,7 +20,7 @@ PANELS = {
 
 
 def plot(options: Options) -> Section:
-    """Two panels that share their legend."""
+    """Plot two panels with a common legend."""
     folder = options.folder("figure2")
     results = read_json(folder / "results.json")
     path = folder / "figure2.png"

@@ -16,7 +16,7 @@ from mitsuba_irrcache.compare.results import write_json
 
 
 def run(options: Options) -> None:
-    """Measures every snapshot of every method."""
+    """Compute the errors of every snapshot of every method."""
     chest = Session.of("chest", options, methods.ALL, options.force)
     curves = {r.method.label: errors(r, chest.truth) for r in chest.recordings}
     write_json(options.folder("figure2") / "results.json", curves)

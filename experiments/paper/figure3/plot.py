@@ -10,12 +10,12 @@ from experiments.support.store import read_json
 from experiments.support.tiles import crop, read, tiles
 from mitsuba_irrcache.compare.report import Figure, Section
 
-#: The upper ribs, as parts of width and height, and the part of the height that is shown.
+#: The upper ribs as fractions of width and height, and the fraction of the height that is shown.
 CENTRE, SHARE = (0.42, 0.38), 0.34
 
 
 def plot(options: Options) -> Section:
-    """A row for each method, a column for each time, the reference at the end."""
+    """Draw a row for each method and a column for each time, with the reference at the end."""
     folder = options.folder("figure3")
     results = read_json(folder / "results.json")
     reference = _detail({"image": results["reference"]})

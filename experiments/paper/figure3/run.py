@@ -2,8 +2,8 @@
 
     python -m experiments.paper.figure3.run [--full]
 
-Takes the images from the recorded runs (`experiments.support.recording`), which are made if they
-are not there, and writes output/figure3/results.json.
+Takes the images from the recorded runs (`experiments.support.recording`), which are rendered if
+they do not exist, and writes output/figure3/results.json.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mitsuba_irrcache.compare.results import write_json
 
 
 def run(options: Options) -> None:
-    """Picks the images of every method and time."""
+    """Select the images of every method and time."""
     chest = Session.of("chest", options, methods.PAPER)
     wanted = strip_times(options.size.horizon)
     results = {

@@ -12,7 +12,7 @@ from mitsuba_irrcache.compare.report import Figure, Section
 
 
 def plot(options: Options) -> Section:
-    """A row for each volume, a column for each method, the reference at the end."""
+    """Draw a row for each volume and a column for each method, with the reference at the end."""
     folder = options.folder("figure4")
     results = read_json(folder / "results.json")
     rows = results["rows"]

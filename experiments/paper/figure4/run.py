@@ -18,7 +18,7 @@ VOLUMES = ("head", "chest", "abdomen")
 
 
 def run(options: Options) -> None:
-    """Picks the images of all methods after the same time."""
+    """Select the images of all methods after the same time."""
     rows = []
     for volume in VOLUMES:
         force = options.force and volume != "chest"

@@ -1,8 +1,8 @@
-"""Prints the peak memory, in bytes, of this process after one image.
+"""Print the peak memory, in bytes, of this process after one image.
 
     python -m experiments.paper.memory.peak SCENE PIXELS INTEGRATOR
 
-A process of its own for each measurement: memory that was once taken is seldom given back.
+Each measurement has its own process, because allocated memory is seldom returned.
 """
 
 from __future__ import annotations
@@ -19,14 +19,16 @@ from mitsuba_irrcache.machine.llvm import require_llvm
 
 
 def measure_peak(scene: Path, pixels: int, integrator: str) -> int:
-    """Bytes at the peak of a new process that renders an image with one sample per pixel."""
+    """Return the peak memory in bytes of a new process that renders an image of one sample per
+    pixel.
+    """
     command = [sys.executable, "-m", __name__, str(scene), str(pixels), integrator]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return int(done.stdout.split()[-1])
 
 
 def main() -> None:
-    """Renders as the command line says."""
+    """Render as the command line specifies."""
     path, pixels, integrator = sys.argv[1:]
     require_llvm()
     mi.set_variant("llvm_ad_rgb")

@@ -14,7 +14,7 @@ from mitsuba_irrcache.compare import style
 from mitsuba_irrcache.compare.report import Figure, Section
 from mitsuba_irrcache.compare.tables import Table
 
-#: What the paper states, of n^3 voxels and m^2 pixels.
+#: The paper's formulas, for n^3 voxels and m^2 pixels.
 PAPER = {
     "path tracing": "O(n³ + m²)",
     "cache": "O(2 n³)",
@@ -23,7 +23,7 @@ PAPER = {
 
 
 def plot(options: Options) -> Section:
-    """Peak memory over voxels, and over pixels, with the fitted bytes for each."""
+    """Plot peak memory over voxels and over pixels, with the fitted bytes for each."""
     folder = options.folder("memory")
     rows: dict[str, list[dict]] = {}
     for row in read_json(folder / "results.json").values():
@@ -44,7 +44,7 @@ def plot(options: Options) -> Section:
 
 
 def _panel(ax: Axes, rows: dict[str, list[dict]], size: str, other: str) -> None:
-    """Of all rows those whose other size is the smallest."""
+    """Plot the rows whose other size is the smallest."""
     for index, (label, own) in enumerate(rows.items()):
         least = min(row[other] for row in own)
         shown = sorted((r for r in own if r[other] == least), key=lambda r: r[size])

@@ -19,13 +19,13 @@ from experiments.support.scenes import scene_file
 from experiments.support.store import Store
 from mitsuba_irrcache.io.mitsuba_vol import read_vol
 
-#: Voxels along the longest side and pixels per side: one grows while the other stays.
+#: Voxels along the longest side and pixels per side: one varies while the other is constant.
 QUICK_SIZES = ((48, 128), (96, 128), (144, 128), (48, 512), (48, 1024))
 FULL_SIZES = ((64, 256), (128, 256), (192, 256), (256, 256), (64, 1024), (64, 2048))
 
 
 def run(options: Options) -> None:
-    """Measures what is missing; a method that cannot run is left out."""
+    """Measure missing rows; a method that cannot run is omitted."""
     store = Store(options.folder("memory") / "results.json", options.force)
     for longest, pixels in FULL_SIZES if options.size == FULL else QUICK_SIZES:
         scene = scene_file("phantom", options.output, longest)
@@ -40,7 +40,7 @@ def run(options: Options) -> None:
 
 
 def measure(method: methods.Method, scene: Path, longest: int, pixels: int) -> dict:
-    """A row: the sizes, and bytes at the peak."""
+    """Return a row: the sizes, and bytes at the peak."""
     print(f"memory: {method.label}, {longest} voxels, {pixels} pixels", flush=True)
     integrator = method.integrator
     if method is not methods.PATH_TRACING:

@@ -14,7 +14,7 @@ from mitsuba_irrcache.compare import style
 from mitsuba_irrcache.compare.report import Figure, Section
 from mitsuba_irrcache.compare.tables import Table
 
-#: Of the banded pictures: the flank, as parts of width and height, and part of the height.
+#: Detail of the images with banding: position as fractions of width and height, and its height.
 CENTRE, SHARE = (0.5, 0.55), 0.35
 PANELS = {
     "fog": "smooth fog, no jitter",
@@ -24,7 +24,7 @@ PANELS = {
 
 
 def plot(options: Options) -> Section:
-    """Errors against step, and the bands."""
+    """Plot errors against step, and the banding."""
     folder = options.folder("quadrature")
     results = read_json(folder / "results.json")
     curves = folder / "orders.png"

@@ -1,9 +1,9 @@
-"""Quadratures: orders of convergence, banding, and what is left of it with jitter.
+"""Quadratures: orders of convergence, banding, and the remaining error with jitter.
 
     python -m experiments.paper.quadrature.run [--full] [--force]
 
 All rules march through the same cache. *Orders*: jitter off, against the same rule at a very fine
-step, in a smooth fog and in the chest phantom. *Banding*: jitter off, pictures of the phantom.
+step, in a smooth fog and in the chest phantom. *Banding*: jitter off, images of the phantom.
 *Jitter*: the integrator's own images of the phantom. Writes output/quadrature/results.json and
 EXRs.
 """
@@ -31,17 +31,17 @@ from mitsuba_irrcache.render.quadrature import QUADRATURES
 from mitsuba_irrcache.render.raymarch import Projection
 
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
-#: Against which errors are measured.
+#: Step of the reference.
 FINE = 1 / 32
-#: Step of the pictures that show bands, and their pixels per side.
+#: Step of the images that show banding, and their pixels per side.
 BANDED, PIXELS = 2.0, 384
 SAMPLES = 16
-#: Dense at the walls of its box: where a medium fades out, even the Riemann sum is of high order.
+#: Dense at the faces of its box: if a medium fades out there, even the Riemann sum has high order.
 FOG = {"peak": 1.5, "falloff": 1.0}
 
 
 def run(options: Options) -> None:
-    """Computes what is missing."""
+    """Compute missing results."""
     folder = options.folder("quadrature")
     store = Store(folder / "results.json", options.force)
     path = scene_file("phantom", options.output, min(options.size.longest, 128))
@@ -57,18 +57,18 @@ def run(options: Options) -> None:
 
 
 def phantom(path: Path, pixels: int) -> tuple[mi.Scene, mi.Ray3f]:
-    """The scene, and a ray through the centre of every pixel."""
+    """Return the scene, and a ray through the centre of every pixel."""
     scene = load_scene(path, parameters(pixels))
     return scene, pixel_rays(scene.sensors()[0])
 
 
 def parameters(pixels: int) -> dict[str, str]:
-    """The scene's parameters for a picture of this size."""
+    """Return the scene's parameters for an image of this size."""
     return APPEARANCE | {"width": str(pixels), "height": str(pixels)}
 
 
 def without_jitter(scene: mi.Scene, rays: mi.Ray3f) -> dict:
-    """Relative RMSE of every rule and step, and the orders."""
+    """Return the relative RMSE of every rule and step, and the orders."""
     builder = built(scene)
     errors = {}
     for quadrature in QUADRATURES:
@@ -81,7 +81,7 @@ def without_jitter(scene: mi.Scene, rays: mi.Ray3f) -> dict:
 
 
 def banding(scene: mi.Scene, rays: mi.Ray3f, folder: Path) -> dict:
-    """Pictures without jitter, and at a fine step."""
+    """Return images without jitter, and at a fine step."""
     builder = built(scene)
     images = {}
     for quadrature, step in [*((q, BANDED) for q in QUADRATURES), ("exponential", FINE)]:
@@ -95,8 +95,9 @@ def banding(scene: mi.Scene, rays: mi.Ray3f, folder: Path) -> dict:
 
 
 def with_jitter(path: Path, pixels: int, cache_file: Path) -> dict:
-    """RMSE and mean error of the integrator's images, in units of the mean, against the finest step
-    for the same samples of the pixels.
+    """Return RMSE and mean error of the integrator's images in units of the mean.
+
+    The reference is the finest step with the same camera samples.
     """
     cache_file.unlink(missing_ok=True)
 
@@ -119,7 +120,7 @@ def with_jitter(path: Path, pixels: int, cache_file: Path) -> dict:
 
 
 def built(scene: mi.Scene) -> CacheBuilder:
-    """The medium and its cache, which all rules share."""
+    """Return the medium and its cache, which all rules share."""
     builder = CacheBuilder(CacheSettings(max_depth=2, samples=SAMPLES))
     builder.update(scene)
     return builder

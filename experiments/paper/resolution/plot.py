@@ -15,7 +15,7 @@ KINDS = ("equal samples per voxel", "equal samples in all")
 
 
 def plot(options: Options) -> Section:
-    """Errors against resolution, and the table behind it."""
+    """Plot errors against resolution, and tabulate them."""
     folder = options.folder("resolution")
     results = read_json(folder / "results.json")
     path = folder / "resolution.png"

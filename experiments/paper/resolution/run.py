@@ -2,8 +2,8 @@
 
     python -m experiments.paper.resolution.run [--full] [--force]
 
-Cache voxels along the longest side of the chest, with as many samples for each voxel, and with as
-many in all. Writes output/resolution/results.json.
+Varies the cache voxels along the longest side of the chest, with equal samples per voxel, and with
+equal samples in all. Writes output/resolution/results.json.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from mitsuba_irrcache.cache.volume import BATCH
 
 QUICK_RESOLUTIONS = (16, 32, 64, 96)
 FULL_RESOLUTIONS = (16, 32, 64, 96, 128)
-#: Samples per voxel where these are equal.
+#: Samples per voxel if these are equal.
 SAMPLES = 16
 
 
 def run(options: Options) -> None:
-    """Measures what is missing."""
+    """Measure missing rows."""
     store = Store(options.folder("resolution") / "results.json", options.force)
     subject = Subject.of("chest", options)
     truth = subject.reference(options.output, options.size.reference)

@@ -1,10 +1,11 @@
 """Writes table 1 from what run.py left: output/table1/table1.txt.
 
-python -m experiments.paper.table1.plot [--full]
+python -m experiments.paper.table1.plot [--full] [--document docs/validation.md]
 """
 
 from __future__ import annotations
 
+from experiments.support.documents import replace_tables
 from experiments.support.options import Options, parse
 from experiments.support.store import read_json
 from mitsuba_irrcache.compare.report import Section
@@ -12,18 +13,20 @@ from mitsuba_irrcache.compare.tables import Table, seconds
 
 
 def plot(options: Options) -> Section:
-    """Two tables: the paper's criterion, and equal error."""
+    """Write two tables: the paper's criterion, and equal error."""
     folder = options.folder("table1")
     results = read_json(folder / "results.json")
     tables = [converged(results), equal_error(results)]
     text = "\n\n".join(f"{table.as_text()}\n  {table.note}" for table in tables)
     (folder / "table1.txt").write_text(text + "\n")
     print(text)
+    if options.document:
+        replace_tables(options.document, {"paper-table-1": tables[0]})
     return Section("Table 1: time to convergence", tables)
 
 
 def converged(results: dict) -> Table:
-    """Seconds until the image is that of the horizon, beside the paper's."""
+    """Tabulate the seconds until the image equals that of the horizon, and those of the paper."""
     rows = [
         [label, _time(row), _times(row["speed_up"], row["how"]),
          f"{row['paper_seconds']:.2f} s" if row["paper_seconds"] else "—",
@@ -43,7 +46,7 @@ def converged(results: dict) -> Table:
 
 
 def equal_error(results: dict) -> Table:
-    """Seconds to errors against the independent reference, with speed-ups."""
+    """Tabulate seconds to errors against the independent reference, with speed-ups."""
     labels = list(results["converged"])
     rows = [
         [level, *(_with_speed_up(row[label]) for label in labels)]
@@ -72,4 +75,4 @@ def _times(ratio: float | None, how: str = "") -> str:
 
 
 if __name__ == "__main__":
-    plot(parse(__doc__))
+    plot(parse(__doc__, documented=True))

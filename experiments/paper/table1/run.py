@@ -1,11 +1,12 @@
-"""Table 1: seconds to convergence, by the paper's criterion and against an independent reference.
+"""Table 1: seconds to convergence, by the paper's criterion and against an independent
+reference.
 
     python -m experiments.paper.table1.run [--full]
 
-From the recorded runs (`experiments.support.recording`), which are made if they are not there. The
-paper asks when a method's image differs from its own last one by an RMSE below 1e-2. That cannot
-see bias, so the time to equal error against an independent reference stands beside it. Writes
-output/table1/results.json.
+Uses the recorded runs (`experiments.support.recording`), which are rendered if they do not exist.
+The paper measures when a method's image differs from its own last one by an RMSE below 1e-2. That
+cannot detect bias, so the time to equal error against an independent reference is given, too.
+Writes output/table1/results.json.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 
 #: The paper's threshold.
 LEVEL = 1e-2
-#: Errors against the reference that are asked for.
+#: Target errors against the reference.
 LEVELS = (5e-2, 2e-2, 1e-2, 5e-3, 2e-3)
 
 
 def run(options: Options) -> None:
-    """Times of all methods, and their ratios to path tracing."""
+    """Compute the times of all methods, and their ratios to path tracing."""
     chest = Session.of("chest", options, methods.ALL)
     found = {r.method: errors(r, chest.truth) for r in chest.recordings}
     results = {
@@ -52,7 +53,9 @@ def run(options: Options) -> None:
 
 
 def compared(times: dict[methods.Method, Reached]) -> dict[str, dict]:
-    """Rows by label: seconds, how they were found, speed-up over path tracing, and the paper's."""
+    """Return rows by label: seconds, how they were found, speed-up over path tracing, and the
+    paper's.
+    """
     stock, paper = times[methods.PATH_TRACING], methods.PATH_TRACING.paper
     return {
         method.label: {k: v for k, v in asdict(reached).items() if v != np.inf}
@@ -66,7 +69,7 @@ def compared(times: dict[methods.Method, Reached]) -> dict[str, dict]:
 
 
 def cache_voxels(scene_file: Path, parameters: dict[str, str]) -> dict[str, int]:
-    """Voxels of the cache in all, and those that see the medium."""
+    """Return the number of cache voxels, and that of active ones."""
     builder = CacheBuilder(CacheSettings(max_depth=2, samples=8))
     scene: mi.Scene = load_scene(scene_file, parameters)
     builder.update(scene)

@@ -18,7 +18,7 @@ KINDS = (("cold", "irrcache, cold cache"), ("moved", "irrcache, camera moved"))
 
 
 def plot(options: Options) -> Section:
-    """A panel for each scene and depth."""
+    """Plot a panel for each scene and depth."""
     folder = options.folder("performance")
     cases = list(read_json(folder / "results.json").values())
     path = folder / "performance.png"

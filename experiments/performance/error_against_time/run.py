@@ -1,4 +1,4 @@
-"""Error against time: ``irrcache`` beside Mitsuba's own integrators.
+"""Error against time: ``irrcache`` and Mitsuba's own integrators.
 
     python -m experiments.performance.error_against_time.run
         [--scenes procedural head cloud chest] [--depths 2 -1]
@@ -6,18 +6,18 @@
 
 White sky of radiance 1; RMSE is absolute and net of the noise of the reference, which gets
 ``--seconds``. A stock integrator's time to an error is its variance over the square of the error,
-times what a sample takes. ``irrcache`` is run at many settings; the least time of any that reaches
-the error, one standard error of its measurement added, counts: with a cold cache (kernels warm,
-loading excluded), with a moved camera, and in a new process, all counted, that finds its kernels on
-disk. So these settings are the best of a grid, selected with the reference at hand; the row
-"defaults" of the table is what a user gets who sets nothing, beside the stock integrator's time to
-the same error. Errors are told in units of the sky's radiance and of the mean radiance of the
-volume alone: of the image without the light that comes to the camera without being scattered.
+times the duration of a sample. ``irrcache`` is run with many settings; reported is the least time
+of any that reaches the error, one standard error of its measurement added: with a cold cache
+(kernels warm, loading excluded), with a moved camera, and in a new process, all included, that
+finds its kernels on disk. So these settings are the best of a grid, selected with knowledge of the
+reference; the row "defaults" of the table is the result without any settings, with the stock
+integrator's time to the same error. Errors are in units of the sky's radiance and of the mean
+radiance of the volume alone: of the image without the unscattered radiance.
 
-Whatever is finished is kept: stop it, and run it again. ``--force`` forgets ``irrcache``'s rows of
-these scenes and depths (output/performance/irrcache.json); those of the stock integrators stay
-until stock.json is deleted.
-Prints a table and writes output/performance/results.json, which plot.py draws.
+Finished results are saved: the script can be stopped and run again. ``--force`` discards
+``irrcache``'s rows of these scenes and depths (output/performance/irrcache.json); those of the
+stock integrators remain until stock.json is deleted. Prints a table and writes
+output/performance/results.json, which plot.py draws.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from experiments.support.documents import replace_tables
 from experiments.support.methods import specify
+from experiments.support.options import add_document
 from experiments.support.scenes import available, scene_file
 from experiments.support.store import Store
 from mitsuba_irrcache.compare import metrics
@@ -60,7 +62,7 @@ SCENES = {
 }
 TARGETS = (1e-2, 4e-3)
 STOCK = ("volpath", "volpathmis", "prbvolpath")
-#: From which depth on paths play Russian roulette. It does not matter to single scattering.
+#: Depth at which Russian roulette starts. It does not affect single scattering.
 RR_DEPTHS = (5, 20, 1000)
 #: Images for a variance, and most samples per pixel of one: bounds memory.
 STOCK_IMAGES, STOCK_SPP = 4, 128
@@ -70,13 +72,13 @@ BATCHES = (1, 2, 4)
 #: Resolution and samples per voxel of ``solver=path``.
 PATH = ((32, 8), (64, 8), (64, 16))
 SPP, STEPS = (1, 2, 4, 16), (1.0, 2.0, 4.0)
-#: Of all caches, before the best of them are seen in other ways.
+#: Number of the best caches that are rendered with further image settings.
 FIRST_SPP, FIRST_STEP = 4, 1.0
 COLD_RUNS, MOVED_RUNS, PROCESS_RUNS = 3, 5, 5
 #: Samples per pixel of the scenes.
 DEFAULT_SPP = 64
 UNSCATTERED_SPP = 64
-#: A setting that takes longer than so many seconds is not repeated, nor are costlier ones tried.
+#: Settings slower than this many seconds are not repeated, and costlier ones are not tried.
 PATIENCE = 10.0
 #: A stock integrator in a process of its own: variant, scene, image, integrator, parameters.
 STOCK_PROCESS = """
@@ -102,7 +104,7 @@ class Case:
 
     @classmethod
     def of(cls, name: str, depth: int, pixels: int, output: Path) -> Case:
-        """A scene, or what stands for it where its data are not at hand."""
+        """Return the case of a scene, or of its substitute if its data are missing."""
         variant, further = SCENES[name]
         sides = {"max_depth": str(depth), "width": str(pixels), "height": str(pixels)}
         found = available(name)
@@ -113,7 +115,7 @@ class Case:
         return f"{self.name} {self.depth} {self.pixels}"
 
     def load(self, integrator: str) -> mi.Scene:
-        """The scene, loaded anew: its cache is cold."""
+        """Load the scene anew, with a cold cache."""
         gc.collect()
         scene = load_scene(self.scene, self.parameters, integrator)
         dr.sync_thread()
@@ -121,7 +123,7 @@ class Case:
 
 
 def main() -> None:
-    """Measures what is missing, case by case."""
+    """Measure missing results, case by case."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -138,6 +140,7 @@ def main() -> None:
     parser.add_argument("--steps", nargs="+", type=float, default=STEPS, help="likewise")
     parser.add_argument("-o", "--output", type=Path, default=Path("output"))
     parser.add_argument("--force", action="store_true", help="measure irrcache again")
+    add_document(parser)
     args = parser.parse_args()
 
     require_llvm()
@@ -161,10 +164,13 @@ def main() -> None:
             print(table(cases[-1:]).as_text(), flush=True)
     whole = table(cases)
     print(f"\n{whole.as_text()}\n  {whole.note}\n\n{defaults(cases).as_text()}")
+    if args.document:
+        tables = {"error-against-time": whole, "defaults": defaults(cases)}
+        replace_tables(args.document, tables)
 
 
 def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -> dict:
-    """All that is known of a case."""
+    """Return all measurements of a case."""
     rivals = [
         stock.row(f"{case.key} {name}", partial(stock_row, case, name, args.stock_seconds))
         for name in stock_integrators(case.depth)
@@ -175,7 +181,7 @@ def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -
         case.scene, case.parameters, judge, args.output / "references", seconds=args.seconds
     )
     mean, noise = float(truth.mean.mean()), metrics.noise(truth.a, truth.b)
-    # The root of the standard error that the mean square error of a perfect image has.
+    # Square root of the standard error of the mean square error of a perfect image.
     least = float(noise / case.pixels**0.5)
     say(case, f"errors from {least:.1e} on can be told from none; more --seconds, smaller ones")
 
@@ -209,14 +215,15 @@ def measure(case: Case, args: argparse.Namespace, stock: Store, points: Store) -
 
 
 def stock_integrators(depth: int) -> list[str]:
-    """Those that are compared."""
+    """Return the integrators that are compared."""
     rr_depths = RR_DEPTHS[-1:] if depth == 2 else RR_DEPTHS
     return [specify(name, rr_depth=rr_depth) for name in STOCK for rr_depth in rr_depths]
 
 
 def reference_integrator(depth: int, rivals: list[dict]) -> str:
-    """The one for the reference: the cheapest where there is a choice. In white, dense matter
-    roulette makes noise that no time of ours would overcome.
+    """Return the integrator for the reference, the cheapest if there is a choice.
+
+    In dense media of albedo 1, Russian roulette would cause prohibitive noise.
     """
     if depth == 2:
         return specify("volpath", rr_depth=1000)
@@ -224,15 +231,17 @@ def reference_integrator(depth: int, rivals: list[dict]) -> str:
 
 
 def cost(rival: dict) -> float:
-    """Seconds to an RMSE of 1; to another, over its square."""
+    """Return the seconds to an RMSE of 1; divide by the square of another RMSE."""
     return rival["variance"] * rival["seconds_per_sample"]
 
 
 def stock_row(case: Case, integrator: str, wanted: float) -> dict:
-    """Variance and time of a sample per pixel, from images that take about ``wanted`` seconds."""
+    """Return variance and duration of a sample per pixel, from images of about ``wanted``
+    seconds.
+    """
     say(case, integrator)
     scene = case.load(integrator)
-    picture(scene, 1, 0)  # kernels
+    picture(scene, 1, 0)  # compiles kernels
     spp = 1
     for share in (0.2, 1.0):
         took = picture(scene, spp, 1)[1]
@@ -251,13 +260,13 @@ def stock_row(case: Case, integrator: str, wanted: float) -> dict:
 
 
 def unscattered_row(case: Case, integrator: str) -> dict:
-    """The mean radiance of the emitters behind the volume, attenuated by it."""
+    """Return the mean radiance of the emitters behind the volume, attenuated by it."""
     scene = case.load(specify(integrator, max_depth=1))
     return {"mean": float(picture(scene, UNSCATTERED_SPP, 0)[0].mean())}
 
 
 def picture(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
-    """Colours, float64, and the seconds they took; values that are not finite are 0."""
+    """Render colours, float64, and measure the seconds; values that are not finite are set to 0."""
     started = time.perf_counter()
     image = np.array(mi.render(scene, spp=spp, seed=seed))
     took = time.perf_counter() - started
@@ -265,7 +274,9 @@ def picture(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
 
 
 def explore(depth: int, args: argparse.Namespace, point: Callable) -> list[dict]:
-    """Caches of all resolutions and samples first, then images from the best two of them."""
+    """Measure caches of all resolutions and samples first, then images from the best two of
+    them.
+    """
     series = [
         [{"resolution": r, "cache_spp": n * BATCH, "solver": "sweep"} for n in args.batches]
         for r in args.resolutions
@@ -288,7 +299,10 @@ def explore(depth: int, args: argparse.Namespace, point: Callable) -> list[dict]
 
 
 def finalists(caches: list[tuple[dict, dict]]) -> list[tuple[dict, dict]]:
-    """For each target the fastest that reaches it and is not chosen yet, or else the most exact."""
+    """Return, for each target, the fastest setting that reaches it, or else the most accurate.
+
+    Settings selected for another target are skipped.
+    """
     chosen: list[tuple[dict, dict]] = []
     for target in TARGETS:
         rest = [c for c in caches if c not in chosen]
@@ -301,8 +315,8 @@ def finalists(caches: list[tuple[dict, dict]]) -> list[tuple[dict, dict]]:
 
 
 def point_row(case: Case, truth: Reference, integrator: str, spp: int) -> dict:
-    """Error, and seconds with a cold cache and with a moved camera."""
-    first, seconds_first = cold_start(case, integrator, spp)[1:]  # compiles what is new
+    """Return the error, and seconds with a cold cache and with a moved camera."""
+    first, seconds_first = cold_start(case, integrator, spp)[1:]  # compiles new kernels
     runs = COLD_RUNS if sum(seconds_first) < PATIENCE else 1
     times = []
     for _ in range(runs):
@@ -334,8 +348,9 @@ def point_row(case: Case, truth: Reference, integrator: str, spp: int) -> dict:
 
 
 def net_mse(image: np.ndarray, truth: Reference) -> tuple[float, float]:
-    """Mean square error net of the reference's noise, and its standard error, for which the
-    channels of a pixel, which share their paths, count as one.
+    """Return the mean square error net of the reference's noise, and its standard error.
+
+    The channels of a pixel, which share their paths, count as one.
     """
     products = ((image - truth.a) * (image - truth.b)).mean(axis=-1)
     return float(products.mean()), float(products.std() / np.sqrt(products.size))
@@ -344,7 +359,7 @@ def net_mse(image: np.ndarray, truth: Reference) -> tuple[float, float]:
 def cold_start(
     case: Case, integrator: str, spp: int
 ) -> tuple[mi.Scene, np.ndarray, tuple[float, float]]:
-    """A scene whose cache is filled here, its image, and seconds of cache and image."""
+    """Return a scene with a new cache, its image, and seconds of cache and image."""
     scene = case.load(integrator)
     started = time.perf_counter()
     scene.integrator().prepare(scene)
@@ -355,7 +370,7 @@ def cold_start(
 
 
 def move(scene: mi.Scene, spp: int, number: int) -> float:
-    """Seconds to turn the camera a little and to render with another seed."""
+    """Return the seconds to rotate the camera a little and to render with another seed."""
     parameters = mi.traverse(scene.sensors()[0])
     started = time.perf_counter()
     placed = parameters["to_world"]
@@ -368,9 +383,7 @@ def move(scene: mi.Scene, spp: int, number: int) -> float:
 def reach(
     case: Case, target: float, rivals: list[dict], points: list[dict], stock: Store, own: Store
 ) -> dict:
-    """Least times to an error of ``target``; those of ``irrcache`` are None where it is not
-    reached.
-    """
+    """Return the least times to an error of ``target``; None for ``irrcache`` if not reached."""
     rival = min(rivals, key=cost)
     stock_seconds = cost(rival) / target**2
     row = {"target": target, "stock": rival["integrator"], "stock_seconds": stock_seconds}
@@ -396,13 +409,13 @@ def reach(
 
 
 def entry(point: dict, took: float, rival: float) -> dict:
-    """A setting, its seconds, and how many times sooner it is there than ``rival``."""
+    """Format a setting, its seconds, and its speed-up over ``rival``."""
     setting = f"{point['integrator']} spp {point['spp']}"
     return {"setting": setting, "seconds": took, "ratio": rival / took}
 
 
 def own_command(case: Case, point: dict, image: str) -> list[str]:
-    """``irrcache render`` with a setting."""
+    """Return the ``irrcache render`` command of a setting."""
     defined = [part for k, v in case.parameters.items() for part in ("-D", f"{k}={v}")]
     command = [sys.executable, "-m", "mitsuba_irrcache", "render", str(case.scene), *defined]
     command += ["-m", case.variant, "-i", point["integrator"], "--spp", str(point["spp"])]
@@ -410,14 +423,16 @@ def own_command(case: Case, point: dict, image: str) -> list[str]:
 
 
 def stock_command(case: Case, rival: dict, image: str) -> list[str]:
-    """Mitsuba alone, one sample per pixel; the default ``rr_depth``, which hardly matters then."""
+    """Return the command for Mitsuba alone with one sample per pixel and the default
+    ``rr_depth``.
+    """
     name = parse_integrator(rival["integrator"])[0]
     command = [sys.executable, "-c", STOCK_PROCESS, case.variant, str(case.scene), image, name]
     return [*command, json.dumps(case.parameters)]
 
 
 def process_row(what: str, command: Callable[[str], list[str]]) -> dict:
-    """Seconds of a process from start to end, after a first one: its kernels are on disk."""
+    """Return the seconds of a process after a first one that saved its kernels to disk."""
     times = []
     with tempfile.TemporaryDirectory() as folder:
         while len(times) < 2 or (len(times) <= PROCESS_RUNS and sum(times) < PATIENCE):
@@ -430,12 +445,12 @@ def process_row(what: str, command: Callable[[str], list[str]]) -> dict:
 
 
 def say(case: Case, text: str) -> None:
-    """A line of progress."""
+    """Print a line of progress."""
     print(f"{case.key}: {text}", flush=True)
 
 
 def table(cases: list[dict]) -> Table:
-    """Seconds to each error, and how many times sooner than the best stock integrator."""
+    """Tabulate seconds to each error, and speed-ups over the best stock integrator."""
     head = ["scene", "depth", "RMSE", "of the volume", "stock", "s", "cold cache", "camera moved"]
     head += ["new process", "setting with a cold cache"]
     cells = []
@@ -462,15 +477,16 @@ def table(cases: list[dict]) -> Table:
 
 
 def of_the_volume(error: float, case: dict) -> str:
-    """In percent of the mean radiance of the volume alone; a dash where nothing is scattered, or
-    the results are of before this was measured.
+    """Format in percent of the mean radiance of the volume alone.
+
+    A dash if nothing is scattered, or if the results are older than this measurement.
     """
     volume = case.get("volume", 0.0)
     return percent(error / volume) if volume > 1e-3 * case["mean"] else "—"
 
 
 def defaults(cases: list[dict]) -> Table:
-    """What ``irrcache`` does when it is told nothing, and with twice the voxels along each axis."""
+    """Measure ``irrcache`` with default settings, and with twice the voxels along each axis."""
     head = ["scene", "depth", "voxels", "RMSE", "% of the mean", "of the volume", "at most"]
     head += ["mean error", "cold cache", "camera moved"]
     cells = [

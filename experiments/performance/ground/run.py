@@ -1,12 +1,12 @@
-"""What the solver ``sweep`` gains where there are surfaces: a dense cloud over the ground.
+"""Speed-up by the solver ``sweep`` with surfaces: a dense cloud over the ground.
 
     python -m experiments.performance.ground.run [--force]
 
 A ball-shaped cloud of 64^3 voxels, albedo 0.97 and an optical depth of about 30 across its middle,
 over a grey ground, under a white sky, and under a sun: all orders of scattering, by each solver at
-default settings. The seconds that the cache takes (and by ``sweep`` a second one, when kernels are
-compiled), and the errors of the image, of pixels and of means over 8 x 8, against volpath, whose
-own noise (of two halves) is taken out. Leaves output/ground/results.json.
+default settings. Measures the seconds of the cache (and with ``sweep`` of a second one, with
+compiled kernels), and the errors of the image, of pixels and of means over 8 x 8, against volpath,
+net of its noise (of two halves). Writes output/ground/results.json.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LIGHTS = {
 
 
 def run(options: Options) -> None:
-    """Computes the rows that are missing and prints all."""
+    """Compute missing rows and print all."""
     store = Store(options.folder("ground") / "results.json", options.force)
     for light in LIGHTS:
         for solver in ("sweep", "path"):
@@ -44,7 +44,7 @@ def run(options: Options) -> None:
 
 
 def measure(light: str, solver: str) -> dict:
-    """Seconds and errors, these in units of the mean radiance."""
+    """Return seconds, and errors in units of the mean radiance."""
     scene, a, b = reference(light)
     seconds = []
     for seed in (1, 2) if solver == "sweep" else (1,):
@@ -63,25 +63,25 @@ def measure(light: str, solver: str) -> dict:
 
 @cache
 def reference(light: str) -> tuple[mi.Scene, np.ndarray, np.ndarray]:
-    """The scene, and two halves of what volpath makes of it."""
+    """Return the scene, and two halves of the reference by volpath."""
     scene = mi.load_dict(description(light))
     stock = mi.load_dict({"type": "volpath", "rr_depth": 50})
     return scene, *(picture(scene, stock, seed) for seed in (3, 4))
 
 
 def picture(scene: mi.Scene, integrator: mi.Integrator, seed: int) -> np.ndarray:
-    """By an integrator other than the scene's."""
+    """Render with an integrator other than the scene's."""
     return np.array(mi.render(scene, integrator=integrator, spp=SPP, seed=seed), np.float64)
 
 
 def means(image: np.ndarray, size: int) -> np.ndarray:
-    """Over squares of pixels."""
+    """Return means over squares of pixels."""
     n = PIXELS // size
     return image.reshape(n, size, n, size, -1).mean(axis=(1, 3))
 
 
 def description(light: str) -> dict:
-    """The scene."""
+    """Return the scene."""
     c = (np.arange(VOXELS) + 0.5) / VOXELS * 2 - 1
     z, y, x = np.meshgrid(c, c, c, indexing="ij")
     density = np.clip(1.0 - 1.4 * np.sqrt(x**2 + y**2 + z**2), 0, None)

@@ -1,18 +1,18 @@
-"""Time at equal error for each kind of scene, also where we lose.
+"""Time at equal error for each kind of scene, including those where irrcache is slower.
 
     python -m experiments.performance.kinds.run [--budget 240] [--seconds 12] [--force] [-o output]
 
 Each scene is rendered by ``irrcache`` at default settings, 16 samples per pixel, 64 x 64 pixels,
 all orders of scattering. Its error is the RMSE in units of the mean radiance, net of the noise of a
 reference of two halves (``--seconds`` each) by the better of volpath and volpathmis. A stock
-integrator's time to the same error is its variance over the square of the error, times what a
-sample takes. Where surfaces are seen, the error is that of their samples, and a cache pays from
-some error on: the last column but one says which. The last one is the solver that ``auto`` did not
-choose, where it could have: its error, and its ratio with a cold cache. Kernels are warm, loading
-is excluded. No data are needed: all is generated.
+integrator's time to the same error is its variance over the square of the error, times the duration
+of a sample. If surfaces are visible, the error is that of their samples, and a cache is faster
+below some error: the last column but one gives it. The last one is the solver that ``auto`` did not
+select, where it is supported: its error, and its ratio with a cold cache. Kernels are warm, loading
+is excluded. No data are needed: all scenes are procedural.
 
-Rows are kept in output/kinds/results.json; none is begun after ``--budget`` seconds: run it again
-for the others.
+Rows are saved in output/kinds/results.json; none is started after ``--budget`` seconds: run it
+again for the others.
 """
 
 from __future__ import annotations
@@ -26,26 +26,27 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from experiments.support.options import begin, parser_of
+from experiments.support.documents import replace_tables
+from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import IrrcacheError
 
 SIZE, SPP = 64, 16
 STOCK = ("volpath", "volpathmis")
-#: Of a stock integrator, from which its variance is known.
+#: Images of a stock integrator for its variance.
 STOCK_SPP, STOCK_IMAGES = 64, 4
-#: Images by irrcache with caches of their own.
+#: Images by irrcache with independent caches.
 RUNS = 3
 
 
 def colour(*rgb: float) -> dict:
-    """A colour."""
+    """Return a colour."""
     return {"type": "rgb", "value": list(rgb)}
 
 
 def placed(centre, scale, towards=None):
-    """A ``to_world``."""
+    """Return a ``to_world``."""
     transform = mi.ScalarTransform4f()
     if towards is not None:
         return transform.look_at(list(centre), list(towards), [0.1, 1, 0.2]).scale(list(scale))
@@ -53,7 +54,7 @@ def placed(centre, scale, towards=None):
 
 
 def smoke(side: int = 48, scale: float = 6.0, albedo=(0.9, 0.9, 0.9), **more) -> dict:
-    """A heterogeneous medium in the cube [-1, 1]^3: a blob with wisps."""
+    """Return a heterogeneous medium in the cube [-1, 1]^3: a blob with noise."""
     z, y, x = (np.indices((side,) * 3) + 0.5) / side * 2 - 1
     wisps = 0.6 + 0.4 * np.sin(7 * x + 3 * np.sin(5 * y)) * np.sin(6 * z + 2 * x) * np.sin(
         5 * y - z
@@ -63,7 +64,7 @@ def smoke(side: int = 48, scale: float = 6.0, albedo=(0.9, 0.9, 0.9), **more) ->
 
 
 def medium(density: np.ndarray, scale: float, albedo) -> dict:
-    """A medium over the cube [-1, 1]^3."""
+    """Return a medium over the cube [-1, 1]^3."""
     place = placed((-1, -1, -1), (2, 2, 2))
     grid = mi.VolumeGrid(density.astype(np.float32))
     sigma_t = {"type": "gridvolume", "grid": grid, "raw": True, "to_world": place}
@@ -72,50 +73,50 @@ def medium(density: np.ndarray, scale: float, albedo) -> dict:
 
 
 def box(interior: dict, centre=(0, 0, 0), scale=(1, 1, 1)) -> dict:
-    """A null boundary."""
+    """Return a null boundary."""
     null = {"type": "null"}
     return {"type": "cube", "to_world": placed(centre, scale), "bsdf": null, "interior": interior}
 
 
 def diffuse(*rgb: float) -> dict:
-    """A BSDF."""
+    """Return a BSDF."""
     return {"type": "diffuse", "reflectance": colour(*rgb)}
 
 
 def wall(centre, towards, size=2.0, bsdf=None) -> dict:
-    """A square."""
+    """Return a square."""
     place = placed(centre, (size, size, 1), towards)
     return {"type": "rectangle", "to_world": place, "bsdf": bsdf or diffuse(0.7, 0.7, 0.7)}
 
 
 def sky() -> dict:
-    """Even light."""
+    """Return a constant environment."""
     return {"type": "constant", "radiance": colour(0.6, 0.8, 1.0)}
 
 
 def sun() -> dict:
-    """Light from one side."""
+    """Return a directional emitter."""
     return {"type": "directional", "direction": [0.4, -1.0, 0.55], "irradiance": 3.0}
 
 
 def kind_cloud() -> dict:
-    """A cloud alone under a sky."""
+    """Return a cloud alone under a sky."""
     return {"box": box(smoke(albedo=(0.99,) * 3)), "sky": sky()}
 
 
 def kind_ground() -> dict:
-    """The same over the ground, with a sun."""
+    """Return the cloud over the ground, with a sun."""
     floor = wall((0, -1.1, 0), (0, 0, 0.001), 5.0, diffuse(0.6, 0.5, 0.4))
     return kind_cloud() | {"ground": floor, "sun": sun()}
 
 
 def kind_forward_ground() -> dict:
-    """The same with a cloud that scatters as clouds do."""
+    """Return the same with a strongly forward scattering cloud."""
     return kind_ground() | kind_forward()
 
 
 def kind_room() -> dict:
-    """Smoke in a room with a lamp under its ceiling."""
+    """Return smoke in a room with an area light under its ceiling."""
     red, green = diffuse(0.6, 0.1, 0.1), diffuse(0.1, 0.5, 0.1)
     area = {"type": "area", "radiance": 12.0}
     return {
@@ -128,7 +129,7 @@ def kind_room() -> dict:
 
 
 def kind_implant() -> dict:
-    """A dense body with an opaque rod of metal in it."""
+    """Return a dense body with an opaque metal rod in it."""
     _, y, x = (np.indices((48,) * 3) + 0.5) / 48 * 2 - 1
     body = 2.0 * (x**2 + y**2 < 0.7) + 8.0 * (np.hypot(x - 0.35, y) < 0.2)
     metal = {"type": "roughconductor", "alpha": 0.2}
@@ -149,20 +150,20 @@ def kind_implant() -> dict:
 
 
 def kind_two() -> dict:
-    """Two media side by side."""
+    """Return two media side by side."""
     other = {"type": "homogeneous", "sigma_t": 2.0, "albedo": colour(0.9, 0.6, 0.3)}
     ball = {"type": "sphere", "center": [1.5, 0.2, 0], "radius": 0.45, "bsdf": {"type": "null"}}
     return {"box": box(smoke()), "ball": ball | {"interior": other}, "sky": sky(), "sun": sun()}
 
 
 def kind_chromatic() -> dict:
-    """Extinction of 1 : 4 : 10."""
+    """Return extinction of 1 : 4 : 10."""
     tint = np.array([0.1, 0.4, 1.0])
     return {"box": box(smoke(scale=12.0, tint=tint, albedo=(0.9, 0.9, 0.9))), "sky": sky()}
 
 
 def kind_fog() -> dict:
-    """A camera in fog, before a ball."""
+    """Return a camera in fog, before a ball."""
     fog = {"type": "homogeneous", "sigma_t": 0.5, "albedo": 0.9, "id": "fog"}
     reference = {"type": "ref", "id": "fog"}
     ball = {"type": "sphere", "radius": 0.5, "bsdf": diffuse(0.8, 0.3, 0.2), "exterior": reference}
@@ -174,12 +175,12 @@ def kind_fog() -> dict:
 
 
 def kind_anisotropic() -> dict:
-    """Forward scattering by hg, g = 0.5, under a sky and a sun."""
+    """Return a medium with hg, g = 0.5, under a sky and a sun."""
     return {"box": box(smoke(phase={"type": "hg", "g": 0.5})), "sky": sky(), "sun": sun()}
 
 
 def kind_forward() -> dict:
-    """A cloud that scatters as clouds do, under a sky and a sun."""
+    """Return a strongly forward scattering cloud under a sky and a sun."""
     cloud = smoke(albedo=(0.99,) * 3, phase={"type": "hg", "g": 0.85})
     return {"box": box(cloud), "sky": sky(), "sun": sun()}
 
@@ -199,7 +200,7 @@ KINDS: dict[str, Callable[[], dict]] = {
 
 
 def sensor() -> dict:
-    """The camera."""
+    """Return the sensor."""
     look = mi.ScalarTransform4f().look_at([0.8, 0.9, -4.5], [0, 0, 0], [0, 1, 0])
     film = {
         "type": "hdrfilm", "width": SIZE, "height": SIZE, "component_format": "float32",
@@ -209,21 +210,21 @@ def sensor() -> dict:
 
 
 def load(build: Callable[[], dict], integrator: str, **settings) -> mi.Scene:
-    """A scene, its cache cold."""
+    """Load a scene with a cold cache."""
     gc.collect()
     depth = {"type": integrator, "max_depth": -1, "rr_depth": 50} | settings
     return mi.load_dict({"type": "scene", "integrator": depth, "sensor": sensor()} | build())
 
 
 def picture(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
-    """Colours, float64, and the seconds they took."""
+    """Render colours, float64, and measure the seconds."""
     started = time.perf_counter()
     image = np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float64)
     return image[..., :3], time.perf_counter() - started
 
 
 def compute(build: Callable[[], dict], seconds: float) -> dict:
-    """What is known of a kind of scene."""
+    """Return all measurements of a kind of scene."""
     stock = {name: stock_row(build, name) for name in STOCK}
     judge = min(stock, key=lambda name: stock[name]["cost"])
     scene, spp = load(build, judge), STOCK_SPP
@@ -241,13 +242,13 @@ def compute(build: Callable[[], dict], seconds: float) -> dict:
 
 
 def solved(build: Callable[[], dict], solver: str, a: np.ndarray, b: np.ndarray) -> dict | None:
-    """Error and times of a solver beside both halves of a reference; None where it is refused."""
+    """Return error and times of a solver against both halves; None if it is refused."""
     ours, mean = load(build, "irrcache", solver=solver), 0.5 * (a + b).mean()
     try:
         ours.integrator().prepare(ours)
     except IrrcacheError:
         return None
-    picture(ours, SPP, 0)  # compiles
+    picture(ours, SPP, 0)  # compiles kernels
     runs = [irrcache_run(build, solver, seed) for seed in range(RUNS)]
     squares = [((image - a) * (image - b)).mean() for image, *_ in runs]
     cold, moved = (float(np.median([run[i] for run in runs])) for i in (1, 2))
@@ -259,7 +260,7 @@ def solved(build: Callable[[], dict], solver: str, a: np.ndarray, b: np.ndarray)
 
 
 def stock_row(build: Callable[[], dict], name: str) -> dict:
-    """Relative variance and seconds of a sample per pixel, and their product."""
+    """Return relative variance and seconds of a sample per pixel, and their product."""
     scene = load(build, name)
     picture(scene, 1, 0)
     images, times = zip(
@@ -273,7 +274,7 @@ def stock_row(build: Callable[[], dict], name: str) -> dict:
 def irrcache_run(
     build: Callable[[], dict], solver: str, seed: int
 ) -> tuple[np.ndarray, float, float]:
-    """An image, the seconds it took with a cold cache, and those of another one."""
+    """Return an image, its seconds with a cold cache, and those of another image."""
     scene = load(build, "irrcache", solver=solver)
     dr.sync_thread()
     image, cold = picture(scene, SPP, seed)
@@ -281,7 +282,7 @@ def irrcache_run(
 
 
 def table(rows: dict[str, dict]) -> Table:
-    """Where the error cannot be told from none, it counts as the least that can."""
+    """Tabulate the rows; errors below the resolution of the reference count as that."""
     cells = []
     for name, row in rows.items():
         error = max(row["rmse"], row["resolved"])
@@ -298,7 +299,7 @@ def table(rows: dict[str, dict]) -> Table:
 
 
 def _other(row: dict) -> str:
-    """What the solver does that was not chosen."""
+    """Format the result of the solver that was not selected."""
     other = row["other"]
     if other is None:
         return "refused"
@@ -308,8 +309,9 @@ def _other(row: dict) -> str:
 
 
 def _from(row: dict, error: float) -> str:
-    """The error below which ``irrcache`` is faster with a cold cache, if its own falls with the
-    samples of its pixels.
+    """Return the error below which ``irrcache`` is faster with a cold cache.
+
+    It is assumed that its own error decreases with the camera samples.
     """
     saved = row["stock"][row["judge"]]["cost"] - row["moved"] * error**2
     cache = max(row["cold"] - row["moved"], 1e-3)
@@ -317,10 +319,11 @@ def _from(row: dict, error: float) -> str:
 
 
 def main() -> None:
-    """Computes the rows that are missing, as many as the budget lets."""
+    """Compute missing rows within the budget."""
     parser = parser_of(__doc__)
     parser.add_argument("--budget", type=float, default=240, help="no row is begun later")
     parser.add_argument("--seconds", type=float, default=12, help="of half a reference")
+    add_document(parser)
     args = parser.parse_args()
     begin()
     folder = args.output / "kinds"
@@ -332,7 +335,10 @@ def main() -> None:
             continue
         store.row(name, partial(compute, build, args.seconds))
         print(table({name: store.rows[name]}).as_text(), flush=True)
-    print(table({name: store.rows[name] for name in KINDS if name in store.rows}).as_text())
+    whole = table({name: store.rows[name] for name in KINDS if name in store.rows})
+    print(whole.as_text())
+    if args.document:
+        replace_tables(args.document, {"kinds": whole})
 
 
 if __name__ == "__main__":

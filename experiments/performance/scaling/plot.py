@@ -13,7 +13,7 @@ from mitsuba_irrcache.compare.report import Figure, Section
 
 
 def plot(options: Options) -> Section:
-    """Throughput against the size of the volume, time against that of the image."""
+    """Plot throughput against the size of the volume, and time against that of the image."""
     folder = options.folder("scaling")
     results = read_json(folder / "results.json")
     sizes = sorted(

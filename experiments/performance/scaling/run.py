@@ -1,14 +1,14 @@
-"""What the solver ``sweep`` costs as volumes and images grow, beside what memory allows.
+"""Cost of the solver ``sweep`` as volumes and images grow, compared with the memory bandwidth.
 
     python -m experiments.performance.scaling.run [--full] [--force]
 
 Single scattering in grey, 256 directions, on procedural clouds up to 128^3 voxels (``--full``: up
 to 256^3, and the paper's 512 x 150 x 350 thorax), each in a process of its own: seconds, voxels
-times directions per second, peak memory. Two floors are measured in the same process. Stream, a
-kernel y = a x: a step of a line would take as long if it moved 12 bytes and did nothing else.
-Loads, a kernel of the loads and stores of a step alone: two words of the extinction, and the light
-of a voxel before and after. Then images of up to 512^2 (``--full``: 1024^2) pixels, and the kernels
-of a pass. Writes output/scaling/results.json.
+times directions per second, peak memory. Two bounds are measured in the same process. Stream, a
+kernel y = a x: the time of a track's step if it only moved 12 bytes. Loads, a kernel with only the
+loads and stores of a step: two words of the extinction, and the irradiance of a voxel before and
+after. Then images of up to 512^2 (``--full``: 1024^2) pixels, and the kernels of a pass. Writes
+output/scaling/results.json.
 """
 
 from __future__ import annotations
@@ -45,25 +45,25 @@ QUICK_SIZES = (("procedural", 32), ("procedural", 64), ("procedural", 128))
 FULL_SIZES = (*QUICK_SIZES, ("procedural", 192), ("procedural", 256), ("phantom-paper", 0))
 QUICK_PIXELS = (128, 256, 512)
 FULL_PIXELS = (*QUICK_PIXELS, 1024)
-#: Of which images and kernels are measured.
+#: Volume of which images and kernels are measured.
 MIDDLE = ("procedural", 128)
 SAMPLES = LARGEST_BATCH
 #: Samples per pixel of an image.
 SPP = 4
 REPEATS = 3
-#: Voxels from which on what a process takes is volumes, not kernels.
+#: Voxels from which on memory is dominated by volumes, not kernels.
 MANY = 1 << 22
-#: Of which kernels are counted.
+#: Volume of which kernels are counted.
 PASSES = 5
-#: Of the floor: numbers in an array, and bytes that a step of a line moves.
+#: For the stream bound: numbers in an array, and bytes moved per step of a track.
 STREAM = 64 << 20
 STEP_BYTES = 12
-#: Of the other one: voxels of a slice that lines move by from one slice to the next.
+#: For the loads bound: voxels by which tracks move from one slice to the next.
 MOVED = 37
 
 
 def run(options: Options) -> None:
-    """Measures what is missing, and prints all."""
+    """Measure missing results, and print all."""
     store = Store(options.folder("scaling") / "results.json", options.force)
     full = options.size == FULL
 
@@ -85,7 +85,7 @@ def run(options: Options) -> None:
 
 
 def alone(function: Callable, scene: Path, *rest: int) -> dict:
-    """What ``function`` returns in a new process, and the machine's load."""
+    """Return the result of ``function`` in a new process, and the machine's load."""
     print(
         f"scaling: {function.__name__} {scene.parent.name} {' '.join(map(str, rest))}", flush=True
     )
@@ -95,7 +95,7 @@ def alone(function: Callable, scene: Path, *rest: int) -> dict:
 
 @contextmanager
 def no_kernels_on_disk() -> Iterator[None]:
-    """New processes do not find those of earlier ones."""
+    """Hide the kernels of earlier processes on disk."""
     before = os.environ.get(KERNEL_CACHE)
     with tempfile.TemporaryDirectory() as folder:
         os.environ[KERNEL_CACHE] = folder
@@ -108,7 +108,7 @@ def no_kernels_on_disk() -> Iterator[None]:
 
 
 def growth(scene: Path) -> dict:
-    """Seconds of a whole cache and of as many directions more, peak memory, and bandwidth."""
+    """Measure a whole cache, as many directions more, peak memory, and bandwidth."""
     set_up()
     parameters = {"max_depth": "2"}
     loaded = load_scene(scene, parameters)
@@ -118,7 +118,7 @@ def growth(scene: Path) -> dict:
     grid, sides = builder.cache.grid, swept_sides(builder.cache)
     whole, more = [], []
     for _ in range(REPEATS):
-        builder = None  # its memory is used again
+        builder = None  # its memory is reused
         builder, seconds = build(load_scene(scene, parameters), SAMPLES, also=(more,))
         whole.append(seconds)
     active = builder.cache.active_count
@@ -139,8 +139,9 @@ def growth(scene: Path) -> dict:
 
 
 def build(scene: mi.Scene, samples: int, also: tuple[list, ...] = ()) -> tuple:
-    """A builder that has filled its cache, and the seconds that took; those of as many samples
-    more go to the lists in ``also``.
+    """Return a builder with a filled cache, and its seconds.
+
+    Those of as many samples more go to the lists in ``also``.
     """
     dr.sync_thread()
     builder = CacheBuilder(CacheSettings(max_depth=2, solver="sweep", samples=samples))
@@ -189,18 +190,18 @@ def kernels(scene: Path) -> dict:
 
 
 def counted(history: list[dict]) -> dict[str, int]:
-    """Launches, and kernels that were compiled."""
+    """Count launches, and kernels that were compiled."""
     compiled = sum(k["type"] == dr.KernelType.JIT and not k["cache_hit"] for k in history)
     return {"launches": len(history), "compiled": compiled}
 
 
 def bandwidth() -> float:
-    """Bytes per second, read and written, of y = a x; the best of 5."""
+    """Return the bytes per second, read and written, of y = a x; the best of 5."""
     x = dr.arange(mi.Float, STREAM)
     a = dr.opaque(mi.Float, 2)
     dr.eval(x)
     times = []
-    for _ in range(6):  # the first one is compiled
+    for _ in range(6):  # compiles the kernel
         y = x * a
         dr.sync_thread()
         started = time.perf_counter()
@@ -212,8 +213,10 @@ def bandwidth() -> float:
 
 
 def loads(sides: np.ndarray) -> float:
-    """Voxels times directions per second of a kernel that loads and stores what a line does, both
-    ways along lines through a box of so many voxels, and does nothing else; the best of 5.
+    """Return the throughput of a kernel that only loads and stores what a track does.
+
+    In voxels times directions per second, both directions along tracks through a box of this many
+    voxels; the best of 5.
     """
     slices, lines = int(sides[2]), int(sides[0] * sides[1])
     step = lines + MOVED
@@ -223,7 +226,7 @@ def loads(sides: np.ndarray) -> float:
     lanes = dr.arange(mi.UInt32, lines)
     dr.eval(lanes)
     times = []
-    for _ in range(6):  # the first one is compiled
+    for _ in range(6):  # compiles the kernel
         dr.sync_thread()
         started = time.perf_counter()
         dr.eval(_loaded(words, light, lanes, *numbers), light)
@@ -234,7 +237,7 @@ def loads(sides: np.ndarray) -> float:
 
 @symbolic
 def _loaded(words, light, lanes, slices, step, row):
-    """The kernel of `loads`; what it reads of the extinction is in the result."""
+    """Run the kernel of `loads`; the extinction that it reads contributes to its result."""
     there, back = mi.UInt32(lanes), lanes + (slices - 1) * step
     found, k = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(k < slices, label="loads"):
@@ -250,35 +253,35 @@ def _loaded(words, light, lanes, slices, step, row):
 
 
 def swept_sides(cache) -> np.ndarray:
-    """Sides of the box of voxels that lines pass through: the least one with all active voxels."""
+    """Return the sides of the smallest box of voxels that contains all active ones."""
     places = np.stack(np.unravel_index(np.array(cache.active), cache.grid.shape))
     return places.max(axis=1) - places.min(axis=1) + 1
 
 
 def set_up() -> None:
-    """A new process has no variant."""
+    """Set the variant in a new process."""
     require_llvm()
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
 
 
 def rate(row: dict, kind: str = "seconds_more") -> float:
-    """Voxels times directions per second, of those voxels that are swept."""
+    """Return the voxels times directions per second, for the voxels that are swept."""
     return row["swept"] * row["directions"] / row[kind]
 
 
 def floor(row: dict) -> float:
-    """The same if each took a step's bytes at the bandwidth of the machine."""
+    """Return the same for the bytes of a step at the bandwidth of the machine."""
     return row["bandwidth"] / STEP_BYTES
 
 
 def volumes(row: dict) -> float:
-    """Numbers per voxel, of four bytes, that the process took beyond those of the scene."""
+    """Return the four-byte numbers per voxel that the process took beyond those of the scene."""
     return (row["peak"] - row["peak_loaded"]) / (4 * row["voxels"])
 
 
 def sizes_table(rows: list[dict]) -> Table:
-    """Time, throughput and memory by size."""
+    """Tabulate time, throughput and memory by size."""
     head = ["voxels", "swept", "s", "M/s", "s, sweeps", "M/s, sweeps", "stream", "share"]
     head += ["loads", "share", "peak MiB", "volumes"]
     cells = [
@@ -295,7 +298,7 @@ def sizes_table(rows: list[dict]) -> Table:
 
 
 def images_table(rows: list[dict]) -> Table:
-    """Time by size of the image."""
+    """Tabulate time by size of the image."""
     head = ["pixels", "spp", "s", "ns per sample", "peak MiB"]
     cells = [
         [f"{r['pixels'] ** 0.5:.0f}^2", str(r["spp"]), f"{r['seconds']:.3f}",

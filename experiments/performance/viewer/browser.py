@@ -1,4 +1,4 @@
-"""A real browser, headless, that looks at ``irrcache view`` and notes when pictures appear."""
+"""A headless browser that displays ``irrcache view`` and records when images appear."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from pathlib import Path
 
 from playwright.sync_api import Locator, Page, sync_playwright
 
-#: Names that Chromium is installed under.
+#: Names under which Chromium is installed.
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-#: Notes the time of every mouse event, and of every picture that goes to the screen: from images
-#: that were made of received data, not of the page itself.
+#: Records the time of every mouse event, and of every displayed image that was made of received
+#: data instead of the page's own.
 _HOOKS = """
 (() => {
   const now = () => performance.timeOrigin + performance.now();
@@ -40,14 +40,15 @@ _HOOKS = """
 
 
 def chromium() -> str | None:
-    """Where Chromium is; None where it is not."""
+    """Return the path of Chromium, or None."""
     return next(filter(None, map(shutil.which, CHROMIUM)), None)
 
 
 @contextmanager
 def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
-    """``irrcache view`` with these arguments in a process of its own, and its address; what it
-    prints goes to ``log``, and to stderr too if what is done with it, or it itself, fails.
+    """Start ``irrcache view`` with these arguments in a process of its own; return its address.
+
+    Its output goes to ``log``, and to stderr if an exception is raised.
     """
     command = [sys.executable, "-m", "mitsuba_irrcache", "view", *arguments, "--no-browser"]
     with open(log, "w") as stream:
@@ -69,11 +70,11 @@ def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
 
 
 class Window:
-    """A browser window that looks at the viewer."""
+    """A browser window that displays the viewer."""
 
     def __init__(self, page: Page, address: str) -> None:
         self.page = page
-        #: what the console said: (kind, text)
+        #: console messages: (kind, text)
         self.console: list[tuple[str, str]] = []
         page.on("console", lambda message: self.console.append((message.type, message.text)))
         page.on("pageerror", lambda error: self.console.append(("error", str(error))))
@@ -83,30 +84,30 @@ class Window:
 
     @property
     def errors(self) -> list[str]:
-        """Errors in the console."""
+        """Return the errors in the console."""
         return [text for kind, text in self.console if kind == "error"]
 
     def moves(self) -> list[float]:
-        """When the mouse moved, seconds."""
+        """Return the times of mouse events in seconds."""
         return [t / 1000 for t in self.page.evaluate("window.__moves")]
 
     def shown(self) -> list[dict]:
-        """The pictures that were shown: "at" (seconds), "width" and "height"."""
+        """Return the displayed images: "at" (seconds), "width" and "height"."""
         entries = self.page.evaluate("window.__shown.filter(e => e.at > 0)")
         return [entry | {"at": entry["at"] / 1000} for entry in entries]
 
     def note(self) -> str:
-        """What the window says of its picture, "" before there is one."""
+        """Return the window's text about its image, "" before there is one."""
         found = self.page.get_by_text(re.compile(r"per pixel$")).first
         return found.inner_text() if found.count() else ""
 
     def wait_for(self, note: str, seconds: float = 20.0) -> None:
-        """Until the window's note on its picture matches."""
+        """Wait until the window's text about its image matches."""
         pattern = re.compile(note)
         self.page.get_by_text(pattern).first.wait_for(state="attached", timeout=1000 * seconds)
 
     def wait_for_picture(self, after: int, width: int = 0, seconds: float = 60.0) -> None:
-        """Until a picture was shown beyond the first ``after``; of this width, if one is given."""
+        """Wait for an image beyond the first ``after``, of this width if one is given."""
         self.page.wait_for_function(
             "([n, w]) => __shown.slice(n).some(e => e.at > 0 && (w == 0 || e.width == w))",
             arg=[after, width],
@@ -114,32 +115,32 @@ class Window:
         )
 
     def field(self, label: str) -> Locator:
-        """The input of the control with this label."""
+        """Return the input of the control with this label."""
         row = "ancestor::div[contains(@class, 'mantine-Flex-root')][1]"
         return self.page.locator(
             f"xpath=//label[text()='{label}']/{row}//input[not(@type='hidden')]"
         ).first
 
     def enter(self, label: str, value: object) -> None:
-        """Writes a value into a control."""
+        """Enter a value into a control."""
         field = self.field(label)
         field.fill(str(value))
         field.press("Enter")
 
     def choose(self, label: str, option: str) -> None:
-        """Picks the first option of a list that begins like this."""
+        """Select the first option of a list with this beginning."""
         self.field(label).click()
         pattern = re.compile(rf"^{re.escape(option)}")
         self.page.get_by_role("option", name=pattern).filter(visible=True).first.click()
 
     def tick(self, label: str) -> None:
-        """Sets or clears a check box."""
+        """Set or clear a check box."""
         self.page.get_by_text(label, exact=True).locator(
             "xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]//input"
         ).first.click()
 
     def orbit(self, steps: int, pixels: float, pause: float, first: float = 60.0) -> None:
-        """Drags the mouse from ``first`` on, in ``steps`` of so many pixels."""
+        """Drag the mouse from ``first``, in ``steps`` of this many pixels."""
         mouse, height = self.page.mouse, self.page.viewport_size["height"]
         mouse.move(first, 0.8 * height)
         mouse.down()
@@ -149,18 +150,18 @@ class Window:
         mouse.up()
 
     def zoom(self, turns: int, pause: float = 0.05) -> None:
-        """Turns the wheel."""
+        """Turn the mouse wheel."""
         for _ in range(abs(turns)):
             self.page.mouse.wheel(0, 100 if turns > 0 else -100)
             self.page.wait_for_timeout(1000 * pause)
 
 
 class Browser:
-    """Chromium, for as many windows as are opened; a context manager."""
+    """Chromium with any number of windows; a context manager."""
 
     def __enter__(self) -> Browser:
         self._playwright = sync_playwright().start()
-        # Shared memory of containers is small, and a page that wants more of it crashes.
+        # Shared memory of containers is small, and a page that needs more of it crashes.
         arguments = ["--no-sandbox", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
         self._browser = self._playwright.chromium.launch(executable_path=chromium(), args=arguments)
         return self
@@ -170,6 +171,6 @@ class Browser:
         self._playwright.stop()
 
     def open(self, address: str, size: tuple[int, int] = (512, 512)) -> Window:
-        """A new window of this (width, height)."""
+        """Open a new window of this (width, height)."""
         page = self._browser.new_page(viewport={"width": size[0], "height": size[1]})
         return Window(page, address)

@@ -1,4 +1,4 @@
-"""Who uses the processor: seconds by process, from Linux's /proc."""
+"""Processor time by process, from Linux's /proc."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ _TICK = 1 / os.sysconf("SC_CLK_TCK")
 
 
 def processor_seconds() -> dict[str, float]:
-    """Seconds of processor time so far of this program's children, theirs too: of the "viewer", of
-    Chromium's processes by their type, and of "others", all else on this machine.
+    """Return the processor seconds of this program's descendants so far, and of all others.
+
+    The keys are "viewer", Chromium's process types, and "others".
     """
     found: dict[str, float] = {}
     for pid in _descendants():
         try:
             name, seconds = _name(_words(pid)), _seconds(pid)
-        except (FileNotFoundError, ProcessLookupError):  # it has just ended
+        except (FileNotFoundError, ProcessLookupError):  # the process has just ended
             continue
         found[name] = found.get(name, 0.0) + seconds
     columns = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
@@ -29,7 +30,7 @@ def processor_seconds() -> dict[str, float]:
 
 
 def viewer_memory() -> float:
-    """Resident memory of the viewers that this program has started, MB."""
+    """Return the resident memory of the viewers that this program has started, MB."""
     total = 0.0
     for pid in _descendants():
         with suppress(FileNotFoundError, ProcessLookupError, AttributeError):
@@ -40,7 +41,7 @@ def viewer_memory() -> float:
 
 
 def _descendants() -> list[int]:
-    """Processes that this one has started, and those that they have."""
+    """Return the processes that this one has started, and their descendants."""
     parents = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -55,7 +56,7 @@ def _descendants() -> list[int]:
 
 
 def _words(pid: int) -> list[str]:
-    """Its command line; Chromium puts spaces between words."""
+    """Return a command line; Chromium separates words by spaces."""
     line = (Path("/proc") / str(pid) / "cmdline").read_bytes()
     return line.replace(b"\0", b" ").decode(errors="replace").split()
 
@@ -66,7 +67,7 @@ def _seconds(pid: int) -> float:
 
 
 def _fields(pid: int) -> list[str]:
-    """Of /proc/PID/stat, from the state on: the name before it may hold anything."""
+    """Return the fields of /proc/PID/stat after the name, which may contain any characters."""
     return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()
 
 

@@ -1,8 +1,8 @@
-"""How fast the viewer is, measured in a browser: ``python -m experiments.performance.viewer.run
-SCENE``.
+"""Latency and frame rate of the viewer in a browser: ``python -m
+experiments.performance.viewer.run SCENE``.
 
-Frames per second while a camera orbits, from the mouse to the picture, from the end of a drag to
-full resolution, from an edit to new light, and from the command to the first picture.
+Frames per second while a camera orbits, from the mouse to the image, from the end of a drag to full
+resolution, from an edit to the new illumination, and from the command to the first image.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import numpy as np
 from experiments.performance.viewer.browser import Browser, Window, viewer
 from experiments.performance.viewer.load import processor_seconds
 
-#: Error of the light, percent, at which nothing goes on while an edit is waited for.
+#: Relative error of the caches, percent, at which refinement is complete before an edit.
 ENOUGH = 50
 
 
 def main() -> None:
-    """Measures and prints; what is not known is for ``irrcache view``."""
+    """Measure and print; unknown options are passed to ``irrcache view``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=512, help="of the window, pixels")
     parser.add_argument("--repeats", type=int, default=5, help="of each measurement")
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def orbiting(window: Window, repeats: int) -> dict[str, float]:
-    """Pictures per second while the mouse is dragged as fast as the page takes it."""
+    """Measure images per second while the mouse is dragged as fast as the page allows."""
     rates, sizes, loads = [], [], []
     for _ in range(repeats):
         before, load = len(window.shown()), processor_seconds()
@@ -75,7 +75,9 @@ def orbiting(window: Window, repeats: int) -> dict[str, float]:
 
 
 def latency(window: Window, repeats: int) -> dict[str, float]:
-    """From a mouse event within a drag to the next picture, events a tenth of a second apart."""
+    """Measure from a mouse event in a drag to the next image, with events a tenth of a second
+    apart.
+    """
     found = []
     for _ in range(repeats):
         moved, shown = len(window.moves()), len(window.shown())
@@ -89,7 +91,7 @@ def latency(window: Window, repeats: int) -> dict[str, float]:
 
 
 def stopping(window: Window, repeats: int) -> dict[str, float]:
-    """From the last mouse event of a drag to a picture of full resolution."""
+    """Measure from the last mouse event of a drag to an image of full resolution."""
     found, size = [], window.page.viewport_size["width"]
     for _ in range(repeats):
         window.wait_for("at rest|final", 60)
@@ -104,8 +106,9 @@ def stopping(window: Window, repeats: int) -> dict[str, float]:
 
 
 def _seen(window: Window, shown: int, since: float, width: int = 0) -> float:
-    """When the first picture after so many, and after ``since``, was on the screen: a frame later
-    than it was uploaded.
+    """Return when the first image after this many, and after ``since``, was visible.
+
+    That is a frame later than it was uploaded.
     """
     for _ in range(200):
         for picture in window.shown()[shown:]:
@@ -116,16 +119,14 @@ def _seen(window: Window, shown: int, since: float, width: int = 0) -> float:
 
 
 def editing(window: Window, repeats: int) -> dict[str, float]:
-    """From an edit of the transfer function to a picture with the new light; where there is none,
-    of the density.
-    """
+    """Measure from an edit of the transfer function, or else the density, to the new image."""
     found = []
     label = "opacity" if window.field("opacity").count() else "density"
     if label == "opacity":
         window.choose("point", "4")
     window.enter("target error %", ENOUGH)
     for number in range(repeats):
-        window.wait_for("^final", 60)  # nothing else is shown from now on
+        window.wait_for("^final", 60)  # no other image is displayed from now on
         shown = len(window.shown())
         began = time.time()
         window.enter(label, round(0.2 + 0.05 * number, 2))

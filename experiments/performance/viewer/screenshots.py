@@ -1,4 +1,5 @@
-"""The README's pictures of the viewer: ``python -m experiments.performance.viewer.screenshots``.
+"""Screenshots of the viewer for the README: ``python -m
+experiments.performance.viewer.screenshots``.
 
 The thorax phantom with the panel open, and the same beside volpath after ``--seconds`` of it.
 """
@@ -16,12 +17,12 @@ VIEW = (
     "phantom:thorax:190,120,165", "--preset", "ct-chest", "-D", "hide_emitters=true",
     "-D", "radiance=2",
 )  # fmt: skip
-#: Of the light, percent.
+#: Relative error of the caches in percent.
 TARGET = 2
 
 
 def main() -> None:
-    """Takes them."""
+    """Take the screenshots."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=Path("output/viewer"))
     parser.add_argument("--seconds", type=float, default=60.0, help="for volpath")
@@ -41,7 +42,7 @@ def main() -> None:
 
 
 def take(window: Window, file: Path) -> None:
-    """A screenshot, without the notes of viser that come and go."""
+    """Take a screenshot without viser's temporary notifications."""
     window.page.add_style_tag(content="[class*=Notification] {display: none !important}")
     window.page.mouse.move(150, SIZE[1] - 5)
     window.page.screenshot(path=str(file), type="jpeg", quality=90)

@@ -1,9 +1,9 @@
-"""The viewer in use: ``python -m experiments.performance.viewer.usage --seconds 280 --seed 0
-SCENE``.
+"""Random usage of the viewer: ``python -m experiments.performance.viewer.usage --seconds 280
+--seed 0 SCENE``.
 
 A browser drags, zooms, edits, saves, reloads, compares, and opens and closes further windows, at
-random but by a seed. Leaves how much memory the viewer had, second by second, what was done, and
-what went wrong: tracebacks in its log, errors in the browsers' consoles.
+random from a seed. Records the memory of the viewer, second by second, the actions, and the errors:
+tracebacks in its log, errors in the browsers' consoles.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from experiments.performance.viewer.browser import Browser, Window, viewer
 from experiments.performance.viewer.load import viewer_memory
 from mitsuba_irrcache.view.picture import KINDS
 
-#: Windows at once, at most.
+#: Maximum number of windows.
 MOST_WINDOWS = 3
 SIZE = (512, 384)
-#: Seconds to wait for what should have come by then, on a machine that others use too.
+#: Timeout in seconds for an expected event, on a machine with other load.
 PATIENCE = 240
 
 
 @dataclass
 class Usage:
-    """What happened: ``memory`` as (seconds, MB), ``done`` how often by name."""
+    """The results: ``memory`` as (seconds, MB), and ``done`` with counts by name."""
 
     memory: list[tuple[float, float]] = field(default_factory=list)
     done: dict[str, int] = field(default_factory=dict)
@@ -39,9 +39,10 @@ class Usage:
 
     @property
     def growth(self) -> float:
-        """MB from the second quarter of the time to the last: in the first one there is much to be
-        done for the first time. Of each its tenth percentile: what lies above it comes and goes
-        with the light and the windows that there happen to be.
+        """Return the growth in MB from the second quarter of the time to the last.
+
+        The first quarter includes initialisations. The tenth percentile of each excludes temporary
+        memory of caches and windows.
         """
         seconds, sizes = np.array(self.memory).T
         part = seconds / seconds[-1]
@@ -50,7 +51,7 @@ class Usage:
 
 
 class User:
-    """Does things to an open viewer, at random."""
+    """Interact with an open viewer at random."""
 
     def __init__(self, browser: Browser, address: str, rng: np.random.Generator) -> None:
         self._browser, self._address, self._rng = browser, address, rng
@@ -64,7 +65,7 @@ class User:
         }  # fmt: skip
 
     def act(self) -> None:
-        """One thing, in one of the windows."""
+        """Do one action in one of the windows."""
         actions, weights = list(self._actions), np.array(list(self._actions.values()), float)
         action = actions[self._rng.choice(len(actions), p=weights / weights.sum())]
         window = self.windows[self._rng.integers(len(self.windows))]
@@ -72,77 +73,77 @@ class User:
         self.usage.done[action.__name__] = self.usage.done.get(action.__name__, 0) + 1
 
     def drag(self, window: Window) -> None:
-        """A drag, and time to rest after some."""
+        """Drag, and sometimes wait."""
         steps = int(self._rng.integers(3, 20))
         window.orbit(steps, float(self._rng.uniform(-4, 4)), 0.02, SIZE[0] / 3)
         if self._rng.random() < 0.3:
             window.wait_for("at rest|final", PATIENCE)
 
     def zoom(self, window: Window) -> None:
-        """In or out; as far in as into the medium."""
+        """Zoom in or out, at most into the medium."""
         window.page.mouse.move(SIZE[0] / 3, SIZE[1] / 2)
         window.zoom(int(self._rng.choice([-4, -2, 2, 4])))
 
     def opacity(self, window: Window) -> None:
-        """Another transfer function."""
+        """Change the transfer function."""
         window.enter("opacity", round(self._rng.uniform(0.05, 0.95), 2))
 
     def density(self, window: Window) -> None:
-        """Sometimes one that cannot be."""
+        """Change the density, sometimes to an invalid value."""
         window.enter("density", self._rng.choice(["0.5", "1", "2", "-3"]))
 
     def sun(self, window: Window) -> None:
-        """On and off."""
+        """Switch the sun on and off."""
         window.enter("sun", self._rng.choice(["0", "2", "5"]))
 
     def kind(self, window: Window) -> None:
-        """Something else is shown."""
+        """Display another quantity."""
         window.choose("show", str(self._rng.choice(KINDS)))
 
     def compare(self, window: Window) -> None:
-        """With volpath, or not any more."""
+        """Switch the comparison with volpath."""
         window.tick("compare with volpath")
 
     def preset(self, window: Window) -> None:
-        """A ready transfer function."""
+        """Select a preset of the transfer function."""
         window.choose("preset", str(self._rng.choice(["ct-bone", "ct-chest"])))
 
     def save(self, window: Window) -> None:
-        """All that can be kept."""
+        """Save all kinds of files."""
         name = window.page.get_by_role("button", name=re.compile("^(save|download)$"))
         if not name.is_visible():
-            window.page.get_by_text("Keep", exact=True).click()
+            window.page.get_by_text("Save", exact=True).click()
         name.click()
         window.page.get_by_text(re.compile("^(saved|downloaded) ")).first.wait_for(
             timeout=1000 * PATIENCE
         )
 
     def reload(self, window: Window) -> None:
-        """The page, anew."""
+        """Reload the page."""
         window.page.reload()
         window.wait_for("per pixel", PATIENCE)
 
     def open(self, _: Window) -> None:
-        """One window more."""
+        """Open another window."""
         if len(self.windows) < MOST_WINDOWS:
             self.windows.append(self._browser.open(self._address, SIZE))
             self.windows[-1].wait_for("per pixel", PATIENCE)
 
     def close(self, window: Window) -> None:
-        """One window less, but never none."""
+        """Close a window unless it is the last one."""
         if len(self.windows) > 1:
             self.leave(window)
             self.windows.remove(window)
 
     def leave(self, window: Window) -> None:
-        """Notes what a window has seen, and closes it."""
+        """Record the errors of a window, and close it."""
         self.usage.errors += window.errors
         self.usage.pictures += len(window.shown())
         window.page.close()
 
 
 def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path) -> Usage:
-    """Uses ``irrcache view`` with these arguments for so long; what it prints goes to ``log``."""
+    """Use ``irrcache view`` with these arguments for a time; its output goes to ``log``."""
     rng = np.random.default_rng(seed)
     with viewer(view, log) as address:
         user = User(browser, address, rng)
@@ -159,7 +160,7 @@ def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path)
 
 
 def main() -> None:
-    """Uses it, and tells; what is not known is for ``irrcache view``."""
+    """Run and report; unknown options are passed to ``irrcache view``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=600)
     parser.add_argument("--seed", type=int, default=0)

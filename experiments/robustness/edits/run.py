@@ -1,10 +1,10 @@
-"""Do edited scenes show what they hold? A table of edits and outcomes.
+"""Images after scene edits: a table of edits and outcomes.
 
     python -m experiments.robustness.edits.run
 
-Parameters are assigned plain values, three times in a row in one process. After each the image has
-to be that of an integrator which has not rendered before, to the last bit. An edit is "stale" where
-it is the image of before, and "wrong" where it is another one; edits of the camera must make no
+Parameters are assigned plain values, three times in a row in one process. After each the image must
+equal that of an integrator which has not rendered before, bit by bit. An edit is "stale" if the
+image is the previous one, and "wrong" if it is another one; edits of the camera must not rebuild a
 cache. Only Mitsuba's interface is used, so that the same file measures older versions as well:
 ``PYTHONPATH=<checkout> python <this file>``.
 """
@@ -65,7 +65,7 @@ SKY = {"type": "constant"}
 
 
 def scenes() -> dict[str, tuple[dict, list[tuple[str, Callable]]]]:
-    """Objects of a scene beside its camera, and its edits: a parameter's ending, and new values."""
+    """Return the objects of a scene, and its edits: a parameter's suffix, and new values."""
     cloud = {"type": "heterogeneous", "sigma_t": _grid(), "albedo": _rgb(0.9, 0.7, 0.5)}
     lamp = {
         "type": "rectangle",
@@ -151,7 +151,8 @@ def _outcomes(objects: dict, ending: str, new: Callable, solver: str) -> list[st
     )
     params, old, found = mi.traverse(scene), _image(scene), []
     (key,) = [k for k in params.keys() if k.endswith(ending)]
-    # No reference to the variable that is edited: it is freed, as in a script that assigns numbers.
+    # No reference to the edited variable remains, so it is freed, as in a script that assigns
+    # numbers.
     kind, cache = type(params[key]), scene.integrator().cache
     transform = hasattr(params[key], "inverse_transpose")
     original = np.array(params[key].matrix if transform else params[key])
@@ -170,7 +171,7 @@ def _outcomes(objects: dict, ending: str, new: Callable, solver: str) -> list[st
 
 
 def main() -> None:
-    """Prints the table; fails where an edit did not show."""
+    """Print the table; exit with 1 if an edit has not changed the image correctly."""
     right = total = 0
     print(f"| scene | parameter | {' | '.join(SOLVERS)} |\n|---|---|{'---|' * len(SOLVERS)}")
     for name, (objects, edits) in scenes().items():

@@ -1,8 +1,7 @@
-"""Command lines that nobody should type: each works, or prints one error and leaves nothing.
+"""Random command lines: each succeeds, or prints one error and writes no files.
 
-A case is a JSON list of arguments, so that it is tried like a file that was tampered with, in a
-folder of its own. What a command does for minutes, or until it is ended, is left out: the runs of
-``compare`` and the server of ``view``.
+A case is a JSON list of arguments, so that it is mutated and run like a damaged file, in a folder
+of its own. Long-running work is excluded: the runs of ``compare`` and the server of ``view``.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ VALID = (
     ["doctor", "-m", "llvm_ad_rgb", "--json"],
     ["--help"],
 )  # fmt: skip
-#: Options that may turn up anywhere, with a value or without.
+#: Options that are inserted anywhere, with a value or without.
 OPTIONS = [
     "-o", "-i", "-m", "-D", "-s", "--spp", "--seed", "--sensor", "--budget", "--error", "--density",
     "--preset", "--transfer-function", "--albedo", "--flip", "--crop", "--rescale", "--clip",
@@ -41,7 +40,7 @@ OPTIONS = [
     "--up", "--reference", "--reference-spp", "--reference-seconds", "--exposure", "--import",
     "--overwrite", "--host", "--port", "--none-such", "-v", "--json",
 ]  # fmt: skip
-#: Numbers between 10^4 and 2^32 are work that somebody may want.
+#: Numbers between 10^4 and 2^32 are valid but would take too long.
 WRONG = [
     "", " ", "-", "--", "-1", "0", "0.5", "1e400", "-1e400", "nan", "inf", "4294967296", "9" * 30,
     "x", "=", "a=", "=b", "a=b=c", "a=1,b=2", "{", "}", "irrcache{", "irrcache}", "irrcache{}",
@@ -53,18 +52,18 @@ WRONG = [
     "/", "/dev/null", "/proc/self/status", "ü", "\udc80", "%s%n", "$x", "`x`", "a\nb", "x" * 5000,
     "llvm_ad_mono", "scalar_rgb", "cuda_ad_rgb", "llvm_ad_spectral", "uint64", "float32", "object",
 ]  # fmt: skip
-#: Of these, others than their own values are places to write to.
+#: Values of these options, unless listed, are paths to write to.
 _OUTPUTS = ("-o", "--output", "--references")
-#: Modules that are imported because somebody says so are not ours.
+#: Modules imported on request may have any effect.
 _CODE = ("--import",)
 
 
 class WorkBegins(Exception):  # noqa: N818
-    """The command has understood its arguments and is about to work."""
+    """Raised instead of long-running work after the arguments have been accepted."""
 
 
 def mutated_command(content: bytes, rng: np.random.Generator) -> bytes:
-    """Arguments some of which are wrong."""
+    """Return arguments of which some are wrong."""
 
     def one(values) -> str:
         return values[int(rng.integers(0, len(values)))]
@@ -87,14 +86,14 @@ def mutated_command(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def write_valid(path: Path) -> None:
-    """The case that nothing is wrong with."""
+    """Write the valid case."""
     path.write_text(json.dumps(VALID[0]))
 
 
 def run_case(path: Path) -> None:
-    """Runs the command line in this file in a folder of its own.
+    """Run the command line in this file in a folder of its own.
 
-    Raises IrrcacheError if it ends with one message; AssertionError for whatever is not right.
+    Raises IrrcacheError if it ends with one message; AssertionError for any other failure.
     """
     arguments = json.loads(path.read_text())
     with own_folder():
@@ -112,7 +111,7 @@ def _run(arguments: list[str]) -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             try:
                 status = main(arguments)
-            except SystemExit as end:  # argparse, which has printed what is wrong
+            except SystemExit as end:  # argparse, which has printed the error
                 status = end.code or 0
             except WorkBegins:
                 status = 0
@@ -131,7 +130,7 @@ def _run(arguments: list[str]) -> None:
 
 @contextlib.contextmanager
 def _without_long_work():
-    """Commands that would work on for long end where they begin to."""
+    """Make long-running commands end where their work begins."""
     from mitsuba_irrcache.compare import command as compare
     from mitsuba_irrcache.view import command as view
 

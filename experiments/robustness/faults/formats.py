@@ -1,5 +1,6 @@
-"""Valid files of all formats, small ones, and their readers; each reader is a plain function, since
-it is sent to another process.
+"""Small valid files of all formats, and their readers.
+
+Each reader is a plain function, since it is sent to another process.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from mitsuba_irrcache.volumes.transfer import load_preset, load_transfer_functio
 
 @dataclass(frozen=True)
 class Format:
-    """How to make a valid file, damage it, and read it."""
+    """Functions that write, damage and read a file of a format."""
 
     name: str
     make: Callable[[Path], None]
@@ -29,7 +30,7 @@ class Format:
 
 
 def read_cache(path: Path) -> None:
-    """Loads a cache, and uses all that it holds."""
+    """Load a cache, and access all its contents."""
     import mitsuba as mi
 
     if mi.variant() != "llvm_ad_rgb":
@@ -38,7 +39,7 @@ def read_cache(path: Path) -> None:
 
     IrradianceCache.description_of(path)
     cache = IrradianceCache.load(path)
-    if cache.grid.voxel_count <= 1 << 20:  # else the scene's own grid is another one
+    if cache.grid.voxel_count <= 1 << 20:  # otherwise the scene's own grid differs
         field = cache.field()
         assert np.isfinite(np.array(field.data)).all()
 
@@ -67,7 +68,7 @@ def _write_vol(path: Path) -> None:
 
 
 def _write_dicom(path: Path) -> None:
-    """A slice; the other ones stay as they are."""
+    """Write a slice; the other ones are unchanged."""
     writer = SimpleITK.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
     for index in range(3):
@@ -87,7 +88,7 @@ def _write_dicom(path: Path) -> None:
 
 
 def read_series(path: Path) -> object:
-    """The folder that a slice is in."""
+    """Read the folder that contains a slice."""
     return read_volume(path.parent)
 
 

@@ -1,7 +1,7 @@
-"""Files that were tampered with: each is read as what it is, or refused with an IrrcacheError.
+"""Damaged files: each is read, or refused with an IrrcacheError.
 
-Readers run in a process of their own, which is allowed so much memory and time: a crash or a hang
-is counted, and the next file is tried.
+Readers run in a process of their own with limited memory and time: a crash or a hang is counted,
+and the next file is tried.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
 
-#: Bytes of address space that reading a file of some kilobytes may take beyond what there was.
+#: Bytes of additional address space for reading a file of some kilobytes.
 MEMORY = 4 << 30
-#: Seconds for one file.
+#: Time limit in seconds for one file.
 PATIENCE = 20.0
 
 
 @dataclass
 class Tally:
-    """What became of the files of one format; ``errors`` are those that are no IrrcacheError."""
+    """Outcomes for the files of one format; ``errors`` are those other than IrrcacheError."""
 
     tried: int = 0
     read: int = 0
@@ -46,12 +46,12 @@ class Tally:
         return bool(self.crashes or self.hangs or self.errors)
 
     def row(self) -> dict:
-        """As JSON takes it."""
+        """Return the tally for JSON."""
         return asdict(self)
 
 
 def mutated(content: bytes, rng: np.random.Generator) -> bytes:
-    """A file in which something is wrong."""
+    """Return a damaged file."""
     data, size = bytearray(content), len(content)
     for _ in range(rng.integers(1, 4)):
         start = int(rng.integers(0, max(len(data), 1)))
@@ -80,8 +80,9 @@ def mutated(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def mutated_gzip(content: bytes, rng: np.random.Generator) -> bytes:
-    """A compressed file that is damaged, or that was compressed after something was wrong in it:
-    of a stream that does not match its checksum nothing is read.
+    """Return a compressed file that was damaged before or after compression.
+
+    A stream that does not match its checksum would not be read any further.
     """
     if rng.random() < 0.3:
         return mutated(content, rng)
@@ -89,7 +90,7 @@ def mutated_gzip(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def lying_cache(content: bytes, rng: np.random.Generator) -> bytes:
-    """A cache file that is whole, but for one thing that it says."""
+    """Return a valid cache file with one inconsistent entry."""
     if rng.random() < 0.3:
         return mutated(content, rng)
     arrays = dict(np.load(io.BytesIO(content)))
@@ -137,7 +138,7 @@ def lying_cache(content: bytes, rng: np.random.Generator) -> bytes:
 
 @contextlib.contextmanager
 def own_folder() -> Iterator[None]:
-    """An empty folder to work in; whatever a case writes under a relative name ends there."""
+    """Work in a new empty folder, in which relative file names end up."""
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
@@ -148,7 +149,7 @@ def own_folder() -> Iterator[None]:
 
 
 def files_here() -> set[str]:
-    """The files in the folder that is worked in, and below it."""
+    """Return the files in and below the working folder."""
     return {str(p) for p in Path().rglob("*") if p.is_file()}
 
 
@@ -159,7 +160,7 @@ def try_files(
     count: int,
     folder: Path,
 ) -> Tally:
-    """Reads ``count`` mutants of the file ``valid``, written to ``folder`` under its name."""
+    """Read ``count`` mutants of the file ``valid``, written to ``folder`` under its name."""
     tally, first = Tally(), 0
     context = multiprocessing.get_context("spawn")
     while first < count:
@@ -173,10 +174,10 @@ def try_files(
 
 
 def _listen(pipe, process, tally: Tally, first: int, count: int) -> int:
-    """Follows a worker to its end, or to that of a file that it does not survive; what to go on
-    with.
+    """Receive a worker's results until it ends, or until a file crashes it; return the next
+    file.
     """
-    index, patience = first - 1, 10 * PATIENCE  # it starts with imports
+    index, patience = first - 1, 10 * PATIENCE  # the worker starts with imports
     try:
         while index < count - 1:
             if not pipe.poll(patience):
@@ -189,7 +190,7 @@ def _listen(pipe, process, tally: Tally, first: int, count: int) -> int:
             tally.peak_megabytes = max(tally.peak_megabytes, peak)
             if error:
                 tally.errors.append(f"mutant {index}: {error}")
-        process.join(PATIENCE)  # to its own end: what is killed leaves semaphores behind
+        process.join(PATIENCE)  # let it exit: killed processes leave semaphores behind
         return count
     except EOFError:
         tally.crashes += 1
@@ -204,8 +205,8 @@ def _worker(valid, mutate, read, first, count, folder, pipe) -> None:
     content = valid.read_bytes()
     target = folder / valid.name
     silent = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(silent, 2)  # libraries tell their troubles to the terminal
-    read(valid)  # imports all that it needs
+    os.dup2(silent, 2)  # libraries print messages to the terminal
+    read(valid)  # import everything in advance
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -216,7 +217,7 @@ def _worker(valid, mutate, read, first, count, folder, pipe) -> None:
             read(target)
         except IrrcacheError:
             outcome = "refused"
-        except Exception as other:  # what a reader should not let through
+        except Exception as other:  # exceptions that a reader should not raise
             outcome, error = "", f"{type(other).__name__}: {str(other)[:200]}"
         peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024
         pipe.send((index, outcome, error, peak))

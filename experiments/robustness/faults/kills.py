@@ -1,4 +1,4 @@
-"""Processes that are killed while they fill and write a cache: is what was there still there?"""
+"""Processes killed while they fill and write a cache: earlier samples must survive."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ SCENE = """<scene version="3.0.0">
     <emitter type="constant"/>
 </scene>
 """
-#: Voxels along each side: a file of 18 MB, which takes a while to be written.
+#: Voxels along each side: a file of 18 MB, which takes some time to write.
 RESOLUTION = 64
 
 
 @dataclass
 class Toll:
-    """What became of so many kills: those in the middle of a write, caches that were lost (the file
-    is damaged, or has fewer samples than before), and runs that did not go on from what there was.
+    """Outcomes of the kills: during a write, lost caches, and runs that did not continue.
+
+    A cache is lost if its file is damaged, or has fewer samples than before.
     """
 
     kills: int = 0
@@ -47,8 +48,9 @@ class Toll:
 
 
 def kill_renders(folder: Path, rounds: int, seed: int = 0) -> Toll:
-    """Starts ``irrcache render`` with one cache file again and again, asks for one batch more each
-    time, and kills it: in turns somewhere on its way, and while it writes.
+    """Start ``irrcache render`` repeatedly with one cache file, and kill it.
+
+    Each run requests one batch more; in turns it is killed at any time, and while it writes.
     """
     rng, toll = np.random.default_rng(seed), Toll()
     (folder / "scene.xml").write_text(SCENE)
@@ -94,7 +96,7 @@ def _until_writing(process: subprocess.Popen, folder: Path) -> None:
 
 
 def _samples(file: Path) -> int:
-    """In a file that is whole; -1 for one that is not."""
+    """Return the samples in a valid file; -1 for a damaged one."""
     if not file.exists():
         return 0
     try:

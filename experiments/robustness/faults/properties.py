@@ -1,7 +1,7 @@
-"""Properties of the integrator that nobody should write: each scene renders, or is refused by name.
+"""Random properties of the integrator: each scene renders, or is refused by name.
 
-A case is a JSON text, so that it is tried like a file that was tampered with: through `load_dict`
-or as XML, rendered with few pixels.
+A case is a JSON text, so that it is mutated like a file: through `load_dict` or as XML, rendered
+with few pixels.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from experiments.robustness.faults.fuzz import files_here, own_folder
 from mitsuba_irrcache.errors import IrrcacheError, essence
 
-#: Work little and end soon, whatever else is changed.
+#: Limits that make rendering fast whatever else is changed.
 VALID = {"solver": "sweep", "resolution": 4, "cache_spp": 32, "timeout": 0.5}
-#: Every property, with values that are its own.
+#: Every property with valid values.
 PROPERTIES = {
     "max_depth": [-1, 0, 1, 2, 5],
     "rr_depth": [1, 5, 100],
@@ -47,7 +47,7 @@ UNKNOWN = ["", " ", "max_dept", "Solver", "spp", "type ", "ü", "a.b", "_arg_0",
 
 
 def mutated_properties(content: bytes, rng: np.random.Generator) -> bytes:
-    """A case in which something is wrong, or nothing."""
+    """Return a case with wrong properties, or a valid one."""
 
     def one(values: list) -> object:
         return values[int(rng.integers(0, len(values)))]
@@ -62,15 +62,15 @@ def mutated_properties(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def write_valid(path: Path) -> None:
-    """The case that nothing is wrong with."""
+    """Write the valid case."""
     path.write_text(json.dumps({"how": "dict", "properties": VALID}))
 
 
 def render_case(path: Path) -> None:
-    """Renders the case in this file, in a folder of its own, where its `cache_file` may appear.
+    """Render the case in this file, in a folder of its own, where its `cache_file` may appear.
 
-    Raises IrrcacheError for what is refused by a message that names a property or its value; what
-    is raised otherwise, pictures that are none, and other files are faults.
+    Raises IrrcacheError if it is refused by a message that names a property or its value; other
+    exceptions, invalid images, and other files are failures.
     """
     case = json.loads(path.read_text())
     with own_folder():
@@ -105,7 +105,7 @@ def _render(case: dict) -> None:
 
 
 def _names(message: str, properties: dict) -> bool:
-    """Whether a message tells what to look at, in one paragraph."""
+    """Return whether a one-paragraph message names a property or value."""
     changed = [
         text
         for name, value in properties.items()
@@ -116,7 +116,9 @@ def _names(message: str, properties: dict) -> bool:
 
 
 def _named(value: object) -> str:
-    """What Mitsuba calls a nested object: a colour by its numbers, others by their plugin."""
+    """Return Mitsuba's notation of a nested object: a colour by its numbers, others by their
+    plugin.
+    """
     if not isinstance(value, dict):
         return ""
     return _colour(value) if value["type"] == "rgb" else value["type"]
@@ -127,7 +129,7 @@ def _colour(value: dict) -> str:
 
 
 def _xml(properties: dict) -> str:
-    """The scene of `worlds.scene` as text."""
+    """Return the scene of `worlds.scene` as XML."""
     body = "".join(_element(name, value) for name, value in properties.items())
     return f"""<scene version="3.0.0">
     <integrator type="irrcache">{body}</integrator>
@@ -143,7 +145,7 @@ def _xml(properties: dict) -> str:
 
 
 def _element(name: str, value: object) -> str:
-    """A property as XML; of no kind that there is, as text."""
+    """Return a property as XML; as a string if its type has no element."""
     if isinstance(value, dict):
         kind = value["type"]
         if kind == "rgb":

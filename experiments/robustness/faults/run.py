@@ -1,11 +1,11 @@
-"""Faults from outside: kills while caches are written, files that were tampered with, properties
-of scenes and command lines that nobody should write.
+"""Faults from outside: processes killed while caches are written, damaged files, random
+properties and random command lines.
 
     python -m experiments.robustness.faults.run [--kills 60] [--files 1000]
         [-o output]      (make stress)
 
-Writes output/faults/results.json and prints both tables. Ends with 1 if a cache was lost, or a file
-crashed or hung a reader or raised anything but an IrrcacheError.
+Writes output/faults/results.json and prints both tables. Exits with 1 if a cache was lost, or if a
+reader crashed, hung or raised anything but an IrrcacheError.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mitsuba_irrcache.machine.llvm import require_llvm
 
 
 def main() -> int:
-    """Runs both and prints what came out."""
+    """Run both parts and print the results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -60,7 +60,7 @@ def main() -> int:
 
 
 def fuzz(format_: Format, count: int) -> Tally:
-    """Mutants of a valid file; nothing but the file itself may appear in its folder."""
+    """Test mutants of a valid file; only the file itself may appear in its folder."""
     with tempfile.TemporaryDirectory() as folder:
         valid = Path(folder) / "valid" / format_.name
         target = Path(folder) / "mutants"
@@ -78,7 +78,7 @@ def fuzz(format_: Format, count: int) -> Tally:
 
 
 def tabulated(tallies: dict[str, Tally]) -> Table:
-    """A line for each format."""
+    """Tabulate a row for each format."""
     rows = [
         [name, *map(str, (t.tried, t.read, t.refused, t.crashes, t.hangs, len(t.errors),
                           t.peak_megabytes))]

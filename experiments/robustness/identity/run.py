@@ -1,12 +1,12 @@
-"""Renders small scenes of all kinds, and compares the images bit by bit with those of another run.
+"""Render small scenes of all kinds, and compare the images bit by bit with those of another run.
 
     python -m experiments.robustness.identity.run FOLDER [--against OTHER_FOLDER] [--only PART]
 
 Writes FOLDER/<scene>-<solver>.npy, one image for each solver that supports the scene. With
 ``--against``, every image is compared with the one of the same name in OTHER_FOLDER; the script
-prints those that differ, by how much, and ends with 1 if there are any. To be run before and after
-a change that must not change results, for instance one of the structure of the code, on the same
-machine with the same versions of Mitsuba and Dr.Jit.
+prints the differences, and exits with 1 if there are any. To be run before and after a change that
+must not affect results, for instance a refactoring, on the same machine with the same versions of
+Mitsuba and Dr.Jit.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ SOLVERS = ("path", "sweep")
 SMALL = {"resolution": 16, "cache_spp": 32}
 #: Enough voxels for several multigrid levels, and for a kernel launch for each pair of ordinates.
 FINE = {"resolution": 48, "solver": "sweep", "cache_spp": 32}
-#: Every image beside the radiance.
+#: All AOVs.
 AOVS = "colour, illumination, background, transmittance, depth, noise, bias"
 
 
 def homogeneous(sigma_t: float, **more) -> dict:
-    """A homogeneous medium in the cube [-1, 1]^3."""
+    """Return a homogeneous medium in the cube [-1, 1]^3."""
     interior = {"type": "homogeneous", "sigma_t": sigma_t, "albedo": kinds.colour(0.95, 0.9, 0.8)}
     return {"box": kinds.box(interior | more)}
 
 
 def cloud(*emitters: dict, **more) -> dict:
-    """A heterogeneous medium with these emitters."""
+    """Return a heterogeneous medium with these emitters."""
     lights = {f"light{i}": emitter for i, emitter in enumerate(emitters)}
     return {"box": kinds.box(kinds.smoke(16, **more))} | lights
 
 
 def apart(scale: float) -> dict:
-    """Two balls at opposite corners of the cube [-1, 1]^3, most of which is empty."""
+    """Return two balls at opposite corners of the cube [-1, 1]^3, most of which is empty."""
     places = np.moveaxis(np.indices((48,) * 3) + 0.5, 0, -1) / 24 - 1
     distances = [np.linalg.norm(places - centre, axis=-1) for centre in (-0.6, 0.6)]
     density = np.clip(1.5 - 4 * np.minimum(*distances), 0, 1)[..., None]
@@ -54,30 +54,30 @@ def apart(scale: float) -> dict:
 
 
 def environment() -> dict:
-    """An environment map that differs in all directions."""
+    """Return an environment map that differs in all directions."""
     values = np.random.default_rng(1).uniform(0.1, 2.0, (8, 16, 3)).astype(np.float32)
     return {"type": "envmap", "bitmap": mi.Bitmap(values)}
 
 
 def spot() -> dict:
-    """A spot light whose beam crosses the medium."""
+    """Return a spot light whose cone intersects the medium."""
     look = mi.ScalarTransform4f().look_at([-2.5, 1.5, -1.0], [0, 0, 0], [0, 1, 0])
     return {"type": "spot", "to_world": look, "cutoff_angle": 18.0, "intensity": 60.0}
 
 
 def point() -> dict:
-    """A point light."""
+    """Return a point light."""
     return {"type": "point", "position": [1.4, 1.6, -0.8], "intensity": kinds.colour(9.0, 7.0, 5.0)}
 
 
 def lamp() -> dict:
-    """An area emitter above the medium."""
+    """Return an area emitter above the medium."""
     area = {"emitter": {"type": "area", "radiance": 12.0}}
     return {"lamp": kinds.wall((0, 1.8, 0), (0, 0, 0.001), 0.5) | area}
 
 
 def room() -> dict:
-    """A room that is full of thin fog, with the camera inside."""
+    """Return a room full of thin fog, with the camera inside."""
     fog = {"type": "homogeneous", "sigma_t": 0.4, "albedo": 0.9, "id": "fog"}
     reference = {"type": "ref", "id": "fog"}
     look = mi.ScalarTransform4f().look_at([0.3, 0.4, -1.2], [0, 0, 0.4], [0, 1, 0])
@@ -89,18 +89,20 @@ def room() -> dict:
 
 
 def glass() -> dict:
-    """A medium within glass, which no cache supports: Mitsuba's own integrator renders it."""
+    """Return a medium within glass, which no cache supports: Mitsuba's own integrator renders
+    it.
+    """
     inside = homogeneous(2.0)
     inside["box"]["bsdf"] = {"type": "dielectric"}
     return inside | {"sky": kinds.sky()}
 
 
 def hg(g: float) -> dict:
-    """A phase function."""
+    """Return a phase function."""
     return {"type": "hg", "g": g}
 
 
-#: Scenes, and properties of the integrator that belong to them.
+#: Scenes, and the integrator properties for them.
 SCENES: dict[str, tuple[Callable[[], dict], dict]] = {
     "heterogeneous": (lambda: cloud(kinds.sky(), kinds.sun()), {}),
     "homogeneous": (lambda: homogeneous(2.0) | {"sky": kinds.sky()}, {}),
@@ -144,7 +146,7 @@ SCENES: dict[str, tuple[Callable[[], dict], dict]] = {
 
 
 def images(only: str) -> Iterator[tuple[str, np.ndarray]]:
-    """The name and the image of each scene with ``only`` in its name and each solver."""
+    """Yield name and image of each scene with ``only`` in its name, for each solver."""
     for name, (build, properties) in SCENES.items():
         for solver in (properties.get("solver"),) if "solver" in properties else SOLVERS:
             title = f"{name}-{solver}"
@@ -158,17 +160,17 @@ def images(only: str) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def rendered(objects: dict, properties: dict) -> np.ndarray:
-    """An image with all channels."""
+    """Return an image with all channels."""
     scene = {"type": "scene", "sensor": kinds.sensor()} | objects
     scene["sensor"]["film"] |= {"width": SIZE, "height": SIZE}
     scene["integrator"] = {"type": "irrcache", "rr_depth": 50} | properties
     loaded = mi.load_dict(scene)
-    loaded.integrator().prepare(loaded)  # raises the error itself, where mi.render wraps it
+    loaded.integrator().prepare(loaded)  # raises the original error, which mi.render would wrap
     return np.array(mi.render(loaded, spp=SPP, seed=3))
 
 
 def difference(image: np.ndarray, file: Path) -> str | None:
-    """How ``image`` differs from the one in ``file``; None where all bits are the same."""
+    """Describe how ``image`` differs from the one in ``file``; None if all bits agree."""
     if not file.exists():
         return "has no counterpart"
     other = np.load(file)
@@ -183,7 +185,7 @@ def difference(image: np.ndarray, file: Path) -> str | None:
 
 
 def main() -> int:
-    """Renders, saves and compares."""
+    """Render, save and compare."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

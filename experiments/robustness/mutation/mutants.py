@@ -1,6 +1,4 @@
-"""Faults as they are made: each a line of the library that is wrong in one place, with the tests
-that should say so.
-"""
+"""Typical faults: each changes one line of the library, and lists the tests that should fail."""
 
 from __future__ import annotations
 
@@ -8,16 +6,16 @@ from dataclasses import dataclass
 
 CLOSED_FORMS = "tests/correctness/test_closed_forms.py"
 SWEEP = "tests/system/test_sweep.py"
-UNBIASED = "tests/system/test_unbiased.py"
+UNBIASED = "tests/system/test_path_is_unbiased.py"
 PROJECTION = "tests/unit/render/test_raymarch.py"
 CACHE = "tests/unit/cache/test_volume.py"
 MOMENTS = "tests/unit/solvers/discrete_ordinates/test_moments.py"
-PHASE = "tests/system/test_phase.py"
+PHASE = "tests/system/test_anisotropic_scattering.py"
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """``old``, which occurs once in ``file`` (of mitsuba_irrcache), is replaced by ``new``."""
+    """Replace ``old``, which occurs once in ``file`` (of mitsuba_irrcache), by ``new``."""
 
     name: str
     file: str
@@ -30,8 +28,8 @@ MUTANTS = (
     Mutant(
         "a factor 4 pi dropped (projection)",
         "render/raymarch.py",
-        "albedo * phi * dr.inv_four_pi, known",
-        "albedo * phi, known",
+        "albedo * phi * dr.inv_four_pi, extras",
+        "albedo * phi, extras",
         (CLOSED_FORMS,),
     ),
     Mutant(
@@ -156,7 +154,7 @@ MUTANTS = (
     Mutant(
         "the background in front of the medium",
         "render/camera.py",
-        "background = self._left_of(transmittance, ray.d) * background + emitted",
+        "background = self._attenuation(transmittance, ray.d) * background + emitted",
         "background = background + emitted",
         (CLOSED_FORMS,),
     ),
@@ -205,8 +203,8 @@ MUTANTS = (
     Mutant(
         "emitters counted twice: sampled and met (surfaces)",
         "transport/path.py",
-        "share = dr.select(sampled, power_heuristic(pdf, density), 1)",
-        "share = mi.Float(1)",
+        "mis_weight = dr.select(sampled, power_heuristic(pdf, density), 1)",
+        "mis_weight = mi.Float(1)",
         ("tests/system/test_surfaces.py",),
     ),
     Mutant(
@@ -214,7 +212,7 @@ MUTANTS = (
         "media/phase.py",
         "found.p, found.wi = p, -direction",
         "found.p, found.wi = p, direction",
-        ("tests/system/test_phase.py",),
+        ("tests/system/test_anisotropic_scattering.py",),
     ),
     Mutant(
         "standard errors of samples, not of batches",
@@ -249,7 +247,7 @@ MUTANTS = (
         "solvers/discrete_ordinates/solver.py",
         "else irradiance[channel] * self._inverse_square_mean",
         "else irradiance[channel]",
-        ("tests/system/test_lamps.py",),
+        ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "light from the opposite side (moments)",
@@ -268,8 +266,8 @@ MUTANTS = (
     Mutant(
         "light of narrow lights twice (moments)",
         "cache/angular.py",
-        "light = light - own",
-        "light = light - 0 * own",
+        "radiance = radiance - own",
+        "radiance = radiance - 0 * own",
         (PHASE,),
     ),
     Mutant(
@@ -282,15 +280,16 @@ MUTANTS = (
     Mutant(
         "wide lamps as narrow as points (directional)",
         "cache/angular.py",
-        "left *= ratio",
-        "left *= 1",
+        "attenuation *= ratio",
+        "attenuation *= 1",
         ("tests/unit/cache/test_angular.py",),
     ),
     Mutant(
         "forward peaks of other media taken away, too",
-        "transport/path.py",
-        "grid if grid is medium else grid.with_peak",
-        "grid",
+        "scene/compile.py",
+        "tuple(grid for grid in grids if grid is not medium)",
+        "tuple(without_forward_peak(g) if g.phase.has_peak else g for g in grids if g is not "
+        "medium)",
         ("tests/unit/media/test_delta_m.py",),
     ),
     Mutant(
@@ -324,15 +323,15 @@ MUTANTS = (
     Mutant(
         "interpolated roots do not keep the light",
         "cache/volume.py",
-        "values = conserving(self.grid, values, marked(self.grid, self.active), channels)",
+        "values = conserving(self.grid, values, known, channels, share)",
         "values = values + 0",
-        ("tests/system/test_lamps.py",),
+        ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "interpolated roots keep half of the light that bends",
         "cache/conservative.py",
-        "bend(spread) / 6",
-        "bend(spread) / 12",
+        "second_difference(smoothed) / 6",
+        "second_difference(smoothed) / 12",
         ("tests/unit/cache/test_conservative.py",),
     ),
     Mutant(

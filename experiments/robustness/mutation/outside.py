@@ -1,13 +1,13 @@
-"""Mutants that people made who had not seen the tests, and that no test of the time detected."""
+"""Mutants by people who had not seen the tests, and that no test detected at that time."""
 
 from __future__ import annotations
 
 from experiments.robustness.mutation.mutants import Mutant
 
-NEIGHBOURS = "tests/unit/cache/test_conservative_at_every_voxel.py"
+NEIGHBOURS = "tests/unit/cache/test_conservative_symmetry_and_borders.py"
 FILTER = "tests/unit/render/test_denoise_symmetry_and_rejection.py"
 ERRORS = "tests/unit/cache/test_uncertainty_of_lookups.py"
-SIMILARITY = "tests/unit/media/test_delta_m_narrow_lights.py"
+SIMILARITY = "tests/unit/media/test_delta_m_narrow_emitters.py"
 SEGMENTS = "tests/unit/render/test_raymarch_segments.py"
 
 OUTSIDE = (
@@ -70,8 +70,8 @@ OUTSIDE = (
     Mutant(
         "light in a forward peak is never scattered",
         "media/delta_m.py",
-        "medium.unscattered_exponent = _mean(sigma_t) / remaining if remaining else 1.0",
-        "medium.unscattered_exponent = 1.0",
+        "unscattered_exponent=_mean(sigma_t) / remaining if remaining else 1.0,",
+        "unscattered_exponent=1.0,",
         (SIMILARITY,),
     ),
     Mutant(
@@ -84,8 +84,8 @@ OUTSIDE = (
     Mutant(
         "steps of 64 where little light is left",
         "render/raymarch.py",
-        "dr.select(left > COARSEST * sofar, stride, 4)",
-        "dr.select(left > COARSEST * sofar, stride, 64)",
+        "dr.select(remaining > COARSEST * accumulated, stride, 4)",
+        "dr.select(remaining > COARSEST * accumulated, stride, 64)",
         (SEGMENTS,),
     ),
     Mutant(

@@ -1,10 +1,10 @@
-"""Does the test suite see faults? Each mutant in a copy of the project, against those tests of
-``make test`` that should catch it.
+"""Mutation tests: apply each mutant to a copy of the project, and run the tests that should
+fail.
 
     python -m experiments.robustness.mutation.run [--only PART_OF_A_NAME] [--force] [-o output]
 
-Writes output/mutation/results.json, a row for each mutant, and prints the table: caught or not, by
-which test. Ends with 1 if one survives.
+The tests are part of ``make test``. Writes output/mutation/results.json, a row for each mutant, and
+prints the table: whether and by which test it was detected. Exits with 1 if one survives.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ALL = (*MUTANTS, *OUTSIDE, *SLIPS)
 
 
 def main() -> int:
-    """Runs the mutants that there is no result of yet."""
+    """Run the mutants without a result."""
     parser = parser_of(__doc__)
     parser.add_argument("--only", default="", help="mutants with this in their names")
     args = parser.parse_args()
@@ -54,7 +54,7 @@ def main() -> int:
 
 
 def verdict(mutant: Mutant) -> dict:
-    """The first test that fails with ``mutant``."""
+    """Return the first test that fails with ``mutant``."""
     with tempfile.TemporaryDirectory() as folder:
         copy = copied(Path(folder))
         apply(mutant, copy / "mitsuba_irrcache")
@@ -71,7 +71,7 @@ def verdict(mutant: Mutant) -> dict:
 
 
 def copied(folder: Path) -> Path:
-    """A copy of the project that is imported from where it is."""
+    """Create a copy of the project that is imported from its own folder."""
     ignored = shutil.ignore_patterns("__pycache__", *MAPPED)
     for part in PARTS:
         source = PROJECT / part
@@ -85,16 +85,16 @@ def copied(folder: Path) -> Path:
 
 
 def apply(mutant: Mutant, package: Path) -> None:
-    """Changes the one place; raises ValueError where it is not there, or not the only one."""
+    """Change the only occurrence; raise ValueError if there is none or more than one."""
     file = package / mutant.file
-    text = file.read_text()
+    text = file.read_text(encoding="utf-8")
     if text.count(mutant.old) != 1:
         raise ValueError(f'{mutant.file} has {text.count(mutant.old)} times "{mutant.old}"')
     file.write_text(text.replace(mutant.old, mutant.new))
 
 
 def tabulated(rows: dict[str, dict]) -> Table:
-    """A line for each mutant."""
+    """Tabulate a row for each mutant."""
     cells = [[name, row["by"].removeprefix("tests/")] for name, row in rows.items()]
     return Table("Mutants", ["mutant", "caught by"], cells)
 

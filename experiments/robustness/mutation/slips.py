@@ -1,23 +1,23 @@
-"""Mutants that an ordinary slip makes, spread over all modules: an index off by one, a wrong sign,
-a wrong neighbour, a missing factor, exchanged axes, a normalisation for cubic voxels only.
+"""Mutants by ordinary mistakes in all modules: an index off by one, a wrong sign, a wrong
+neighbour, a missing factor, exchanged axes, a normalisation for cubic voxels only.
 """
 
 from __future__ import annotations
 
 from experiments.robustness.mutation.mutants import CACHE, PROJECTION, UNBIASED, Mutant
 
-BOUNDS = "tests/system/test_no_access_out_of_bounds.py"
+BOUNDS = "tests/system/test_out_of_bounds_access.py"
 LATTICE = "tests/unit/solvers/discrete_ordinates/test_tracks.py"
 SCATTERING = "tests/unit/solvers/discrete_ordinates/test_multigrid.py"
 LINE_DIRECTIONS = "tests/unit/solvers/discrete_ordinates/test_directions_of_incoming_radiance.py"
-SKIES = "tests/unit/solvers/discrete_ordinates/test_incident.py"
+SKIES = "tests/unit/solvers/discrete_ordinates/test_distant_illumination.py"
 COARSER = "tests/unit/solvers/discrete_ordinates/test_multigrid_levels.py"
 MEANS = "tests/unit/solvers/discrete_ordinates/test_resampling_to_larger_voxels.py"
 LAMPS = "tests/unit/lights/test_falloff.py"
 SURFACES = "tests/system/test_surfaces.py"
-AMONG_SURFACES = "tests/system/test_sweep_among_surfaces.py"
+AMONG_SURFACES = "tests/system/test_sweep_with_surfaces.py"
 EMISSION = "tests/system/test_emission.py"
-LAYERS = "tests/system/test_layers.py"
+LAYERS = "tests/system/test_aovs_and_filter.py"
 GRID = "tests/unit/grids/test_grid.py"
 MACROCELLS = "tests/unit/grids/test_majorants.py"
 VOLUME_FILES = "tests/unit/volumes/test_readers.py"
@@ -178,7 +178,7 @@ SLIPS = (
         "render/raymarch.py",
         "self.falloff.means(lamps, t, end)",
         "self.falloff.means(lamps, near, end)",
-        ("tests/system/test_lamps.py",),
+        ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "emission of a segment bent to the wrong side",
@@ -253,8 +253,8 @@ SLIPS = (
     Mutant(
         "emission beyond the wall of a macrocell (tracking)",
         "transport/tracking.py",
-        "end = dr.minimum(dr.select(leaves, wall, candidate), shines_to)",
-        "end = dr.minimum(candidate, shines_to)",
+        "end = dr.minimum(dr.select(exits_cell, cell_exit, candidate), emission_far)",
+        "end = dr.minimum(candidate, emission_far)",
         (EMISSION,),
     ),
     Mutant(
@@ -269,7 +269,7 @@ SLIPS = (
         "solvers/path/solver.py",
         "dr.minimum(far, record.dist)",
         "dr.minimum(far, dr.inf)",
-        (UNBIASED, "tests/system/test_lamps.py"),
+        (UNBIASED, "tests/system/test_point_lights.py"),
     ),
     Mutant(
         "the brightest light of a cache without what lamps add (cache)",
@@ -311,7 +311,7 @@ SLIPS = (
         "media/phase.py",
         "4 * dr.pi / (1 - self.forward) * value[0]",
         "4 * dr.pi * value[0]",
-        ("tests/unit/media/test_delta_m_narrow_lights.py",),
+        ("tests/unit/media/test_delta_m_narrow_emitters.py",),
     ),
     Mutant(
         "axes exchanged of cells that a flame reaches (emission)",

@@ -1,4 +1,4 @@
-"""What a case of a hazard is: a scene, and what must hold of it."""
+"""The description of a test case: a scene, and the properties that must hold."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from experiments.robustness.stability.worlds import (
 from mitsuba_irrcache.render.quadrature import QUADRATURES
 
 SOLVERS = ("sweep", "path")
-#: What a cache is asked for; roulette is put off, since its weights grow without end in furnaces.
+#: Cache settings; Russian roulette starts late, since its weights are unbounded in furnaces.
 SETTINGS = {"resolution": RESOLUTION, "cache_spp": 64, "rr_depth": 200}
 
 
@@ -30,10 +30,10 @@ class Case:
 
     Attributes:
         build: makes the scene with an integrator of these properties.
-        properties: what must hold; that all is finite and not negative always must.
+        properties: what must hold, in addition to finite and nonnegative values.
         settings: of the integrator, where they differ from `SETTINGS`.
         solvers, quadratures: those that it runs with.
-        rays: along which to look instead of through the camera.
+        rays: rays to evaluate instead of rendering through the camera.
         refused: a part of the message with which the scene must be refused.
     """
 
@@ -48,11 +48,11 @@ class Case:
     refused: str = ""
 
     def observe(self, settings: dict) -> p.Found:
-        """What this case looks like with an integrator of these properties."""
+        """Render this case with an integrator of these properties."""
         return p.observe(self.build(settings), settings, SAMPLES, self.rays)
 
     def judge(self, settings: dict) -> list[p.Verdict]:
-        """Every property with its error and the largest one admitted."""
+        """Return every property with its error and the largest one admitted."""
         settings = SETTINGS | self.settings | settings
         if self.refused:
             said = p.refusal(lambda: self.observe(settings))
@@ -72,7 +72,7 @@ def case(
     beside=None,
     **options,
 ) -> Case:
-    """A case whose scene `worlds.scene` makes of these."""
+    """Return a case whose scene `worlds.scene` makes of these arguments."""
     return Case(
         hazard,
         name,
@@ -87,8 +87,9 @@ FURNACE = Matter(texture((5, 6, 7), 0.0, 3.0), 1.0, (2.0, 1.6, 1.2), turn=20)
 
 
 def same_as(matter: Matter, **changes) -> Callable[[dict], p.Found]:
-    """What another description of the same problem looks like, with ``changes`` of the settings;
-    rendered once for all cases.
+    """Return a function that renders another description of the same problem.
+
+    ``changes`` are of the settings; the image is rendered once for all cases.
     """
     known: dict[tuple, p.Found] = {}
 
@@ -103,5 +104,5 @@ def same_as(matter: Matter, **changes) -> Callable[[dict], p.Found]:
 
 
 def clear() -> None:
-    """Frees what Dr.Jit holds on to between cases."""
+    """Free the memory that Dr.Jit caches between cases."""
     dr.flush_malloc_cache()

@@ -1,6 +1,8 @@
-"""The hazards: everything in a scene that may break arithmetic, each with what must hold of it.
+"""The hazards: scenes that may cause numerical failures, each with the properties that must
+hold.
 
-Every case runs with both solvers, all quadratures, grey and in colour, unless it says otherwise.
+Every case runs with both solvers, all quadratures, grey and in colour, unless it specifies
+otherwise.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from experiments.robustness.stability.case import Case
 
 
 def cases() -> list[Case]:
-    """All of them, hazard by hazard."""
+    """Return the cases of all hazards."""
     makers = (
         media.optical_depths,
         media.extinctions,

@@ -1,4 +1,4 @@
-"""Hazards of matter: how dense, how white, in what voxels."""
+"""Hazards of media: extreme optical depths, albedos and grids."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from experiments.robustness.stability.worlds import Matter, blob, scene, texture
 
 
 def optical_depths() -> list[Case]:
-    """Of the whole medium, from nothing to walls. From 1e3 on no path that starts in the middle of
-    a voxel comes out, so that only `sweep` knows that a furnace is white; and from 1e4 on per
-    voxel the image is that of the surface alone.
+    """Return optical depths of the whole medium, from 0 to opaque.
+
+    From 1e3 on no path from the middle of a voxel leaves the medium, so that only `sweep` solves a
+    furnace; and from 1e4 per voxel on the image depends on the surface alone.
     """
     found = []
     for depth in (0, 1e-30, 1e-8, 1e-3, 1, 10, 80, 104, 1e3, 1e4, 1e8, 1e30):
@@ -40,8 +41,11 @@ def optical_depths() -> list[Case]:
 
 
 def extinctions() -> list[Case]:
-    """Of single voxels beside others: denormal numbers, and large factors between neighbours. What
-    `path` takes for the air around a voxel grows with the voxel's extinction: up to 1e3 here.
+    """Return extinctions of single voxels: denormal numbers, and large factors between
+    neighbours.
+
+    The empty space that `path` assumes around a voxel grows with the voxel's extinction: up to 1e3
+    here.
     """
     found = []
     for low, high in ((1e-38, 1e-38), (1e-45, 1e-40), (1e-38, 1.0), (0.0, 1e3), (0.0, 1e6)):
@@ -65,7 +69,7 @@ def extinctions() -> list[Case]:
 
 
 def albedos() -> list[Case]:
-    """0, where the picture is the transmittance; 1 and just below."""
+    """Return albedos of 0, where the image is the transmittance, of 1 and just below."""
     black = Matter(texture((5, 6, 7), 0.0, 3.0), 0.0)
     found = [
         case(
@@ -86,7 +90,7 @@ def albedos() -> list[Case]:
 
 
 def voxels() -> list[Case]:
-    """Far from cubic ones, turned and mirrored: a constant grid is a homogeneous medium."""
+    """Return non-cubic, rotated and mirrored voxels: a constant grid is a homogeneous medium."""
     plain = Matter(0.8, 0.9)
     same = p.like(same_as(plain), 0.01, 0.03)
     found = []
@@ -106,7 +110,7 @@ def voxels() -> list[Case]:
 
 
 def grids() -> list[Case]:
-    """One voxel, one layer, prime numbers of them; caches of one voxel."""
+    """Return grids of one voxel, one layer, and prime sizes; and caches of one voxel."""
     plain = Matter(0.8, 0.9)
     same = p.like(same_as(plain), 0.01, 0.03)
     found = []
@@ -130,7 +134,7 @@ def grids() -> list[Case]:
 
 
 def colours() -> list[Case]:
-    """Extinctions far apart in their channels: each as if it were alone."""
+    """Return extinctions far apart in their channels: each must equal a separate solution."""
 
     def alone(settings: dict) -> p.Found:
         found = [known(settings) for known in grey]
@@ -162,7 +166,7 @@ def colours() -> list[Case]:
 
 
 def empty_media() -> list[Case]:
-    """Nothing at all, in several ways."""
+    """Return empty media of several kinds."""
     return [
         case("empty", "a grid of zeros", p.is_sky, matter=Matter(np.zeros((4, 4, 4)), 0.9)),
         case("empty", "an extinction of 0", p.is_sky, matter=Matter(0.0, 0.9)),
@@ -178,9 +182,9 @@ def empty_media() -> list[Case]:
 
 
 def phases() -> list[Case]:
-    """Light that is known by its direction: at all depths, in few voxels, among empty ones.
+    """Return anisotropic phase functions: at all depths, in few voxels, among empty ones.
 
-    From 0.6 on a forward peak is taken away.
+    From 0.6 on a forward peak is delta-M scaled.
     """
     found = []
     for g in (-0.5, 0.5, 0.85):
@@ -201,7 +205,7 @@ def phases() -> list[Case]:
 
 
 def phases_over_the_ground() -> list[Case]:
-    """The same among surfaces: over the ground, in all whiteness and with light of one side."""
+    """Return the same over the ground, with all albedos and illumination from one side."""
     place = mi.ScalarTransform4f().look_at([0, -1.2, 0], [0, 0, 0.001], [0, 1, 0]).scale(4)
     white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
     ground = {"ground": {"type": "rectangle", "to_world": place, "bsdf": white}}
@@ -223,8 +227,9 @@ def phases_over_the_ground() -> list[Case]:
 
 
 def many_samples() -> list[Case]:
-    """2^25 samples of one voxel: in the middle of a ball every ray is as long, so the mean of all
-    samples is that of each.
+    """Return 2^25 samples of one voxel.
+
+    At the centre of a ball all rays have equal length, so the mean of all samples is that of each.
     """
     ball = Matter(0.7, 0.5, shape="sphere")
     return [
@@ -241,7 +246,7 @@ def many_samples() -> list[Case]:
 
 
 def refusals() -> list[Case]:
-    """What no medium can be."""
+    """Return invalid media."""
     bad = {
         "a NaN": (np.nan, "not finite"),
         "an infinity": (np.inf, "not finite"),

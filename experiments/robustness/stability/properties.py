@@ -1,7 +1,7 @@
-"""What must hold of every picture and cache, whatever the numbers in the scene.
+"""Properties that must hold for every image and cache, whatever the numbers in the scene.
 
-A property maps what was `Found` to an error and the largest one that is admitted; both are plain
-numbers, so that a table can say which came nearest to failing.
+A property maps `Found` to an error and the largest one that is admitted; both are plain numbers, so
+that a table can list the smallest margins.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from mitsuba_irrcache.errors import essence
 
 @dataclass(frozen=True)
 class Found:
-    """A picture (rows, columns, channels) or radiances (n, channels) along given rays, and the
-    irradiance of the cache over 4 pi with its standard error (None where there is no cache).
+    """An image (rows, columns, channels) or radiances (n, channels) along given rays, and the
+    cache.
+
+    Of the cache it has the irradiance over 4 pi with its standard error (None without a cache).
     """
 
     image: np.ndarray
@@ -29,7 +31,7 @@ class Found:
 
     @property
     def noisy(self) -> bool:
-        """Whether voxels are sampled, each for itself."""
+        """Return whether voxels are sampled independently."""
         return self.settings["solver"] == "path"
 
 
@@ -39,21 +41,21 @@ Property = Callable[[Found], Verdict]
 
 
 def finite(found: Found) -> Verdict:
-    """The share of numbers that are none."""
+    """Return the share of values that are not finite."""
     arrays = [found.image] + ([] if found.phi is None else [found.phi])
     return "finite", max(float((~np.isfinite(a)).mean()) if a.size else 0.0 for a in arrays), 0.0
 
 
 def not_negative(found: Found) -> Verdict:
-    """The most negative number; alpha too."""
+    """Return the most negative value, including alpha."""
     arrays = [found.image] + ([] if found.phi is None else [found.phi])
     return "not negative", max(float(-np.nanmin(a, initial=0.0)) for a in arrays), 0.0
 
 
 def no_brighter(limit: float = 1.0) -> Property:
-    """No light where none is lit that is brighter than the brightest light: energy is not made.
+    """Without emission, no radiance exceeds that of the brightest emitter: energy is conserved.
 
-    Of sampled voxels, which err, on average: within four standard errors, and 2 %.
+    For sampled voxels, which are noisy, on average: within four standard errors, and 2 %.
     """
 
     def check(found: Found) -> Verdict:
@@ -72,10 +74,12 @@ def no_brighter(limit: float = 1.0) -> Property:
 
 
 def furnace(found: Found) -> Verdict:
-    """Albedo 1 under a sky of 1: every pixel is 1. To 1 % if swept (the solver promises 1e-3 on
-    average, pixels see the worst of it), 3 % by the trapezoidal rule, which is not exact for even
-    light where the extinction varies; of sampled voxels the mean of a picture, within four
-    standard errors of the mean of four voxels: from a corner there are not many more to be seen.
+    """With albedo 1 under a sky of 1 every pixel is 1.
+
+    To 1 % with `sweep` (which guarantees 1e-3 on average, while pixels depend on single voxels), 3
+    % by the trapezoidal rule, which is not exact for constant radiance if the extinction varies;
+    for sampled voxels the mean of an image, within four standard errors of the mean of four voxels:
+    from a corner few more are visible.
     """
     colour = found.image[..., :3]
     if found.noisy and found.error is not None:
@@ -85,24 +89,24 @@ def furnace(found: Found) -> Verdict:
 
 
 def furnace_of_voxels(found: Found) -> Verdict:
-    """The same of the mean of all voxels, to 2 %: surfaces that are seen have noise."""
+    """The mean of all voxels in a furnace, to 2 %: voxels at visible surfaces are noisy."""
     phi = found.phi[found.phi.sum(axis=-1) > 0]
     return "furnace of voxels", abs(float(phi.mean()) - 1) if phi.size else 0.0, 0.02
 
 
 def _rms(error: np.ndarray) -> float:
-    """Of what is not 0."""
+    """Return the root mean square of nonzero values."""
     known = error[error > 0]
     return float(np.sqrt(np.square(known).mean())) if known.size else 0.0
 
 
 def is_sky(found: Found) -> Verdict:
-    """The picture of nothing: the sky, to rounding."""
+    """The image of an empty medium is the sky, to rounding."""
     return "sky", float(np.abs(found.image[..., :3] - 1).max()), 1e-5
 
 
 def is_value(expected: np.ndarray | float, tolerance: float = 1e-4) -> Property:
-    """The picture, or radiances along rays, in closed form: relative to the brightest."""
+    """The image, or radiances along rays, in closed form, relative to the maximum."""
 
     def check(found: Found) -> Verdict:
         reference = np.asarray(expected, dtype=np.float64)
@@ -114,9 +118,10 @@ def is_value(expected: np.ndarray | float, tolerance: float = 1e-4) -> Property:
 
 
 def like(reference: Callable[[dict], Found], swept: float, sampled: float) -> Property:
-    """The picture of another description of the same problem, in units of its mean; the first bound
-    is that for swept caches, the other one for sampled ones, whose paths take other ways after the
-    slightest rounding.
+    """The image equals that of another description of the same problem, in units of its mean.
+
+    The first bound is for `sweep`, the other one for sampled caches, whose paths diverge after
+    rounding errors.
     """
 
     def check(found: Found) -> Verdict:
@@ -141,7 +146,7 @@ def centre_is(value: float, tolerance: float) -> Property:
 def observe(
     scene: mi.Scene, settings: dict, samples: int, rays: Callable[[], mi.Ray3f] | None = None
 ) -> Found:
-    """Renders a scene, or what arrives along ``rays``."""
+    """Render a scene, or the radiance along ``rays``."""
     integrator = scene.integrator()
     if rays is None:
         image = np.array(mi.render(scene, spp=samples), dtype=np.float64)
@@ -161,7 +166,7 @@ def observe(
 
 
 def refusal(action: Callable[[], object]) -> str:
-    """What an error says that ``action`` raises, "" if it raises none."""
+    """Return the message of the error that ``action`` raises, "" if it raises none."""
     try:
         action()
     except (RuntimeError, ValueError) as error:

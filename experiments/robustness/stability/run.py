@@ -1,10 +1,10 @@
-"""Every hazard with every solver and quadrature, grey and in colour: what fails, and by how much.
+"""Every hazard with every solver and quadrature, grey and in colour: failures and their size.
 
     python -m experiments.robustness.stability.run [--only HAZARD] [-o output]      (make stress)
 
 Writes output/stability/results.json and prints a table: for each hazard the number of cases and
-failures, the property that came nearest to failing (or failed by most), and the first failure.
-Ends with 1 if anything failed.
+failures, the property with the smallest margin (or largest violation), and the first failure. Exits
+with 1 if anything failed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono")
 
 
 def main() -> int:
-    """Runs all, writes and prints the table."""
+    """Run all cases, write and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -58,13 +58,13 @@ def main() -> int:
 
 
 def run_case(case: Case, variant: str, quadratures: Sequence[str] = QUADRATURES) -> list[dict]:
-    """A row for each property with each solver and each of ``quadratures`` that the case takes."""
+    """Return a row for each property with each solver and each of ``quadratures`` of the case."""
     rows = []
     for solver in case.solvers:
         for quadrature in (q for q in case.quadratures if q in quadratures):
             try:
                 verdicts = case.judge({"solver": solver, "quadrature": quadrature})
-            except Exception as error:  # whatever it is, it is a failure of this case
+            except Exception as error:  # any exception is a failure of this case
                 verdicts = [(f"raised {type(error).__name__}: {essence(error)}", 1.0, 0.0)]
             about = {"hazard": case.hazard, "case": case.name, "variant": variant}
             about |= {"solver": solver, "quadrature": quadrature}
@@ -83,7 +83,7 @@ def run_case(case: Case, variant: str, quadratures: Sequence[str] = QUADRATURES)
 
 
 def summary(rows: list[dict]) -> str:
-    """One line."""
+    """Summarise the rows in one line."""
     runs = {
         tuple(r[k] for k in ("hazard", "case", "variant", "solver", "quadrature")) for r in rows
     }
@@ -92,7 +92,7 @@ def summary(rows: list[dict]) -> str:
 
 
 def described(row: dict) -> str:
-    """A failure, with all it takes to see it again."""
+    """Describe a failure with everything needed to reproduce it."""
     return (
         f"{row['hazard']}: {row['case']} [{row['solver']}, {row['quadrature']}, "
         f"{row['variant']}]: {row['property']}: {row['error']:.3g}, admitted {row['admitted']:.3g}"
@@ -100,7 +100,7 @@ def described(row: dict) -> str:
 
 
 def tabulated(rows: list[dict]) -> Table:
-    """A line for each hazard."""
+    """Tabulate a row for each hazard."""
     cells = []
     for hazard in dict.fromkeys(row["hazard"] for row in rows):
         own = [row for row in rows if row["hazard"] == hazard]

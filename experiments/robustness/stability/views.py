@@ -1,4 +1,4 @@
-"""Hazards of places: of worlds, rays, cameras, lights and films."""
+"""Hazards of positions and directions: worlds, rays, cameras, emitters and films."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from experiments.robustness.stability.worlds import (
 
 
 def scales() -> list[Case]:
-    """The same cloud in worlds of other units."""
+    """Return the same cloud in worlds of other units."""
     same = p.like(same_as(CLOUD), 1e-3, 0.02)
     return [
         case("world scale", f"{scale:g}", same, p.no_brighter(), matter=CLOUD, world=World(scale))
@@ -30,8 +30,9 @@ def scales() -> list[Case]:
 
 
 def offsets() -> list[Case]:
-    """The same cloud far away from the origin: where single precision can tell its voxels apart,
-    the same picture; else it is refused.
+    """Return the same cloud far away from the origin.
+
+    If single precision distinguishes its voxels, the image is the same; else it is refused.
     """
     same = p.like(same_as(CLOUD), 0.01, 0.03)
     found = [
@@ -54,7 +55,7 @@ def offsets() -> list[Case]:
 
 
 def _bundle(*lines: tuple) -> Callable[[], mi.Ray3f]:
-    """Rays of these origins and directions."""
+    """Return rays with these origins and directions."""
 
     def make() -> mi.Ray3f:
         origins, directions = (np.float32(part).T for part in zip(*lines, strict=True))
@@ -67,7 +68,7 @@ def _bundle(*lines: tuple) -> Callable[[], mi.Ray3f]:
 
 
 def rays() -> list[Case]:
-    """Along axes, in faces and edges, grazing, with denormal components."""
+    """Return rays along axes, in faces and edges, grazing, with denormal components."""
     box = Matter(texture((4, 4, 4), 0.5, 2.0), 1.0)
     tiny = 1e-40
     bundles = {
@@ -127,8 +128,9 @@ def rays() -> list[Case]:
 
 
 def _chord(origin: tuple, direction: tuple) -> float:
-    """Length of a ray in the box [-1, 1]^3; NaN where it lies in a face, and has none or all of it,
-    or misses one by less than single precision can tell.
+    """Return the length of a ray in the box [-1, 1]^3.
+
+    NaN if it lies in a face, or passes one within single precision: any length is correct then.
     """
     o, d = np.float64(np.float32(origin)), np.float64(np.float32(direction))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -139,7 +141,9 @@ def _chord(origin: tuple, direction: tuple) -> float:
 
 
 def cameras() -> list[Case]:
-    """On faces, edges and corners, far away; within the box but not in its medium."""
+    """Return cameras on faces, edges and corners, far away; within the box but not in its
+    medium.
+    """
     places = {
         "on a face": Camera((0, 0, -1)),
         "on a face, along it": Camera((0, 0, -1), (1, 0, -1)),
@@ -162,14 +166,16 @@ def cameras() -> list[Case]:
 
 
 def _sky(texel: float) -> dict:
-    """An environment of 1 with one texel of ``texel``."""
+    """Return an environment of 1 with one texel of ``texel``."""
     image = np.ones((8, 16, 3), np.float32)
     image[2, 5] = texel
     return {"type": "envmap", "bitmap": mi.Bitmap(image)}
 
 
 def lights() -> list[Case]:
-    """One very bright texel, no light, lights in odd places."""
+    """Return environments with one very bright texel, no emitters, and emitters in unusual
+    places.
+    """
 
     def under(make: Callable[[], dict], matter: Matter = CLOUD) -> Callable[[dict], mi.Scene]:
         return lambda settings: scene(settings, matter, make())
@@ -185,7 +191,7 @@ def lights() -> list[Case]:
     for direction in ((0, 0, 1), (1, 0, 0), (1, 1, 0), (1, 1, 1), (1e-30, 1e-38, -1)):
         sun = {"type": "directional", "direction": list(direction), "irradiance": 1e6}
         found.append(Case("light", f"a sun along {direction}", under(lambda s=sun: s)))
-    step = 2 / RESOLUTION  # a voxel of the cache, whose corners lie outside of a ball
+    step = 2 / RESOLUTION  # a voxel of the cache whose corners lie outside of the ball
     ball = replace(CLOUD, sigma_t=np.full((8, 8, 8), 1.0, np.float32), shape="sphere")
     corner = [1 - step / 2] * 3
     places = {
@@ -203,7 +209,7 @@ def lights() -> list[Case]:
 
 
 def films() -> list[Case]:
-    """One pixel, a crop, none at all."""
+    """Return films of one pixel, with a crop window, and of size 0."""
     sizes = {
         "1x1": {"width": 1, "height": 1},
         "1x9": {"width": 1, "height": 9},

@@ -1,4 +1,5 @@
-"""Small scenes for hazards: a medium in a box or sphere, a sky, a camera, at any scale and place.
+"""Small scenes for hazards: a medium in a box or sphere, a sky, a camera, at any scale and
+position.
 
 All lengths are in units of a *world*, whose unit is ``scale`` scene units long and whose origin
 lies at ``offset``; extinctions are per unit. So one description is the same problem at every scale.
@@ -15,7 +16,7 @@ import mitsuba_irrcache  # noqa: F401 (registers the plugin)
 
 PIXELS = 8
 SAMPLES = 4  # per pixel
-#: Cache voxels along the longest side, unless a case says otherwise.
+#: Cache voxels along the longest side, unless a case specifies others.
 RESOLUTION = 8
 
 WHITE_SKY = {"type": "constant", "radiance": 1.0}
@@ -23,10 +24,10 @@ WHITE_SKY = {"type": "constant", "radiance": 1.0}
 
 @dataclass(frozen=True)
 class World:
-    """Where things are.
+    """Scale and position of a scene.
 
     Attributes:
-        scale: scene units in a unit.
+        scale: scene units per unit.
         offset: of the origin, in scene units, along x, y and z alike.
     """
 
@@ -34,14 +35,14 @@ class World:
     offset: float = 0.0
 
     def place(self, linear: np.ndarray, origin: np.ndarray) -> mi.ScalarTransform4f:
-        """The affine map with these columns, in units."""
+        """Return the affine map with these columns, in units."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * linear
         matrix[:3, 3] = self.scale * np.asarray(origin) + self.offset
         return mi.ScalarTransform4f(matrix)
 
     def point(self, p: tuple[float, float, float]) -> list[float]:
-        """A position given in units."""
+        """Return a position given in units."""
         return [self.scale * v + self.offset for v in p]
 
 
@@ -66,7 +67,7 @@ class Matter:
     g: float = 0.0
 
     def _linear(self) -> np.ndarray:
-        """Columns: half the edges of the box."""
+        """Return half the edges of the box as columns."""
         axis = np.array([0.48, 0.64, 0.6])
         cross, angle = np.cross(np.eye(3), axis), np.deg2rad(self.turn)
         rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
@@ -74,7 +75,7 @@ class Matter:
         return rotation @ np.diag(0.5 * np.array(self.edges) * (sign, 1.0, 1.0))
 
     def description(self, world: World) -> dict:
-        """The shape with its medium."""
+        """Return the shape with its medium."""
         linear = self._linear()
         grid = world.place(2 * linear, -linear.sum(axis=1))
         outwards = np.diag([np.sign(np.linalg.det(linear)), 1.0, 1.0])
@@ -105,8 +106,8 @@ class Camera:
     film: dict = field(default_factory=dict)
 
     def description(self, world: World) -> dict:
-        """The sensor; it sees nothing nearer than a hundredth of a unit, as by default."""
-        # Of the view only directions matter, and these are the same in every world.
+        """Return the sensor; its near clip distance is a hundredth of a unit, as by default."""
+        # Only directions matter here, and these are the same in every world.
         way = np.subtract(self.target, self.origin)
         look = mi.ScalarTransform4f().look_at([0, 0, 0], way.tolist(), [0.02, 1, 0.01])
         matrix = np.array(look.matrix, dtype=np.float64)
@@ -137,7 +138,7 @@ def scene(
     world: World | None = None,
     beside: dict | None = None,
 ) -> mi.Scene:
-    """All together, under a white sky unless ``light`` says otherwise; ``beside``: more objects."""
+    """Return the scene, under a white sky unless ``light`` is given; ``beside``: more objects."""
     world = world or World()
     parts = {"type": "scene", "integrator": {"type": "irrcache"} | integrator}
     parts["sensor"] = (camera or Camera()).description(world)
@@ -149,12 +150,12 @@ def scene(
 
 
 def texture(shape: tuple[int, ...], low: float, high: float, seed: int = 1) -> np.ndarray:
-    """Random voxels in [low, high]."""
+    """Return random voxels in [low, high]."""
     return np.random.default_rng(seed).uniform(low, high, shape).astype(np.float32)
 
 
 def blob(n: int, peak: float) -> np.ndarray:
-    """A smooth ball of n^3 voxels that is nearly empty at its borders."""
+    """Return a smooth ball of n^3 voxels that is nearly empty at its borders."""
     c = (np.arange(n) + 0.5) / n * 2 - 1
     z, y, x = np.meshgrid(c, c, c, indexing="ij")
     return (peak * np.exp(-4 * ((x - 0.2) ** 2 + (y + 0.1) ** 2 + z**2))).astype(np.float32)

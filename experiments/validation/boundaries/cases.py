@@ -1,4 +1,4 @@
-"""Scenes with odd boundaries, placements and media: what users write, and what goes wrong."""
+"""Scenes with unusual boundaries, placements and media, including invalid ones."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ UNIT = np.eye(4)
 
 
 def matrix(array: object) -> mi.ScalarTransform4f:
-    """A ``to_world``."""
+    """Return a ``to_world``."""
     return mi.ScalarTransform4f(np.asarray(array, dtype=np.float64))
 
 
 def placed(centre=(0, 0, 0), scale=(1, 1, 1), turn: float = 0.0) -> np.ndarray:
-    """Scaled, then turned about an oblique axis of length 1, then moved."""
+    """Return a scaling, then a rotation about an oblique axis, then a translation."""
     transform = mi.ScalarTransform4f().translate(list(centre)).rotate([0.48, 0.64, 0.6], turn)
     return np.array(transform.scale(list(scale)).matrix, dtype=np.float64)
 
 
 def sheared(amount: float = 0.5) -> np.ndarray:
-    """A shear of x along y."""
+    """Return a shear of x along y."""
     result = np.eye(4)
     result[0, 1] = amount
     return result
 
 
 def fog(extinction: float = 1.0, albedo: float = 0.8, **more: object) -> dict:
-    """A homogeneous medium."""
+    """Return a homogeneous medium."""
     return {"type": "homogeneous", "sigma_t": extinction, "albedo": albedo} | more
 
 
 def smoke(place: np.ndarray | None = None, seed: int = 1, **more: object) -> dict:
-    """A heterogeneous medium of 6^3 voxels over the cube [-1, 1]^3, or ``place`` of it."""
+    """Return a heterogeneous medium of 6^3 voxels over the cube [-1, 1]^3, or ``place`` of it."""
     unit = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]])
     values = np.random.default_rng(seed).uniform(0, 2.5, (6, 6, 6, 1)).astype(np.float32)
     to_world = matrix(unit if place is None else place @ unit)
@@ -45,17 +45,17 @@ def smoke(place: np.ndarray | None = None, seed: int = 1, **more: object) -> dic
 
 
 def bound(interior: dict, place: np.ndarray = UNIT, kind: str = "cube", **more: object) -> dict:
-    """A null boundary."""
+    """Return a null boundary."""
     return {"type": kind, "to_world": matrix(place), "bsdf": NULL, "interior": interior} | more
 
 
 def ref(name: str) -> dict:
-    """An object that the scene has under this name."""
+    """Return a reference to an object of the scene."""
     return {"type": "ref", "id": name}
 
 
 def tin(bsdf: dict, place: np.ndarray = UNIT) -> dict:
-    """A closed cylinder about the z axis, of three shapes that have the medium "A" inside."""
+    """Return a closed cylinder about the z axis: three shapes with the interior medium "A"."""
     lid = np.diag([1.0, -1.0, -1.0, 1.0])
     parts = {"side": ("cylinder", placed((0, 0, -1), (1, 1, 2)))}
     parts |= {"top": ("disk", placed((0, 0, 1))), "base": ("disk", placed((0, 0, -1)) @ lid)}
@@ -66,7 +66,7 @@ def tin(bsdf: dict, place: np.ndarray = UNIT) -> dict:
 
 
 def room(half: float, **more: object) -> dict:
-    """Six walls that face inwards."""
+    """Return six walls that face inwards."""
     walls = {}
     for axis in range(3):
         for sign in (-1, 1):
@@ -79,19 +79,19 @@ def room(half: float, **more: object) -> dict:
 
 
 def ground(height: float) -> dict:
-    """A large diffuse square."""
+    """Return a large diffuse square."""
     turned = mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], -90).scale(5)
     return {"ground": {"type": "rectangle", "to_world": turned}}
 
 
 def lamp(kind: str, place: np.ndarray, radiance: float = 6.0, **more: object) -> dict:
-    """An area emitter."""
+    """Return an area emitter."""
     emitter = {"type": "area", "radiance": radiance}
     return {"lamp": {"type": kind, "to_world": matrix(place), "emitter": emitter} | more}
 
 
 def environment(height: int, width: int, place: np.ndarray = UNIT, bright: float = 0.0) -> dict:
-    """A random environment map, with a ``bright`` texel if asked for."""
+    """Return a random environment map, with a ``bright`` texel if requested."""
     texels = np.random.default_rng(3).uniform(0.2, 1.0, (height, width, 3)).astype(np.float32)
     if bright:
         texels[height // 3, width // 3] = bright
@@ -100,13 +100,13 @@ def environment(height: int, width: int, place: np.ndarray = UNIT, bright: float
 
 
 def camera(origin=(1.0, 1.5, -6.0), **more: object) -> dict:
-    """Another sensor."""
+    """Return another sensor."""
     look = mi.ScalarTransform4f().look_at(list(origin), [0, 0, 0], [0, 1, 0])
     return {"sensor": {"type": "perspective", "fov": 38.0, "to_world": look} | more}
 
 
 def open_box() -> dict:
-    """A cube without one face, as a mesh."""
+    """Return a cube without one face, as a mesh."""
     cube = mi.load_dict({"type": "cube"})
     vertices = np.array(mi.traverse(cube)["vertex_positions"])
     faces = np.array(mi.traverse(cube)["faces"]).reshape(-1, 3)[:-2]
@@ -121,7 +121,7 @@ def open_box() -> dict:
 
 
 def overlaps() -> dict[str, dict]:
-    """Boundaries that overlap, touch, or lie within each other."""
+    """Return boundaries that overlap, touch, or contain each other."""
     a, b = {"A": fog()}, fog(2.0, 0.6)
     box = {"a": bound(ref("A"))} | a
     small = placed((0.1, 0, 0), (0.4, 0.4, 0.4))
@@ -167,7 +167,7 @@ def overlaps() -> dict[str, dict]:
 
 
 def shapes() -> dict[str, dict]:
-    """Odd shapes and placements of boundaries."""
+    """Return unusual shapes and placements of boundaries."""
     uneven = placed(scale=(1.3, 0.8, 0.5))
     a = {"A": fog()}
     return {
@@ -234,7 +234,7 @@ def shapes() -> dict[str, dict]:
 
 
 def lights() -> dict[str, dict]:
-    """Odd emitters and placements of them."""
+    """Return unusual emitters and placements of them."""
     box = {"a": bound(smoke())}
     uneven, none = placed(scale=(1, 2, 0.5)), {"sky": None, "sun": None}
     above = placed((0, 2.2, 0)) @ np.array(
@@ -295,7 +295,7 @@ def lights() -> dict[str, dict]:
 
 
 def sensors() -> dict[str, dict]:
-    """Sensors inside and outside of media, with and without saying so."""
+    """Return sensors inside and outside of media, with and without a declared medium."""
     a, near = {"A": fog()}, (0.2, 0.1, -0.6)
     box, vapour = a | {"a": bound(ref("A"))}, {"A": smoke()}
     ball = {"ball": {"type": "sphere", "radius": 0.2, "center": [0, 0, 0.4]}}
@@ -326,14 +326,14 @@ CLASSES = {"overlap": overlaps, "boundary": shapes, "emitter": lights, "sensor":
 
 
 def scene(objects: dict, integrator: dict, pixels: int) -> mi.Scene:
-    """The scene of a case."""
+    """Return the scene of a case."""
     film = {
         "type": "hdrfilm", "width": pixels, "height": pixels, "component_format": "float32",
         "rfilter": {"type": "box"},
     }  # fmt: skip
     described = {"type": "scene", "integrator": integrator, "sky": SKY, "sun": SUN} | camera()
     described |= objects
-    # References must follow what they refer to.
+    # References must follow the objects.
     media = {k: v for k, v in described.items() if k in ("A", "B")}
     described = {"type": "scene"} | media | described
     described["sensor"] = described["sensor"] | {"film": film}

@@ -1,14 +1,14 @@
-"""Odd boundaries, placements and media, beside volpath: what is rendered, and what is refused.
+"""Unusual boundaries, placements and media compared with volpath: rendered or refused.
 
     python -m experiments.validation.boundaries.run [--only TEXT] [--force] [-o output]
 
-Every case is a small scene of `cases`, all orders of scattering. Where ``irrcache`` accepts it, its
+Every case is a small scene of `cases`, all orders of scattering. If ``irrcache`` accepts it, its
 images (solver ``auto``, caches of different seeds) are compared with volpath's: the difference of
 the means and the RMSE of blocks of 4 x 4 pixels, both in units of the mean radiance, with the
-standard error that the images' own noise leads one to expect of each. Where it refuses, the message
-is shown. A row with a difference of more than four standard errors and 1 % is marked.
+standard error that the images' own noise implies for each. If it refuses, the message is shown. A
+row with a difference of more than four standard errors and 1 % is marked.
 
-Rows are kept in output/boundaries/results.json. No data are needed.
+Rows are saved in output/boundaries/results.json. No data are needed.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ PIXELS, BLOCK = 24, 4
 OURS, OUR_SPP = 2, 64
 THEIRS, THEIR_SPP = 4, 256
 DEPTH = {"max_depth": -1, "rr_depth": 50}
-#: What counts as different: so many standard errors, and this part of the mean radiance.
+#: Threshold of a difference: standard errors, and fraction of the mean radiance.
 SIGMAS, PART = 4.0, 0.01
 
 
 def measure(objects: dict) -> dict:
-    """A row: the message of a scene that is refused, or differences and what noise explains."""
+    """Return a row: the message of a refused scene, or differences and their standard errors."""
     ours = {"type": "irrcache", "resolution": 16, "cache_spp": 64} | DEPTH
     try:
         mine = [
@@ -50,15 +50,17 @@ def measure(objects: dict) -> dict:
 
 
 def image(loaded: mi.Scene, spp: int, seed: int) -> np.ndarray:
-    """Means of blocks."""
+    """Return block means of the image."""
     pixels = np.array(mi.render(loaded, spp=spp, seed=seed), dtype=np.float64)[..., :3]
     n = PIXELS // BLOCK
     return pixels.reshape(n, BLOCK, n, BLOCK, 3).mean(axis=(1, 3))
 
 
 def compared(mine: np.ndarray, theirs: np.ndarray) -> dict:
-    """Differences between the means of images (n, y, x, channel) in units of the mean radiance, and
-    the standard errors of these.
+    """Return differences between the means of images (n, y, x, channel) and their standard
+    errors.
+
+    Both are in units of the mean radiance.
     """
     scale = max(theirs.mean(), 1e-12)
     apart = (mine.mean(axis=0) - theirs.mean(axis=0)) / scale
@@ -72,7 +74,7 @@ def compared(mine: np.ndarray, theirs: np.ndarray) -> dict:
 
 
 def differs(row: dict) -> bool:
-    """Whether an accepted case is not what volpath renders."""
+    """Return whether an accepted case differs from volpath."""
     if "refused" in row:
         return False
     mean = abs(row["mean"]) > max(SIGMAS * row["mean_error"], PART)
@@ -80,7 +82,7 @@ def differs(row: dict) -> bool:
 
 
 def run() -> None:
-    """Computes the rows that are missing and prints the table."""
+    """Compute missing rows and print the table."""
     parser = parser_of(__doc__)
     parser.add_argument("--only", default="", help="cases whose name contains this")
     args = parser.parse_args()
@@ -95,7 +97,7 @@ def run() -> None:
 
 
 def line(name: str, row: dict) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     if "refused" in row:
         return f"{name:55} refused: {row['refused']}"
     mark = "  DIFFERS" if differs(row) else ""

@@ -2,9 +2,9 @@
 
     python -m experiments.validation.convergence.run
 
-A smooth medium, so that orders can be seen: a Gaussian ball on a 32^3 grid. *Step*: jitter off,
-against the same rule at a 64 times finer step. *Resolution*: voxel values with little noise, the
-image against that of the finest cache.
+The medium is smooth, so that orders are visible: a Gaussian ball on a 32^3 grid. *Step*: jitter
+off, against the same rule at a 64 times finer step. *Resolution*: voxel values with little noise,
+the image against that of the finest cache.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mitsuba_irrcache.render.raymarch import Projection
 
 
 def main() -> None:
-    """Prints both tables."""
+    """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=2048, help="per cache voxel")
     args = parser.parse_args()
@@ -64,8 +64,10 @@ def main() -> None:
 
 
 def gaussian_ball(peak: float = 6.0, falloff: float = 6.0) -> dict:
-    """A smooth heterogeneous medium under a white sky: the extinction is ``peak`` in the middle and
-    e^-``falloff`` of it one unit away, where its box ends. The default has an optical depth of 4.
+    """Return a smooth heterogeneous medium under a white sky, by default of optical depth 4.
+
+    The extinction is ``peak`` in the middle and e^-``falloff`` of it one unit away, where its box
+    ends.
     """
     c = (np.arange(32) + 0.5) / 32 * 2 - 1
     z, y, x = np.meshgrid(c, c, c, indexing="ij")
@@ -91,12 +93,12 @@ def gaussian_ball(peak: float = 6.0, falloff: float = 6.0) -> dict:
 
 
 def image(medium, field, quadrature: str, step: float) -> np.ndarray:
-    """Scattered radiance of `parallel_rays`, without jitter."""
+    """Return the scattered radiance of `parallel_rays`, without jitter."""
     return unjittered(Projection(medium, field, quadrature, step), parallel_rays())[0]
 
 
 def parallel_rays() -> mi.Ray3f:
-    """48 x 48 parallel, slightly oblique rays through the ball."""
+    """Return 48 x 48 parallel, slightly oblique rays through the ball."""
     side = 48
     u = (dr.arange(mi.Float, side) + 0.5) / side * 1.6 - 0.8
     x, y = dr.meshgrid(u, u)
@@ -105,12 +107,12 @@ def parallel_rays() -> mi.Ray3f:
 
 
 def projected_noise(cache: IrradianceCache) -> float:
-    """Rough: standard error of a voxel over the number of voxels that a ray averages."""
+    """Estimate the standard error of a voxel over the number of voxels that a ray averages."""
     return float(np.nanmean(np.array(cache.standard_error))) / (4 * np.pi) / 4
 
 
 def print_orders(name: str, errors: list[float], scale: float) -> None:
-    """Relative errors, and the slope between the last two."""
+    """Print relative errors, and the slope between the last two."""
     order = np.log2(errors[-2] / errors[-1])
     print(f"{name:<24}" + "".join(f"{e / scale:>12.2e}" for e in errors) + f"{order:>12.2f}")
 

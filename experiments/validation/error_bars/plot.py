@@ -13,12 +13,12 @@ from mitsuba_irrcache.compare import style
 from mitsuba_irrcache.compare.report import Figure, Section
 from mitsuba_irrcache.compare.tables import Table, percent
 
-#: Shares within 1, 2, 3 standard errors if errors were normally distributed.
+#: Shares within 1, 2, 3 standard errors of a normal distribution.
 NORMAL = (0.683, 0.954, 0.997)
 
 
 def plot(options: Options) -> Section:
-    """Measured against predicted errors, and how often the truth lies inside the bars."""
+    """Plot measured against predicted errors, and the coverage of the error bars."""
     folder = options.folder("error_bars")
     rows = read_json(folder / "results.json")
     path = folder / "error_bars.png"

@@ -1,10 +1,10 @@
-"""Are the error bars true? How often the truth lies inside those of the AOVs ``noise`` and
-``bias``, and how large the errors are where they are said to be small or large.
+"""Coverage of the error bars given by the AOVs ``noise`` and ``bias``, and the ratio of actual
+to predicted errors.
 
     python -m experiments.validation.error_bars.run [--full] [--force]
 
 Single scattering, a coarse cache of few samples and a finer one, against a volpath reference of two
-halves. Leaves output/error_bars/results.json.
+halves. Writes output/error_bars/results.json.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ SCENES = ("phantom", "cloud", "head")
 CACHES = ((32, 16), (64, 16), (64, 64), (128, 16))  # resolution, samples per voxel
 PIXELS = 96
 REFERENCE_SPP = 256
-#: The image is rendered with so many samples that only the cache's errors are left.
+#: Samples per pixel of the image, so many that only the cache's errors remain.
 SPP = 64
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 BINS = 8
 
 
 def run(options: Options) -> None:
-    """Computes the rows that are missing and prints all."""
+    """Compute missing rows and print all."""
     store = Store(options.folder("error_bars") / "results.json", options.force)
     for name in SCENES:
         path = scene_file(name, options.output)
@@ -56,7 +56,7 @@ def run(options: Options) -> None:
 
 
 def measure(path, parameters: dict, truth: Reference, resolution: int, samples: int) -> dict:
-    """Errors of the luminance in units of its mean, of pixels that see the medium."""
+    """Return errors of the luminance in units of its mean, of pixels that see the medium."""
     images, layers = [], {}
     for seed in (1, 2):
         integrator = specify(
@@ -95,7 +95,7 @@ def measure(path, parameters: dict, truth: Reference, resolution: int, samples: 
 
 
 def bins(predicted: np.ndarray, squared: np.ndarray) -> list[tuple[float, float]]:
-    """RMS of prediction and of error in groups of pixels of rising prediction."""
+    """Return the RMS of prediction and of error in groups of pixels of increasing prediction."""
     groups = np.array_split(np.argsort(predicted), BINS)
     return [
         (rms(predicted[g]), float(np.sqrt(max(squared[g].mean(), 0)))) for g in groups if g.size

@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 
 PIXELS = 16
-#: Half the width of the film, and where the camera is.
+#: Half the width of the film, and the position of the camera.
 HALF_WIDTH, CAMERA = 0.6, (1.6, 0.7, -4.8)
-#: Largest over smallest extinction, and the mean optical depth from face to face.
+#: Ratio of largest to smallest extinction, and the mean optical depth from face to face.
 CONTRAST, DEPTH = 1e5, 6.0
 ALBEDO = 0.8
 #: Shapes (z, y, x) of the grids.
@@ -22,25 +22,26 @@ GRIDS = {"4x4x4": (4, 4, 4), "3x5x2": (3, 5, 2), "1x1x6": (1, 1, 6)}
 
 
 def look(origin, target, up=(0.0, 0.0, 1.0)) -> mi.ScalarTransform4f:
-    """A transformation that looks from ``origin`` at ``target``."""
+    """Return a transformation that looks from ``origin`` at ``target``."""
     return mi.ScalarTransform4f().look_at(list(origin), list(target), list(up))
 
 
 def point(position) -> dict:
-    """A point light."""
+    """Return a point light."""
     return {"type": "point", "position": list(position), "intensity": 1.0}
 
 
 def spot(cutoff: float, beam: float) -> dict:
-    """A spot light above the cube that points into it."""
+    """Return a spot light above the cube that points into it."""
     place = look((0.5, 3.0, 0.3), (-0.1, 0.0, -0.3))
     angles = {"cutoff_angle": cutoff, "beam_width": beam}
     return {"type": "spot", "to_world": place, "intensity": 1.0} | angles
 
 
 def lamp(kind: str, centre, size: float) -> dict:
-    """An area light that faces the middle of the cube; a ``size`` of 1 is a radius or half an edge
-    of 1.
+    """Return an area light that faces the centre of the cube.
+
+    A ``size`` of 1 is a radius or half an edge of 1.
     """
     emitter = {"type": "area", "radiance": 1.0}
     if kind == "sphere":
@@ -50,13 +51,13 @@ def lamp(kind: str, centre, size: float) -> dict:
 
 
 def sky_with_spot() -> dict:
-    """An environment map that is dim but for four texels."""
+    """Return an environment map that is dim except for four texels."""
     texels = np.full((16, 32, 3), 0.2, dtype=np.float32)
     texels[3:5, 8:10] = 100.0
     return {"type": "envmap", "bitmap": mi.Bitmap(texels), "scale": 1.0}
 
 
-#: Emitters by name. Those that end in a number of edges or a distance say where they are.
+#: Emitters by name. A number of edges or a distance at the end gives the position.
 EMITTERS = {
     "constant": lambda: {"type": "constant", "radiance": 1.0},
     "envmap": sky_with_spot,
@@ -97,22 +98,22 @@ class Case:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Return the name for tables."""
         depth = "all orders" if self.max_depth < 0 else f"max_depth {self.max_depth}"
         return f"{self.emitter}, {self.phase}, {self.grid}, {depth}"
 
     @property
     def position(self) -> list[float] | None:
-        """Where a point light is that is seen itself."""
+        """Return the position of a visible point light."""
         return EMITTERS[self.emitter]()["position"] if self.emitter == "point in view" else None
 
     @property
     def has_direction(self) -> bool:
-        """Whether the light of the emitter comes from one direction at every place."""
+        """Return whether the emitter illuminates every point from a single direction."""
         return self.emitter.startswith(("directional", "point", "spot"))
 
     def extinction(self) -> np.ndarray:
-        """Voxels (z, y, x) in random order, half of them thin and half of them dense."""
+        """Return voxels (z, y, x) in random order, half of them thin and half of them dense."""
         shape = GRIDS[self.grid]
         count = int(np.prod(shape))
         thin = np.geomspace(1 / CONTRAST, 100 / CONTRAST, count // 2)
@@ -121,7 +122,7 @@ class Case:
         return np.float32(values * (DEPTH / 2 / values.mean()))
 
     def scene(self, **integrator) -> mi.Scene:
-        """The scene, its cache cold."""
+        """Load the scene with a cold cache."""
         place = look(CAMERA, (0, 0, 0), (0, 1, 0)) @ mi.ScalarTransform4f().scale(HALF_WIDTH)
         film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
         film |= {"component_format": "float32", "pixel_format": "rgb"}
@@ -144,7 +145,7 @@ class Case:
 
 
 def cases() -> list[Case]:
-    """All: every emitter with every phase function and depth that matters to it."""
+    """Return every emitter with every phase function and depth that is relevant to it."""
     found = [Case(emitter) for emitter in EMITTERS]
     found += [replace(c, grid=grid) for grid in ("3x5x2", "1x1x6") for c in found[:10:3]]
     for phase in ("hg 0.3", "hg 0.58", "hg -0.4", "rayleigh"):

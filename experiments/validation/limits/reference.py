@@ -2,10 +2,10 @@
 
     L = int T sigma_s int p L_e T' dw dt
 
-At the points of a fixed quadrature along fixed rays of each pixel, light comes from
-`Emitter.sample_direction` of Mitsuba, for emitters with a size at points of a lattice that is
-shifted at random for every place. Transmittances are exact: between the planes through voxel
-centres extinction is a cubic polynomial along a ray.
+At the points of a fixed quadrature along fixed rays of each pixel, `Emitter.sample_direction` of
+Mitsuba gives the direct illumination, for area emitters at points of a lattice that is shifted at
+random for every point. Transmittances are exact: between the planes through voxel centres
+extinction is a cubic polynomial along a ray.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from experiments.validation.limits.cases import ALBEDO, PHASES, PIXELS, Case
 #: Two Gauss points of [0, 1], and steps along a ray that each have them.
 GAUSS = 0.5 - 3**-0.5 / 2, 0.5 + 3**-0.5 / 2
 STEPS = 128
-#: Optical depth beyond which nothing is looked up.
+#: Optical depth beyond which contributions are neglected.
 DARK = 40.0
 
 
@@ -33,15 +33,17 @@ class Extinction:
         self.sides = mi.Vector3f(*(float(n) for n in values.shape[::-1]))
 
     def at(self, p: mi.Point3f) -> mi.Float:
-        """The extinction at world positions."""
+        """Return the extinction at world positions."""
         return self.texture.eval(mi.Point3f(0.5 * (p + 1)))[0]
 
     @dr.syntax
     def transmittance(self, o: mi.Point3f, d: mi.Vector3f, far: mi.Float) -> mi.Float:
-        """From ``o`` in the cube along ``d`` up to ``far``, or to where the ray leaves the cube."""
+        """Return the transmittance from ``o`` along ``d`` to ``far``, or to the border of the
+        cube.
+        """
         rcp = dr.rcp(dr.select(dr.abs(d) < 1e-7, 1e-7, d))
         far = dr.minimum(far, dr.min((mi.Vector3f(dr.sign(rcp)) - o) * rcp))
-        # Coordinates in which the centre of voxel i is at i; the distance from plane to plane along
+        # In these coordinates the centre of voxel i is at i; the distance from plane to plane along
         # each axis, and to the next one.
         u = 0.5 * (o + 1) * self.sides - 0.5
         spacing = dr.abs(2 * rcp / self.sides)
@@ -58,7 +60,7 @@ class Extinction:
 
 
 def phase_value(name: str, cosine: mi.Float) -> mi.Float:
-    """The phase function; ``cosine`` is 1 for forward scattering."""
+    """Return the phase function; ``cosine`` is 1 for forward scattering."""
     phase = PHASES[name]
     if phase["type"] == "hg":
         g = phase["g"]
@@ -70,8 +72,9 @@ def phase_value(name: str, cosine: mi.Float) -> mi.Float:
 
 
 def single(case: Case, rays: int = 3, lights: int = 32, steps: int = STEPS) -> np.ndarray:
-    """Pixels (y, x) of the image: means over ``rays``^2 rays each, and ``lights`` points on an
-    emitter from every place.
+    """Return the pixels (y, x): means over ``rays``^2 rays each.
+
+    From every point on a ray ``lights`` points on the emitter are sampled.
     """
     scene = case.scene()
     side = PIXELS * rays
@@ -87,7 +90,7 @@ def single(case: Case, rays: int = 3, lights: int = 32, steps: int = STEPS) -> n
 
 
 def _integral(case, scene, o, d, length, lights, steps):
-    """Radiance that rays from ``o`` gather along ``d``."""
+    """Return the scattered radiance of rays from ``o`` along ``d``."""
     emitter = scene.emitters()[0]
     extinction = Extinction(case.extinction())
     lights = 1 if case.has_direction else lights
@@ -98,7 +101,7 @@ def _integral(case, scene, o, d, length, lights, steps):
     part = (mi.Float(node // 2) + dr.select(node % 2 == 0, *GAUSS)) / steps
     if case.position is None:
         t, weight = part * length, length / (2 * steps)
-    else:  # equiangular: radiance grows like 1 / r^2 next to the light
+    else:  # equiangular: radiance grows like 1 / r^2 next to the emitter
         way = mi.Point3f(*case.position) - o
         middle = dr.dot(way, d)
         q = dr.norm(way - middle * d)
@@ -115,7 +118,7 @@ def _integral(case, scene, o, d, length, lights, steps):
 
 @dr.syntax
 def _light(phase: str, emitter, extinction, p, d, lights: int):
-    """What ``lights`` points on the emitter scatter at ``p`` into the direction -d."""
+    """Return the radiance of ``lights`` emitter samples, scattered at ``p`` into direction -d."""
     a, b = mi.sample_tea_32(dr.arange(mi.UInt32, dr.width(p)), mi.UInt32(1))
     shift = mi.Point2f(mi.Float(a >> 8), mi.Float(b >> 8)) * 2**-24
     at = dr.zeros(mi.Interaction3f, dr.width(p))
@@ -131,16 +134,17 @@ def _light(phase: str, emitter, extinction, p, d, lights: int):
     return total
 
 
-#: Independent parts of a Monte Carlo reference, which tell its noise.
+#: Independent parts of a Monte Carlo reference, for its standard error.
 BATCHES = 16
-#: Collisions after which paths end at random, and the probability to go on.
+#: Collisions after which Russian roulette starts, and the survival probability.
 CERTAIN, SURVIVE = 6, 0.8
 
 
 def orders(case: Case, paths: int, seed: int = 0, with_control: bool = True) -> tuple[float, float]:
-    """The mean of the image for any ``max_depth``, and its standard error: delta tracking from the
-    camera, with light from the emitter at every collision as in `single`, whose result is the
-    control variate if wanted. Unlike volpath it has no offsets of rays.
+    """Return the mean of the image for any ``max_depth``, and its standard error.
+
+    It uses delta tracking from the camera with emitter sampling at every collision as in `single`,
+    whose result is an optional control variate. Unlike volpath it does not offset rays.
     """
     scene = case.scene()
     extinction = Extinction(case.extinction())
@@ -158,7 +162,7 @@ def orders(case: Case, paths: int, seed: int = 0, with_control: bool = True) -> 
 
 
 def _paths(case, scene, extinction, majorant: float, count: int, seed: int):
-    """Radiance of so many paths after their first collision, and in all."""
+    """Return the radiance of paths after their first collision, and in all."""
     rng = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
     film = mi.Point2f(rng.next_float32(), rng.next_float32())
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
@@ -174,7 +178,7 @@ def _paths(case, scene, extinction, majorant: float, count: int, seed: int):
 
 @dr.syntax
 def _walk(phase, emitter, extinction, majorant, p, d, rng, most):
-    """Radiance of paths from ``p``, at the border of the cube, along ``d``."""
+    """Return the radiance of paths from ``p``, at the border of the cube, along ``d``."""
     first = dr.zeros(mi.Float, dr.width(p))
     total, weight, collisions = dr.zeros(mi.Float, dr.width(p)), mi.Float(1), mi.UInt32(0)
     d, active = mi.Vector3f(d), dr.full(mi.Bool, True, dr.width(p))
@@ -209,7 +213,7 @@ def _walk(phase, emitter, extinction, majorant, p, d, rng, most):
 
 
 def _scattered(phase: str, u: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """The cosine of a scattering angle, and its weight."""
+    """Sample the cosine of a scattering angle; return it with its weight."""
     g = PHASES[phase].get("g", 0.0)
     if not g:
         cosine = 1 - 2 * u

@@ -1,17 +1,17 @@
-"""Whether images converge to the exact ones as resolution and cache_spp grow and step falls.
+"""Convergence of images to exact references as resolution and cache_spp grow and step decreases.
 
     python -m experiments.validation.limits.run [--only TEXT] [--solver sweep|path] [--budget 280]
         [--force]
 
 Coarse grids of high contrast, every emitter and phase function, both solvers (see cases.py). For
 max_depth 2 the reference is a quadrature without noise; for others Monte Carlo with a standard
-error of about 0.05 % (see reference.py). Printed is the error of the mean of the image in % of it,
-and the RMSE of its pixels where the reference has no noise, for one setting after the other; of the
-last two resolutions what errors of order 2 would leave in the limit; and the standard error of all
-this by caches of other seeds. A case *converges* where the last error, or the limit, is within
-0.1 % or three standard errors.
+error of about 0.05 % (see reference.py). The table has the relative error of the mean of the image,
+and the RMSE of its pixels if the reference has no noise, for one setting after the other; the limit
+that the last two resolutions imply if the error is of order 2; and the standard error of all this
+from caches of other seeds. A case *converges* if the last error, or the limit, is within 0.1 % or
+three standard errors.
 
-Rows are kept in output/limits/results.json; no case is begun after ``--budget`` seconds.
+Rows are saved in output/limits/results.json; no case is started after ``--budget`` seconds.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from experiments.validation.limits.reference import orders, single
 from mitsuba_irrcache.errors import IrrcacheError, origin
 
 #: Resolutions with samples per voxel; the last two with several seeds. With few samples images of
-#: ``path`` are too dark (16 at a resolution of 64: 0.5 to 1 %, some 4 % in a narrow beam), which
-#: vanishes with the noise of the samples; probably since roots of light are interpolated.
+#: ``path`` are too dark (16 at a resolution of 64: 0.5 to 1 %, some 4 % in a narrow cone), which
+#: decreases with the noise of the samples; probably because roots of irradiance are interpolated.
 SWEEP = ((16, 512), (32, 512), (64, 512), (128, 512))
 PATH = ((16, 64), (32, 64), (64, 64))
 #: Settings of slow sweeps: anisotropic phase functions, or many orders of scattering.
 LONG_SWEEP = SWEEP[:3]
-#: Steps at the second but last resolution, beside 1.
+#: Steps at the second but last resolution, besides 1.
 STEPS = (0.5, 0.25)
 SEEDS, SPP, PATHS = 2, 256, 1 << 22
 BOUND, SIGMAS = 1e-3, 3.0
 
 
 def measure(case: Case, solver: str, store: Store) -> dict:
-    """A row: errors by setting, their noise, and the seconds in all."""
+    """Return a row: errors by setting, their noise, and the seconds in all."""
     started = time.perf_counter()
     known = store.row(f"reference: {case.name}", partial(reference, case))
     pixels = None if known["pixels"] is None else np.array(known["pixels"])
@@ -63,7 +63,7 @@ def measure(case: Case, solver: str, store: Store) -> dict:
 
 
 def reference(case: Case) -> dict:
-    """The mean, its relative standard error, and the pixels if these have no noise."""
+    """Return the mean, its relative standard error, and the pixels if these have no noise."""
     if case.max_depth == 2:
         pixels = single(case, 3, 64)
         return {"mean": pixels.mean(), "noise": 0.0, "pixels": pixels.tolist()}
@@ -72,8 +72,9 @@ def reference(case: Case) -> dict:
 
 
 def error(case: Case, solver: str, settings: dict, seeds: int, mean: float, pixels) -> dict:
-    """Relative errors of the mean, by cache seeds, and of the pixels of the mean of the images. Of
-    a point light that is seen, pixels next to it are left out.
+    """Return relative errors of the mean, by cache seeds, and of the pixels of the mean image.
+
+    For a visible point light, pixels next to it are excluded.
     """
     known = None if pixels is None else pixels < (np.inf if case.position is None else 4 * mean)
     images = []
@@ -89,9 +90,7 @@ def error(case: Case, solver: str, settings: dict, seeds: int, mean: float, pixe
 
 
 def summary(row: dict) -> dict:
-    """The error at the finest resolution, in the limit, the standard error of the former, and
-    whether it converges.
-    """
+    """Return the error at the finest resolution, its limit and standard error, and convergence."""
     plain = [e for e in row["errors"] if e["step"] == 1]
     coarse, fine = (float(np.mean(e["means"])) for e in plain[-2:])
     ratio = (plain[-1]["resolution"] / plain[-2]["resolution"]) ** 2
@@ -104,7 +103,7 @@ def summary(row: dict) -> dict:
 
 
 def line(name: str, row: dict) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     if "refused" in row:
         return f"{name:55} refused: {row['refused'][:90]}"
     parts = []
@@ -120,7 +119,7 @@ def line(name: str, row: dict) -> str:
 
 
 def attempt(case: Case, solver: str, store: Store) -> dict:
-    """A row, or why the scene is refused."""
+    """Return a row, or the reason for which the scene is refused."""
     try:
         return measure(case, solver, store)
     except RuntimeError as problem:
@@ -130,7 +129,7 @@ def attempt(case: Case, solver: str, store: Store) -> dict:
 
 
 def run() -> None:
-    """Computes the rows that are missing, and prints the table."""
+    """Compute missing rows, and print the table."""
     parser = parser_of(__doc__)
     parser.add_argument("--only", default="", help="cases whose name contains this")
     parser.add_argument("--solver", choices=("sweep", "path"), help="one of the two")

@@ -15,7 +15,7 @@ INTEGRATORS = ("irrcache", "volpath")
 
 
 def plot(options: Options) -> Section:
-    """Mean errors against the references of others, with their standard errors."""
+    """Plot mean errors against third-party references, with their standard errors."""
     folder = options.folder("others")
     rows = read_json(folder / "results.json")
     table = tabulated(rows)
@@ -46,7 +46,7 @@ def plot(options: Options) -> Section:
 
 
 def tabulated(rows: dict) -> Table:
-    """All rows; of scenes that are refused the reason is in the note."""
+    """Tabulate all rows; for refused scenes the note holds the reason."""
     cells, refused = [], []
     for name, row in rows.items():
         if "refused" in row:

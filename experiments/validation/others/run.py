@@ -1,11 +1,14 @@
-"""Scenes by others, against their own references: those of Mitsuba's test suite, with the images
-and variances that its authors made, and those of lajolla, with images of other renderers.
+"""Third-party scenes with their own references.
+
+These are scenes of Mitsuba's test suite, with its images and variances, and those of lajolla, with
+images of other renderers.
 
     python -m experiments.validation.others.run [--force]
 
-The scenes are looked for where ``experiments.support.scenes`` says, in scenes/mitsuba-data and
-scenes/lajolla. Beside irrcache, volpath is measured with as many samples: what the reference and
-the samples err, it errs too. Prints a table and writes output/others/results.json.
+The scenes are looked up in the data folder of ``experiments.support.scenes``, in
+scenes/mitsuba-data and scenes/lajolla. volpath is measured with equal samples as a control: it has
+the same errors due to the reference and the samples. Prints a table and writes
+output/others/results.json.
 """
 
 from __future__ import annotations
@@ -31,11 +34,11 @@ from mitsuba_irrcache.io.scene_files import load_scene
 
 SUITE = DATA / "scenes" / "mitsuba-data" / "tests" / "scenes" / "participating_media"
 LAJOLLA = DATA / "scenes" / "lajolla"
-#: lajolla's images are made smaller by this, and so are ours.
+#: Factor by which lajolla's and our images are downsampled.
 SMALLER = 4
 #: Samples per pixel of the Z-test: few, for the reference has noise of its own.
 SUITE_SPP = 64
-#: Bytes before the voxels of a .vol file, with the place of its grid.
+#: Bytes before the voxels of a .vol file, including the bounding box of its grid.
 HEADER = 48
 #: Where no ray can meet a cache, irrcache renders as volpath does.
 BY_PATHS = ("surf_area_light", "homo_dielectric_envmap")
@@ -43,14 +46,14 @@ BY_PATHS = ("surf_area_light", "homo_dielectric_envmap")
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene made by others.
+    """A third-party scene.
 
     Attributes:
         max_depth: of its own integrator.
         spp: samples per pixel that are rendered here.
-        source: the file that says whether its data are at hand.
-        prepare: gives the file to load, which may have to be edited first.
-        reference: gives the image, and the variance of one sample where it is known.
+        source: the file that exists if the data are available.
+        prepare: returns the file to load, which may be edited first.
+        reference: returns the image, and the variance of one sample if it is known.
     """
 
     max_depth: int
@@ -61,13 +64,13 @@ class Scene:
 
 
 def of_the_suite(name: str, max_depth: int) -> Scene:
-    """One of Mitsuba's, as it is."""
+    """Return one of Mitsuba's scenes, unchanged."""
     source = SUITE / f"test_{name}_volpath.xml"
     return Scene(max_depth, 1024, source, lambda _: source, lambda: _of_the_suite(name))
 
 
 def of_lajolla(name: str, repaired: bool = False) -> Scene:
-    """One of lajolla's, in today's dialect."""
+    """Return one of lajolla's scenes, converted to Mitsuba 3."""
     return Scene(
         -1,
         64,
@@ -90,7 +93,7 @@ SCENES = {
 
 
 def run(options: Options) -> None:
-    """Computes the rows that are missing and prints all."""
+    """Compute missing rows and print all."""
     store = Store(options.folder("others") / "results.json", options.force)
     for name, scene in SCENES.items():
         if not scene.source.exists():
@@ -100,10 +103,10 @@ def run(options: Options) -> None:
 
 
 def compute(name: str, scene: Scene, options: Options) -> dict:
-    """Errors of irrcache and of volpath, in units of the reference's mean; or why there are none.
+    """Return errors of irrcache and of volpath in units of the reference's mean, or the reason.
 
-    ``z`` is the root mean square of the deviations over their standard errors, about 1 where there
-    is no bias, and ``passed`` the share of pixels and channels in Mitsuba's own Z-test.
+    ``z`` is the root mean square of the deviations over their standard errors, about 1 without
+    bias, and ``passed`` the share of pixels and channels that pass Mitsuba's own Z-test.
     """
     path = scene.prepare(options.folder("others"))
     target, variance = scene.reference()
@@ -122,7 +125,7 @@ def compute(name: str, scene: Scene, options: Options) -> dict:
 def measured(
     path: Path, integrator: str, spp: int, target: np.ndarray, variance: np.ndarray | None
 ) -> dict[str, float]:
-    """One image against the target."""
+    """Measure one image against the target."""
     loaded = load_scene(path, None, integrator)
     started = time.perf_counter()
     image = np.array(mi.render(loaded, spp=spp, seed=1), dtype=np.float64)
@@ -142,8 +145,10 @@ def measured(
 
 
 def z_test(image: np.ndarray, target: np.ndarray, variance: np.ndarray) -> dict[str, float]:
-    """As in Mitsuba's src/render/tests/test_renders.py, which wants 99.75 % to pass, and no less
-    variance than 1e-4. It holds for volpath's variance: images with less of it pass more easily.
+    """Apply the Z-test of Mitsuba's src/render/tests/test_renders.py.
+
+    It requires 99.75 % to pass, and a variance of at least 1e-4. It is designed for volpath's
+    variance: images with less of it pass more easily.
     """
     z = (image - target) * np.sqrt(SUITE_SPP / np.maximum(variance, 1e-4))
     significance = 1 - (1 - 0.01) ** (1 / z[..., 0].size)  # Sidak's, of each pixel
@@ -152,7 +157,7 @@ def z_test(image: np.ndarray, target: np.ndarray, variance: np.ndarray) -> dict[
 
 
 def print_row(name: str, row: dict) -> None:
-    """One line for each integrator."""
+    """Print one line for each integrator."""
     if "refused" in row:
         print(f"{name:25} refused: {row['refused']}")
         return
@@ -180,8 +185,8 @@ def _smaller(image: np.ndarray) -> np.ndarray:
     return metrics.block_means(image, SMALLER)
 
 
-#: From the dialect of Mitsuba 0.5, beyond what Mitsuba translates itself; hg with g = 0 is
-#: isotropic, and volumes lay where their files said.
+#: Substitutions from the dialect of Mitsuba 0.5, in addition to Mitsuba's own; hg with g = 0 is
+#: isotropic, and volumes had the positions given in their files.
 EDITS = (
     (r'\s*<(integer|string|float|boolean) name="(version|method|stepSize|banner)"[^>]*/>', ""),
     (r'(?s)<phase type="hg">.*?</phase>', '<phase type="isotropic"/>'),
@@ -194,8 +199,9 @@ EDITS = (
 
 
 def modernised(name: str, repaired: bool, folder: Path) -> Path:
-    """The scene ``name`` for Mitsuba 3, its files named in full; ``repaired``: with an extinction
-    whose negative voxels are 0.
+    """Return the scene ``name`` for Mitsuba 3 with absolute file names.
+
+    ``repaired``: with an extinction whose negative voxels are 0.
     """
     text = (LAJOLLA / f"{name}.xml").read_text()
     for pattern, replacement in EDITS:

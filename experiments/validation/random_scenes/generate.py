@@ -1,8 +1,8 @@
-"""Random scenes: a medium with a boundary, emitters, a camera, and what stands around it.
+"""Random scenes: a medium with a boundary, emitters, a camera, and surrounding objects.
 
 Scene ``index`` depends on the seed and the index alone. Every property (grid, boundary, emitter,
-...) has a list of options that is gone through in a new random order again and again, so that each
-option occurs in about as many scenes, in combinations that nobody chose.
+...) has a list of options that is repeatedly shuffled and traversed, so that each option occurs in
+about as many scenes, in random combinations.
 
 The medium fills about the cube [-5, 5]^3. volpath offsets its rays by about 9e-5 (1 + max |p|), an
 absolute length that would matter in smaller scenes.
@@ -52,13 +52,13 @@ SURROUNDINGS = (
     "ball inside",
 )  # fmt: skip
 MAX_DEPTHS = (2, -1, -1, 3, 2, -1, 5, 1)
-#: A lamp in view has more noise than all that the medium scatters.
+#: A visible area light has more noise than all scattered radiance.
 HIDES_EMITTERS = (True, False, True)
 
 
 @dataclass(frozen=True)
 class RandomScene:
-    """What was drawn for a scene; `describe` says it in a line, `build` makes the scene of it."""
+    """The properties of a scene; `describe` returns them in a line, `build` makes the scene."""
 
     seed: int
     index: int
@@ -71,7 +71,7 @@ class RandomScene:
     phase: str
     boundary: str
     emitter: str
-    sky: bool  #: a dim constant one beside the other emitter
+    sky: bool  #: a dim constant environment in addition to the other emitter
     camera: str
     surroundings: str
     max_depth: int
@@ -79,7 +79,7 @@ class RandomScene:
 
     @classmethod
     def draw(cls, seed: int, index: int) -> RandomScene:
-        """The properties of scene ``index``."""
+        """Draw the properties of scene ``index``."""
 
         def pick(name: str, options: tuple) -> object:
             block, place = divmod(index, len(options))
@@ -92,7 +92,7 @@ class RandomScene:
             "contrast": pick("contrast", CONTRASTS), "depth": pick("depth", DEPTHS),
             "albedo": pick("albedo", ALBEDOS), "tint": pick("tint", TINTS),
             "phase": pick("phase", PHASES), "boundary": pick("boundary", BOUNDARIES),
-            # Mitsuba has one environment at most.
+            # Mitsuba supports one environment at most.
             "sky": not ENVIRONMENTS & {emitter} and pick("sky", (True, False, False)),
             "camera": pick("camera", CAMERAS), "surroundings": pick("surroundings", SURROUNDINGS),
             "max_depth": pick("max_depth", MAX_DEPTHS),
@@ -106,15 +106,17 @@ class RandomScene:
         return replace(case, depth=case._renderable_depth())
 
     def _renderable_depth(self) -> float:
-        """The optical depth, less where volpath would be wrong: between the grid and a boundary
-        that is larger, its exp(-majorant length) underflows, and 0 / 0 counts as 0 there.
+        """Limit the optical depth where volpath would be wrong.
+
+        Between the grid and a larger boundary, its exp(-majorant length) underflows, and 0 / 0
+        counts as 0.
         """
         if self.boundary != "cube, smaller grid" or self.grid is None:
             return self.depth
         return float(f"{self.depth * min(1, 40 / self.voxels().max()):.2g}")
 
     def describe(self) -> str:
-        """One line for a table."""
+        """Return one line for a table."""
         matter = "homogeneous"
         if self.grid:
             size = " x ".join(map(str, self.grid[::-1]))
@@ -132,25 +134,25 @@ class RandomScene:
         )
 
     def as_dict(self) -> dict:
-        """For a file of results."""
+        """Return the properties for a file of results."""
         return asdict(self) | {"contrast": str(self.contrast)}
 
     @property
     def is_chromatic(self) -> bool:
-        """Whether the extinction differs between channels."""
+        """Return whether the extinction differs between channels."""
         return len(set(self.tint)) > 1
 
     def stream(self, name: str) -> np.random.Generator:
-        """Random numbers of a part of the scene."""
+        """Return random numbers for a part of the scene."""
         return _stream(self.seed, name, self.index)
 
     @property
     def properties(self) -> dict:
-        """The properties of the integrator that determine what is visible."""
+        """Return the properties of the integrator that affect the image."""
         return {"max_depth": self.max_depth, "hide_emitters": self.hide_emitters}
 
     def build(self, integrator: dict, folder: Path) -> dict:
-        """The dictionary for `mi.load_dict`; meshes are written to ``folder``."""
+        """Return the dictionary for `mi.load_dict`; meshes are written to ``folder``."""
         folder.mkdir(parents=True, exist_ok=True)
         parts = {"type": "scene", "integrator": integrator, "medium": self._medium()}
         inside = {"type": "ref", "id": "medium"}
@@ -158,11 +160,12 @@ class RandomScene:
         parts |= self._emitters(folder) | self._surroundings() | {"sensor": self._sensor()}
         return parts
 
-    # -- matter ------------------------------------------------------------------------------------
+    # -- media -------------------------------------------------------------------------------------
 
     def voxels(self) -> np.ndarray:
-        """Relative extinction (z, y, x), scaled such that the densest line along an axis of the
-        grid, in a cube with edges of 1, has the wanted optical depth.
+        """Return the relative extinction (z, y, x), scaled to the requested optical depth.
+
+        The depth is that of the densest line along an axis of the grid, in a cube with edges of 1.
         """
         random = self.stream("voxels")
         z, y, x = (
@@ -198,7 +201,7 @@ class RandomScene:
         tint = np.array(self.tint) / max(self.tint)
         medium: dict = {"id": "medium", "phase": self._phase(), "albedo": self._albedo()}
         if self.grid is None:
-            # Mitsuba takes no colour above 1 there.
+            # Mitsuba allows no colour above 1 there.
             medium |= {"type": "homogeneous", "sigma_t": _rgb(*tint)}
             return medium | {"scale": self.depth / (2 * SIDE)}
         density = self.voxels()[..., None] * (tint if self.is_chromatic else np.ones(1))
@@ -262,7 +265,7 @@ class RandomScene:
         place = place @ mi.ScalarTransform4f().scale((SIDE * self._edges()).tolist())
         return {"type": shape, "to_world": place}
 
-    # -- light -------------------------------------------------------------------------------------
+    # -- emitters ----------------------------------------------------------------------------------
 
     def _emitters(self, folder: Path) -> dict:
         random = self.stream("emitter")
@@ -305,7 +308,7 @@ class RandomScene:
         return found | {"light": light}
 
     def _leaves(self, direction: np.ndarray) -> float:
-        """Where a ray from the centre leaves the boundary, in units of SIDE."""
+        """Return where a ray from the centre leaves the boundary, in units of SIDE."""
         turn = np.eye(3)
         if self.boundary in ("rotated cube", "stretched cube"):
             turn = np.array(self._turn().matrix)[:3, :3]
@@ -333,7 +336,7 @@ class RandomScene:
             path.write_text(icosahedron())
             lamp |= {"type": "obj", "filename": str(path)}
         if where == "inside":
-            lamp["exterior"] = {"type": "ref", "id": "medium"}  # it emits to its front alone
+            lamp["exterior"] = {"type": "ref", "id": "medium"}  # it emits from its front only
         return lamp | {"emitter": emitter, "bsdf": _diffuse(0.3, 0.3, 0.3)}
 
     def _envmap(self, random: np.random.Generator) -> dict:
@@ -359,13 +362,13 @@ class RandomScene:
         elif self.camera == "close":
             origin, fov = np.array([0.4, 0.5, -2.4]) * SIDE, 45.0
         elif self.camera == "inside":
-            # Inside of every boundary, also of the thinnest of the stretched ones.
+            # Inside of every boundary, including the thinnest of the stretched ones.
             origin, fov = 0.1 * np.array([0.5, 0.4, -0.7]) * SIDE, 70.0
             target = np.array([0.1, 0.0, 1.0]) * SIDE
         if self.surroundings == "room" and self.camera != "inside":
             origin, fov = np.array([0.2, 0.3, -3.4]) * SIDE, 45.0
         if self.surroundings in ("second medium", "ball beside") and self.camera != "inside":
-            fov = 58.0  # they are to be seen
+            fov = 58.0  # so that they are visible
         film = {
             "type": "hdrfilm", "width": PIXELS, "height": PIXELS, "component_format": "float32",
             "rfilter": {"type": "box"},
@@ -405,7 +408,7 @@ class RandomScene:
                 "ball": ball | {"center": [-2.5 * SIDE, 0.5 * SIDE, -0.5], "radius": 0.6 * SIDE}
             }
         if self.surroundings == "ball inside":
-            # Away from the camera and from the lamps in the medium.
+            # Away from the camera and from the emitters in the medium.
             medium = {"exterior": {"type": "ref", "id": "medium"}}
             return {
                 "ball": ball | medium | {"center": [0.02 * SIDE, -0.16 * SIDE, 0.1 * SIDE],
@@ -415,7 +418,7 @@ class RandomScene:
 
 
 def icosahedron() -> str:
-    """A closed mesh of twenty triangles in the unit sphere, as an OBJ file."""
+    """Return a closed mesh of twenty triangles in the unit sphere, as an OBJ file."""
     golden = (1 + 5**0.5) / 2
     corners = np.array(
         [p for a in (-1, 1) for b in (-golden, golden) for p in ((0, a, b), (a, b, 0), (b, 0, a))]
@@ -439,7 +442,7 @@ def _stream(seed: int, name: str, number: int) -> np.random.Generator:
 
 
 def _rotation(random: np.random.Generator, least: float, most: float) -> mi.ScalarTransform4f:
-    """By an angle in degrees about a random axis, which Mitsuba wants to have unit length."""
+    """Return a rotation about a random axis, normalised as Mitsuba requires."""
     axis = random.normal(size=3)
     axis /= np.linalg.norm(axis)
     return mi.ScalarTransform4f().rotate(axis.tolist(), float(random.uniform(least, most)))

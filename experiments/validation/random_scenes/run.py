@@ -4,25 +4,26 @@
         [--seconds 12]
         [--budget 480] [--force]
 
-Each scene (see generate.py) is loaded by `mi.load_dict`, its integrator ``irrcache`` with nothing
-set but ``max_depth`` and ``hide_emitters``, and rendered twice, with another ``cache_seed`` the
-second time, which separates the noise of the cache from its bias. The reference is rendered by
-volpath (volpathmis where it is cheaper) in two independent halves. A pilot chooses its samples: the
-noise of a pixel is to be 4 % of the mean radiance in each half, which makes that of the mean much
-less than a third of a percent; all of the reference gets about ``--seconds``. A scene whose mean is
-not known to a third of a percent by then counts as undecided; where that of the volume alone is
-not, it says so.
+Each scene (see generate.py) is loaded by `mi.load_dict`, with the integrator ``irrcache`` at
+default settings except ``max_depth`` and ``hide_emitters``, and rendered with two values of
+``cache_seed``, which separates the noise of the cache from its bias. The reference is rendered by
+volpath (volpathmis if it is cheaper) in two independent halves. A pilot run selects the samples for
+a noise of 4 % of the mean radiance per pixel in each half, with which that of the mean is much less
+than a third of a percent, within about ``--seconds`` for the whole reference. A scene whose mean is
+not known to a third of a percent then counts as undecided; the table marks scenes for which only
+the mean of the volume alone is uncertain.
 
-Printed are the difference of the means; the RMSE, the noise of the reference removed by
-mean((x - a)(x - b)); what of it is bias, by mean((x - a)(y - b)), with a bound that it exceeds by
-three standard errors; the worst block of 4 x 4 pixels. All in % of the mean radiance of the image
-and, in brackets, of that of the volume alone: of the image without the light that reaches the
-camera without being scattered (volpath at depth 1). A scene *disagrees* where one of these, in both
+The table has the difference of the means; the RMSE, net of the reference's noise, by
+mean((x - a)(x - b)); its bias, by mean((x - a)(y - b)), with a lower bound of three standard
+errors; the largest error of a block of 4 x 4 pixels. All in % of the mean radiance of the image
+and, in brackets, of that of the volume alone: of the image without the
+unscattered radiance (volpath at depth 1). A scene *disagrees* if one of these, in both
 renderings, is beyond three standard errors (4.5 for the worst of 64 blocks) and beyond LIMITS.
 
-Rows are kept in output/random_scenes/<seed>.json, images beside them as .npz; no scene is begun
-after ``--budget`` seconds: run it again for the others, and with more ``--seconds`` for those that
-are undecided.
+Rows are stored in output/random_scenes/<seed>.json, images and references as .npz files;
+``--force`` discards the rows and renders with irrcache again, against the stored references. No
+scene is started after ``--budget`` seconds: run it again for the others, and with more
+``--seconds`` for those that are undecided.
 """
 
 from __future__ import annotations
@@ -52,18 +53,18 @@ LARGEST_SPP = 1024
 BLOCK = 4
 #: Noise of a pixel of half a reference, and of the mean radiance, in units of the mean.
 PIXEL_NOISE, MEAN_NOISE = 0.04, 0.01 / 3
-#: Errors that count, in units of the mean, and the standard errors they have to be beyond.
+#: Thresholds of errors in units of the mean, and in standard errors.
 LIMITS = {"mean": 0.01, "bias": 0.01, "block": 0.03}
 SIGMAS = {"mean": 3.0, "bias": 3.0, "block": 4.5}
 
 
 def compute(case: RandomScene, seconds: float, folder: Path) -> dict:
-    """All that is known of a scene."""
+    """Measure a scene."""
     row = {"about": case.describe(), "drawn": case.as_dict(), "seconds_granted": seconds}
     ours = ours_of(case, folder)
     if "failed" in ours:
         return row | ours
-    reference = reference_of(case, seconds, folder)
+    reference = stored_reference(case, seconds, folder)
     images = {name: reference.pop(name) for name in ("a", "b", "unscattered")}
     images |= {name: ours.pop(name) for name in ("x", "y")}
     np.savez_compressed(folder / f"{case.seed}-{case.index}.npz", **images)
@@ -71,20 +72,21 @@ def compute(case: RandomScene, seconds: float, folder: Path) -> dict:
 
 
 def load(case: RandomScene, integrator: str, folder: Path, **settings) -> mi.Scene:
-    """The scene, its cache cold."""
+    """Load the scene with a cold cache."""
     gc.collect()
     plugin = {"type": integrator} | case.properties | settings
     return mi.load_dict(case.build(plugin, folder))
 
 
 def picture(scene: mi.Scene, spp: int, seed: int) -> np.ndarray:
-    """Colours, float64."""
+    """Render colours, float64."""
     return colours(np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float64))
 
 
 def ours_of(case: RandomScene, folder: Path) -> dict:
-    """Images with two seeds, the solver, and the seconds of the first image; or why there are
-    none: ``refused`` tells whether it was irrcache that said why.
+    """Return images with two seeds, the solver, and the seconds of the first image.
+
+    If there are none, ``refused`` says whether irrcache refused the scene with a message.
     """
     found: dict = {}
     try:
@@ -93,7 +95,7 @@ def ours_of(case: RandomScene, folder: Path) -> dict:
             scene = load(case, "irrcache", folder, **({"cache_seed": seed} if seed else {}))
             found[name] = picture(scene, SPP, seed)
             found.setdefault("seconds", time.perf_counter() - started)
-    except Exception as error:  # whatever a user would see
+    except Exception as error:  # any exception that a user would see
         refused = isinstance(origin(error), IrrcacheError)
         return {"failed": essence(error), "refused": refused, "kind": type(origin(error)).__name__}
     builder = scene.integrator()._builder
@@ -102,7 +104,7 @@ def ours_of(case: RandomScene, folder: Path) -> dict:
 
 
 def reference_of(case: RandomScene, seconds: float, folder: Path) -> dict:
-    """Two halves by the cheaper stock integrator, and what of them was not scattered."""
+    """Render two halves with the cheaper stock integrator, and their unscattered part."""
     candidates = ("volpath", "volpathmis") if case.is_chromatic else ("volpath",)
     pilots = {name: pilot(load(case, name, folder, rr_depth=50)) for name in candidates}
     judge = min(pilots, key=lambda name: pilots[name][0] * pilots[name][1])
@@ -121,9 +123,22 @@ def reference_of(case: RandomScene, seconds: float, folder: Path) -> dict:
     return {"a": a, "b": b, "unscattered": unscattered, "judge": judge, "spp": 2 * spp * count}
 
 
+def stored_reference(case: RandomScene, seconds: float, folder: Path) -> dict:
+    """Return `reference_of`, from its file if that is of the same scene and ``seconds``."""
+    file, drawn = folder / f"{case.seed}-{case.index}-reference.npz", json.dumps(case.as_dict())
+    if file.exists():
+        with np.load(file) as stored:
+            if str(stored["drawn"]) == drawn and stored["seconds"] >= seconds:
+                found = {name: stored[name] for name in ("a", "b", "unscattered")}
+                return found | {"judge": str(stored["judge"]), "spp": int(stored["spp"])}
+    found = reference_of(case, seconds, folder)
+    np.savez_compressed(file, drawn=drawn, seconds=seconds, **found)
+    return found
+
+
 def pilot(scene: mi.Scene) -> tuple[float, float, float]:
-    """Variance of a sample, averaged over pixels, its seconds, and the mean radiance."""
-    picture(scene, 1, 0)  # compiles
+    """Return the variance of a sample, averaged over pixels, its seconds, and the mean radiance."""
+    picture(scene, 1, 0)  # compiles kernels
     dr.sync_thread()
     started = time.perf_counter()
     images = [picture(scene, PILOT_SPP, seed) for seed in range(1, 1 + PILOTS)]
@@ -132,10 +147,10 @@ def pilot(scene: mi.Scene) -> tuple[float, float, float]:
 
 
 def compare(a, b, unscattered, x, y) -> dict:
-    """Errors of ``x`` and ``y``, two images with caches of their own, in units of the mean of the
-    reference ``a`` and ``b``, and what this is in units of the mean radiance of the volume.
+    """Return the errors of images ``x`` and ``y`` with separate caches against ``a`` and ``b``.
 
-    Channels of a pixel share their paths and count as one for standard errors.
+    They are in units of the mean of the reference, whose ratio to the mean radiance of the volume
+    is returned, too. Channels of a pixel share their paths and count as one for standard errors.
     """
     r = 0.5 * (a + b)
     mean = r.mean()
@@ -146,13 +161,13 @@ def compare(a, b, unscattered, x, y) -> dict:
     grey = 0.25 * ((a - b).mean(axis=-1) ** 2)  # variance of the reference's grey pixels
     own = 0.5 * (x - y).mean(axis=-1) ** 2  # likewise of an image of ours, camera and cache
     found["noise"] = float(np.sqrt(grey.mean() / grey.size) / mean)
-    # The difference of two means, of which each has a noise of its own: one sample of it.
+    # One sample of the difference of two means, each with noise of its own.
     found["own_noise"] = float(abs(x.mean() - y.mean()) / 2**0.5 / mean)
     blocks, block_noise = (
         [],
         np.sqrt((block_means((grey + own)[..., None], BLOCK)[..., 0]) / BLOCK**2),
     )
-    floor = np.sqrt((grey + own).mean()) / BLOCK  # of pixels that no sample has met yet
+    floor = np.sqrt((grey + own).mean()) / BLOCK  # of pixels without a sample that hit anything
     block_noise = np.maximum(block_noise, floor)
     for name, image in (("x", x), ("y", y)):
         signed = block_means((image - r).mean(axis=-1)[..., None], BLOCK)[..., 0]
@@ -166,7 +181,7 @@ def compare(a, b, unscattered, x, y) -> dict:
     found["bias_at_least"] = _root(
         (shared.mean() - SIGMAS["bias"] * shared.std() / shared.size**0.5) / mean**2
     )
-    # The block that stands out most in both.
+    # The block with the largest significance in both.
     least = np.where(np.sign(blocks[0]) == np.sign(blocks[1]), np.abs(blocks).min(axis=0), 0)
     significant = least > SIGMAS["block"] * block_noise
     worst = np.unravel_index(np.argmax(np.where(significant, least, 0) + 1e-9 * least), least.shape)
@@ -181,18 +196,19 @@ def compare(a, b, unscattered, x, y) -> dict:
 
 
 def _root(value: float) -> float:
-    """Square root that keeps the sign."""
+    """Return the square root with the sign of the argument."""
     return float(np.copysign(np.sqrt(abs(value)), value))
 
 
 def verdict(row: dict) -> str:
-    """Whether a scene agrees, is refused or undecided, or in what it disagrees."""
+    """Return whether a scene agrees, is refused or undecided, or how it disagrees."""
     if "failed" in row:
         return "refused" if row["refused"] else "ERROR"
     if not row["finite"]:
         return "NOT FINITE"
     if "x" not in row:
-        return "agrees" if row["dark_difference"] == 0 else "undecided"  # no path found light
+        # No path reached an emitter.
+        return "agrees" if row["dark_difference"] == 0 else "undecided"
     found = []
     volume = row["volume"] / row["mean"]
     for suffix, unit in (("", 1.0), (" of volume", volume)):
@@ -217,12 +233,12 @@ def verdict(row: dict) -> str:
 
 
 def total_noise(row: dict) -> float:
-    """Standard error of the difference of the means, without the bias of our image."""
+    """Return the standard error of the difference of the means, without the bias of our image."""
     return float(np.hypot(row["noise"], row["own_noise"]))
 
 
 def line(key: str, row: dict) -> list[str]:
-    """Cells of a table."""
+    """Return the cells of a table row."""
     if "failed" in row:
         kind = "" if row["refused"] else f"{row['kind']}: "
         return [key, verdict(row), "-", "-", "-", "-", "-", "-", kind + row["failed"][:150]]
@@ -246,7 +262,7 @@ def line(key: str, row: dict) -> list[str]:
 
 
 def table(rows: dict[str, dict], title: str) -> Table:
-    """Errors in % of the mean."""
+    """Tabulate errors in % of the mean."""
     head = [
         "scene",
         "verdict",
@@ -260,14 +276,14 @@ def table(rows: dict[str, dict], title: str) -> Table:
 
 
 def is_outdated(row: dict | None, case: RandomScene, seconds: float) -> bool:
-    """Whether a row is of another version of its scene, or undecided and more time is granted."""
+    """Return whether a row is of another version of its scene, or undecided with less time."""
     if row is None or row["drawn"] != json.loads(json.dumps(case.as_dict())):
         return True
     return verdict(row) == "undecided" and row["seconds_granted"] < seconds
 
 
 def main() -> None:
-    """Computes the rows that are missing, as many as the budget lets."""
+    """Compute missing rows within the budget."""
     parser = parser_of(__doc__)
     parser.add_argument("--count", type=int, default=60, help="scenes")
     parser.add_argument("--seed", type=int, default=1, help="of the scenes")

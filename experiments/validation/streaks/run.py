@@ -1,10 +1,10 @@
-"""Do directions that all voxels share leave streaks? The spectrum of the noise of `sweep`.
+"""Streaks due to directions that all voxels share: the spectrum of the noise of `sweep`.
 
     python -m experiments.validation.streaks.run [--full] [--force]
 
 Differences of images from caches of different seeds, 32 directions each, single scattering: their
-power by direction in the image (24 sectors) and by frequency. A set of few directions would show as
-peaks across them; noise without structure has the same power in every sector. Leaves
+power by direction in the image (24 sectors) and by frequency. A set of few directions would give
+peaks across them; noise without structure has the same power in every sector. Writes
 output/streaks/results.json.
 """
 
@@ -27,12 +27,12 @@ SCENES = ("procedural", "cloud", "head")
 PIXELS, SPP, DIRECTIONS = 128, 32, 32
 SEEDS = (1, 2, 3, 4)
 SECTORS = 24
-#: Frequencies in cycles per image: below the first of them there is too little to tell directions.
+#: Frequencies in cycles per image: lower ones contain too few values to distinguish directions.
 RINGS = (4, 8, 16, 32, 64)
 
 
 def run(options: Options) -> None:
-    """Computes the rows that are missing and prints all."""
+    """Compute missing rows and print all."""
     store = Store(options.folder("streaks") / "results.json", options.force)
     for name in SCENES:
         path = scene_file(name, options.output)
@@ -49,7 +49,7 @@ def run(options: Options) -> None:
 
 
 def measure(path: Path) -> dict:
-    """Noise in units of the mean, and mean power of all pairs' differences."""
+    """Return the noise in units of the mean, and the mean power of all pairs' differences."""
     sides = {"max_depth": "2", "width": str(PIXELS), "height": str(PIXELS)}
     images = []
     for seed in SEEDS:
@@ -74,7 +74,7 @@ def measure(path: Path) -> dict:
 
 
 def power(difference: np.ndarray) -> np.ndarray:
-    """Power spectrum with frequency 0 in the middle; a window takes the image's borders away."""
+    """Return the power spectrum with frequency 0 in the middle, windowed against border effects."""
     window = np.outer(np.hanning(PIXELS), np.hanning(PIXELS))
     transformed = np.fft.fftshift(np.fft.fft2((difference - difference.mean()) * window))
     return np.abs(transformed) ** 2

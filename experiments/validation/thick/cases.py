@@ -1,4 +1,4 @@
-"""Scenes of optically thick voxels, coarse grids and narrow beams."""
+"""Scenes with optically thick voxels, coarse grids and narrow spot lights."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ POINT = {"point": {"type": "point", "position": [1.5, 2.0, 1.0], "intensity": 8.
 
 
 def lamp() -> dict:
-    """A square area light of edge 0.8 near a corner of the cube."""
+    """Return a square area light of edge 0.8 near a corner of the cube."""
     look = mi.ScalarTransform4f().look_at([1.5, 2, 1], [0, 0, 0], [0, 1, 0]).scale(0.4)
     emitter = {"type": "area", "radiance": 10.0}
     return {"lamp": {"type": "rectangle", "to_world": look, "emitter": emitter}}
 
 
 def spot(cutoff: float) -> dict:
-    """A spot light above the cube."""
+    """Return a spot light above the cube."""
     look = mi.ScalarTransform4f().look_at([0.3, 2.2, 0.1], [-0.1, 0, 0], [1, 0, 0])
     return {"spot": {"type": "spot", "to_world": look, "cutoff_angle": cutoff, "intensity": 10.0}}
 
 
 def centres(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coordinates z, y, x of voxel centres in [-1, 1]^3."""
+    """Return the coordinates z, y, x of voxel centres in [-1, 1]^3."""
     c = (np.arange(n) + 0.5) / n * 2 - 1
     return np.meshgrid(c, c, c, indexing="ij")
 
 
 def ball(n: int) -> np.ndarray:
-    """1 inside of a ball, 0 outside, one voxel between."""
+    """Return 1 inside of a ball and 0 outside, with a transition of one voxel."""
     z, y, x = centres(n)
     return np.clip((0.7 - np.sqrt(x * x + y * y + z * z)) * n / 2 + 0.5, 0, 1)
 
 
 def bone(n: int) -> np.ndarray:
-    """Filtered noise through a steep transfer function, as opaque bone in a CT volume."""
+    """Return filtered noise through a steep transfer function, like opaque bone in a CT volume."""
     frequency = np.fft.fftfreq(n) * n
     squared = sum(np.meshgrid(*[frequency**2] * 3))
     noise = np.random.default_rng(3).normal(size=(n, n, n))
@@ -49,26 +49,27 @@ def bone(n: int) -> np.ndarray:
 
 
 def contrast() -> np.ndarray:
-    """4^3 voxels over four decades."""
+    """Return 4^3 voxels over four decades."""
     values = np.random.default_rng(5).random((4, 4, 4)) ** 8 + 1e-4
     values[1, 2, 1] = 1
     return values
 
 
 def smooth() -> np.ndarray:
-    """32^3 voxels, dense up to the boundary."""
+    """Return 32^3 voxels, dense up to the boundary."""
     z, y, x = centres(32)
     return 0.7 + 0.3 * np.sin(2 * x) * np.cos(1.5 * y + z)
 
 
 def row(n: int) -> np.ndarray:
-    """Random voxels in a row."""
+    """Return random voxels in a row."""
     return np.random.default_rng(5).random(n) + 0.1
 
 
 def medium(values: np.ndarray | None, depth: float, albedo: float = 0.8) -> dict:
-    """Matter of this optical depth along an edge of the cube where it is densest; homogeneous
-    without ``values``.
+    """Return a medium of this optical depth along the densest edge of the cube.
+
+    It is homogeneous without ``values``.
     """
     if values is None:
         return {"type": "homogeneous", "sigma_t": 1.0, "albedo": albedo, "scale": depth / 2}
@@ -82,18 +83,18 @@ def medium(values: np.ndarray | None, depth: float, albedo: float = 0.8) -> dict
 
 
 def objects(interior: dict, lights: dict, shape: str = "cube") -> dict:
-    """A medium in the cube [-1, 1]^3, or a sphere in it, and lights."""
+    """Return a medium in the cube [-1, 1]^3, or a sphere in it, and emitters."""
     return {"shape": {"type": shape, "bsdf": {"type": "null"}, "interior": interior}} | lights
 
 
 def floor() -> dict:
-    """A diffuse floor below the cube."""
+    """Return a diffuse floor below the cube."""
     place = mi.ScalarTransform4f().translate([0, -1.5, 0]).rotate([1, 0, 0], -90).scale(4)
     return {"floor": {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse"}}}
 
 
 def grids() -> dict[str, tuple[dict, int]]:
-    """Opaque matter on grids: 5 to 100 optical depths per data voxel."""
+    """Return opaque media on grids: 5 to 100 optical depths per data voxel."""
     found = {}
     for name, values in (("ball 16^3", ball(16)), ("bone 32^3", bone(32))):
         for per_voxel in (5, 30, 100):
@@ -111,7 +112,7 @@ def grids() -> dict[str, tuple[dict, int]]:
 
 
 def coarse() -> dict[str, tuple[dict, int]]:
-    """Few data voxels, or matter that the boundary cuts."""
+    """Return few data voxels, or media that the boundary cuts."""
     one = np.ones((1, 1, 1))
     cases = {
         "1^3 in a sphere, depth 5": objects(medium(one, 5), SKY, "sphere"),
@@ -128,7 +129,7 @@ def coarse() -> dict[str, tuple[dict, int]]:
 
 
 def homogeneous() -> dict[str, tuple[dict, int]]:
-    """Homogeneous media from thin to opaque."""
+    """Return homogeneous media from thin to opaque."""
     found = {}
     for shape, depths in (("sphere", (40, 100, 300)), ("cube", (30, 100, 300))):
         for across in depths:
@@ -140,7 +141,7 @@ def homogeneous() -> dict[str, tuple[dict, int]]:
 
 
 def beams() -> dict[str, tuple[dict, int]]:
-    """Spot lights in fog."""
+    """Return spot lights in fog."""
     wisps = np.random.default_rng(2).random((16, 16, 16)) ** 2
     return {
         "spot of 7 degrees in fog, single": (objects(medium(None, 1), spot(7)), 2),
@@ -167,7 +168,7 @@ CLASSES: dict[str, Callable[[], dict[str, tuple[dict, int]]]] = {
 
 
 def scene(found: dict, integrator: dict, pixels: int) -> dict:
-    """The description of a scene seen by a camera outside of the cube."""
+    """Return the description of a scene seen by a camera outside of the cube."""
     film = {
         "type": "hdrfilm", "width": pixels, "height": pixels, "pixel_format": "rgb",
         "component_format": "float32", "rfilter": {"type": "box"},

@@ -1,16 +1,16 @@
-"""Errors at default settings where voxels are optically thick, data are coarse, or beams narrow.
+"""Errors at default settings for thick voxels, coarse data, or narrow spot lights.
 
     python -m experiments.validation.thick.run [--only TEXT] [--seconds S] [--force] [-o output]
 
 Every case of `cases` is rendered with ``irrcache`` at default settings and compared with two
 independent images of volpath, of ``--seconds`` of processor time together. The table shows the
 difference of the means, the RMSE and the largest difference of a block of 4 x 4 pixels in units of
-the mean radiance, with the noise of the reference, which is taken out of the RMSE; and the
-processor time of a cold image. volpath's rays leave a surface at an absolute distance of about
-2e-4 here: its images of 300 mean free paths across are too dark by 2 % under a sky, by 9 % in the
-sun; these rows are marked.
+the mean radiance, with the noise of the reference, which is subtracted from the RMSE; and the
+processor time of a cold image. volpath offsets rays at surfaces by about 2e-4 here: its images of
+media with 300 mean free paths are too dark by 2 % under a sky, by 9 % in the sun; these rows are
+marked.
 
-Rows and references are kept in output/thick; ``--force`` forgets the rows. No data are needed.
+Rows and references are saved in output/thick; ``--force`` discards the rows. No data are needed.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from experiments.support.store import Store
 from experiments.validation.thick.cases import CLASSES, scene
 
 PIXELS, BLOCK, SPP = 48, 4, 256
-#: Largest ratio of the distance at which volpath's rays leave a surface to a mean free path.
+#: Largest ratio of volpath's ray offset to a mean free path.
 OFFSET, TRUSTED = 1.8e-4, 0.01
 
 
 def reference(objects: dict, depth: int, seconds: float) -> np.ndarray:
-    """Two independent images (2, y, x, channel) of volpath, of so many ``seconds`` together."""
+    """Render two independent images (2, y, x, channel) of volpath, of ``seconds`` together."""
     integrator = {"type": "volpath", "max_depth": depth, "rr_depth": 50}
     loaded = mi.load_dict(scene(objects, integrator, PIXELS))
     halves, count, begun = [0.0, 0.0], 0, process_time()
@@ -44,7 +44,7 @@ def reference(objects: dict, depth: int, seconds: float) -> np.ndarray:
 
 
 def measure(objects: dict, depth: int, seconds: float, file: Path) -> dict:
-    """A row; the reference is kept in ``file``."""
+    """Return a row; the reference is saved in ``file``."""
     if not file.exists():
         np.save(file, reference(objects, depth, seconds))
     a, b = np.load(file)
@@ -70,18 +70,18 @@ def measure(objects: dict, depth: int, seconds: float, file: Path) -> dict:
 
 
 def image(scene: mi.Scene, spp: int, seed: int) -> np.ndarray:
-    """The rendered image."""
+    """Return the rendered image."""
     return np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float64)
 
 
 def blocks(image: np.ndarray) -> np.ndarray:
-    """Means over blocks of pixels and the channels."""
+    """Return means over blocks of pixels and the channels."""
     n = PIXELS // BLOCK
     return image.mean(axis=2).reshape(n, BLOCK, n, BLOCK).mean(axis=(1, 3))
 
 
 def line(name: str, row: dict) -> str:
-    """A row of the table, noise in parentheses."""
+    """Return a row of the table, noise in parentheses."""
     mark = "  volpath is biased here" if row["offset"] > TRUSTED else ""
     mean, rmse, block = (
         f"{key} {row[key]:+6.2f} % ({row[f'{key}_noise']:.2f})" for key in ("mean", "rmse", "block")
@@ -90,7 +90,7 @@ def line(name: str, row: dict) -> str:
 
 
 def run() -> None:
-    """Computes the rows that are missing and prints the table."""
+    """Compute missing rows and print the table."""
     parser = parser_of(__doc__)
     parser.add_argument("--only", default="", help="cases whose name contains this")
     parser.add_argument("--seconds", type=float, default=20.0, help="of volpath for each case")

@@ -33,6 +33,7 @@ class AndersonAcceleration:
 
     def next(self, phi: mi.Float, image: mi.Float) -> mi.Float:
         """The point to continue from, after a step from ``phi`` to its ``image``."""
+        # docs/primer, eq. (4.11)
         residual = image - phi
         dr.eval(residual)
         last, self._last = self._last, (residual, image)

@@ -113,6 +113,7 @@ def strata(sets: int, coordinate: np.ndarray, step: float) -> np.ndarray:
 
 def _weights(points: np.ndarray) -> np.ndarray:
     """The weights nearest to equal ones that integrate all products of two coordinates exactly."""
+    # docs/primer, eq. (4.1)
     count = len(points)
     x, y, z = points.T
     moments = np.stack([np.ones(count), x * x, y * y, x * y, y * z, z * x])

@@ -25,13 +25,13 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.context import probe
+from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
-from mitsuba_irrcache.transport.path import Start, trace, trace_to_infinity
+from mitsuba_irrcache.transport.path import Media, Start, trace, trace_to_infinity
 
 #: Cells of an ordinate, at most about: a path is traced for one track in each; rays that only test
 #: the visibility of emitters are cheaper. Radiance from surfaces varies more from one direction to
@@ -63,7 +63,7 @@ class SurfaceBoundary:
         rr_depth: int,
         angular_basis: AngularBasis | None = None,
     ) -> None:
-        self.scene, self.media = scene, medium.surroundings.media.around(medium)
+        self.scene, self.media = scene, Media.around(medium)
         self.pointer, self.area_emitters = medium.pointer, list(area_emitters)
         #: without this medium, which is convex: a ray that leaves it straight never meets it again
         self.other_media = self.media.without(medium)
@@ -74,7 +74,7 @@ class SurfaceBoundary:
     @property
     def has_sources(self) -> bool:
         """Whether tracks meet emitters or emissive media by chance."""
-        return bool(self.area_emitters) or self.other_media.shines
+        return bool(self.area_emitters) or self.other_media.is_emissive
 
 
 class IncomingRadiance:
@@ -280,6 +280,7 @@ class ReflectedBoundarySource(BoundarySource):
 
     def update(self, phi: mi.Float | None) -> None:
         """Sets the values for a mean irradiance of collisions ``phi`` (None: 0)."""
+        # docs/primer, eq. (4.13)
         values = dr.zeros(mi.Float, dr.width(self._index))
         if phi is not None:
             radiance = self._level.scattered_radiance(phi, self._index, self._direction)

@@ -18,8 +18,9 @@ from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.transport.path import visibility
+from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 #: Solid angle of an emitter, the mean over the voxels, from which on tracks are relied upon to hit
@@ -34,10 +35,7 @@ SAMPLES, MOST_SAMPLES = 4, 16
 
 def is_area_emitter(emitter: mi.Emitter) -> bool:
     """Whether it is an area emitter that emits in all directions."""
-    flags = emitter.flags()
-    return mi.has_flag(flags, mi.EmitterFlags.Surface) and not mi.has_flag(
-        flags, mi.EmitterFlags.Delta
-    )
+    return kind_of(emitter) is EmitterKind.AREA
 
 
 def split_by_solid_angle(
@@ -83,7 +81,7 @@ class EmitterSampling:
     ) -> None:
         self.scene, self.medium, self.p = scene, medium, p
         self.angular_basis = angular_basis
-        self._other_media = medium.surroundings.media.around(medium).without(medium)
+        self._other_media = Media.around(medium).without(medium)
         self._small = len(small)
         if small:
             pointers = [mi.EmitterPtr(e) for e in small]

@@ -16,6 +16,7 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import spots_of
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.core.sequences import kronecker_steps, lattice_points
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
     Ordinates,
@@ -43,9 +44,10 @@ class DistantIllumination:
         self._bright_regions: tuple | None = None
         self._suns, self.point_lights = [], []
         for emitter in scene.emitters():
-            if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
+            kind = kind_of(emitter)
+            if kind is EmitterKind.SUN:
                 self._suns.append(_sun(emitter))
-            elif mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+            elif kind.is_point_like:
                 self.point_lights.append(emitter)
 
     def factored_ordinates(
@@ -75,7 +77,7 @@ class DistantIllumination:
         even = joint_ordinates(passes, pairs, rng)
         varies = (
             self._environment is not None
-            and self._environment.class_name() != "ConstantBackgroundEmitter"
+            and kind_of(self._environment) is not EmitterKind.CONSTANT_ENVIRONMENT
         )
         if varies:
             found = self._with_samples(even, max(1, pairs // PAIRS_PER_SAMPLE), rng)
@@ -141,6 +143,7 @@ class DistantIllumination:
         A direction may result from either strategy, and as the opposite of one: the solid angle it
         stands for is one over the sum of all densities (balance heuristic).
         """
+        # docs/primer, eq. (4.2)
         sets = []
         chosen = self._samples(len(even), count, rng)
         for (plain, weights), sampled in zip(even, chosen, strict=True):

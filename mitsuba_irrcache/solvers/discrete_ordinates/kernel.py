@@ -488,6 +488,7 @@ class _PairSweep:
         """Radiance behind a slice, and what its voxel adds up: (0, irradiance in its middle,
         radiance lost, optical depth), for a source that is constant in it.
         """
+        # docs/primer, eqs. (4.6), (4.7)
         # A track stands for a cross section that is the less the longer it stays in a voxel.
         area, count = self.area, self.solid_angle
         first, second = (half * self.scale for half in extinction)
@@ -509,6 +510,7 @@ def _transmittance(state: _TrackState, here: mi.Float, scale: mi.Float) -> mi.Fl
     """Transmittance from the middle of the previous slice to that of this one, or from the point of
     entry; ``here`` is the extinction in the half of this one that is crossed first.
     """
+    # docs/primer, eq. (4.4)
     since = state.since_entry
     return decay(dr.select(since < 1, here * since, 0.5 * (state.previous + here)) * scale)
 

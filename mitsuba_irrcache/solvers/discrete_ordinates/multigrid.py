@@ -167,6 +167,7 @@ class MultigridLevel:
 
         ``phi``, a mean irradiance of collisions, may be None for 0.
         """
+        # docs/primer, eq. (4.8)
         tracks = self.tracks
         place, channel = voxel_and_channel(tracks.active_count, self.channels)
         slot = dr.gather(mi.UInt32, tracks.active, place) * self.channels + channel
@@ -245,6 +246,7 @@ class MultigridLevel:
         """Solve phi = A phi + b by accelerated multigrid cycles, for ``ordinates`` and
         ``boundary_source`` as in `tables`, to ``tolerance`` times the relative error `TOLERANCE`.
         """
+        # docs/primer, eq. (4.9)
         tables = self.tables(ordinates, boundary_source)
         phi = self._initial_guess(b, tables)
         change, nonzero = np.inf, self._scattered_sums(dr.abs(b)).max() > 0
@@ -292,6 +294,7 @@ class MultigridLevel:
         """The result ``swept`` of a sweep of ``phi``, with the remaining error corrected on the
         coarser level; ``coarse`` are the tables of that and those below.
         """
+        # docs/primer, eq. (4.10)
         if self.coarsest:
             return swept
         _, residual = self.coarser.sweep(self.restrict(swept - phi), coarse[0])

@@ -29,7 +29,6 @@ from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import Surfa
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emission_irradiance
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
     EmitterSampling,
-    is_area_emitter,
     split_by_solid_angle,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
@@ -64,20 +63,10 @@ NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
 Progress = Callable[[int, int], None]
 
 
-def takes(emitter: mi.Emitter) -> bool:
-    """Whether the solver supports an emitter: distant, point-like, or an area emitter that emits in
-    all directions.
-    """
-    flags = mi.EmitterFlags.Infinite, mi.EmitterFlags.DeltaDirection, mi.EmitterFlags.DeltaPosition
-    surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-    if surface:
-        return is_area_emitter(emitter)
-    return any(mi.has_flag(emitter.flags(), f) for f in flags)
-
-
 def swept_together(medium: MediumGrid, voxels: int) -> bool:
     """Whether all channels of a cache of so many ``voxels`` are swept at once."""
-    return medium.phase is None and medium.sigma_t.channels == 1 and voxels <= TOGETHER
+    isotropic = medium.phase.is_isotropic
+    return isotropic and medium.sigma_t.channels == 1 and voxels <= TOGETHER
 
 
 def batch_of(samples: int, least: int) -> int:

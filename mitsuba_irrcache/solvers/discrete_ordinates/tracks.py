@@ -143,6 +143,7 @@ class Tracks:
             offsets: (n, 2), in [0, 1), random shifts of the tracks.
             by_slice: whether the swept volume is laid out by the slices of each dominant axis.
         """
+        # docs/primer, eq. (4.3)
         incoming = incoming if incoming.ndim == 3 else incoming[..., None]
         velocities = directions @ self._to_voxels.T
         axis = np.abs(velocities).argmax(axis=1)
@@ -387,6 +388,7 @@ def values_at_centres(
     both transverse axes take back the smoothing. Results are never negative. ``means``, laid out by
     slices from ``begin`` on, have several ``channels``, of which one is taken.
     """
+    # docs/primer, eq. (4.5)
     places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
     place = flat_index(places, strides) + begin
 

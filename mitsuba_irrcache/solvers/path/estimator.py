@@ -1,9 +1,8 @@
-"""The estimator of the solver ``path`` for general scenes: surfaces, lights on them, several media.
+"""The estimator of the solver ``path`` for general scenes: surfaces, area emitters, several media.
 
-A voxel centre is an isotropic scattering vertex of a path from the camera, its first one. What it
-receives, int_S2 L dw, is estimated twice: straight from emitters that are sampled, and from a
-uniform direction, along which a path goes on through all of the scene. Either counts in proportion
-to how well it does (multiple importance sampling).
+A voxel centre is the first vertex of a path, where scattering is isotropic. Its irradiance,
+int_S2 L dw, is estimated with multiple importance sampling: by emitter sampling, and by a path that
+starts in a uniform direction and continues through the scene.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ def contributions(
     rng: mi.PCG32,
     max_depth: mi.UInt32,
     rr_depth: mi.UInt32,
-    apart: Sequence[mi.EmitterPtr] = (),
+    excluded: Sequence[mi.EmitterPtr] = (),
 ) -> list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]:
-    """One sample per lane of the light at ``position``, in the medium ``pointer``: directions (to
-    where it comes from), and what comes from there uncollided and scattered. The sum is an
-    unbiased estimate of the irradiance; any moment of the radiance follows from the directions.
+    """One sample per lane of the incident radiance at ``position``, in the medium ``pointer``:
+    directions towards its origin, and the uncollided and scattered irradiance from there. The sum
+    is an unbiased estimate of the irradiance; moments of the radiance follow from the directions.
 
-    ``spread`` are four uniform numbers for the directions. Light straight from the emitters
-    ``apart``, which have no extent, is left out.
+    ``spread`` are four uniform numbers for the directions. Radiance directly from the emitters
+    ``excluded``, which have no extent, is left out.
     """
     vertex, always = dr.zeros(mi.Interaction3f), mi.Bool(True)
     vertex.p = position
@@ -41,15 +40,15 @@ def contributions(
     record, light, rng = sample_emitter(scene, media, vertex, pointer, sample, rng, always)
     density = dr.select(record.delta, 0, dr.inv_four_pi)
     light *= power_heuristic(record.pdf, density)
-    for emitter in apart:
+    for emitter in excluded:
         light = dr.select(record.emitter == emitter, 0, light)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
     start = Start(mi.Ray3f(position, direction), pointer, depth=1, pdf=dr.inv_four_pi)
-    straight, scattered, *_ = trace(scene, media, start, max_depth, rr_depth, False, rng, always)
+    uncollided, scattered, *_ = trace(scene, media, start, max_depth, rr_depth, False, rng, always)
     sphere = 4 * dr.pi
     return [
         (record.d, light, mi.Spectrum(0)),
-        (direction, sphere * straight, sphere * scattered),
+        (direction, sphere * uncollided, sphere * scattered),
     ]
 
 

@@ -1,78 +1,149 @@
-"""The solver ``path``: unbiased Monte Carlo path tracing from the voxel centres to the lights.
+"""The solver ``path``: unbiased Monte Carlo path tracing from the voxel centres to the emitters.
 
 With isotropic scattering the irradiance at x is a sum over scattering orders (paper, section 3):
 
     Phi(x) = sum_k E[beta_k D(x_k)],   x_0 = x,  beta_0 = 1,  beta_k = beta_(k-1) albedo(x_k)
 
 where x_k follows from x_(k-1) by a uniform direction and a free flight, and D(x) = int_S2 L_e T dw
-is the light that reaches x straight from the emitters. Order 0 is the *uncollided* layer of the
+is the irradiance at x directly from the emitters. Order 0 is the *uncollided* layer of the
 cache, the others the *scattered* one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from time import perf_counter
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.volume import BATCH, LAYERS, IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.occluders import hole_in
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
+from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask, register
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import occupied_box
+from mitsuba_irrcache.solvers.grid_size import SizeAmongSurfaces, SizeRule
 from mitsuba_irrcache.solvers.path import estimator as volume_path
+from mitsuba_irrcache.transport.path import Media
 from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 
 #: Paths in one kernel launch: enough to fill any machine, few enough to bound memory (about 100
 #: bytes each).
 LANES = 1 << 21
 
-#: called with (samples done, samples in all), both in voxels times samples
-Progress = Callable[[int, int], None]
+#: Samples of all voxels together by default, without and among surfaces, where each is more work;
+#: and samples per voxel, at least and at most.
+PATHS, PATHS_AMONG_SURFACES = 2**24, 2**22
+FEWEST_SAMPLES, MOST_SAMPLES = 16, 256
 
 
-def refine(
-    scene: mi.Scene,
-    medium: MediumGrid,
-    cache: IrradianceCache,
-    samples: int,
-    seed: int,
-    rr_depth: int,
-    progress: Progress | None = None,
-) -> None:
-    """Adds ``samples`` per voxel (a multiple of ``BATCH``) of the random stream ``seed``.
+@register
+class PathSolver(Solver):
+    """Traces paths from the voxel centres, in any scene."""
 
-    The stream goes on where an earlier call with the same seed stopped. If ``progress`` raises,
-    passes that are complete stay in the cache.
-    """
-    dark = not scene.emitters() and medium.emission is None
-    if not cache.active_count or _orders(cache) < 1 or dark:
-        cache.note_samples(seed, samples)
-        return
-    estimator = _Estimator(scene, medium, cache, seed, rr_depth)
-    total, done = cache.active_count * samples, 0
-    if total > 16 * LANES:
-        seconds = estimator.seconds(total)
-        mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
-    lanes = _lanes(cache)
-    block = min(cache.active_count, lanes // BATCH)
-    batches_at_once = max(1, lanes // (BATCH * block))
-    remaining = samples // BATCH
-    while remaining:
-        count = min(batches_at_once, remaining)
-        first = cache.streams.get(seed, 0) // BATCH
-        layers = []
-        for voxels in _blocks(cache.active_count, block):
-            if layers and progress is not None:
+    name = "path"
+    #: Its noise in smaller voxels would exceed the error of larger ones, and its work grows with
+    #: their number; among surfaces the number of paths does not depend on that of the voxels.
+    size_rule = SizeRule(
+        target_error=1.0,
+        fewest=16,
+        most_by_contrast=32,
+        most_by_border=32,
+        refines_dense_data=False,
+        most=128,
+        among_surfaces=SizeAmongSurfaces(32, 64, target_error=0.25),
+    )
+    has_preview = True
+
+    @classmethod
+    def why_not(
+        cls, scene: mi.Scene, medium: MediumGrid, max_depth: int, resolution: int
+    ) -> str | None:
+        return None
+
+    @classmethod
+    def why(cls, medium: MediumGrid) -> str:
+        return "it supports all scenes"
+
+    @classmethod
+    def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
+        paths = PATHS_AMONG_SURFACES if medium.is_traced else PATHS
+        return int(np.clip(paths // max(active_count, 1), FEWEST_SAMPLES, MOST_SAMPLES))
+
+    @classmethod
+    def batch_size(
+        cls, medium: MediumGrid, max_depth: int, samples: int, basis: AngularBasis | None
+    ) -> int:
+        return BATCH
+
+    @classmethod
+    def numbers_per_voxel(
+        cls, medium: MediumGrid, max_depth: int, moments: int, voxels: int, channels: int
+    ) -> int:
+        # Sums are in float64.
+        return channels * (3 * 2 + 3) + 5 + channels * moments * 3
+
+    @classmethod
+    def voxel_classes(
+        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid
+    ) -> VoxelClasses | None:
+        return VoxelClasses(scene, media, medium, grid) if medium.is_traced else None
+
+    @classmethod
+    def knows_direct_lights(
+        cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
+    ) -> bool:
+        """Whether all of a straight line within the boundary of ``medium`` is in the medium, unless
+        it ends at a surface.
+        """
+        if medium.is_isolated or not dr.width(active):
+            return medium.is_isolated
+        if not medium.has_exact_boundary or medium.others:
+            return False
+        return hole_in(scene, medium, grid, occupied_box(grid, active)) is None
+
+    def __init__(self, task: SolverTask) -> None:
+        self._task = task
+
+    def refine(self, samples: int, progress: Progress | None = None) -> None:
+        task = self._task
+        cache, seed = task.cache, task.seed
+        dark = not task.description.emitters and task.medium.emission is None
+        if not cache.active_count or _orders(cache) < 1 or dark:
+            cache.note_samples(seed, samples)
+            return
+        estimator = _Estimator(task)
+        total, done = cache.active_count * samples, 0
+        if total > 16 * LANES:
+            seconds = estimator.seconds(total)
+            mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
+        lanes = _lanes(cache)
+        block = min(cache.active_count, lanes // BATCH)
+        batches_at_once = max(1, lanes // (BATCH * block))
+        remaining = samples // BATCH
+        while remaining:
+            count = min(batches_at_once, remaining)
+            first = cache.streams.get(seed, 0) // BATCH
+            layers = []
+            for voxels in _blocks(cache.active_count, block):
+                if layers and progress is not None:
+                    progress(done, total)
+                layers.append(estimator.batches(voxels, first, count))
+                done += dr.width(voxels) * BATCH * count
+            cache.add(seed, BATCH * count, layers)
+            if progress is not None:
                 progress(done, total)
-            layers.append(estimator.batches(voxels, first, count))
-            done += dr.width(voxels) * BATCH * count
-        cache.add(seed, BATCH * count, layers)
-        if progress is not None:
-            progress(done, total)
-        remaining -= count
+            remaining -= count
+
+    def preview(self) -> Opening:
+        return Opening(self._task)
 
 
 def _orders(cache: IrradianceCache) -> int:
@@ -81,20 +152,21 @@ def _orders(cache: IrradianceCache) -> int:
 
 
 def _blocks(count: int, width: int) -> Iterator[mi.UInt32]:
-    """The numbers below ``count`` in arrays of ``width``, the last of which may be shorter."""
+    """The numbers 0 .. ``count`` - 1 in arrays of ``width``, the last of which may be shorter."""
     for start in range(0, count, width):
         yield dr.arange(mi.UInt32, min(width, count - start)) + dr.opaque(mi.UInt32, start)
 
 
 def _lanes(cache: IrradianceCache) -> int:
-    """Paths in one kernel launch: each moment of the radiance takes as much again."""
+    """Paths in one kernel launch: fewer where moments of the radiance are stored, too."""
     return LANES // 8 if cache.moments else LANES
 
 
 def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
-    """From sums over batches of ``size`` samples, ``count`` batches of a voxel in a row: per voxel,
-    the sums of batch means for each layer and channel; and for each channel the squared deviations
-    of both layers' sum from its mean; then sums of batch means of the moments, if there are any.
+    """Statistics of each voxel from sums over batches of ``size`` samples, ``count`` consecutive
+    batches for each voxel: sums of batch means for each layer and channel; squared deviations of
+    the sum of both layers from its mean for each channel; sums of batch means of the moments, if
+    there are any.
     """
     means = [total / size for total in totals]
     n = dr.opaque(type(means[0]), count)
@@ -110,17 +182,15 @@ def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
     return (layers, tuple(spreads), *([moments] if moments else []))
 
 
-class Opening:
-    """The first two batches of a stream, a few samples of both at a time, for early images: two are
-    enough for a standard error. Complete, they are what `refine` begins with.
+class Opening(Preview):
+    """The first two batches of a stream, a few samples of both at a time: two are enough for a
+    standard error. Complete, they are the first two batches of `PathSolver.refine`.
     """
 
-    def __init__(
-        self, scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache, seed: int, rr_depth: int
-    ) -> None:
-        self.cache, self.seed = cache, seed
+    def __init__(self, task: SolverTask) -> None:
+        self.cache, self.seed = task.cache, task.seed
         self.size = 0  #: samples of each batch so far
-        self._estimator = _Estimator(scene, medium, cache, seed, rr_depth)
+        self._estimator = _Estimator(task)
         # In blocks of voxels, for each layer and channel: the sums of both batches.
         self._totals: list[list] = []
 
@@ -147,33 +217,32 @@ class Opening:
 
 
 class _Estimator:
-    """One kernel for all passes: whatever differs between them is opaque to it."""
+    """Estimates of batches, by one kernel for all passes: what differs between them is opaque."""
 
-    def __init__(
-        self,
-        scene: mi.Scene,
-        medium: MediumGrid,
-        cache: IrradianceCache,
-        seed: int,
-        rr_depth: int,
-    ) -> None:
+    def __init__(self, task: SolverTask) -> None:
+        scene, medium, cache = task.scene, task.medium, task.cache
         orders = _orders(cache)
-        self.scene, self.medium, self.cache = scene, medium, cache
-        self.places = VoxelSamplePoints(scene, cache.grid)
-        # Emitters of direct lights are not sampled at the voxels themselves.
-        self._apart = [mi.EmitterPtr(light.emitter) for light in cache.direct_lights]
+        self.scene, self.media, self.medium, self.cache = (
+            scene,
+            task.description.media,
+            medium,
+            cache,
+        )
+        self.sample_points = VoxelSamplePoints(scene, cache.grid)
+        # Direct lights are not sampled from the voxels.
+        self._excluded = [mi.EmitterPtr(light.emitter) for light in cache.direct_lights]
         numbers = [
             i
             for i, emitter in enumerate(scene.emitters())
             if all(light.emitter != emitter for light in cache.direct_lights)
         ]
-        self._others = None
-        if self._apart:
-            self._others = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(numbers))
-        # Light of the medium itself is found on the way to the next collision.
+        self._sampled = None
+        if self._excluded:
+            self._sampled = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(numbers))
+        # Emission of the medium is estimated along the flight to the next collision.
         self.multiple = orders > 1 or medium.emission is not None
         self.orders, self.seed, self.rr_depth = (
-            dr.opaque(mi.UInt32, n) for n in (orders, seed, rr_depth)
+            dr.opaque(mi.UInt32, n) for n in (orders, task.seed, task.rr_depth)
         )
 
     def batches(self, voxels: mi.UInt32, first: int, count: int) -> tuple:
@@ -192,10 +261,10 @@ class _Estimator:
 
     def sums(self, voxels: mi.UInt32, first: int, count: int, start: int, size: int) -> list:
         """Sums of the samples ``start`` to ``start + size`` of the batches ``first`` to ``first +
-        count``, for every layer and channel; all batches of a voxel in a row.
+        count``, for every layer and channel; the batches of a voxel are consecutive.
 
-        In float64 sums of float32 values are exact (unless these span a factor of 2^25): it does
-        not matter in which passes the samples come.
+        In float64, sums of float32 values are exact (unless these span a factor of 2^25), so they
+        do not depend on how samples are divided into passes.
         """
         cache = self.cache
         per_batch, per_voxel = (dr.opaque(mi.UInt32, n) for n in (size, size * count))
@@ -203,11 +272,11 @@ class _Estimator:
         row = lane // per_batch
         batch = row % dr.opaque(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
         within = lane - row * per_batch + dr.opaque(mi.UInt32, start)
-        place = dr.gather(mi.UInt32, voxels, lane // per_voxel)
-        voxel = dr.gather(mi.UInt32, cache.active, place)
-        layers = list(self._layers(self.places.of(voxel), batch, within, voxel))
+        number = dr.gather(mi.UInt32, voxels, lane // per_voxel)
+        voxel = dr.gather(mi.UInt32, cache.active, number)
+        layers = list(self._layers(self.sample_points.of(voxel), batch, within, voxel))
         for light in cache.direct_lights:
-            layers[0] += dr.gather(mi.Spectrum, light.irradiance, place)
+            layers[0] += dr.gather(mi.Spectrum, light.irradiance, number)
         double = dr.float64_array_t(mi.Float)
         # A layer that is zero throughout comes as a literal without a width.
         none = dr.zeros(mi.Float, dr.width(lane))
@@ -223,9 +292,8 @@ class _Estimator:
     def _layers(
         self, position: mi.Point3f, batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32
     ) -> Sequence[mi.Spectrum]:
-        """One sample of both layers per lane, and of the moments."""
-        around = self.medium.surroundings
-        if around is None:
+        """One sample per lane of both layers, and of the moments."""
+        if not self.medium.is_traced:
             return _estimate(
                 self.scene,
                 self.medium,
@@ -237,22 +305,23 @@ class _Estimator:
                 self.orders,
                 self.rr_depth,
                 self.multiple,
-                self._others,
+                self._sampled,
             )
         rng, spread = _random_numbers(batch, within, voxel, self.seed)
-        pointer = around.pointer(dr.gather(mi.UInt32, self.cache.survey.place, voxel))
+        number = dr.gather(mi.UInt32, self.cache.voxel_classes.medium_number, voxel)
+        pointer = self.media.pointer_of(number)
         max_depth = dr.select(self.orders < 0xFFFFFFFF, self.orders + 1, self.orders)
         return volume_path.estimate(
             self.cache.directional,
             self.scene,
-            around.media,
+            self.media,
             position,
             pointer,
             spread,
             rng,
             max_depth,
             self.rr_depth,
-            self._apart,
+            self._excluded,
         )
 
     def seconds(self, samples: int) -> float:
@@ -281,16 +350,17 @@ def _estimate(
     multiple: bool,
     emitters: mi.EmitterPtr | None,
 ):
-    """One sample of both layers per lane; the samples ``within`` a batch are spread evenly over
+    """One sample of both layers per lane; the samples ``within`` a batch are stratified over
     directions.
     """
+    # docs/primer, eq. (3.1)
     rng, spread = _random_numbers(batch, within, voxel, seed)
     always = mi.Bool(True)
     uncollided, rng = direct_light(
         scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always, emitters
     )
-    scattered, glowing = mi.Spectrum(0), medium.emission is not None
-    further = 1 if glowing else 0  # flights beyond the last collision
+    scattered, emits = mi.Spectrum(0), medium.emission is not None
+    further = 1 if emits else 0  # flights beyond the last collision
     if dr.hint(multiple, mode="scalar"):
         weight = mi.Spectrum(1)
         direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
@@ -303,7 +373,7 @@ def _estimate(
             collided, t, weight, rng, light = free_flight(
                 medium, ray, near, far, weight, rng, active & hit
             )
-            if dr.hint(glowing, mode="scalar"):
+            if dr.hint(emits, mode="scalar"):
                 uncollided += dr.select(order == 1, 4 * dr.pi * light, 0)
                 scattered += dr.select(order == 1, 0, 4 * dr.pi * light)
                 active &= order < orders
@@ -328,7 +398,7 @@ def _estimate(
 def _random_numbers(
     batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32, seed: mi.UInt32
 ) -> tuple[mi.PCG32, list[mi.Float]]:
-    """The random stream of a sample, and four numbers that the samples of a batch spread evenly."""
+    """The random stream of a sample, and its point of a four-dimensional low-discrepancy set."""
     first, second = mi.sample_tea_32(voxel, mi.sample_tea_32(seed, batch)[0])
     rng = random_stream((first, second), mi.UInt64(within) + 1)
     # A batch shares one random shift of a low-discrepancy set; each point alone is uniform.
@@ -356,16 +426,16 @@ def direct_light(
         count = dr.width(emitters)
         if not count:
             return mi.Spectrum(0), rng
-        place = sample.x * count
-        number = dr.minimum(mi.UInt32(place), count - 1)
+        scaled = sample.x * count
+        number = dr.minimum(mi.UInt32(scaled), count - 1)
         emitter = dr.gather(mi.EmitterPtr, emitters, number, active)
-        sample = mi.Point2f(place - mi.Float(number), sample.y)
+        sample = mi.Point2f(scaled - mi.Float(number), sample.y)
         record, radiance = emitter.sample_direction(interaction, sample, active)
         radiance = radiance * count
-    lit = active & (record.pdf > 0) & (dr.max(radiance) > 0)
+    contributes = active & (record.pdf > 0) & (dr.max(radiance) > 0)
     ray = mi.Ray3f(position, record.d)
     hit, near, far = medium.intersect(ray)
     near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
-    through, rng = transmittance(medium, ray, near, far, rng, lit & hit)
+    through, rng = transmittance(medium, ray, near, far, rng, contributes & hit)
     through = dr.select(hit & (near < far), through, 1)
-    return dr.select(lit, radiance * through, 0), rng
+    return dr.select(contributes, radiance * through, 0), rng

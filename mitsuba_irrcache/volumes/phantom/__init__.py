@@ -1,4 +1,4 @@
-"""Procedural phantoms, for machines that have no data at hand: a chest CT and a cloud."""
+"""Procedural phantoms for use without data: a chest CT and a cloud."""
 
 from __future__ import annotations
 

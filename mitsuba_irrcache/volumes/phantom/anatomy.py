@@ -57,7 +57,7 @@ TORSO = Trunk(
     )
 )
 
-# The surface on which the ribs' centre lines lie.
+# The surface that contains the centre lines of the ribs.
 CAGE = Trunk(
     np.array(
         [
@@ -78,7 +78,7 @@ CAGE = Trunk(
     exponent=2.3,
 )
 
-# The pleura runs this far below the ribs' centre lines.
+# Depth of the pleura below the centre lines of the ribs.
 PLEURA_DEPTH = 7.0
 
 # The centre of the vertebral bodies: z, y (thoracic kyphosis, lumbar and cervical lordosis).
@@ -88,11 +88,11 @@ SPINE = np.array(
 
 
 def spine_y(z: np.ndarray | float) -> np.ndarray:
-    """The y of the centre of the vertebral column at height ``z``, mm."""
+    """Return the y of the centre of the vertebral column at height ``z``, mm."""
     return PchipInterpolator(SPINE[:, 0], SPINE[:, 1])(np.clip(z, SPINE[0, 0], SPINE[-1, 0]))
 
 
 def spine_axis(z: float) -> np.ndarray:
-    """The upward direction of the vertebral column at height ``z``, a vector of length 1."""
+    """Return the unit vector along the vertebral column, upwards, at height ``z``."""
     direction = np.array([0.0, float(spine_y(z + 5) - spine_y(z - 5)), 10.0])
     return direction / np.linalg.norm(direction)

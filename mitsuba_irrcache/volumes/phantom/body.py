@@ -1,4 +1,4 @@
-"""The outside of the body: skin, subcutaneous fat and the muscles over the rib cage."""
+"""The body surface: skin, subcutaneous fat and the muscles over the rib cage."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from mitsuba_irrcache.volumes.phantom.distance import Ellipsoid
 
 SKIN_THICKNESS = 2.0
 
-# Width in voxels over which the body blends into the air. This step of 1000 HU crosses all values
-# that a transfer function gives to lungs. Within one voxel it would be undersampled: the optical
-# depth of the skin would depend on where the surface lies between voxel centres, which shows as
-# rings like wood grain. Its standard deviation is 0.7 voxels, as of a scanner's blur.
+# Width in voxels of the transition from body to air. This step of 1000 HU crosses all values that a
+# transfer function assigns to lungs. Within one voxel it would be undersampled: the optical depth
+# of the skin would depend on the position of the surface between voxel centres, which would be
+# visible as rings like wood grain. Its standard deviation of 0.7 voxels resembles a scanner's blur.
 SKIN_SOFTNESS = 2.5
 
 # Subcutaneous fat: z, thickness in mm.
 FAT_THICKNESS = ((0, 15), (100, 11), (200, 8), (280, 7), (330, 5))
 
-# The sheet of fat between the rib cage and the muscles over it: height above the ribs' centre
-# lines and thickness in mm.
+# The layer of fat between the rib cage and the muscles over it: height above the centre lines of
+# the ribs, and thickness in mm.
 FASCIA_HEIGHT, FASCIA_THICKNESS = 9.0, 2.4
 
 # The furrow over the spine: half width and depth in mm.
@@ -31,7 +31,8 @@ def paint_body(canvas: Canvas) -> None:
     """Paint skin, subcutaneous fat, muscle, and the fat between the muscles and in the armpits."""
     region = canvas.region(anatomy.WHOLE)
     distance = skin_distance(region)
-    # Beyond the surface, too: the air that is blended in below needs skin under all of its edge.
+    # The region extends beyond the surface: where the body blends into air, skin must be
+    # underneath.
     canvas.paint(region, distance - np.float32(SKIN_SOFTNESS * canvas.edge), anatomy.SKIN)
     distance += np.float32(SKIN_THICKNESS)
     canvas.paint(region, distance, anatomy.FAT)
@@ -52,7 +53,7 @@ def _paint_fascia(canvas: Canvas) -> None:
 
 
 def skin_distance(region: Region) -> np.ndarray:
-    """Signed distance (z, y, x) in mm to the skin, with the furrow over the spine."""
+    """Return the signed distance (z, y, x) in mm to the skin, with the furrow of the spine."""
     distance = anatomy.TORSO.distance(region.x, region.y, region.z)
     distance += FURROW_DEPTH * np.exp(-((region.x / FURROW_WIDTH) ** 2)) * (region.y > 0)
     return distance

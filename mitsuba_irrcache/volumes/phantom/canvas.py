@@ -57,7 +57,7 @@ class Canvas:
         self._texture = texture(self.axes, lower, upper)
 
     def region(self, bounds: Bounds, margin: float = 0.0) -> Region:
-        """The voxels with centres within ``bounds`` widened by ``margin`` mm; it may be empty."""
+        """Return the voxels whose centres lie within ``bounds`` widened by ``margin`` mm."""
         lower, upper = np.subtract(bounds[0], margin), np.add(bounds[1], margin)
         return self._region(
             [
@@ -73,10 +73,11 @@ class Canvas:
     def union(
         self, solids: Iterable[Solid], region: Region | None = None
     ) -> tuple[Region, np.ndarray]:
-        """Signed distance in mm to all ``solids`` together, in the region they occupy.
+        """Return the signed distance in mm to the union of ``solids``, where they are.
 
-        A ``region`` that is given instead cuts the solids. Each solid is evaluated in its own box
-        only, and the distance is cut off at ``edge``, where nothing is painted any more.
+        If a ``region`` is given, the distance is restricted to it. Each solid is evaluated in its
+        own bounding box only, and the distance is clamped at ``edge``, beyond which nothing is
+        painted.
         """
         solids = list(solids)
         if region is None:
@@ -100,9 +101,7 @@ class Canvas:
     def paint(
         self, region: Region, distance: np.ndarray, tissue: Tissue, softness: float = 1.0
     ) -> None:
-        """Cover what lies within ``distance`` <= 0 with ``tissue``, blended over ``softness`` times
-        ``edge``.
-        """
+        """Paint ``tissue`` where ``distance`` <= 0, blended over ``softness`` times ``edge``."""
         edge = softness * self.edge
         touched = distance < edge / 2
         coverage = np.minimum(0.5 - distance[touched] / edge, 1)
@@ -112,13 +111,13 @@ class Canvas:
         values[touched] = before + coverage * (colour - before)
 
     def paint_solids(self, solids: Iterable[Solid], tissue: Tissue) -> None:
-        """Cover the union of ``solids`` with ``tissue``."""
+        """Paint the union of ``solids`` with ``tissue``."""
         self.paint(*self.union(solids), tissue)
 
     def paint_shell(
         self, solids: Iterable[Solid], shell: Tissue, core: Tissue, thickness: float
     ) -> None:
-        """Cover the union of ``solids`` with ``core`` under a ``shell`` of ``thickness`` mm."""
+        """Paint the union of ``solids`` with ``core`` under a ``shell`` of ``thickness`` mm."""
         region, distance = self.union(solids)
         self.paint(region, distance, shell)
         self.paint(region, distance + np.float32(thickness), core)

@@ -1,4 +1,4 @@
-"""A procedural cumulus cloud, for machines that have no cloud at hand."""
+"""A procedural cumulus cloud for use without data."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from mitsuba_irrcache.volumes.phantom.texture import interpolate
 
 SMALLEST_SIDE = 32
 
-# Places and lengths are those of a cubic box, [-1, 1]^3. Nothing lies beyond LIMIT along any axis,
-# so that the outermost two voxels are empty even where there are fewest.
+# Positions and lengths refer to a cubic box, [-1, 1]^3. Nothing lies beyond LIMIT along any axis,
+# so that the outermost two voxels are empty at the lowest resolution, too.
 LIMIT = 1 - 4 / SMALLEST_SIDE
 
-# Centres (x, y, z) and radii of the balls that billow, and the height that is cut off below.
+# Centres (x, y, z) and radii of the spheres that form the cloud, and the height of its flat base.
 BALLS = (
     ((0.04, 0.04, -0.08), 0.52),
     ((-0.42, -0.14, -0.46), 0.36),
@@ -30,32 +30,32 @@ BALLS = (
 )
 BASE = -0.68
 
-# Pitch of the lattices of noise whose folds are the billows, and how far these reach.
+# Lattice spacing of the noise octaves whose folds form the billows, and their amplitudes.
 OCTAVES = ((0.45, 0.14), (0.23, 0.10), (0.12, 0.06), (0.063, 0.03))
-# What is left of the billows at the base.
+# Amplitude of the billows at the base, as a share.
 BASE_BILLOWS = 0.3
 
-# The length over which the cloud thickens from its surface inwards.
+# Distance from the surface over which the density increases.
 EDGE = 0.09
-# Density between the billows, and how fast it rises with their reach; it ends at 1.
+# Density between the billows, and its slope with their amplitude; it is clamped to 1.
 CREVICE, RISE = 0.5, 3.0
 
-# Peak use in bytes per voxel, but for small volumes, and voxels that are made at a time.
+# Peak memory in bytes per voxel, except for small volumes, and voxels computed at a time.
 BYTES_PER_VOXEL = 6
 _AT_A_TIME = 1 << 17
 
 
 def cloud(shape: Sequence[int] = (128, 128, 128), memory_limit: int = 8 * 2**30) -> VolumeData:
-    """A cumulus with a flattish base and billows of several sizes, as densities of 0 to 1.
+    """Create a cumulus with a flat base and billows of several sizes, as densities of 0 to 1.
 
-    The voxels are cubes, and the box, whose longest side is 2, lies about the origin with +z up;
-    the cloud is stretched to its sides. Equal shapes give equal volumes, and a place relative to
+    The voxels are cubes, and the box, whose longest side is 2, is centred at the origin with +z up;
+    the cloud is stretched to its sides. Equal shapes give equal volumes, and a position relative to
     the sides has the same density at every resolution. Two voxels at least are empty (exactly 0)
     along every side.
 
     Args:
         shape: voxel counts ``(z, y, x)``, each at least 32.
-        memory_limit: the most memory in bytes that may be used.
+        memory_limit: maximum memory in bytes.
 
     Returns:
         Values float32, shape ``shape``.
@@ -83,7 +83,7 @@ def cloud(shape: Sequence[int] = (128, 128, 128), memory_limit: int = 8 * 2**30)
 
 
 def _density(coordinates: Sequence[np.ndarray], lattices: Sequence[np.ndarray]) -> np.ndarray:
-    """Density (z, y, x) at a grid's x, y and z."""
+    """Return the density (z, y, x) at a grid's x, y and z."""
     x, y, z = _open_grid(coordinates)
     billows = np.zeros((z.size, y.size, x.size), dtype=np.float32)
     for lattice, (pitch, reach) in zip(lattices, OCTAVES, strict=True):
@@ -101,7 +101,7 @@ def _density(coordinates: Sequence[np.ndarray], lattices: Sequence[np.ndarray]) 
 
 
 def _distance(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Signed distance to the union of the balls, negative inside."""
+    """Return the signed distance to the union of the spheres, negative inside."""
     nearest = np.full((z.size, y.size, x.size), np.inf, dtype=np.float32)
     for centre, radius in BALLS:
         cx, cy, cz = np.float32(centre)
@@ -113,17 +113,17 @@ def _distance(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _lattices(seed: int = 28) -> list[np.ndarray]:
-    """Random linear functions at the points of each octave's lattice, (4, z, y, x).
+    """Return random linear functions at the lattice points of each octave, (4, z, y, x).
 
     The first three are the gradient along x, y and z, the last the value at the box's lower corner.
-    Only uniform deviates of a fixed bit generator are drawn, whose stream NumPy keeps stable.
+    Only uniform deviates of a fixed bit generator are drawn, whose stream NumPy guarantees.
     """
     generator = np.random.Generator(np.random.PCG64(seed))
     lattices = []
     for pitch, _ in OCTAVES:
         count = int(np.ceil(2 / pitch)) + 1
         lattice = 2 * generator.random((4, count, count, count), dtype=np.float32) - 1
-        # Values are drawn at the lattice points; moved to the corner, they need no distances.
+        # Values are drawn at the lattice points, then extrapolated to the corner of the box.
         for gradient, index in zip(
             lattice[:3], _open_grid([np.arange(count, dtype=np.float32)] * 3), strict=True
         ):
@@ -133,7 +133,7 @@ def _lattices(seed: int = 28) -> list[np.ndarray]:
 
 
 def _noise(lattice: np.ndarray, coordinates: Sequence[np.ndarray], pitch: float) -> np.ndarray:
-    """Smooth noise (z, y, x): the linear functions, blended by quintic weights."""
+    """Return smooth noise (z, y, x): the linear functions, blended with quintic weights."""
     positions = [(axis + 1) / np.float32(pitch) for axis in coordinates]
     total = _blend(lattice[3], positions)
     for gradient, position in zip(lattice[:3], _open_grid(positions), strict=True):
@@ -142,7 +142,7 @@ def _noise(lattice: np.ndarray, coordinates: Sequence[np.ndarray], pitch: float)
 
 
 def _blend(lattice: np.ndarray, positions: Sequence[np.ndarray]) -> np.ndarray:
-    """Quintic interpolation at fractional indices along x, y and z."""
+    """Interpolate with quintic weights at fractional indices along x, y and z."""
     # Along z first, where the grid has the fewest points.
     for axis, position in enumerate(positions[::-1]):
         index = np.floor(position)

@@ -1,6 +1,6 @@
-"""Signed distances (mm, negative inside) of the solids an anatomical phantom is built from.
+"""Signed distances (mm, negative inside) to the solids of an anatomical phantom.
 
-Every solid has ``bounds()``, the corners ``(lower, upper)`` of an axis-aligned box around it, and
+Every solid has ``bounds()``, the corners ``(lower, upper)`` of an axis-aligned bounding box, and
 ``distance(x, y, z, edge)`` for coordinates in mm that broadcast against each other. ``edge`` is the
 width in mm over which a surface is blended; only solids thinner than that need it.
 """
@@ -18,13 +18,13 @@ Bounds = tuple[np.ndarray, np.ndarray]
 
 
 class Solid(Protocol):
-    """What a canvas can paint."""
+    """The interface of the solids that a canvas can paint."""
 
     def bounds(self) -> Bounds:
-        """Corners of a box around the solid, mm."""
+        """Return the corners of a bounding box in mm."""
 
     def distance(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, edge: float) -> np.ndarray:
-        """Signed distance in mm."""
+        """Return the signed distance in mm."""
 
 
 def _unit(vector: Sequence[float]) -> np.ndarray:
@@ -33,7 +33,7 @@ def _unit(vector: Sequence[float]) -> np.ndarray:
 
 
 def _along(axis: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Scalar product with ``axis``, in float32: the coordinates' small axes are scaled first."""
+    """Return the scalar product with ``axis`` in float32, scaling the coordinate axes first."""
     axis = axis.astype(np.float32)
     return (axis[2] * z + axis[1] * y) + axis[0] * x
 
@@ -73,7 +73,7 @@ class Segment:
         return self._conserve(np.sqrt(np.maximum(squared, 0)), radius, edge)
 
     def _conserve(self, to_axis: np.ndarray, radius: np.ndarray, edge: float) -> np.ndarray:
-        """Distance whose blended coverage keeps the cross-section of a bar thinner than ``edge``.
+        """Scale the distance so that a bar thinner than ``edge`` keeps its cross-section.
 
         Such a bar is drawn with radius ``edge / 2`` and its coverage ``1/2 - distance / edge`` is
         scaled by the ratio of the cross-sections, which is again a linear function of distance.
@@ -91,7 +91,7 @@ def chain(
     half_width: float = 0.0,
     side: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> list[Segment]:
-    """Segments through ``points`` (n, 3) with one radius or one per point, mm."""
+    """Return segments through ``points`` (n, 3) with one radius or one per point, mm."""
     points = np.asarray(points, dtype=np.float64)
     radii = np.broadcast_to(np.asarray(radii, dtype=np.float64), len(points))
     return [
@@ -101,7 +101,7 @@ def chain(
 
 
 def smooth_curve(points: Sequence[Sequence[float]], count: int, reach: float = 1.0) -> np.ndarray:
-    """``count`` points (count, 3) on the cubic spline through ``points``, up to ``reach`` of it."""
+    """Return ``count`` points on the first part ``reach`` of the spline through ``points``."""
     points = np.asarray(points, dtype=np.float64)
     chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
     position = np.concatenate([[0.0], np.cumsum(chords)])
@@ -110,7 +110,7 @@ def smooth_curve(points: Sequence[Sequence[float]], count: int, reach: float = 1
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """An ellipsoid; ``long_axis`` is the direction of its first radius, the last stays upright."""
+    """An ellipsoid; ``long_axis`` is the direction of its first radius, z of the last."""
 
     centre: tuple[float, float, float]
     radii: tuple[float, float, float]
@@ -126,7 +126,7 @@ class Ellipsoid:
         return np.asarray(self.centre) - reach, np.asarray(self.centre) + reach
 
     def distance(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, edge: float) -> np.ndarray:
-        """First-order distance ``f / |grad f|`` of ``f = k (k - 1)``, exact for a sphere."""
+        """Return ``f / |grad f|`` of ``f = k (k - 1)``: exact distance for a sphere."""
         x, y, z = (c - np.float32(s) for c, s in zip((x, y, z), self.centre, strict=True))
         level, slope = np.float32(0), np.float32(1e-12)
         for axis, radius in zip(self._axes(), self.radii, strict=True):
@@ -168,7 +168,7 @@ class Trunk:
     """A body with superelliptic cross-sections ``|x/a|^n + |y/b|^n = 1`` that vary with z.
 
     ``profile`` has rows ``(z, half width, y of the widest place, y of the front, y of the back)``;
-    front and back have their own half depth. Beyond the table its end rows go on.
+    front and back have separate half depths. Outside the table its first and last row are used.
     """
 
     profile: np.ndarray
@@ -180,26 +180,26 @@ class Trunk:
         object.__setattr__(self, "_curves", PchipInterpolator(rows[:, 0], rows[:, 1:]))
 
     def inset(self, thickness: float) -> Trunk:
-        """The trunk within this one, ``thickness`` mm below its sides."""
+        """Return the trunk within this one, ``thickness`` mm below its sides."""
         rows = np.array(self.profile, dtype=np.float64)
         rows[:, [1, 4]] -= thickness
         rows[:, 3] += thickness
         return Trunk(rows, self.exponent)
 
     def bounds(self) -> Bounds:
-        """Corners of a box around all sections; its height is that of the table."""
+        """Return the corners of a box around all sections; its height is that of the table."""
         rows = np.asarray(self.profile, dtype=np.float64)
         width = rows[:, 1].max()
         lower = np.array([-width, rows[:, 3].min(), rows[0, 0]])
         return lower, np.array([width, rows[:, 4].max(), rows[-1, 0]])
 
     def section(self, z: np.ndarray) -> np.ndarray:
-        """Half width and y of widest place, front and back at ``z``, as an array (..., 4) in mm."""
+        """Return half width and y of widest place, front and back at ``z``, (..., 4) in mm."""
         ends = np.asarray(self.profile)[[0, -1], 0]
         return self._curves(np.clip(z, *ends))
 
     def on_surface(self, angle: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Points (n, 3) at ``angle`` (0 at the back, pi/2 at +x, pi in front) and height ``z``."""
+        """Return points (n, 3) at ``angle`` (0: back, pi/2: +x, pi: front) and height ``z``."""
         width, centre, front, back = np.moveaxis(self.section(z), -1, 0)
         sine, cosine = np.sin(angle), np.cos(angle)
         power = 2 / self.exponent
@@ -209,7 +209,7 @@ class Trunk:
         return np.stack([x, y, z], axis=-1)
 
     def distance(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """First-order distance ``(f - 1) / |grad f|`` with ``f = (|x/a|^n + |y/b|^n)^(1/n)``.
+        """Return ``(f - 1) / |grad f|`` with ``f = (|x/a|^n + |y/b|^n)^(1/n)``.
 
         All but the last lines work on one (z, x) or (z, y) plane when given an open grid.
         """

@@ -104,7 +104,7 @@ STOMACH = (Ellipsoid((62, -30, 58), (40, 46, 42)), Ellipsoid((40, -52, 20), (44,
 STOMACH_BUBBLE = (Ellipsoid((64, -46, 72), (30, 24, 22)),)
 SPLEEN = (Ellipsoid((98, 34, 52), (24, 42, 46)),)
 KIDNEYS = (Ellipsoid((-54, 44, 6), (22, 24, 44)), Ellipsoid((54, 44, 6), (22, 24, 44)))
-# In the order in which they are painted.
+# In painting order.
 ABDOMINAL_ORGANS = (
     (STOMACH, anatomy.FLUID),
     (STOMACH_BUBBLE, anatomy.AIR),
@@ -115,14 +115,14 @@ ABDOMINAL_ORGANS = (
 
 
 def paint_cavities(canvas: Canvas) -> None:
-    """Paint the lungs, what parts them, and the organs of the upper abdomen."""
+    """Paint the lungs, the mediastinum between them, and the organs of the upper abdomen."""
     region = canvas.region(PLEURA.bounds(), canvas.edge)
     walls = PLEURA.distance(region.x, region.y, region.z)
     domes = dome_distance(region.x, region.y, region.z)
     canvas.paint(region, lung_distance(walls, domes, region.y, region.z), anatomy.LUNG)
     for side in (anatomy.RIGHT, anatomy.LEFT):
         canvas.paint_solids(vessel_tree(HILA[side], _lung_points(side)), anatomy.VESSEL)
-    # The abdomen comes after the fat that rests on the diaphragm, and the heart after both.
+    # The abdomen overwrites the fat on the diaphragm, and the heart overwrites both.
     canvas.paint_solids(_mediastinal_fat(), anatomy.FAT)
     abdomen = np.maximum(walls, domes, out=domes)
     abdomen += np.float32(DIAPHRAGM_THICKNESS)
@@ -133,24 +133,24 @@ def paint_cavities(canvas: Canvas) -> None:
 
 
 def dome_distance(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Signed distance in mm to what lies under the diaphragm; its domes' lower halves are open."""
+    """Return the signed distance in mm to the space below the diaphragm's domes."""
     z = np.maximum(z, max(dome.centre[2] for dome in DOMES))
     return np.minimum.reduce([dome.distance(x, y, z, edge=0.0) for dome in DOMES])
 
 
 def lung_distance(walls: np.ndarray, domes: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Signed distance in mm to both lungs together, before the mediastinum is painted over them.
+    """Return the signed distance in mm to both lungs, including the mediastinum's part.
 
     ``walls`` and ``domes`` are the distances to the pleural walls and to the space under the domes.
     """
-    # The costodiaphragmatic recess ends lower behind than in front.
+    # The costodiaphragmatic recess reaches lower at the back than at the front.
     floor = np.float32(0.97) * (np.float32(62) - np.float32(0.25) * y - z)
     ceiling = z - np.float32(308)
     return np.maximum(np.maximum(walls, -domes), np.maximum(floor, ceiling))
 
 
 def _lung_points(side: int, count: int = 700) -> np.ndarray:
-    """Scattered points (count, 3) in mm inside one lung, clear of heart and mediastinum."""
+    """Return random points (count, 3) in mm inside one lung, outside of the mediastinum."""
     generator = np.random.Generator(np.random.PCG64(7 + side))
     low, high = np.array([26.0, -90.0, 45.0]), np.array([126.0, 85.0, 308.0])
     points = (low + generator.random((40 * count, 3)) * (high - low)) * (side, 1, 1)
@@ -177,7 +177,7 @@ def paint_mediastinum(canvas: Canvas) -> None:
 
 
 def _mediastinal_fat() -> list[Solid]:
-    """Sheets in the median plane, thin behind the sternum, and a pad under the heart."""
+    """Return fat in the median plane, thin behind the sternum, and a pad under the heart."""
     front = chain([(0, -62, 268), (2, -72, 200), (4, -72, 110), (4, -68, 74)], 6.0, 20.0, (0, 1, 0))
     middle = chain(
         [(0, -8, 298), (0, -12, 280), (0, -16, 250), (2, -16, 200), (4, -10, 150), (4, -4, 80)],
@@ -195,7 +195,7 @@ def _paravertebral_muscle() -> list[Segment]:
 
 
 def paint_heart(canvas: Canvas) -> None:
-    """Pericardial fat, muscle and the four blood pools; the apex points left and forwards."""
+    """Paint pericardial fat, muscle and the four blood pools; the apex points left and forwards."""
     canvas.paint_solids(HEART, anatomy.FAT)
     region, distance = canvas.union(HEART)
     canvas.paint(region, distance + np.float32(3), anatomy.MYOCARDIUM)
@@ -207,7 +207,7 @@ def paint_heart(canvas: Canvas) -> None:
 def _paint_tubes(
     canvas: Canvas, tubes: Sequence[Sequence], tissue: Tissue, thickening: float = 0.0
 ) -> None:
-    """Tubes given as rows of (point, radius), smoothed."""
+    """Paint smoothed tubes given as rows of (point, radius)."""
     segments = []
     for tube in tubes:
         points = [point for point, _ in tube]

@@ -1,4 +1,4 @@
-"""Checks of the size that is asked for, before any of it is made."""
+"""Checks of the requested size before any memory is allocated."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 
 
 def checked_shape(shape: Sequence[int], smallest: int) -> tuple[int, int, int]:
-    """``shape`` as three integers (z, y, x).
+    """Return ``shape`` as three integers (z, y, x).
 
     Raises:
         IrrcacheError: a shape of other than three integers, or a side below ``smallest``.
@@ -29,7 +29,7 @@ def checked_shape(shape: Sequence[int], smallest: int) -> tuple[int, int, int]:
 def check_memory(
     shape: Sequence[int], voxels: Sequence[int], bytes_per_voxel: int, memory_limit: int
 ) -> None:
-    """Refuse ``shape`` if the ``voxels`` (z, y, x) it takes need more than the limit in bytes.
+    """Refuse ``shape`` if its ``voxels`` (z, y, x) need more memory than the limit in bytes.
 
     Raises:
         IrrcacheError: both numbers of bytes are named.

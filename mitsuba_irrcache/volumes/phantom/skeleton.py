@@ -21,7 +21,7 @@ from mitsuba_irrcache.volumes.phantom.distance import (
 
 @dataclass(frozen=True)
 class Vertebra:
-    """Heights in mm: ``z`` of the body's centre, its height, and how far its spine hangs down."""
+    """Heights in mm: centre ``z`` and height of the body, drop of the spinous process."""
 
     name: str
     z: float
@@ -36,7 +36,7 @@ class Vertebra:
 
     @property
     def arch_y(self) -> float:
-        """The y of the middle of the vertebral canal."""
+        """Return the y of the middle of the vertebral canal."""
         return self.centre[1] + self.radii[1] + 8.0
 
 
@@ -63,9 +63,9 @@ THORACIC = {int(v.name[1:]): v for v in VERTEBRAE if v.name.startswith("T")}
 
 @dataclass(frozen=True)
 class Rib:
-    """A rib's course: how far it falls in mm, and the angle on the cage where its bone ends.
+    """The course of a rib: its descent in mm, and the angle on the cage at which its bone ends.
 
-    The angle is 0 at the back and 180 degrees in front. ``joint`` is where its cartilage ends on
+    The angle is 0 at the back and 180 degrees in front. ``joint`` is the end of its cartilage on
     the left side (x, y, z in mm): at the sternum, or on the cartilage above; floating ribs have
     none. ``half_height`` and ``radius`` give the section of the flat bone.
     """
@@ -115,7 +115,7 @@ def _spine() -> list[Solid]:
 
 
 def _vertebra(vertebra: Vertebra) -> list[Solid]:
-    """Body, pedicles, laminae, and the transverse, articular and spinous processes."""
+    """Return body, pedicles, laminae, and the transverse, articular and spinous processes."""
     axis = anatomy.spine_axis(vertebra.z)
     body = Drum(vertebra.centre, vertebra.radii, vertebra.height / 2, axis, waist=0.12)
     back, z = vertebra.arch_y, vertebra.z
@@ -147,12 +147,12 @@ def _canal(radius: float) -> list[Segment]:
 
 
 def rib_course(rib: Rib, side: int, count: int = 28) -> np.ndarray:
-    """Centre line (count, 3) in mm of a rib's bone, from its head to where its cartilage begins."""
+    """Return the centre line (count, 3) in mm of a rib's bone, from its head to its cartilage."""
     vertebra = THORACIC[rib.number]
     head = (0.85 * vertebra.radii[0] + 2, vertebra.centre[1] + 8, vertebra.z + 7)
     neck = (vertebra.transverse - 4, vertebra.arch_y + 3, vertebra.z + 6)
     angles = np.radians(np.linspace(36, rib.end_angle, 7))
-    # Ribs fall steeply behind and at the side and level out in front.
+    # Ribs descend steeply at the back and the side, and are nearly level in front.
     share = np.sin(angles / np.radians(rib.end_angle) * np.pi / 2) ** 1.6
     fall = rib.drop * np.where(angles < np.radians(rib.end_angle), share, 1)
     on_cage = anatomy.CAGE.on_surface(angles, vertebra.z + 6 - fall)
@@ -201,14 +201,14 @@ def _shoulder_girdle() -> list[Solid]:
 
 
 def _clavicle(side: int) -> list[Segment]:
-    """An S from the manubrium to the acromion."""
+    """Return an S-shaped bar from the manubrium to the acromion."""
     points = [(22, -68, 274), (50, -62, 281), (85, -36, 287), (115, -14, 288), (136, 4, 287)]
     curve = smooth_curve(points, 14) * (side, 1, 1)
     return chain(curve, [7.5, 6.5, *[5.5] * 10, 6.0, 6.5])
 
 
 def _scapula(side: int) -> list[Solid]:
-    """Blade between its medial and lateral borders, spine with acromion, coracoid, socket."""
+    """Return blade between its borders, spine with acromion, coracoid, and socket."""
     mirror = (side, 1, 1)
     medial = smooth_curve([(68, 88, 268), (66, 98, 240), (72, 102, 205), (90, 100, 168)], 14)
     lateral = smooth_curve([(122, 42, 268), (122, 48, 250), (113, 76, 212), (92, 99, 168)], 14)

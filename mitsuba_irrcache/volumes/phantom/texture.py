@@ -1,4 +1,4 @@
-"""Correlated random texture: a function of position, so that every resolution shows the same."""
+"""Correlated random texture as a function of position, equal at all resolutions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-# Pitch in mm of the lattices whose interpolated random values are added up, and their weights.
+# Lattice spacings in mm of the interpolated random values that are summed, and their weights.
 OCTAVES = ((9.0, 0.7), (3.0, 0.7))
 
 
@@ -16,18 +16,18 @@ def texture(
     upper: Sequence[float],
     seed: int = 2015,
 ) -> np.ndarray:
-    """Texture (z, y, x), float32, of mean 0 and deviation near 1/2.
+    """Return a texture (z, y, x), float32, with mean 0 and a standard deviation of about 1/2.
 
-    ``coordinates`` are the grid's x, y and z in mm, within the box from ``lower`` to ``upper``,
-    which alone (and ``seed``) decides the texture. Only uniform deviates of a fixed bit generator
-    are drawn, whose stream NumPy keeps stable.
+    ``coordinates`` are the grid's x, y and z in mm, within the box from ``lower`` to ``upper``. The
+    texture depends on this box and on ``seed`` only. Only uniform deviates of a fixed bit generator
+    are drawn, whose stream NumPy guarantees.
     """
     generator = np.random.Generator(np.random.PCG64(seed))
     total = np.zeros([axis.size for axis in coordinates[::-1]], dtype=np.float32)
     for pitch, weight in OCTAVES:
         counts = [int(np.ceil((h - lo) / pitch)) + 1 for lo, h in zip(lower, upper, strict=True)]
         lattice = generator.random(counts[::-1], dtype=np.float32)
-        # sqrt(12) is the inverse deviation of a uniform deviate; interpolation halves it.
+        # sqrt(12) is the inverse standard deviation of a uniform deviate; interpolation halves it.
         lattice = (lattice - 0.5) * np.float32(weight * 12**0.5)
         for axis, (coordinate, low) in enumerate(zip(coordinates, lower, strict=True)):
             lattice = interpolate(lattice, (coordinate - low) / pitch, 2 - axis)
@@ -36,7 +36,7 @@ def texture(
 
 
 def interpolate(lattice: np.ndarray, position: np.ndarray, axis: int) -> np.ndarray:
-    """Linear interpolation along one axis at fractional indices ``position``."""
+    """Interpolate linearly along one axis at fractional indices ``position``."""
     index = np.clip(np.floor(position).astype(np.intp), 0, lattice.shape[axis] - 2)
     shape = [1, 1, 1]
     shape[axis] = position.size

@@ -1,4 +1,4 @@
-"""A procedural chest CT, for machines that have no scan at hand."""
+"""A procedural chest CT for use without data."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from mitsuba_irrcache.volumes.phantom.skeleton import paint_skeleton
 
 SMALLEST_SIDE = 8
 
-# Coarser grids are block means of a finer one, which is what a scanner's voxel is: thin bone
-# dims but neither vanishes nor swells.
+# Coarse grids are block means of a finer one, as a scanner's voxels are: thin bone becomes darker,
+# but is neither lost nor thickened.
 COARSEST_SPACING = 3.0
 
-# Peak use while painting, in bytes per painted voxel.
+# Peak memory while painting, in bytes per painted voxel.
 BYTES_PER_VOXEL = 40
 
 
 def thorax(shape: Sequence[int] = (350, 150, 512), memory_limit: int = 8 * 2**30) -> VolumeData:
-    """A chest CT with contrast agent of a made-up patient, in Hounsfield units.
+    """Create a contrast-enhanced chest CT of a fictitious patient, in Hounsfield units.
 
     Whatever the shape, the volume is 380 x 240 x 330 mm (x, y, z) in LPS axes: +x is the patient's
-    left, +y backwards, +z upwards. Equal shapes give equal volumes, and a place in the body has the
-    same anatomy and texture at every resolution, up to partial-volume blur.
+    left, +y backwards, +z upwards. Equal shapes give equal volumes, and a position in the body has
+    the same anatomy and texture at every resolution, up to partial-volume blur.
 
     Args:
         shape: voxel counts ``(z, y, x)``, each at least 8.
-        memory_limit: the most memory in bytes that may be used.
+        memory_limit: maximum memory in bytes.
 
     Returns:
         Values int16 in HU, shape ``shape``; spacing and origin in mm.
@@ -65,7 +65,7 @@ def thorax(shape: Sequence[int] = (350, 150, 512), memory_limit: int = 8 * 2**30
 
 
 def _block_means(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Means over blocks of ``factors`` (z, y, x) voxels."""
+    """Return means over blocks of ``factors`` (z, y, x) voxels."""
     for axis, factor in enumerate(factors):
         if factor > 1:
             split = list(values.shape)

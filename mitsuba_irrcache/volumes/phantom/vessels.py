@@ -8,18 +8,19 @@ import numpy as np
 
 from mitsuba_irrcache.volumes.phantom.distance import Segment
 
-# Murray's law: this power of a vessel's radius is the sum over its branches. The law's 3 is for
-# laminar flow; measured pulmonary arteries branch with less.
+# Murray's law: this power of a vessel's radius is the sum over its branches. The law's exponent 3
+# is for laminar flow; that of measured pulmonary arteries is smaller.
 MURRAY_EXPONENT = 2.8
 
 
 def vessel_tree(
     root: Sequence[float], points: np.ndarray, tip_radius: float = 0.8, detour: float = 0.5
 ) -> list[Segment]:
-    """Segments of a tree from ``root`` to all ``points`` (n, 3), mm.
+    """Return the segments of a tree from ``root`` to all ``points`` (n, 3), mm.
 
-    From the root outwards each point joins the vessel it reaches with least new length plus
-    ``detour`` times the way back to the root. Radii follow Murray's law from ``tip_radius``.
+    Starting at the root, each point is connected to the vessel with the least new length plus
+    ``detour`` times the distance to the root along the tree. Radii follow Murray's law from
+    ``tip_radius``.
     """
     points = points[np.argsort(np.linalg.norm(points - root, axis=1), kind="stable")]
     nodes = np.vstack([root, points])
@@ -34,7 +35,7 @@ def vessel_tree(
 
 
 def _parents(nodes: np.ndarray, detour: float) -> np.ndarray:
-    """Index of the node that each node hangs on; the root's is 0."""
+    """Return the index of each node's parent; the root's is 0."""
     parents = np.zeros(len(nodes), dtype=np.intp)
     way = np.zeros(len(nodes))
     for child in range(1, len(nodes)):
@@ -45,7 +46,7 @@ def _parents(nodes: np.ndarray, detour: float) -> np.ndarray:
 
 
 def _tips(parents: np.ndarray) -> np.ndarray:
-    """Number of tips beyond each node, itself included where nothing hangs on it."""
+    """Return the number of leaves below each node; a leaf counts itself."""
     tips = np.zeros(len(parents))
     for child in range(len(parents) - 1, 0, -1):
         tips[child] = max(tips[child], 1)

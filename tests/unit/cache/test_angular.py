@@ -1,4 +1,4 @@
-"""Phase functions by their moments, and light by its direction."""
+"""Phase functions and their angular moments, and radiance by direction."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
 from mitsuba_irrcache.errors import UnsupportedSceneError
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.path.estimator import contributions
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -37,14 +37,14 @@ MOMENTS = {
 
 @pytest.mark.parametrize(("phase", "moments", "order"), MOMENTS.values(), ids=MOMENTS)
 def test_moments(scenes, phase, moments, order):
-    found = bake_media(scene_of(scenes, phase))[0].phase
+    found = compile_scene(scene_of(scenes, phase)).visible[0].phase
     np.testing.assert_allclose(found.moments[:4], moments, atol=2e-4)
     assert found.order == order
 
 
 @pytest.mark.parametrize("phase", [{"type": "isotropic"}, hg(0.0)])
-def test_isotropic_ones_have_none(scenes, phase):
-    assert bake_media(scene_of(scenes, phase))[0].phase is None
+def test_isotropic_phase_functions_have_no_moments(scenes, phase):
+    assert compile_scene(scene_of(scenes, phase)).visible[0].phase.is_isotropic
 
 
 REFUSED = {
@@ -57,12 +57,12 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("phase", "message"), REFUSED.values(), ids=REFUSED)
-def test_others_are_refused(scenes, phase, message):
+def test_unsupported_phase_functions_are_refused(scenes, phase, message):
     if "S" in phase:
         values = np.tile(np.float32([0.1, 0.1, 1, 0, 0, 0]), (2, 2, 2, 1))
         phase["S"] = {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True}
     with pytest.raises(UnsupportedSceneError, match=message):
-        bake_media(scene_of(scenes, phase))
+        compile_scene(scene_of(scenes, phase))
 
 
 def lamp(size: float, place: tuple = (0.6, 2.2, 1.5)) -> dict:
@@ -83,21 +83,22 @@ LIGHTS = {
 
 @pytest.mark.parametrize(("objects", "tolerance"), LIGHTS.values(), ids=LIGHTS)
 @pytest.mark.parametrize("g", [0.5, -0.3])
-def test_scattered_light_of_one_place(scenes, objects, tolerance, g):
-    """From the moments, and from all directions one by one: relative to the mean, 4 pi p weighted
-    with the same samples.
+def test_scattered_radiance_from_moments_and_from_directions(scenes, objects, tolerance, g):
+    """Scattered radiance from moments agrees with the sum over directions.
+
+    The sum weights the same samples by 4 pi p; the difference is relative to the mean.
     """
     if isinstance(objects.get("emitter"), float):
         objects = objects | {"emitter": lamp(objects["emitter"])}
     elif isinstance(objects.get("emitter"), tuple):
         objects = objects | {"emitter": lamp(*objects["emitter"])}
     scene = scene_of(scenes, hg(g), **objects)
-    medium, count = bake_media(scene)[0], 1 << 16
+    media, count = compile_scene(scene).media, 1 << 16
+    medium = media.grids[0]
     directional = AngularBasis(medium.phase, sources_of(scene))
     rng, p = mi.PCG32(count), mi.Point3f(0.2, 0.5, -0.3)
     spread = [rng.next_float32() for _ in range(4)]
     limits = [dr.opaque(mi.UInt32, n) for n in (3, 100)]
-    media = medium.surroundings.media
     found = contributions(scene, media, p, medium.pointer, spread, rng, *limits)
     dr.eval(found)
 

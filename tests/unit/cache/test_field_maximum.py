@@ -1,4 +1,4 @@
-"""The brightest light of a cache, by which rays end early: no less than any that is looked up."""
+"""The maximum of a cache, by which rays are terminated, bounds every lookup."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
@@ -15,12 +16,13 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.mark.parametrize("correlated", [True, False])
 @pytest.mark.parametrize("lamp", [(0.5, 0.5, 0.5), (0.47, 0.62, 0.5)], ids=str)
-def test_maximum_is_reached_by_no_voxel(lamp, correlated):
-    """Light of a lamp in the medium, and at the centres of voxels what the cache holds there."""
+def test_maximum_bounds_all_lookups(lamp, correlated):
+    """The maximum bounds lookups next to a light in the medium, and the cached values."""
     grid, voxels = Grid((8, 8, 8), np.eye(4)), mi.UInt32(np.arange(512, dtype=np.uint32))
     light = {"type": "point", "position": list(lamp), "intensity": 3.0}
-    cache = IrradianceCache(grid, voxels, 1, -1, correlated=correlated)
-    cache.falloff = InverseSquareFactor.of(mi.load_dict({"type": "scene", "lamp": light}), grid)
+    falloff = InverseSquareFactor.of(mi.load_dict({"type": "scene", "lamp": light}), grid)
+    interpolation = Interpolation(falloff=falloff)
+    cache = IrradianceCache(grid, voxels, 1, -1, correlated=correlated, interpolation=interpolation)
     places = cache.falloff.places.of(voxels)
     way = np.array(places, np.float64) - np.array(lamp)[:, None]
     phi = 3 / np.sum(way**2, axis=0)

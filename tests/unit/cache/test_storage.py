@@ -1,4 +1,4 @@
-"""What a cache file may say, which caches may be merged, and when there is a standard error."""
+"""Validation of cache files, merging of caches, and availability of the standard error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ VOXELS = 8
 
 
 def cache(seed: int = 0, batches: int = 2, batch: int = BATCH, correlated=False, **others):
-    """A cache of 2^3 voxels with random sums."""
+    """Return a cache of 2^3 voxels with random sums."""
     active = dr.arange(mi.UInt32, VOXELS)
     grid = Grid((2, 2, 2), np.eye(4))
     made = IrradianceCache(
@@ -44,9 +44,7 @@ def file(tmp_path):
 
 
 def rewrite(file, seal: bool, change) -> None:
-    """Writes a file anew after ``change``, whose archive is whole; with digests that fit if it is
-    to ``seal`` it.
-    """
+    """Rewrite a file after ``change``; if ``seal``, with matching digests."""
     arrays = dict(np.load(file))
     description = json.loads(arrays.pop("description").tobytes())
     change(description, arrays)
@@ -58,8 +56,8 @@ def rewrite(file, seal: bool, change) -> None:
         np.savez(stream, description=encoded, **arrays)
 
 
-def test_a_file_that_is_written_anew_is_read(file):
-    """What the other tests do to a file harms only by what they change."""
+def test_unchanged_rewritten_file_is_read(file):
+    """A file rewritten without a change is read, so that other tests fail by their change only."""
     rewrite(file, True, lambda description, arrays: None)
     assert IrradianceCache.load(file).samples == 2 * BATCH
     rewrite(file, False, lambda description, arrays: None)
@@ -68,7 +66,7 @@ def test_a_file_that_is_written_anew_is_read(file):
 
 @pytest.mark.parametrize("name", ["active", "totals", "spreads"])
 def test_altered_values_are_refused(file, name):
-    """Each of them possible by itself."""
+    """Altered values are refused by their digests, although each is valid by itself."""
 
     def change(description, arrays):
         if name == "active":
@@ -113,13 +111,13 @@ def test_altered_descriptions_are_refused(file, lie):
         ({"batch": 10**6, "correlated": True}, "type|batches"),
         ({"streams": {"0": 10**12}}, "samples"),
         ({"streams": {"-1": 16}}, "samples"),
-        ({"streams": {"0": 8}}, "more light than 1 batch"),
-        ({"streams": {}}, "more light than 0 batch"),
+        ({"streams": {"0": 8}}, "non-zero sums, but only 1 batch"),
+        ({"streams": {}}, "non-zero sums, but only 0 batch"),
     ],
     ids=str,
 )
 def test_impossible_descriptions_are_refused(file, lie, said):
-    """Whoever writes them writes digests that fit."""
+    """Invalid descriptions are refused although their digests match."""
     rewrite(file, True, lambda description, arrays: description.update(lie))
     with pytest.raises(CacheFileError, match=said):
         IrradianceCache.load(file)
@@ -132,7 +130,7 @@ def test_impossible_descriptions_are_refused(file, lie, said):
 )
 def test_caches_whose_samples_differ_in_kind_are_not_merged(other):
     first, second = cache(0), cache(1)
-    first.merge(second)  # alike
+    first.merge(second)  # equal
     assert first.samples == 4 * BATCH
     if "moments" in other:
         odd = IrradianceCache(first.grid, first.active, 1, -1, first.fingerprint, moments=1)
@@ -148,8 +146,8 @@ def test_caches_whose_samples_differ_in_kind_are_not_merged(other):
 
 @pytest.mark.parametrize("solver", ["sweep", "path"])
 @pytest.mark.parametrize("samples", [1, 8, 32, 64])
-def test_what_needs_an_error_gets_two_batches(scenes, solver, samples):
-    """However few samples are asked for; without a need for an error one batch is enough."""
+def test_error_estimates_take_two_batches(scenes, solver, samples):
+    """A cache that needs an error estimate takes two batches; otherwise one suffices."""
     shape = scenes.boundary(scenes.medium(1.0, 0.5))
     common = {"type": "irrcache", "solver": solver, "resolution": 2, "max_depth": 2}
     for aovs, least in (("", 1), ("noise", 2)):

@@ -1,7 +1,7 @@
-"""The error of the cache as a field: noise as random errors, bias from half the resolution.
+"""Error estimates of lookups: noise as random probes, bias from half the resolution.
 
-The caches are filled by hand, so that every voxel's value and standard error are known; what
-lookups make of them is computed anew in NumPy.
+The caches are filled by hand, so that every voxel's value and standard error are known; expected
+values are computed in NumPy.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ UNIT = np.eye(4)
 
 
 def cache_of(batches: np.ndarray, shape, to_world=UNIT, active=None) -> IrradianceCache:
-    """A cache whose batches of samples have these means, (batch, active voxel[, 3])."""
+    """Return a cache whose batches have these means, (batch, active voxel[, 3])."""
     batches = np.asarray(batches, dtype=np.float64)
     if batches.ndim == 2:
         batches = np.repeat(batches[..., None], 3, axis=2)
@@ -30,18 +30,18 @@ def cache_of(batches: np.ndarray, shape, to_world=UNIT, active=None) -> Irradian
     double = dr.float64_array_t(mi.Float)
     totals = [double(batches[..., c].sum(axis=0)) for c in range(3)]
     spreads = [double(batches[..., c].var(axis=0) * len(batches)) for c in range(3)]
-    nothing = [None] * 3  # scattered
+    nothing = [None] * 3  # scattered layer
     cache.add(0, BATCH * len(batches), [((*totals, *nothing), spreads)])
     return cache
 
 
 def with_error(phi: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Two batches that have exactly this mean and this standard error of the mean."""
+    """Return two batches with exactly this mean and standard error of the mean."""
     return np.array([phi - error, phi + error])
 
 
 def errors_at(cache: IrradianceCache, points: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Luminance at world points (n, 3), and the errors in its units: probes (k, n), bias (n)."""
+    """Return luminance, relative probes (k, n) and relative bias (n) at world points (n, 3)."""
     p = mi.Point3f(np.float32(points.T))
     phi = cache.field().at_world(p)
     *probes, bias = (np.float64(e) for e in uncertainty_of(cache).at_world(p, phi, mi.Bool(True)))
@@ -50,7 +50,7 @@ def errors_at(cache: IrradianceCache, points: np.ndarray) -> tuple[np.ndarray, .
 
 
 def trilinear(points: np.ndarray, shape, to_world) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices and weights (n, 8) of the voxels around world points (n, 3)."""
+    """Return flat indices and weights (n, 8) of the voxels around world points (n, 3)."""
     counts = np.array(shape)[::-1]
     inverse = np.linalg.inv(to_world)
     local = points @ inverse[:3, :3].T + inverse[:3, 3]
@@ -66,7 +66,7 @@ def trilinear(points: np.ndarray, shape, to_world) -> tuple[np.ndarray, np.ndarr
 
 
 def inside(to_world: np.ndarray, count: int, margin: float = 0.0, seed: int = 1) -> np.ndarray:
-    """Random world points (n, 3) in a grid, ``margin`` of its edges away from its faces."""
+    """Return random world points (n, 3) in a grid, ``margin`` of its edges away from its faces."""
     local = np.random.default_rng(seed).uniform(margin, 1 - margin, (count, 3))
     return local @ to_world[:3, :3].T + to_world[:3, 3]
 
@@ -79,30 +79,33 @@ def white(n: int) -> np.ndarray:
 
 
 def varied(n: int) -> np.ndarray:
-    """Neighbours that differ by up to a factor of 10, grey."""
+    """Return a grey field whose neighbours differ by up to a factor of 10."""
     return np.exp(np.random.default_rng(2).uniform(-1.15, 1.15, (n, 1))) * np.ones(3)
 
 
 def saturated(n: int) -> np.ndarray:
-    """Almost only red light: the root of the mean is far from the mean of the roots."""
+    """Return an almost purely red field: the root of the mean is far from the mean of the roots."""
     return varied(n) * [1.0, 0.02, 0.02]
 
 
 @pytest.mark.parametrize("light", [white, varied, saturated])
 def test_probes_have_the_variance_of_interpolated_noise(scenes, light):
-    """Mean square of the probes at random places against sum_i w_i^2 e_i^2 of what a lookup makes
-    of independent voxel errors e_i (to first order in them, through roots), here in NumPy; away
-    from the outermost half voxel.
+    """Probes have the variance of interpolated independent voxel errors.
+
+    The mean square of the probes at random points is compared with sum_i w_i^2 e_i^2, to first
+    order in the errors e_i of the voxels and through roots, computed in NumPy; away from the
+    outermost half voxel.
 
     The ratio is known to 1.4 % (8000 voxels, 4 signs each); a sum of |w_i e_i| is wrong by a factor
-    of 3, weights not squared by 3, a wrong root of coloured light by 2.
+    of 3, weights not squared by 3, a wrong root of coloured radiance by 2.
     """
     shape, to_world = (20, 16, 25), scenes.placement((2.0, 1.0, 1.5), turn=25)
     n = int(np.prod(shape))
     phi = light(n)
     relative = np.random.default_rng(3).uniform(0.01, 0.1, (n, 1))
     cache = cache_of(with_error(phi, phi * relative), shape, to_world)
-    points = inside(to_world, 20000, margin=0.04)  # half a voxel: beyond, values are extrapolated
+    # The margin is half a voxel, beyond which values are extrapolated.
+    points = inside(to_world, 20000, margin=0.04)
     brightness, probes, _ = errors_at(cache, points)
     index, weight = trilinear(points, shape, to_world)
     root = np.sqrt(phi[:, 0])
@@ -113,11 +116,11 @@ def test_probes_have_the_variance_of_interpolated_noise(scenes, light):
 
 
 def test_probes_have_the_variance_of_lookups_at_the_border():
-    """In the outermost half voxel, against lookups in 96 caches of the same light and noise of 5 %:
-    what lies there is extrapolated, which makes its noise larger (here by 1.6 in all).
+    """In the outermost half voxel, probes have the standard deviation of lookups in 96 caches.
 
-    The ratio of deviations is known to 2 %; errors that are clamped where the light is not are 1.3
-    to 1.5 times too small.
+    All caches have the same field with 5 % of noise. Values there are extrapolated, which increases
+    their noise (here by 1.6 in all). The ratio of deviations is known to 2 %; errors clamped where
+    the field is extrapolated are 1.3 to 1.5 times too small.
     """
     n, rng = 10, np.random.default_rng(6)
     phi = at_centers(lambda p: np.exp(-3 * p[:, 0]), n)
@@ -134,7 +137,7 @@ def test_probes_have_the_variance_of_lookups_at_the_border():
 
 
 def signs(cache: IrradianceCache) -> np.ndarray:
-    """The random errors at the voxel centres in units of the standard error, (probe, z, y, x)."""
+    """Return the probes at the voxel centres in units of the standard error, (probe, z, y, x)."""
     index = mi.UInt32(np.arange(cache.grid.voxel_count, dtype=np.uint32))
     centers = np.array(cache.grid.centers(index)).T
     _, probes, _ = errors_at(cache, centers)
@@ -144,21 +147,24 @@ def signs(cache: IrradianceCache) -> np.ndarray:
 
 @pytest.fixture
 def plain() -> IrradianceCache:
-    """A cache of 16^3 voxels with some noise in each."""
+    """Return a cache of 16^3 voxels with some noise in each."""
     error = np.random.default_rng(4).uniform(0.005, 0.02, 16**3)
     return cache_of(with_error(np.ones(16**3), error), (16, 16, 16))
 
 
 def test_a_probe_at_a_voxel_is_its_standard_error(plain):
-    """Up to its sign: nothing of the sign bits may be left in the value (they are worth 2^-19)."""
+    """The probe at a voxel centre is the standard error up to its sign.
+
+    The bits that store the signs must not remain in the value (they are worth 2^-19).
+    """
     np.testing.assert_allclose(np.abs(signs(plain)), 1, rtol=1e-4)
 
 
-def test_signs_are_fair_coins(plain):
-    """Signs are balanced, and independent between probes and between neighbours: correlations of 24
-    kinds, each within 4.5 standard deviations of 0 (chance of a false alarm 2e-4 in all).
+def test_probe_signs_are_balanced_and_independent(plain):
+    """Signs are balanced, and independent between probes and between neighbours.
 
-    Probes that are all the same, or each other's negatives, are at 64 deviations.
+    Correlations of 24 kinds are each within 4.5 standard deviations of 0 (chance of a false alarm
+    2e-4 in all). Probes that are all equal, or each other's negatives, are at 64 deviations.
     """
     sign = np.sign(signs(plain))
     means = [s.mean() for s in sign]
@@ -169,9 +175,10 @@ def test_signs_are_fair_coins(plain):
     assert np.abs(means).max() < 4.5 / np.sqrt(sign[0].size)
 
 
-def test_the_probes_of_a_cache_do_not_change(plain):
-    """The same errors each time: flickering noise images, and a filter of another strength in every
-    frame, otherwise.
+def test_probes_of_a_cache_are_constant(plain):
+    """The probes of a cache are the same each time.
+
+    Otherwise noise images would flicker, and the strength of the filter would vary between frames.
     """
     np.testing.assert_array_equal(signs(plain), signs(plain))
 
@@ -198,7 +205,7 @@ FIELDS = {
 
 
 def bias_of(function, n: int, noise: float = 0.0, seed: int = 0) -> tuple[float, float, float]:
-    """Predicted and true mean error of lookups away from the border, and the mean light there."""
+    """Return predicted and true mean error of lookups away from the border, and the mean value."""
     rng = np.random.default_rng(seed)
     phi = at_centers(function, n)
     draws = np.clip(rng.normal(size=(2, n**3)), -3, 3)
@@ -211,9 +218,10 @@ def bias_of(function, n: int, noise: float = 0.0, seed: int = 0) -> tuple[float,
 
 @pytest.mark.parametrize("function", FIELDS.values(), ids=FIELDS)
 def test_bias_of_a_smooth_field(function):
-    """The mean error of lookups at random places, predicted within 10 % with 24 voxels an edge.
+    """The mean error of lookups in a smooth field is predicted within 10 % with 24 voxels an
+    edge.
 
-    An error of sign, of the ratio of the resolutions (4 where it is 6), or averages of Phi in place
+    An error of sign, of the ratio of the resolutions (4 instead of 6), or averages of Phi instead
     of its roots (25 % on the exponential) fail.
     """
     predicted, true, mean = bias_of(function, 24)
@@ -222,15 +230,17 @@ def test_bias_of_a_smooth_field(function):
 
 
 def test_no_bias_of_a_constant():
-    """Nor at the border."""
+    """A constant field has no bias, at the border neither."""
     cache = cache_of(np.full((2, 5 * 6 * 7), 0.7), (5, 6, 7))
     _, _, bias = errors_at(cache, inside(UNIT, 1000))
     assert np.abs(bias).max() < 1e-6
 
 
 def test_noise_is_not_mistaken_for_bias():
-    """Voxels with a standard error of 20 %: unless numerator and denominator are balanced,
-    products of one noise with itself look like a bias of some 0.4 % of the light. Known to 0.03 %.
+    """Noise is not mistaken for bias.
+
+    With a standard error of 20 % per voxel, products of one noise with itself would be taken for a
+    bias of some 0.4 %, unless numerator and denominator are balanced. Known to 0.03 %.
     """
     n = 24
     biases = [bias_of(lambda p: np.ones(len(p)), n, 0.2 * np.sqrt(2), seed)[0] for seed in range(4)]
@@ -238,12 +248,13 @@ def test_noise_is_not_mistaken_for_bias():
     assert abs(np.mean(biases)) < 1.5e-3
 
 
-# Where there is little
+# Inactive and dark voxels
 
 
 def test_inactive_voxels_do_not_leak():
-    """Voxels outside the medium have no light and no error; those beside them are not compared with
-    their zeros (a bias of more than 10 % otherwise).
+    """Inactive voxels, whose value is zero, do not affect the bias of their neighbours.
+
+    A comparison with the zeros would give a bias of more than 10 %.
     """
     shape = (7, 8, 9)
     z, y, x = np.indices(shape)
@@ -260,7 +271,7 @@ def test_inactive_voxels_do_not_leak():
 
 @pytest.mark.parametrize("shape", [(6, 6, 6), (1, 1, 5), (1, 1, 1), (3, 1, 2)])
 def test_dark_voxels_give_no_nan(shape):
-    """Phi = 0 in some active voxels or in all, nearly 0 in others; also beyond the grid's faces."""
+    """Phi = 0 in some or all active voxels, and beyond the grid's faces, gives no NaN."""
     n = int(np.prod(shape))
     rng = np.random.default_rng(5)
     levels = [0.0, 0.0, 1e-35, 1e-20, 1.0, 1e6]
@@ -273,8 +284,10 @@ def test_dark_voxels_give_no_nan(shape):
                 assert np.isfinite(np.array(relative * light)).all()
 
 
-def test_lanes_that_are_off_read_nothing():
-    """As every lookup in a ray march: an inactive lane may be anywhere."""
+def test_masked_lanes_read_nothing():
+    """Masked lanes of a lookup read nothing, as in a ray march, where their position is
+    arbitrary.
+    """
     cache = cache_of(np.ones((2, 8)), (2, 2, 2))
     field: UncertaintyField = uncertainty_of(cache)
     far = mi.Point3f([0.5, 1e30, np.nan], 0.5, 0.5)

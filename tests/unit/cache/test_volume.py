@@ -1,6 +1,4 @@
-"""The cache: which voxels it holds, what its statistics mean, and that it survives files and
-merging.
-"""
+"""The cache: its active voxels, the meaning of its statistics, saving and merging."""
 
 from __future__ import annotations
 
@@ -21,29 +19,33 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels
 from mitsuba_irrcache.io.mitsuba_vol import read_vol
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.compile import bake_scene
-from mitsuba_irrcache.solvers.path import solver as path_solver
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.solvers.base import SolverTask
+from mitsuba_irrcache.solvers.path.solver import PathSolver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
 @pytest.fixture
 def make(scenes):
-    """A function: a cache of a small cloud under a sky and a sun, filled by these calls of the
-    solver (seed, samples).
+    """Return a function that makes a cache of a small cloud under a sky and a sun.
+
+    It is filled by these calls of the solver (seed, samples).
     """
     to_world = scenes.placement((2.0, 1.0, 1.5), turn=20)
     sigma_t = scenes.texture((4, 3, 5), 0.0, 2.0, 1)
     shape = scenes.boundary(scenes.medium(sigma_t, 0.8, to_world), to_world)
     scene = scenes.load({"type": "irrcache", "solver": "path"}, shape)
-    medium = bake_scene(scene)
+    description = compile_scene(scene)
+    (medium,) = description.visible
 
     def run(*calls: tuple[int, int], max_depth: int = 3, resolution: int = 6) -> IrradianceCache:
         grid = Grid.near_cubic(medium.frame, resolution)
         active = active_voxels(medium, grid)
         cache = IrradianceCache(grid, active, 3, max_depth, {"medium": "a", "emitters": "b"})
         for seed, samples in calls:
-            path_solver.refine(scene, medium, cache, samples, seed, rr_depth=100)
+            task = SolverTask(scene, description, medium, cache, seed, rr_depth=100)
+            PathSolver(task).refine(samples)
         return cache
 
     return run
@@ -58,14 +60,15 @@ def values(tensor) -> np.ndarray:
 
 @pytest.mark.parametrize("turn", [0.0, 45.0])
 @pytest.mark.parametrize("resolution", [7, 16, 40])
-def test_active_voxels_are_those_that_are_needed(scenes, turn, resolution):
-    """Every voxel that a lookup where sigma_t > 0 reads is active (checked at 2e5 points, also
-    beyond a grid that is smaller than its boundary); and no voxel farther than a macrocell from the
-    medium is.
+def test_active_voxels_are_those_that_lookups_read(scenes, turn, resolution):
+    """Active are all voxels that a lookup with sigma_t > 0 reads, and none far from the medium.
+
+    This is checked at 2e5 points, also beyond a grid that is smaller than its boundary; "far" is
+    more than a macrocell.
     """
     density = np.zeros((16, 20, 24), np.float32)
     density[2:5, 14:19, 3:9] = 1.0
-    density[9:10, 3:4, 22:24] = 1.0  # at the border, so it reaches beyond the grid
+    density[9:10, 3:4, 22:24] = 1.0  # at the border, so that it extends beyond the grid
     to_world = scenes.placement((1.6, 1.4, 1.2), turn=turn)
     field = GridField(Grid(density.shape, to_world), mi.Float(density.ravel()), 1)
     size = 1.3 * scenes.placement((2.0, 2.0, 2.0))
@@ -87,7 +90,7 @@ def test_active_voxels_are_those_that_are_needed(scenes, turn, resolution):
     assert needed.any()
     assert not (needed & ~active).any()
 
-    # Surplus within the grid: within a macrocell (0.3 across) and two voxels of what is needed.
+    # Surplus within the grid: within a macrocell (0.3 across) and two voxels of required ones.
     at = np.stack(np.unravel_index(np.arange(grid.voxel_count), grid.shape)[::-1], axis=1)
     reach = 0.3 * resolution / 2.6 * (1 if turn == 0 else 2.2) + 3
     chosen = at[needed]
@@ -117,7 +120,7 @@ def test_layers_add_up(make):
 
 
 def test_lookup_at_a_centre_is_the_value(make):
-    """Once noise is small: lookups make up for the bias that noise has on interpolated roots."""
+    """At a voxel centre, a lookup returns the value, corrected for the bias of noisy roots."""
     cache = make((0, 8192))
     p = cache.grid.centers(dr.arange(mi.UInt32, cache.grid.voxel_count))
     looked_up = np.array(cache.field().at_world(p)).T.reshape(values(cache.irradiance).shape)
@@ -125,8 +128,10 @@ def test_lookup_at_a_centre_is_the_value(make):
 
 
 def test_noise_does_not_shift_lookups(make):
-    """The mean lookup in 512 caches of the default 16 samples is that of a converged one, to 0.2 %
-    (and 3 standard errors, each below 0.05 %: without a correction it is 0.5 % off).
+    """The mean lookup in 512 caches of the default 16 samples equals that of a converged one.
+
+    The bound is 0.2 % and 3 standard errors, each below 0.05 %; without the correction the
+    difference is 0.5 %.
     """
     rng = np.random.default_rng(1)
     exact = make((999, 1 << 14), resolution=10)
@@ -140,8 +145,9 @@ def test_noise_does_not_shift_lookups(make):
 
 
 def test_standard_error_is_the_scatter_of_repetitions(make):
-    """48 caches of 64 samples: their scatter at each voxel against the error each claims; pooled
-    over some 100 voxels, 10 % is 6 deviations.
+    """The scatter of 48 caches of 64 samples agrees with their standard errors.
+
+    Pooled over some 100 voxels, the bound of 10 % is 6 deviations.
     """
     caches = [make((seed, 64)) for seed in range(48)]
     scatter = np.var([values(c.irradiance) for c in caches], axis=0, ddof=1)
@@ -153,8 +159,8 @@ def test_no_standard_error_from_one_batch(make):
     assert np.isnan(values(make((0, BATCH)).standard_error)).all()
 
 
-def test_resuming_is_the_same_as_going_on(make):
-    """32 samples and then 32 more are the 64 of one go, to the rounding of float32 sums."""
+def test_resuming_equals_a_single_run(make):
+    """32 samples and then 32 more equal 64 at once, to the rounding of float32 sums."""
     parts, whole = make((5, 32), (5, 32)), make((5, 64))
     assert parts.streams == whole.streams == {5: 64}
     np.testing.assert_allclose(values(parts.irradiance), values(whole.irradiance), rtol=2e-6)
@@ -164,7 +170,7 @@ def test_resuming_is_the_same_as_going_on(make):
 
 
 def test_streams_are_independent(make):
-    """Two seeds: no correlation of their errors over the voxels (|r| < 4 / sqrt(n))."""
+    """Errors of two seeds are uncorrelated over the voxels (|r| < 4 / sqrt(n))."""
     truth = values(make((99, 8192)).uncollided)[..., 0].ravel()
     a, b = (values(make((seed, 64)).uncollided)[..., 0].ravel() - truth for seed in (1, 2))
     assert abs(np.corrcoef(a, b)[0, 1]) < 4 / np.sqrt(a.size)
@@ -174,10 +180,8 @@ def test_streams_are_independent(make):
 # Merging
 
 
-def test_merging_is_one_longer_run(make):
-    """Seeds 1 and 2 merged are the solver's own run over both streams, and weighted by their
-    samples.
-    """
+def test_merging_equals_one_longer_run(make):
+    """Merged caches of seeds 1 and 2 equal one run over both streams, weighted by samples."""
     merged, other = make((1, 64)), make((2, 32))
     expected = (64 * values(merged.irradiance) + 32 * values(other.irradiance)) / 96
     merged.merge(other)
@@ -199,7 +203,7 @@ def test_equal_seeds_are_refused(make):
     assert cache.samples == 32
 
 
-def test_other_light_is_refused(make):
+def test_caches_of_other_emitters_are_not_merged(make):
     cache, other = make((1, 16)), make((2, 16))
     other.fingerprint["emitters"] = "c"
     with pytest.raises(IrrcacheError, match="emitters differs"):
@@ -207,7 +211,7 @@ def test_other_light_is_refused(make):
 
 
 @pytest.mark.parametrize("change", [{"resolution": 5}, {"max_depth": 2}])
-def test_other_shapes_are_refused(make, change):
+def test_caches_of_other_shapes_are_not_merged(make, change):
     with pytest.raises(IrrcacheError, match="does not fit"):
         make((1, 16)).merge(make((2, 16), **change))
 
@@ -216,7 +220,7 @@ def test_other_shapes_are_refused(make, change):
 
 
 def test_saved_and_loaded(make, tmp_path):
-    """All statistics come back to the last bit, and both may be refined and merged further."""
+    """All statistics are restored bit by bit, and a loaded cache can be refined and merged."""
     cache = make((4, 48))
     cache.save(tmp_path / "light.npz")
     loaded = IrradianceCache.load(tmp_path / "light.npz")
@@ -275,8 +279,8 @@ def test_damaged_files_are_refused_by_name(make, tmp_path, how):
         IrradianceCache.load(file)
 
 
-def test_a_bomb_is_refused_before_it_is_read(make, tmp_path):
-    """A small file whose header claims 2^40 values."""
+def test_oversized_header_is_refused_before_reading(make, tmp_path):
+    """A small file whose header declares 2^40 values is refused before its data are read."""
     file = tmp_path / "light.npz"
     with zipfile.ZipFile(file, "w") as archive:
         for name in ("description", "active", "totals", "spreads"):
@@ -307,7 +311,7 @@ def test_a_failure_while_writing_leaves_the_old_file(make, tmp_path, monkeypatch
 
 
 def test_export_to_mitsuba(make, tmp_path):
-    """The .vol file holds the irradiance, and Mitsuba reads it."""
+    """The exported .vol file holds the irradiance and is read by Mitsuba."""
     cache = make((4, 16))
     cache.export_vol(tmp_path / "phi.vol")
     array, bounds = read_vol(tmp_path / "phi.vol")

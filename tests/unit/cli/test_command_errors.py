@@ -1,6 +1,4 @@
-"""Commands without their optional packages, with files that are none, and with wrong values: one
-error that names the thing and the remedy, never a traceback.
-"""
+"""Commands without optional packages, with invalid files and values: one error with a remedy."""
 
 from __future__ import annotations
 
@@ -19,7 +17,7 @@ from mitsuba_irrcache.machine import doctor, versions
 from mitsuba_irrcache.machine.extras import missing_package
 
 NAMES = [name for name, *_ in COMMANDS]
-#: Runs a command as if no package of an extra were installed.
+#: Runs commands with the packages of all extras hidden.
 WITHOUT = """
 import sys
 from mitsuba_irrcache.machine import versions
@@ -40,7 +38,7 @@ for arguments in sys.argv[1:]:
 
 
 def without_extras(*commands: str, cwd=None) -> list[tuple[int, str, str]]:
-    """Status, output and errors of commands, all in one process: to start one takes a second."""
+    """Return status, output and errors of commands, run in one process to save start-up time."""
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT, *commands], capture_output=True, text=True, cwd=cwd
     )
@@ -60,7 +58,7 @@ def test_help_needs_no_extras():
 
 
 def test_missing_packages_are_named_with_the_command(tmp_path):
-    """Each command names its own extra, also where what is missing is imported late."""
+    """Each command names the extra it needs, also if a package is imported late."""
     (tmp_path / "scene.xml").write_text("<scene version='3.0.0'/>")
     (tmp_path / "ct.nrrd").write_text("NRRD0004\n")
     (tmp_path / "slices").mkdir()
@@ -82,7 +80,10 @@ def test_missing_packages_are_named_with_the_command(tmp_path):
 
 
 def test_every_requirement_belongs_to_an_extra_that_is_named():
-    """By the name that Python's error has; a module of nobody is a mistake in the code."""
+    """Every requirement is found in an extra by the module name of the import error.
+
+    An unknown module is not attributed to an extra: that would be a bug in the code.
+    """
     for extra in ("", *versions.extras()):
         for requirement in versions.requirements(extra):
             module = {"colour-science": "colour", "flip-evaluator": "flip_evaluator"}
@@ -123,7 +124,7 @@ def test_the_doctor_lists_all_extras(working, capsys):
 
 
 @pytest.mark.parametrize("variant", ["foo", "", "llvm_ad_rgbx"])
-def test_the_doctor_refuses_variants_that_are_none(working, capsys, variant):
+def test_the_doctor_refuses_unknown_variants(working, capsys, variant):
     assert main(["doctor", "-m", variant or " "]) == 1
     out, error = capsys.readouterr()
     assert not out and f'no variant "{variant or " "}"' in error and "llvm_ad_rgb" in error
@@ -131,32 +132,32 @@ def test_the_doctor_refuses_variants_that_are_none(working, capsys, variant):
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral"])
 @pytest.mark.parametrize("json", [[], ["--json"]])
-def test_all_is_not_well_where_irrcache_does_not_run(working, capsys, variant, json):
-    """Whatever Mitsuba itself can do with the variant."""
+def test_doctor_fails_if_irrcache_does_not_run(working, capsys, variant, json):
+    """The doctor reports a failure if irrcache does not run, whatever Mitsuba itself can do."""
     assert main(["doctor", "-m", variant, *json]) == 1
     printed = capsys.readouterr().out
     assert "All is well" not in printed and "llvm_ad_mono" in printed
 
 
-def test_all_is_not_well_without_a_remedy(monkeypatch):
-    """The last line follows the verdict, not the list of remedies."""
+def test_doctor_failure_without_a_remedy(monkeypatch):
+    """After a failure without a remedy, the last line is the verdict."""
     monkeypatch.setattr(doctor, "_probe", lambda variant, environment: "broken")
     report = doctor.examine(["llvm_ad_rgb"]) | {"remedies": []}
     assert not report["ok"] and "All is well" not in doctor.as_text(report)
 
 
-# Files that are none
+# Invalid files
 
 
 def refused(capsys, *arguments: str) -> str:
-    """The error of a command that is refused."""
+    """Return the error of a refused command."""
     assert main(list(arguments)) == 1
     error = capsys.readouterr().err
     assert error.startswith("irrcache: error: ") and error.count("\n") == 1, error
     return error
 
 
-def test_scenes_that_are_no_files(tmp_path, capsys, monkeypatch, rgb):
+def test_invalid_scene_files_are_refused(tmp_path, capsys, monkeypatch, rgb):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.xml").mkdir()
     (tmp_path / "empty.xml").touch()
@@ -185,7 +186,7 @@ def test_scenes_that_are_no_files(tmp_path, capsys, monkeypatch, rgb):
     assert set(os.listdir(tmp_path)) == before
 
 
-def test_volumes_and_outputs_that_are_no_files(tmp_path, capsys, monkeypatch, rgb):
+def test_invalid_volume_and_output_files_are_refused(tmp_path, capsys, monkeypatch, rgb):
     import mitsuba as mi
     import numpy as np
 
@@ -220,7 +221,7 @@ def test_volumes_and_outputs_that_are_no_files(tmp_path, capsys, monkeypatch, rg
 
 
 def options(name: str) -> list[argparse.Action]:
-    """The options of a command that take a value of some type."""
+    """Return the options of a command that convert their value."""
     parser = argparse.ArgumentParser()
     module = import_module(f"mitsuba_irrcache.{next(c[1] for c in COMMANDS if c[0] == name)}")
     module.add_arguments(parser)
@@ -229,15 +230,15 @@ def options(name: str) -> list[argparse.Action]:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("text", ["x", "", "40x32x24", "nan", "1,,2", ":", "9" * 5000])
-def test_wrong_values_are_answered_in_words(name, text):
-    """No message shows the name of a function of ours, and none but an argparse error is raised."""
+def test_errors_of_wrong_values_name_no_functions(name, text):
+    """Errors of wrong values contain no function names; all are argparse errors."""
     for action in options(name):
         try:
             action.type(text)
         except argparse.ArgumentTypeError as error:
             assert "it must be" in str(error) and "_" not in str(error) and len(str(error)) < 250
         except ValueError:
-            assert action.type in (int, float)  # argparse has words of its own for these
+            assert action.type in (int, float)  # argparse has its own messages for these
 
 
 def test_types():

@@ -1,4 +1,4 @@
-"""Errors against a noisy reference, and errors of the displayed picture."""
+"""Errors against a noisy reference, and errors of the tone-mapped image."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def halves(truth, rng, sigma=0.1):
 
 
 def test_the_noise_of_the_reference_drops_out(truth, rng):
-    """An error five times smaller than the reference's noise is found to a few percent."""
+    """An error five times smaller than the reference's noise is estimated to a few percent."""
     a, b = halves(truth, rng)
     image = truth + rng.normal(0, 0.02, SHAPE)
     square, uncertainty = metrics.net_mse(image, a, b)
@@ -39,7 +39,7 @@ def test_the_noise_of_the_reference_drops_out(truth, rng):
 
 
 def test_uncertainty_is_that_of_repetition(truth):
-    """The stated standard error is the spread over independent references."""
+    """The stated standard error is the scatter over independent references."""
     estimates, stated = [], []
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -51,7 +51,7 @@ def test_uncertainty_is_that_of_repetition(truth):
 
 
 def test_mean_error_with_correlated_noise(truth):
-    """Blotches of 8 x 8 pixels: the uncertainty of the mean error must not believe pixels."""
+    """The uncertainty of the mean error accounts for noise correlated over 8 x 8 pixels."""
     errors, stated = [], []
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -62,8 +62,8 @@ def test_mean_error_with_correlated_noise(truth):
     assert np.std(errors) == pytest.approx(np.mean(stated), rel=0.4)
 
 
-def test_blocks_see_blotches_not_noise(truth, rng):
-    """Of two errors with one RMSE, the blotched one has the larger block error, by a factor 8."""
+def test_block_error_measures_blotches(truth, rng):
+    """A blotched error has a block error 8 times that of pixel noise with equal RMSE."""
     a, b = halves(truth, rng, 1e-6)
     fine = truth + rng.normal(0, 0.05, SHAPE)
     blotches = np.kron(rng.normal(0, 0.05, (16, 12)), np.ones((8, 8)))[..., None]
@@ -73,7 +73,7 @@ def test_blocks_see_blotches_not_noise(truth, rng):
 
 
 def test_relative_mse_weighs_dark_pixels(truth):
-    """The same relative error everywhere gives its square, but where it is nearly black."""
+    """An equal relative error everywhere gives its square, except in nearly black pixels."""
     assert metrics.relative_mse(1.1 * truth, truth, truth) == pytest.approx(0.01, rel=0.06)
 
 
@@ -83,7 +83,7 @@ def test_alpha_and_aovs_are_no_colours():
 
 
 def test_display_is_srgb():
-    """Anchors of IEC 61966-2-1, clipping, exposure in stops, grey repeated."""
+    """Display values follow IEC 61966-2-1, with clipping, exposure in stops, and repeated grey."""
     image = np.array([[[0.0], [0.214041], [1.0], [7.0]]])
     shown = perceptual.display(image)
     assert shown.shape == (1, 4, 3)
@@ -92,7 +92,7 @@ def test_display_is_srgb():
 
 
 def test_ciede2000_of_known_colours():
-    """Equal pictures differ by 0, white and black by 100."""
+    """Equal images differ by 0, white and black by 100."""
     white, black = np.ones((2, 2, 3)), np.zeros((2, 2, 3))
     assert perceptual.ciede2000(white, white) == pytest.approx(np.zeros((2, 2)), abs=1e-9)
     assert perceptual.ciede2000(white, black) == pytest.approx(np.full((2, 2), 100), abs=0.1)

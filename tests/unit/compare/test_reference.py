@@ -78,7 +78,7 @@ def test_all_files_of_a_scene(scene):
     assert names == {"scene.xml", "camera.xml", "density.vol"}
 
 
-def test_kept(scene, launches):
+def test_reference_is_reused(scene, launches):
     """Found again, also with a file more beside it, from another folder, or for fewer samples."""
     first = make(scene, 4)
     count = len(launches)

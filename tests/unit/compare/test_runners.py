@@ -1,4 +1,4 @@
-"""How budgets are spent, with a clock and an integrator that are made up."""
+"""How time budgets are spent, with a simulated clock and integrator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mitsuba_irrcache.compare.runners import Average, accumulate, follow
 
 
 class Renderer(runners.Subject):
-    """A subject that renders an image of the next number, in a time that is given."""
+    """A subject whose n-th image has the value n and takes a given time."""
 
     def __init__(self, seconds: float, **stages: float) -> None:
         super().__init__(None, {}, "nothing")
@@ -42,23 +42,28 @@ def test_a_budget_is_met_to_half_a_launch(seconds):
         assert abs(snapshot.total - snapshot.budget) <= 0.5 * seconds + 1e-9
 
 
-def test_budgets_that_the_cache_outlasts():
-    """The first image stands for the largest of them, with its true time."""
+def test_budgets_shorter_than_the_cache():
+    """If the cache takes longer than several budgets, the first image counts for the largest of
+    them.
+
+    It has its actual time.
+    """
     frames = spend([1.0, 2.0, 5.0, 8.0], seconds=0.5, spent={"cache": 6.0})
     assert [s.budget for s, _ in frames] == [5.0, 8.0]
     assert frames[0][0].seconds == {"cache": 6.0, "image": 0.5}
     assert frames[1][0].total == pytest.approx(8.0, abs=0.25)
 
 
-def test_stages_of_images_are_kept_apart():
-    """An integrator that filters its images itself."""
+def test_stages_of_images_are_separate():
+    """Times of image and filter are separate if the integrator filters its images itself."""
     ((snapshot, _),) = accumulate(Renderer(0.3, filter=0.2), None, [2.0], 4, {"cache": 1.0})
     assert snapshot.seconds == pytest.approx({"cache": 1.0, "image": 0.6, "filter": 0.4})
 
 
-def test_an_average_knows_its_error():
-    """The claimed error of means of 8 images is the scatter of such means (4096 pixels: 2 %), of
-    the mean over the colours; alpha is none.
+def test_error_of_an_average():
+    """The standard error of means of 8 images is their scatter, and alpha has none.
+
+    The bound is for 4096 pixels; the error is that of the mean over the colours.
     """
     images = np.random.default_rng(1).normal(1.0, [0.1, 0.2, 0.3, 9.0], (8, 64, 64, 4))
     average = Average()
@@ -70,11 +75,11 @@ def test_an_average_knows_its_error():
     np.testing.assert_allclose(average.mean, images.mean(axis=0), rtol=1e-4, atol=1e-5)
 
 
-# A filter from outside
+# External filter
 
 
 class Filtered(Renderer):
-    """Its images have an alpha channel, which is not filtered."""
+    """A subject whose images have an alpha channel, which is not filtered."""
 
     is_filtered_here = True
 
@@ -85,7 +90,7 @@ class Filtered(Renderer):
 
 @pytest.fixture
 def denoise(monkeypatch):
-    """The filter, made up: it halves the image, and takes 0.25 s. Its calls are listed."""
+    """Record the calls of a fake filter that halves the image and takes 0.25 s."""
     calls, now = [], [0.0]
 
     def halve(image, standard_error):
@@ -101,8 +106,10 @@ def denoise(monkeypatch):
 
 
 def test_averages_are_filtered(denoise):
-    """Once for a snapshot, of two images at least, with the error of their mean; the time counts,
-    but not twice.
+    """Averages of at least two images are filtered once per snapshot, with the error of their
+    mean.
+
+    The filter's time is counted once.
     """
     subject = Filtered(0.1)
     subject.filter_seconds = 0.25
@@ -126,8 +133,8 @@ def test_averages_are_filtered(denoise):
         ("volpath{filter=blur}", False),
     ],
 )
-def test_who_is_filtered_here(tmp_path, integrator, expected):
-    """An integrator that does not know the property, which is not handed on to it."""
+def test_which_integrators_are_filtered_here(tmp_path, integrator, expected):
+    """Images are filtered here if the integrator lacks the property, which it is not given then."""
     subject = runners.Subject(tmp_path, {}, integrator)
     assert subject.is_filtered_here is expected
     assert ("filter" in subject.specification(max_depth=3)) == (
@@ -145,8 +152,9 @@ def frame(seconds: float, number: int = 0) -> SimpleNamespace:
 
 
 def followed(times, budgets, seconds=0.01):
-    """(budget, samples of the cache, camera samples, seconds) of each snapshot, where an image
-    takes ``seconds``.
+    """Return (budget, cache samples, camera samples, seconds) of each snapshot.
+
+    An image takes ``seconds``.
     """
     frames = (frame(t, i) for i, t in enumerate(times))
     snapshots = [s for s, _ in follow(Renderer(seconds), None, frames, budgets, 4)]
@@ -154,8 +162,9 @@ def followed(times, budgets, seconds=0.01):
 
 
 def test_snapshots_of_a_run():
-    """The first frame that reaches its share of a budget; the rest is spent on more images, to half
-    an image, and counts for all that follow.
+    """A snapshot is the first frame that reaches its share of a budget, and further images.
+
+    These use the rest of the budget, to half an image, and also count for later budgets.
     """
     first, second = followed([0.3, 0.85, 1.5, 2.56, 9.0], [3, 1])
     assert first == (1, "8", 4 * 16, pytest.approx(1.0, abs=0.006))
@@ -163,22 +172,26 @@ def test_snapshots_of_a_run():
 
 
 def test_snapshots_are_means_of_one_cache():
-    """The frame's image (its number) and those that follow it (1, 2, 3, ...), none of before."""
+    """A snapshot is the mean of its frame's image and the images after it, none of earlier
+    frames.
+    """
     frames = [frame(0.85, 7), frame(1.7, 9)]
     snapshots = follow(Renderer(0.05), None, frames, [1.0, 2.0], 4)
     means = [float(image.mean()) for _, image in snapshots]
     assert means == [pytest.approx((7 + 1 + 2 + 3) / 4), pytest.approx((9 + 4 + 5 + 6) / 4)]
 
 
-def test_budgets_that_a_frame_outlasts():
-    """It stands for the largest of them, as it is."""
+def test_budgets_shorter_than_a_frame():
+    """If a frame takes longer than several budgets, it counts for the largest of them,
+    unchanged.
+    """
     first, second = followed([2.5, 3.9], [1, 2, 4], seconds=0.5)
     assert first == (2, "0", 4, 2.5)
     assert second == (4, "8", 8, pytest.approx(4.4))
 
 
-def test_a_run_is_not_continued_in_vain():
-    """No frame is asked for after the last budget."""
+def test_no_frame_is_requested_after_the_last_budget():
+    """No frame is requested after the last budget."""
 
     def frames():
         yield frame(1.0)
@@ -188,21 +201,21 @@ def test_a_run_is_not_continued_in_vain():
 
 
 class Refining:
-    """An integrator of somebody else, with a cache that is complete after four samples."""
+    """A third-party integrator with a cache that is complete after four samples."""
 
     def prepare(self, scene):
         self.prepared = True
 
     def progressive(self, scene, sensor, seed, spp, times):
         assert (sensor, times) == (3, pytest.approx([0.7, 1.4, 6.3]))
-        assert spp in (1, 4)  # to see when a first image is there, and then as many as fit
+        assert spp in (1, 4)  # to measure the time of a first image, and then as many as fit
         yield frame(0.1, 1)
         yield frame(0.9, 2)
         yield frame(1.2, 4)
 
 
-def test_any_integrator_may_offer_frames(monkeypatch):
-    """What is left of the budgets when its cache is complete goes into more images."""
+def test_third_party_progressive_integrator(monkeypatch):
+    """Once the cache is complete, further images use the rest of the budgets."""
     integrator = Refining()
     scene = SimpleNamespace(integrator=lambda: integrator)
     subject = Renderer(0.5)
@@ -219,15 +232,17 @@ def test_any_integrator_may_offer_frames(monkeypatch):
     assert snapshots[2].total == pytest.approx(9.0, abs=0.25)
 
 
-# What an integrator offers
+# Detection of an integrator's methods
 
 
 @pytest.mark.usefixtures("rgb")
 @pytest.mark.parametrize(
     ("integrator", "expected"), [("irrcache", True), ("volpath", False), ("prbvolpath", False)]
 )
-def test_who_has_a_cache(scenes, integrator, expected):
-    """Mitsuba's differentiable integrators have a method "prepare" too, but it is another one."""
+def test_which_integrators_have_a_cache(scenes, integrator, expected):
+    """The method "prepare" of Mitsuba's differentiable integrators is not taken for a cache
+    build.
+    """
     scene = scenes.load(
         {"type": integrator}, scenes.boundary(scenes.medium(1.0, 0.5)), default_solver="path"
     )
@@ -235,7 +250,7 @@ def test_who_has_a_cache(scenes, integrator, expected):
 
 
 @pytest.mark.usefixtures("rgb")
-def test_who_lets_the_effort_be_chosen(tmp_path):
+def test_which_integrators_accept_an_effort(tmp_path):
     scene = tmp_path / "scene.xml"
     scene.write_text('<scene version="3.0.0"><integrator type="volpath"/></scene>')
     for integrator, expected in (

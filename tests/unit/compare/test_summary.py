@@ -1,4 +1,4 @@
-"""Times to equal error and errors at equal time, on curves whose answer is known."""
+"""Times to equal error and errors at equal time, on curves with known results."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ def noise(times=TIMES):
 
 @pytest.mark.parametrize("error", [0.09, 0.06, 0.04])
 def test_between_snapshots(error):
-    """Exact on a power law, wherever the snapshots are."""
+    """Interpolation is exact on a power law, wherever the snapshots are."""
     reached = time_to(noise(), error)
     assert reached.how == "measured"
     assert reached.seconds == pytest.approx((0.1 / error) ** 2)
 
 
 def test_beyond_the_measurement():
-    """Noise goes on as noise, and is said to be extrapolated."""
+    """Monte Carlo noise is extrapolated, and marked as extrapolated."""
     reached = time_to(noise(), 0.01)
     assert (reached.how, reached.seconds) == ("extrapolated", pytest.approx(100))
-    assert time_to(noise(), 1e-4).how == "never"  # a million seconds: too far to be believed
+    assert time_to(noise(), 1e-4).how == "never"  # a million seconds: too far to extrapolate
 
 
 @pytest.mark.parametrize("errors", [[0.1, 0.05, 0.049], [0.1, 0.05, 0.001]])
 def test_bias_is_not_extrapolated(errors):
-    """Neither a curve that has levelled out nor one that falls faster than noise."""
+    """Curves that level out, or fall faster than noise, are not extrapolated."""
     assert time_to(curve(errors), 5e-4).how == "never"
 
 
-def test_what_the_reference_cannot_resolve_is_not_extrapolated():
+def test_unresolved_errors_are_not_extrapolated():
     assert time_to(curve(0.1 / np.sqrt(TIMES), resolved=0.05), 0.01).how == "never"
 
 
@@ -59,7 +59,7 @@ def test_better_from_the_start():
 
 
 def test_equal_time():
-    """Nothing before the first image and after the last; in between interpolated."""
+    """Errors are interpolated between snapshots, with none before the first or after the last."""
     table = equal_time([noise(), curve([0.2], times=[5])], [20, 0.5, 2, 5])
     assert table[0] == [None, None]
     assert table[1] == [pytest.approx(0.1 / np.sqrt(2)), None]
@@ -87,7 +87,7 @@ def test_curves_of_rows_are_in_order_of_time():
 
 
 def test_depths_are_compared_as_numbers():
-    """Mitsuba prints -1 as an unsigned number, Python's integrators as they got it."""
+    """max_depth is compared as a number; Mitsuba prints -1 as an unsigned integer."""
     described = {"a": "A[ max_depth = 4294967295, rr_depth = 5 ]", "b": "B[max_depth = -1]"}
     assert maximum_depths(described | {"c": "C[max_depth = 6]", "d": "D[]"}) == {
         "a": -1,
@@ -97,7 +97,7 @@ def test_depths_are_compared_as_numbers():
 
 
 def test_uncertainty_of_the_last_error():
-    """The spread of RMSE over many images is what is stated for one."""
+    """The stated uncertainty of the last RMSE is its scatter over many images."""
     truth = np.zeros((64, 64, 1))
     stated, errors = [], []
     for seed in range(60):

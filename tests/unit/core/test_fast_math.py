@@ -1,4 +1,4 @@
-"""Indices taken apart without division, and numbers that take few instructions."""
+"""Integer division by constants, and fast approximations of functions."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ LARGEST = 2**32 - 1
 @settings(max_examples=200, deadline=None)
 @given(number=st.integers(1, LARGEST), index=st.lists(st.integers(0, LARGEST), min_size=1))
 @pytest.mark.parametrize("nearby", [False, True])
-def test_quotients_and_rests(nearby, number, index):
-    """Of all numbers of 32 bits; where they err if they do, beside multiples."""
+def test_quotients_and_remainders(nearby, number, index):
+    """Quotients and remainders are exact for all 32-bit numbers, tested next to multiples."""
     index = np.array(index, dtype=np.uint64)
     if nearby:
         index = index // number * number
@@ -51,7 +51,7 @@ def test_other_numbers_are_the_same_kernel():
 
 
 def test_decay():
-    """e^-x as NumPy knows it; without bias, which would add up over steps; 0 of what is opaque."""
+    """e^-x agrees with NumPy, without bias that would accumulate over steps; 0 if opaque."""
     x = np.float32(np.concatenate([np.geomspace(1e-30, 80, 4001), [0.0]]))
     expected = np.exp(-np.float64(x))
     relative = np.float64(decay(mi.Float(x))) / expected - 1

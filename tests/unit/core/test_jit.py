@@ -1,4 +1,4 @@
-"""Loops of Dr.Jit in Python's words, transformed when they are needed."""
+"""Functions with Dr.Jit loops in Python syntax, transformed on first use."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 
 @symbolic
 def triangular(n: mi.UInt32, step: int = 1):
-    """Sum of the numbers from 1 to ``n``."""
+    """Return the sum of the numbers from 1 to ``n``."""
     total, k = mi.UInt32(0), mi.UInt32(0)
     while k < n:
         k += step
@@ -26,7 +26,7 @@ def test_a_function_is_transformed_once_when_it_is_called(rgb, monkeypatch):
     transformed, original = [], dr.syntax
     monkeypatch.setattr(dr, "syntax", lambda f: transformed.append(f.__name__) or original(f))
     later = symbolic(triangular.__wrapped__)
-    assert later.__name__ == "triangular" and later.__doc__.startswith("Sum")
+    assert later.__name__ == "triangular" and later.__doc__.startswith("Return the sum")
     assert transformed == []
     assert list(later(mi.UInt32([0, 1, 2, 3, 10]))) == [0, 1, 3, 6, 55]
     assert list(later(mi.UInt32([4, 5]), step=2)) == [6, 12]
@@ -34,7 +34,10 @@ def test_a_function_is_transformed_once_when_it_is_called(rgb, monkeypatch):
 
 
 def test_a_file_that_was_changed_after_its_import_is_refused(rgb, tmp_path):
-    """``dr.syntax`` would compile whatever is at the function's line numbers now."""
+    """A source file that changed after its import is refused.
+
+    ``dr.syntax`` would compile whatever code is now at the function's line numbers.
+    """
     file = tmp_path / "edited.py"
     source = "def half(x):\n    return x / 2\n"
     file.write_text(source)

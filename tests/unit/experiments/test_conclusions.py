@@ -1,4 +1,4 @@
-"""What the experiments conclude from measurements, on data whose answer is known."""
+"""Conclusions of the experiments from measurements, on data with known results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RNG = np.random.default_rng(1)
 
 
 def own_errors(seconds, errors):
-    """Errors to the last image, which is its own reference."""
+    """Return the errors against the last image, as its own reference."""
     return {"seconds": list(seconds), "own": [*errors, 0.0]}
 
 
@@ -39,7 +39,10 @@ def test_time_to_converged_on_a_power_law():
 
 @pytest.mark.parametrize("errors", [[], [0.1], [0.1, 0.07]])
 def test_the_last_image_does_not_converge_to_itself(errors):
-    """It is zero away from itself, which is no convergence; and nothing is extrapolated."""
+    """The last image's error of zero against itself does not count as convergence.
+
+    Nothing is extrapolated from it.
+    """
     seconds = [2.0 ** (k + 1) for k in range(len(errors) + 1)]
     reached = analysis.time_to_converged(own_errors(seconds, errors), 0.01)
     assert reached.how == "never"
@@ -50,7 +53,7 @@ def test_speed_up():
     assert analysis.speed_up(stock, other) == pytest.approx(3.44, abs=0.005)
     assert analysis.speed_up(stock, Reached(np.inf, "never")) is None
     assert analysis.speed_up(Reached(np.inf, "never"), other) is None
-    assert analysis.speed_up(Reached(1.0, "at most"), other) is None  # could be any ratio
+    assert analysis.speed_up(Reached(1.0, "at most"), other) is None  # not determined by these data
 
 
 def test_the_paper_s_own_ratios_stand_beside_ours():
@@ -61,7 +64,7 @@ def test_the_paper_s_own_ratios_stand_beside_ours():
 
 
 def images(noise_x: float, noise_y: float, bias: float = 0.0):
-    """Two images with noise, and two halves of a reference with more."""
+    """Return two images with noise, and two halves of a reference with more noise."""
     shape = (64, 64, 3)
     x, y, a, b = (RNG.normal(0, s, shape) for s in (noise_x, noise_y, 0.3, 0.3))
     return x + bias, y, a, b
@@ -84,7 +87,7 @@ def test_difference_of_squares_sees_bias():
     ("errors", "difference", "worse", "close"),
     [
         ((1.0, 2.0, 1.09), 0.1, False, True),  # as good as none, within noise
-        ((1.0, 2.0, 1.2), 4.0, True, False),  # worse than none: it should have faded
+        ((1.0, 2.0, 1.2), 4.0, True, False),  # worse than none: the filter should have faded out
         ((2.0, 1.0, 1.05), -4.0, False, True),  # as good as the fixed one
         ((2.0, 1.0, 1.5), -4.0, False, False),  # better than none, but the fixed one is far better
     ],
@@ -94,8 +97,8 @@ def test_verdict_on_fading(errors, difference, worse, close):
     assert (verdict.worse, verdict.close) == (worse, close)
 
 
-def test_memory_is_taken_apart():
-    """A base and bytes for a voxel and for a pixel, of numbers as far apart as real ones."""
+def test_memory_is_split_into_components():
+    """Memory is split into a base and bytes per voxel and per pixel, for realistic magnitudes."""
     rows = [
         {"voxels": n**3, "pixels": m**2, "bytes": 3e8 + 112 * n**3 + 40 * m**2}
         for n, m in ((48, 128), (96, 128), (144, 128), (48, 512), (48, 1024))
@@ -118,7 +121,7 @@ def test_snapshots_are_dense_and_include_figure_3(size):
 
 
 def test_latest_snapshot_in_time():
-    """A method has no image before its first one, and may be a little late."""
+    """A method has no image before its first one; a slightly late snapshot still counts."""
     snapshots = [Snapshot(t, {"image": t}, 1) for t in (5.0, 1.0)]
     recording = Recording(methods.CACHE, Measurement("irrcache", "x", snapshots), Path())
     assert recording.at(0.5) is None
@@ -150,15 +153,15 @@ def test_full_size_has_folders_of_its_own(tmp_path):
     assert Options(QUICK, tmp_path).folder("a") != Options(FULL, tmp_path).folder("a")
 
 
-def test_phantoms_stand_in_for_missing_data(monkeypatch, tmp_path):
+def test_phantoms_replace_missing_data(monkeypatch, tmp_path):
     monkeypatch.setattr(scenes, "DATA", tmp_path)
     for name in ("chest", "head", "abdomen"):
         assert scenes.SOURCES[scenes.available(name)].arguments[0] == "phantom"
     assert scenes.available("phantom") == "phantom"
 
 
-def test_times_that_are_bounds_are_shown_as_bounds():
-    """A first image that is good enough says "at least so much sooner"."""
+def test_bounded_times_are_shown_as_bounds():
+    """If the first image is good enough already, the speed-up is shown as a lower bound."""
     row = compared(
         {methods.PATH_TRACING: Reached(60.0, "measured"), methods.CACHE: Reached(5.0, "at most")}
     )
@@ -166,8 +169,11 @@ def test_times_that_are_bounds_are_shown_as_bounds():
     assert table.rows == [["0.01", "60 s (1 ×)", "≤ 5 s (≥ 12 ×)"]]
 
 
-def test_from_nothing_to_a_figure(rgb, monkeypatch, tmp_path):
-    """Phantom, reference, recorded run, errors, figure; the second time nothing is rendered."""
+def test_figure_from_scratch(rgb, monkeypatch, tmp_path):
+    """Phantom, reference, recorded run, errors and figure work from scratch.
+
+    The second time nothing is rendered.
+    """
     monkeypatch.setattr(scenes, "DATA", tmp_path)
     monkeypatch.setattr(methods, "ALL", (methods.PATH_TRACING,))
     options = Options(Size(16, 16, 0.4, 0.4, 0.2), tmp_path)
@@ -175,8 +181,8 @@ def test_from_nothing_to_a_figure(rgb, monkeypatch, tmp_path):
     errors = read_json(tmp_path / "figure2" / "results.json")["path tracing"]
     assert errors["seconds"] == sorted(errors["seconds"])
     assert errors["own"][-1] == 0
-    # How much errors fall is up to the machine: these are the errors of what was recorded, and
-    # far below those of no picture at all.
+    # How much errors decrease depends on the machine: these are the errors of the recorded images,
+    # and far below those of a black image.
     session = Session.of("chest", options, methods.ALL)
     (recording,), black = session.recordings, np.zeros((16, 16, 3))
     shown = session.picked(recording, 1e3)
@@ -190,7 +196,9 @@ def test_from_nothing_to_a_figure(rgb, monkeypatch, tmp_path):
 
 
 def test_the_z_test_of_others_references():
-    """Noise of the variance that is stated passes, an error of a few standard errors does not."""
+    """The Z-test of other references accepts the stated noise, and rejects a few standard
+    errors.
+    """
     target, variance = np.ones((48, 48, 3)), np.full((48, 48, 3), 0.25)
     image = target + RNG.normal(0, 0.5 / others_run.SUITE_SPP**0.5, target.shape)
     found = others_run.z_test(image, target, variance)
@@ -207,7 +215,7 @@ def test_scenes_of_others_are_skipped_without_data(tmp_path, monkeypatch, capsys
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda m: m.name)
 def test_mutants_fit_the_library(mutant):
-    """Each still has one place to change, changes it, and names tests that there are."""
-    text = (PROJECT / "mitsuba_irrcache" / mutant.file).read_text()
+    """Each mutant replaces text that occurs exactly once, and names existing tests."""
+    text = (PROJECT / "mitsuba_irrcache" / mutant.file).read_text(encoding="utf-8")
     assert text.count(mutant.old) == 1 and mutant.new != mutant.old
     assert all((PROJECT / test).is_file() for test in mutant.tests)

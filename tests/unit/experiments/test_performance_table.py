@@ -1,5 +1,6 @@
-"""The table of experiments/performance/error_against_time: the best settings, defaults, and errors
-of the volume."""
+"""The table of experiments/performance/error_against_time: best settings, defaults, volume
+errors.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ POINTS = [point | {"moved": point["cold"] / 10} for point in (FAST, EXACT, DEFAU
 
 @pytest.fixture
 def case(tmp_path) -> dict:
-    """A case as run.py leaves it; processes take a second longer than what they do."""
+    """Write a case as run.py does; processes take a second longer than their work."""
     about = run.Case("cloud", -1, 64, "llvm_ad_mono", Path("scene.xml"), {})
     stock, own = Store(tmp_path / "stock.json"), Store(tmp_path / "irrcache.json")
     stock.rows[f"{about.key} process volpath{{rr_depth=20}} spp 1"] = {"seconds": 1.0}
@@ -50,7 +51,10 @@ def test_the_fastest_setting_that_reaches_an_error_counts(case):
 
 
 def test_defaults_have_a_row_of_their_own_error(case):
-    """The stock integrator needs 0.02 / 0.002^2 = 5000 s to this error; ours takes 4 s."""
+    """Default settings have a row with their own error.
+
+    The stock integrator needs 0.02 / 0.002^2 = 5000 s to this error; ours takes 4 s.
+    """
     found = columns(case)
     assert found["RMSE"][-1] == "0.002"
     assert found["s"][-1] == "5000"
@@ -60,10 +64,13 @@ def test_defaults_have_a_row_of_their_own_error(case):
 
 
 def test_errors_of_the_volume_alone(case):
-    """In an image of mean 0.8, 0.2 is scattered: errors are four times those of the image."""
+    """Errors of the volume are relative to the scattered radiance.
+
+    In an image of mean 0.8, 0.2 is scattered: they are four times those of the image.
+    """
     assert columns(case)["of the volume"] == ("5 %", "2 %", "0.5 %", "1 %")
     assert run.of_the_volume(0.01, {"mean": 0.8, "volume": 0.0}) == "—"
-    assert run.of_the_volume(0.01, {"mean": 0.8}) == "—"  # of results without it
+    assert run.of_the_volume(0.01, {"mean": 0.8}) == "—"  # from results without it
 
 
 def test_the_table_says_how_settings_were_chosen(case):

@@ -1,5 +1,5 @@
-"""The random scenes of experiments/validation/random_scenes are what they say, and errors of images
-are found where there are some.
+"""The scenes of experiments/validation/random_scenes match their descriptions, and wrong images
+are detected.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.fixture(scope="module")
 def drawn() -> list[RandomScene]:
-    """The scenes of the experiment."""
+    """Return the scenes of the experiment."""
     return [RandomScene.draw(1, index) for index in range(COUNT)]
 
 
@@ -52,7 +52,7 @@ def test_a_seed_and_an_index_make_a_scene(drawn):
 
 
 def test_mitsuba_loads_all_scenes(drawn, tmp_path):
-    """With the lamps, media and shapes that they describe."""
+    """Mitsuba loads all scenes with the emitters, media and shapes of their descriptions."""
     for case in drawn:
         scene = mi.load_dict(case.build({"type": "volpath"}, tmp_path))
         shapes = {shape.id(): shape for shape in scene.shapes()}
@@ -67,7 +67,7 @@ def test_mitsuba_loads_all_scenes(drawn, tmp_path):
 
 
 def test_the_optical_depth_is_that_of_mitsuba_s_medium(drawn, tmp_path):
-    """Along the densest of the lines through voxel centres that are parallel to an edge."""
+    """The stated optical depth is that of the densest axis-parallel line through voxel centres."""
     for case in drawn:
         scene = mi.load_dict(case.build({"type": "volpath"}, tmp_path))
         shapes = {shape.id(): shape for shape in scene.shapes()}
@@ -84,13 +84,15 @@ def test_the_optical_depth_is_that_of_mitsuba_s_medium(drawn, tmp_path):
         assert longest * 2 * SIDE == pytest.approx(case.depth, rel=2e-2), case.describe()
 
 
-def test_cameras_and_lamps_are_where_they_are_said_to_be(drawn, tmp_path):
-    """A ray from the centre to the camera or lamp leaves the boundary on its way, or not."""
+def test_cameras_and_emitters_are_placed_as_described(drawn, tmp_path):
+    """Cameras and emitters are inside or outside of the boundary as described.
+
+    A ray from the centre to the object crosses the boundary, or does not.
+    """
     for case in drawn:
         scene = mi.load_dict(case.build({"type": "volpath"}, tmp_path))
-        boundary = mi.load_dict(
-            {"type": "scene", "shape": case._boundary(tmp_path)}
-        )  # with nothing in its way
+        # The boundary alone: no other object obstructs the ray.
+        boundary = mi.load_dict({"type": "scene", "shape": case._boundary(tmp_path)})
 
         def within(point, boundary=boundary):
             start, direction = mi.Point3f(0.0), mi.Vector3f(*map(float, point))
@@ -122,7 +124,7 @@ def test_the_mesh_is_closed_and_faces_outwards():
 
 
 def test_placements_keep_angles():
-    """Mitsuba shears where the axis of a rotation is not of unit length."""
+    """Placements preserve angles; Mitsuba shears if a rotation axis is not of unit length."""
     for index in range(5):
         random = np.random.default_rng(index)
         matrix = np.array(generate._rotation(random, 10, 80).matrix)[:3, :3]
@@ -133,7 +135,7 @@ def test_placements_keep_angles():
 
 
 def rendered(error, noise: float = 0.02, seed: int = 0, unscattered: float = 0.5) -> dict:
-    """A row for images of mean 1 that have an ``error`` and noise."""
+    """Return a row for images of mean 1 with an ``error`` and noise."""
     random = np.random.default_rng(seed)
     a, b, x, y = (1 + noise * random.normal(size=(32, 32, 3)) for _ in range(4))
     direct = np.full_like(a, unscattered)
@@ -171,7 +173,7 @@ def test_a_wrong_block_is_found_where_it_is():
     assert row["block"]["error"] == pytest.approx(0.06, abs=4 * row["block"]["noise"])
 
 
-def test_an_error_that_another_cache_has_not_is_noise():
+def test_error_absent_from_another_cache_is_noise():
     random = np.random.default_rng(3)
     a, b, x, y = (1 + 0.01 * random.normal(size=(32, 32, 3)) for _ in range(4))
     row = run.compare(a, b, np.zeros_like(a), x + 0.03, y - 0.03) | {"solver": "sweep"}
@@ -182,18 +184,18 @@ def test_what_the_reference_does_not_resolve_is_undecided():
     assert run.verdict(rendered(0.0, noise=0.3)) == "undecided"
 
 
-def test_rows_are_computed_again_when_they_have_to_be(drawn):
+def test_outdated_rows_are_computed_again(drawn):
     case = drawn[3]
     row = rendered(0.0, noise=0.3)
     row |= {"drawn": json.loads(json.dumps(case.as_dict())), "seconds_granted": 5}
     assert not run.is_outdated(row, case, 5)
-    assert run.is_outdated(row, case, 6)  # it is undecided
+    assert run.is_outdated(row, case, 6)  # the result is undecided
     assert run.is_outdated(None, case, 5)
     assert run.is_outdated(row, drawn[4], 5)
     assert not run.is_outdated(row | rendered(0.0), case, 6)
 
 
-def test_images_that_are_not_finite_and_failures_are_told():
+def test_nonfinite_images_and_failures_are_reported():
     row = rendered(np.where(np.arange(32) == 3, np.nan, 0.0)[:, None, None])
     assert run.verdict(row) == "NOT FINITE"
     assert run.verdict({"failed": "no", "refused": True}) == "refused"

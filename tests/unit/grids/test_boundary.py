@@ -1,4 +1,4 @@
-"""Boundaries: recognised whatever plugin made them, and hit where brute force says."""
+"""Boundaries are recognised from any plugin, and intersections agree with Mitsuba's."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PLACEMENTS = [
 
 
 def rays(count: int = 2048) -> tuple[np.ndarray, np.ndarray]:
-    """From a sphere around the origin towards points near it, (3, n) each, float32."""
+    """Return rays from a sphere around the origin towards points near it, (3, n) each, float32."""
     rng = np.random.default_rng(3)
     origin = rng.normal(size=(3, count))
     origin *= 5 / np.linalg.norm(origin, axis=0)
@@ -29,8 +29,8 @@ def rays(count: int = 2048) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("kind", ["cube", "sphere"])
 @pytest.mark.parametrize("placement", PLACEMENTS)
-def test_hits_are_mitsubas(scenes, kind, placement):
-    """Entry and exit, ray by ray, as ray tracing against the shape finds them."""
+def test_intersections_equal_mitsubas(scenes, kind, placement):
+    """Entry and exit distances equal those of ray tracing against the shape."""
     if kind == "sphere":
         placement = {k: v for k, v in placement.items() if k == "center"}
     shape = scenes.boundary(scenes.medium(1.0, 0.5), scenes.placement(**placement), kind)
@@ -52,8 +52,8 @@ def test_hits_are_mitsubas(scenes, kind, placement):
 
 
 @pytest.mark.parametrize("kind", ["box", "sphere"])
-def test_from_within(kind):
-    """From inside, entry is behind and exit ahead."""
+def test_intersections_from_inside(kind):
+    """From inside, the entry lies behind and the exit ahead."""
     boundary = Boundary(kind, np.eye(4))
     ray = mi.Ray3f(mi.Point3f(0.25, 0, 0), mi.Vector3f(1, 0, 0))
     hit, near, far = boundary.intersect(ray)
@@ -63,7 +63,7 @@ def test_from_within(kind):
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_any_scale(scale):
-    """The same hits, in units of the size."""
+    """Intersections are the same at any scale, in units of the size."""
     boundary = Boundary("box", np.diag([scale, scale, scale, 1.0]))
     origin, direction = rays(256)
     ray = mi.Ray3f(mi.Point3f(origin * np.float32(scale)), mi.Vector3f(direction))
@@ -78,7 +78,7 @@ def test_any_scale(scale):
 
 
 def test_a_box_from_another_plugin(scenes, tmp_path):
-    """A PLY of the turned cube's mesh is the same boundary."""
+    """A PLY of the rotated cube's mesh gives the same boundary."""
     place = scenes.placement((1.0, 2.0, 3.0), turn=50)
     shape = scenes.boundary(scenes.medium(1.0, 0.5), place)
     cube = scenes.load({"type": "volpath"}, shape)
@@ -90,7 +90,7 @@ def test_a_box_from_another_plugin(scenes, tmp_path):
     np.testing.assert_allclose(measured, expected, atol=1e-5)
 
 
-def test_other_shapes_are_refused(scenes):
+def test_caches_of_other_shapes_are_not_merged(scenes):
     shape = scenes.boundary(scenes.medium(1.0, 0.5)) | {"type": "cylinder"}
     scene = scenes.load({"type": "volpath"}, shape)
     with pytest.raises(UnsupportedSceneError, match=r"Cylinder.*boxes"):
@@ -98,7 +98,7 @@ def test_other_shapes_are_refused(scenes):
 
 
 def test_inward_normals_are_refused(scenes):
-    """A cube mirrored by its to_world holds the medium outside of it, in Mitsuba."""
+    """Inward normals are refused: Mitsuba fills the outside of a mirrored cube."""
     shape = scenes.boundary(scenes.medium(1.0, 0.5))
     shape["to_world"] = mi.ScalarTransform4f(np.diag([-1.0, 1, 1, 1]))
     scene = scenes.load({"type": "volpath"}, shape)

@@ -1,4 +1,4 @@
-"""Which points a boundary surrounds: those from which Mitsuba's own shape is met from behind."""
+"""Containment of points in a boundary agrees with the back faces of Mitsuba's shape."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ PLACES = {
 
 
 @pytest.mark.parametrize("kind", PLACES)
-def test_surrounds_what_the_shape_does(scenes, kind):
-    """At points all around the surface, within 5 % of the size of it and farther away: rays along
-    three oblique directions leave the shape through its back wherever the point is inside.
+def test_containment_equals_mitsubas_shape(scenes, kind):
+    """Points are inside if rays along three oblique directions leave the shape through back
+    faces.
+
+    The points lie within 5 % of the size of the surface and farther away.
     """
     place = scenes.placement(**PLACES[kind])
     scene = scenes.load({"type": "volpath"}, scenes.boundary(scenes.medium(1.0, 0.5), place, kind))
     boundary = boundary_of(scene, scene.shapes()[0])
     rng = np.random.default_rng(6)
     local = rng.uniform(-0.3, 1.3, (3, 4096))
-    near = rng.normal(size=(3, 4096))  # on the surface of the unit shape, moved by up to 5 %
+    near = rng.normal(size=(3, 4096))  # on the surface of the unit shape, displaced by up to 5 %
     near /= np.linalg.norm(near, axis=0, ord=np.inf if kind == "cube" else 2)
     near = 0.5 + 0.5 * near * rng.uniform(0.95, 1.05, 4096)
     local = np.concatenate([local, near], axis=1)
@@ -41,7 +43,7 @@ def test_surrounds_what_the_shape_does(scenes, kind):
     known = (votes == 0) | (votes == 3)  # rays through edges may disagree
     assert known.mean() > 0.99 and 0.2 < found.mean() < 0.8
     np.testing.assert_array_equal(found[known], votes[known] == 3)
-    # And in numbers: distances from the middle in units of the shape's half width.
+    # Expected values: distances from the centre in units of the shape's half width.
     order = np.inf if kind == "cube" else 2
     distance = np.linalg.norm(2 * local - 1, axis=0, ord=order)
     clear = np.abs(distance - 1) > 1e-4

@@ -1,4 +1,4 @@
-"""Grids: placement, round trips and lookups against Mitsuba's own gridvolume."""
+"""Grids: placement, round trips and lookups compared with Mitsuba's gridvolume."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PLACEMENTS = [
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_round_trip(scenes, placement):
-    """World and back, to float32 rounding of a voxel coordinate."""
+    """Transforming to the world and back is exact to float32 rounding of a voxel coordinate."""
     grid = Grid((5, 7, 9), scenes.placement(**placement))
     u = np.float32(np.random.default_rng(1).uniform(-2, 11, (3, 256)))
     back = np.array(grid.coordinates.point(grid.world.point(mi.Point3f(u))))
@@ -51,7 +51,9 @@ def test_centers(scenes, placement):
 @pytest.mark.parametrize("placement", PLACEMENTS[:3])
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 2), (4, 3, 6)])
 def test_lookup_is_gridvolumes(scenes, placement, channels, shape):
-    """Inside the grid; outside of it Mitsuba gives zero, and this grid clamps."""
+    """Lookups equal gridvolume's inside the grid; outside Mitsuba gives zero and this grid
+    clamps.
+    """
     to_world = scenes.placement(**placement)
     values = scenes.texture((*shape, channels), 0, 2, 3)
     volume = mi.load_dict(scenes.volume(values, to_world))
@@ -78,8 +80,9 @@ def test_lookup_clamps_outside(scenes):
 @given(st.tuples(*[st.floats(0.01, 100)] * 3), st.integers(1, 200))
 @settings(max_examples=50, deadline=None)
 def test_near_cubic(edges, resolution):
-    """The longest side has the voxels asked for; no edge differs from it by more than rounding a
-    count can cause.
+    """The longest side has the requested number of voxels, and voxels are nearly cubic.
+
+    Edges differ by no more than the rounding of a count.
     """
     mi.set_variant("llvm_ad_rgb")
     grid = Grid.near_cubic(np.diag([*edges, 1.0]), resolution)
@@ -108,12 +111,14 @@ def test_data_of_another_size_are_refused():
         GridField(Grid((2, 2, 2), np.eye(4)), mi.Float([0.0] * 7), 1)
 
 
-# Packets
+# Packed fields
 
 
 def fields_of(grid: Grid, kinds: list[str], seed: int = 5) -> list:
-    """Fields of one grid: ``1`` and ``3`` channels of any size, ``a`` three below 1, ``r`` and
-    ``R`` roots of one and three channels, ``c`` a constant.
+    """Return fields of one grid by letter.
+
+    ``1`` and ``3`` have channels of any size, ``a`` three below 1, ``r`` and ``R`` are roots of one
+    and three channels, and ``c`` is a constant.
     """
     rng = np.random.default_rng(seed)
     fields = []
@@ -132,7 +137,7 @@ def fields_of(grid: Grid, kinds: list[str], seed: int = 5) -> list:
 
 
 def looked_up(lookups: Lookups, p: mi.Point3f) -> list:
-    """The values at places, each on a ray of its own."""
+    """Return the values at the points, each on a ray of its own."""
     rays = mi.Ray3f(p - mi.Vector3f(1, 2, 3), mi.Vector3f(1, 2, 3))
     return lookups.along(rays).at(mi.Float(1), mi.Bool(True))
 
@@ -143,8 +148,8 @@ def looked_up(lookups: Lookups, p: mi.Point3f) -> list:
     [("1", 1), ("3", 1), ("1r", 1), ("1rc", 1), ("1r1", 1), ("1R", 1), ("1ra", 1), ("1Ra", 1),
      ("3Ra", 2)],
 )  # fmt: skip
-def test_packets_hold_what_fields_hold(scenes, shape, kinds, groups):
-    """Inside and outside the grid, for every layout: to 16 bits, 11 of them of the mantissa."""
+def test_packed_fields_equal_the_originals(scenes, shape, kinds, groups):
+    """Packed fields equal the originals to 16 bits (11 of them mantissa) in every layout."""
     grid = Grid(shape, scenes.placement(turn=30.0, edges=(1.0, 2.0, 3.0)))
     fields = fields_of(grid, list(kinds))
     lookups = Lookups(fields)
@@ -159,9 +164,11 @@ def test_packets_hold_what_fields_hold(scenes, shape, kinds, groups):
 
 
 @pytest.mark.parametrize("value", [0.7, 1.0, 3e-5, 1e30, 1e-30])
-def test_packets_are_right_on_average(value):
-    """What 16 bits cannot tell is rounded up and down: a thousand voxels know it ten times as well,
-    whether they are all or one of many orders of magnitude.
+def test_packed_fields_are_unbiased(value):
+    """Rounding to 16 bits is unbiased.
+
+    A thousand voxels determine their mean ten times better, whether they are equal or of many
+    orders of magnitude.
     """
     grid = Grid((10, 10, 10), np.eye(4))
     p = grid.centers(dr.arange(mi.UInt32, 1000))
@@ -175,8 +182,8 @@ def test_packets_are_right_on_average(value):
         assert found[1:].mean() == pytest.approx(value, rel=2.0**-11 / 10)
 
 
-def test_packets_tell_nothing_from_little():
-    """Where there is no matter there is none; what is left out is 2^-30 of the largest at most."""
+def test_packed_fields_distinguish_zero_from_small():
+    """Packed zeros are exact, and values rounded to zero are below 2^-30 of the maximum."""
     grid = Grid((1, 1, 6), np.eye(4))
     values = np.float32([0, 1, 2.0**-29, 2.0**-31, 0, 1e-38])
     p = grid.centers(dr.arange(mi.UInt32, 6))
@@ -186,8 +193,8 @@ def test_packets_tell_nothing_from_little():
     np.testing.assert_array_equal(looked_up(Lookups([empty]), p)[0], 0)
 
 
-def test_packets_keep_to_limits():
-    """Opaque matter is not what everything else is measured by."""
+def test_packed_fields_are_precise_beside_opaque_voxels():
+    """The precision does not degrade because of single opaque voxels."""
     grid = Grid((1, 1, 2), np.eye(4))
     field = GridField(grid, mi.Float([1e30, 1.0]), 1)
     p = grid.centers(dr.arange(mi.UInt32, 2))
@@ -195,8 +202,8 @@ def test_packets_keep_to_limits():
     np.testing.assert_allclose(found, [4096, 1], rtol=2.0**-11)
 
 
-def test_packets_keep_other_grids_apart():
-    """Fields of different voxels are never read at each other's places."""
+def test_packed_fields_of_other_grids_are_separate():
+    """Fields of different grids are not packed together."""
     fine, coarse = (Grid((n, n, n), np.eye(4)) for n in (6, 3))
     lookups = Lookups([*fields_of(fine, ["1"]), *fields_of(coarse, ["1"])])
     assert [group.packets.grid for group in lookups.groups] == [fine, coarse]

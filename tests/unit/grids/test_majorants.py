@@ -1,4 +1,4 @@
-"""Macrocells: bounds that hold everywhere, and a walk that misses nothing."""
+"""Macrocells: bounds that hold everywhere, and a traversal that visits every cell."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def cells_of(shape, channels, seed, sparse=False):
 )
 @settings(max_examples=40, deadline=None)
 def test_bounds_hold_everywhere(shape, channels, sparse, seed):
-    """At random points, also outside the grid, on cell walls and in corners, for every channel."""
+    """Majorants bound the extinction at random points, on cell walls and outside, per channel."""
     mi.set_variant("llvm_ad_rgb")
     field, cells = cells_of(shape, channels, seed, sparse)
     rng = np.random.default_rng(seed + 1)
@@ -51,9 +51,7 @@ def test_bounds_hold_everywhere(shape, channels, sparse, seed):
 
 
 def test_bounds_are_tight():
-    """The majorant is the largest voxel within reach, no more: 5 x 5 x 5 voxels in one cell and its
-    neighbour.
-    """
+    """The majorant is the largest voxel within interpolation reach: 5 x 5 x 5 voxels."""
     field, cells = cells_of((5, 5, 5), 1, 3)
     values = 2 * np.array(field.data).reshape(5, 5, 5)
     assert cells.shape == (2, 2, 2)
@@ -64,10 +62,8 @@ def test_bounds_are_tight():
 
 @given(st.integers(0, 2**31))
 @settings(max_examples=20, deadline=None)
-def test_walk_visits_the_cell_of_every_point(seed):
-    """Following exits from cell to cell, the cell at hand holds each point between entry and exit
-    (to rounding).
-    """
+def test_traversal_visits_the_cell_of_every_point(seed):
+    """Each point of a ray lies in the cell that the traversal visits between its entry and exit."""
     mi.set_variant("llvm_ad_rgb")
     _, cells = cells_of((9, 13, 11), 1, 5)
     rng = np.random.default_rng(seed)

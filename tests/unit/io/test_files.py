@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic file creation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_replaces_the_old_file(tmp_path):
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
-def test_nothing_is_left_after_an_error(tmp_path, error):
+def test_no_file_remains_after_an_error(tmp_path, error):
     with pytest.raises(error), atomic_write(tmp_path / "a.bin") as file:
         file.write(b"half")
         raise error
@@ -30,7 +30,7 @@ def test_nothing_is_left_after_an_error(tmp_path, error):
 
 
 def test_permissions_are_those_of_a_new_file(tmp_path):
-    """Not the 0600 of a temporary file: a shared folder stays shared."""
+    """Permissions are those of a new file, not the 0600 of a temporary file."""
     with atomic_write(tmp_path / "a.bin"):
         pass
     (tmp_path / "b.bin").write_bytes(b"")

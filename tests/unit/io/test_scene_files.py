@@ -1,4 +1,4 @@
-"""Scene files with parameters and with another integrator."""
+"""Loading of scene files with parameters and with another integrator."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SCENE = """<scene version="3.0.0">
 
 @pytest.fixture
 def file(tmp_path):
-    """A scene file that finds its volume beside it, not in the working folder."""
+    """Return a scene file whose volume lies beside it, not in the working folder."""
     mi.VolumeGrid(np.ones((2, 2, 2, 1), np.float32)).write(str(tmp_path / "density.vol"))
     (tmp_path / "scene.xml").write_text(SCENE)
     return tmp_path / "scene.xml"
@@ -80,15 +80,19 @@ def test_scene_as_it_is(file):
     assert tuple(scene.sensors()[0].film().size()) == (5, 5)
 
 
-def test_integrator_takes_over_what_is_shared(file):
+def test_integrator_receives_shared_properties(file):
     text = str(load_scene(file, integrator="irrcache{step=0.5}").integrator())
     assert "max_depth = 3" in text and "rr_depth = 7" in text and "step = 0.5" in text
     assert "max_depth = 9" in str(load_scene(file, integrator="irrcache{max_depth=9}").integrator())
 
 
 @pytest.mark.parametrize("integrator", ["direct", "depth", "aov{aovs=d:depth}", "volpath"])
-def test_what_a_plugin_does_not_know_is_not_taken_over(file, integrator):
-    """``direct`` has no depths; unless the user asks for one, which stays an error."""
+def test_unknown_properties_are_not_passed_on(file, integrator):
+    """Properties that a plugin lacks are not passed on, unless the user gives them, which is an
+    error.
+
+    ``direct`` has no max_depth and rr_depth.
+    """
     load_scene(file, integrator=integrator)
     with pytest.raises(RuntimeError, match="foo"):
         load_scene(
@@ -110,7 +114,7 @@ def test_depth_of_a_plugin_without_depth(file):
         ("volpath{max_depth=2,filter=bilateral}", ["filter"]),
         ("irrcache{filter=bilateral,step=0.5}", []),
         ("irrcache{cache_spp=8,blur=1}", ["blur"]),
-        ("irrcache{step=-1,blur=1}", []),  # refused: it cannot be told
+        ("irrcache{step=-1,blur=1}", []),  # refused: ambiguous
         ("nowhere{blur=1}", []),
     ],
 )

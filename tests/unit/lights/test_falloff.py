@@ -1,4 +1,4 @@
-"""Lamps nearby: how their light falls off, along rays and over voxels."""
+"""Inverse-square factors of nearby emitters, along rays and over voxels."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def value(found: InverseSquareFactor, p: np.ndarray) -> np.ndarray:
     return np.array(found.at(mi.Point3f(np.float32(p))))
 
 
-def test_is_that_of_the_distance():
-    """1 + (16 h / r)^2, whatever the intensity."""
+def test_factor_depends_on_the_distance():
+    """The factor is 1 + (16 h / r)^2, whatever the intensity."""
     p = np.random.default_rng(1).random((3, 50))
     squares = np.sum((p - LAMP[:, None]) ** 2, axis=0)
     np.testing.assert_allclose(value(falloff(), p), 1 + (REACH / 8) ** 2 / squares, rtol=1e-3)
@@ -39,7 +39,7 @@ def test_is_that_of_the_distance():
 @pytest.mark.parametrize("aside", [0.0, 1e-3, 0.04, 0.3])
 @pytest.mark.parametrize(("a", "b"), [(0.2, 0.9), (0.45, 0.46), (0.0, 1e-3), (0.52, 0.54)])
 def test_means_along_a_ray(aside, a, b):
-    """Against adaptive quadrature, for long segments and short ones, far and through the lamp."""
+    """Means along a segment agree with adaptive quadrature, near, far and through the emitter."""
     found = falloff()
     origin = LAMP - [0.53, 0, 0] + [0, aside, 0]
     ray = mi.Ray3f(mi.Point3f(*origin.tolist()), mi.Vector3f(1, 0, 0))
@@ -57,9 +57,10 @@ def test_means_along_a_ray(aside, a, b):
         assert mean[0] == pytest.approx(weighted, rel=2e-3)
 
 
-def test_spread_over_voxels():
-    """Over the lamp's own voxel, its neighbours, and ones farther away: against a fine sum, to
-    1.5 %, 0.5 % and 0.1 %.
+def test_means_over_voxels():
+    """Means over voxels agree with a fine sum to 1.5 %, 0.5 % and 0.1 %.
+
+    The bounds are for the emitter's own voxel, its neighbours, and farther ones.
     """
     position = np.array([4.5, 4.5, 4.5]) / 8
     found = falloff(position)
@@ -73,8 +74,8 @@ def test_spread_over_voxels():
         assert mean == pytest.approx(expected, rel=tolerance)
 
 
-def test_only_what_is_near_and_small_counts():
-    """Everything else lights voxels as smoothly as they can tell."""
+def test_only_near_and_small_emitters_have_a_factor():
+    """Only near and small emitters get a factor; others vary smoothly between voxels."""
     assert falloff([0.5, 0.5, 1 + 0.9 * REACH / 8]) is not None
     assert falloff([0.5, 0.5, 1 + 1.1 * REACH / 8]) is None
     for size, near in ((0.5, True), (2.0, False)):
@@ -86,10 +87,8 @@ def test_only_what_is_near_and_small_counts():
     assert InverseSquareFactor.of(scene, grid_of()) is None
 
 
-def test_a_small_lamp_is_a_point_from_afar():
-    """A sphere's falloff and that of a point, from five radii on, where the
-    squares of both differ by 8 %.
-    """
+def test_small_sphere_equals_a_point_at_a_distance():
+    """A sphere's factor is that of a point from a distance of five radii on, within 8 %."""
     ball = {"type": "sphere", "center": LAMP.tolist(), "radius": 0.02, "emitter": {"type": "area"}}
     found = InverseSquareFactor.of(mi.load_dict({"type": "scene", "ball": ball}), grid_of())
     p = np.random.default_rng(2).random((3, 200))
@@ -97,8 +96,8 @@ def test_a_small_lamp_is_a_point_from_afar():
     np.testing.assert_allclose(value(found, p)[far], value(falloff(), p)[far], rtol=0.12)
 
 
-def test_grid_of_one_voxel_and_a_lamp_in_its_middle():
-    """Finite everywhere, at the lamp itself too."""
+def test_emitter_in_the_middle_of_a_single_voxel():
+    """The factor is finite everywhere, also at the emitter, in a grid of one voxel."""
     found = falloff([0.5, 0.5, 0.5], n=1)
     assert np.isfinite(value(found, np.full((3, 1), 0.5))).all()
     assert np.isfinite(np.array(found.spread(mi.UInt32(0)))).all()

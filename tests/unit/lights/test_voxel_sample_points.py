@@ -1,4 +1,4 @@
-"""Where light is computed in voxels that a lamp is in: not too near it, and no farther away."""
+"""Sample points in voxels that contain a point light have a minimum distance from it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 @pytest.mark.parametrize("aside", [0.0, 1e-3, 0.03, 0.2, 0.6])
-def test_places_keep_away_from_lamps(scenes, aside):
-    """A lamp ``aside`` of a voxel's centre in oblong voxels: the centre is moved straight away from
-    it up to a quarter of the shortest edge, and all others stay.
+def test_sample_points_are_moved_away_from_lights(scenes, aside):
+    """Sample points are moved away from the light up to a quarter of the shortest edge.
+
+    The light lies ``aside`` of the centre of an oblong voxel; points of other voxels are unchanged.
     """
     grid = Grid((5, 6, 7), scenes.placement((7.0, 3.0, 10.0), turn=25))
     index = mi.UInt32(np.arange(grid.voxel_count, dtype=np.uint32))

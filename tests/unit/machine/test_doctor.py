@@ -1,4 +1,4 @@
-"""``irrcache doctor`` reports what works, and survives what aborts."""
+"""``irrcache doctor`` reports working variants, and survives libraries that abort the process."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ needs_llvm = pytest.mark.skipif(llvm.usable_llvm() is None, reason="needs a usab
 
 @pytest.fixture
 def good_llvm(monkeypatch):
-    """An LLVM for the trials, also where Dr.Jit itself has found none."""
+    """Return an LLVM for the trials, also if Dr.Jit itself has found none."""
     monkeypatch.setenv(llvm.LLVM_VARIABLE, str(llvm.usable_llvm().path))
 
 
 @pytest.fixture
 def no_trials(monkeypatch):
-    """Variants that neither work nor take time."""
+    """Replace the trials of variants, which take time, by failures."""
     failed = {"works": False, "seconds": 0.0, "problem": "refused by the test"}
     monkeypatch.setattr(doctor, "try_variant", lambda variant: failed)
 
@@ -112,7 +112,7 @@ def test_missing_package_is_named_with_the_command(monkeypatch, no_trials, capsy
     assert 'pip install --upgrade "tqdm' in text
 
 
-def test_kernel_cache_folder_is_the_one_that_dr_jit_is_told(monkeypatch, tmp_path):
+def test_kernel_cache_folder_is_that_of_dr_jit(monkeypatch, tmp_path):
     (tmp_path / "0123.llvm.v6.bin").write_bytes(bytes(100))
     monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path))
     cache = doctor.examine_kernel_cache()

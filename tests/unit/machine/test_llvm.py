@@ -1,4 +1,4 @@
-"""Finding an LLVM that Dr.Jit can use, and refusing the others before they abort the process."""
+"""The search for an LLVM that Dr.Jit can use; others are refused before they abort the process."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import platform
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,7 @@ def minimum_17(monkeypatch):
 
 @pytest.fixture
 def folder_of_libraries(tmp_path, monkeypatch, minimum_17):
-    """A machine whose only LLVM libraries are those that a test puts into this folder."""
+    """Restrict the search to LLVM libraries in this folder."""
     monkeypatch.setattr(llvm, "_llvm_patterns", lambda: [f"{tmp_path}/libLLVM*.so*"])
     monkeypatch.setenv(llvm.LLVM_VARIABLE, "")
     return tmp_path
@@ -85,29 +84,57 @@ def test_newest_usable_library_is_chosen(folder_of_libraries):
 
 
 @linux_only
-def test_nothing_is_chosen_where_nothing_is_usable(folder_of_libraries):
+def test_no_library_is_chosen_if_none_is_usable(folder_of_libraries):
     put(folder_of_libraries, "libLLVM-14.so.1", "libLLVM-15.so.1")
     llvm.prepare_llvm()
     assert os.environ[llvm.LLVM_VARIABLE] == ""
     assert llvm.usable_llvm() is None
 
 
-def test_the_choice_of_the_user_stands(monkeypatch):
+def test_choice_of_the_user_is_respected(monkeypatch):
     monkeypatch.setenv(llvm.LLVM_VARIABLE, "/my/own/libLLVM.so")
     llvm.prepare_llvm()
     assert os.environ[llvm.LLVM_VARIABLE] == "/my/own/libLLVM.so"
 
 
-def test_preparing_is_fast_and_starts_no_process(monkeypatch):
-    monkeypatch.setenv(llvm.LLVM_VARIABLE, "")
-    monkeypatch.setattr(subprocess, "run", None)
-    llvm.find_llvm()  # the first look at a cold disk is not what is measured
-    start = time.process_time()
-    llvm.prepare_llvm()
-    assert time.process_time() - start < 0.1
+#: Runs ``prepare_llvm`` with an empty variable and without the rest of the package; prints what of
+#: `COSTLY` happened in it, whether Dr.Jit was imported, and what a process started later reports.
+PREPARE = """
+import subprocess, sys
+package = type(sys)("mitsuba_irrcache")
+package.__path__ = [sys.argv[1]]
+sys.modules["mitsuba_irrcache"] = package
+from mitsuba_irrcache.machine import llvm
+costly, events = set(sys.argv[2:]), set()
+sys.addaudithook(lambda name, arguments: events.add(name))
+llvm.prepare_llvm()
+print(sorted(events & costly), "drjit" in sys.modules)
+subprocess.run([sys.executable, "-c", ""])
+print(sorted(events & costly))
+"""
+#: Audit events of starting a process and of loading a library.
+COSTLY = ("ctypes.dlopen", "os.fork", "os.posix_spawn", "os.system", "subprocess.Popen")
 
 
-def test_files_that_are_no_library_are_named_as_such(tmp_path):
+def test_preparing_starts_no_process_and_loads_no_library():
+    """``prepare_llvm``, which every import of the package calls, does no expensive work.
+
+    It starts no process and loads neither an LLVM nor Dr.Jit. Python reports such operations as
+    audit events, here in a process of its own, since audit hooks cannot be removed.
+    """
+    folder = Path(llvm.__file__).parents[1]
+    result = subprocess.run(
+        [sys.executable, "-c", PREPARE, folder, *COSTLY],
+        env=os.environ | {llvm.LLVM_VARIABLE: ""},
+        capture_output=True,
+        text=True,
+    )
+    prepared, started = result.stdout.splitlines()
+    assert prepared == "[] False", result.stderr
+    assert "subprocess.Popen" in started
+
+
+def test_files_that_are_no_libraries_are_refused(tmp_path):
     text = tmp_path / "libLLVM.so.19.1"
     text.write_text("LLVM")
     assert "not a shared library" in llvm.inspect_llvm(text).problem

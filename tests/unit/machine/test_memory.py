@@ -1,4 +1,4 @@
-"""Memory that is free again is the system's, in processes that run for long."""
+"""Freed memory is returned to the operating system in long-running processes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-#: Six threads with 40 MiB each that lie on end in an arena of its own, and then as much of which
-#: every other array is freed; one of 24 MiB before makes glibc learn.
+#: Six threads allocate 40 MiB each in arenas of their own; then every other of 20 arrays is freed.
+#: An array of 24 MiB before makes glibc raise its mmap threshold.
 PROGRAM = """
 import re, threading
 from pathlib import Path
@@ -43,8 +43,8 @@ print(full - resident())
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc needs it")
-def test_freed_arrays_are_the_systems_at_once():
-    """Those of threads that have ended, and those between others; in MiB."""
+def test_freed_arrays_are_returned_to_the_system():
+    """Arrays of ended threads, and arrays between others, are returned at once; in MiB."""
     program = [sys.executable, "-c", PROGRAM]
     done = subprocess.run(program, capture_output=True, text=True, check=True)
     kept, returned = map(float, done.stdout.split())

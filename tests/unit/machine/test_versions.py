@@ -1,4 +1,4 @@
-"""Lower bounds come from the package's own metadata and are compared as versions."""
+"""Lower bounds are read from the package's metadata and compared as versions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from packaging.requirements import Requirement
 from mitsuba_irrcache.machine import versions
 
 
-def test_everything_that_is_needed_is_installed():
+def test_requirements_are_installed():
     versions.check_versions()
 
 

@@ -1,4 +1,4 @@
-"""Baking: the medium's own values and extent, exactly, and refusal of what cannot be right."""
+"""Baking a medium: exact coefficients and extent, and refusal of invalid media."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
-from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.scene.compile import compile_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def baked(scenes, medium, to_world=None, kind="cube"):
-    return bake_scene(scenes.load({"type": "volpath"}, scenes.boundary(medium, to_world, kind)))
+    return compile_scene(
+        scenes.load({"type": "volpath"}, scenes.boundary(medium, to_world, kind))
+    ).visible[0]
 
 
 def mitsubas(medium: dict, p: mi.Point3f) -> tuple[np.ndarray, np.ndarray]:
@@ -28,8 +30,9 @@ def mitsubas(medium: dict, p: mi.Point3f) -> tuple[np.ndarray, np.ndarray]:
 )
 @pytest.mark.parametrize("channels", [1, 3])
 def test_coefficients_are_mitsubas(scenes, placement, channels):
-    """sigma_t and sigma_s inside, with a scale, in grids of different sizes; the placement of a
-    turned grid is known to 1e-6 of its size.
+    """Baked sigma_t and sigma_s equal Mitsuba's, for scaled media and grids of different sizes.
+
+    The placement of a rotated grid is known to 1e-6 of its size.
     """
     to_world = scenes.placement(**placement)
     sigma_t = scenes.texture((4, 5, 6, channels), 0, 3, 1)
@@ -47,12 +50,12 @@ def test_coefficients_are_mitsubas(scenes, placement, channels):
 
 
 def test_data_are_not_copied(scenes):
-    """The baked field reads the medium's own array: no second copy of a large volume."""
+    """The baked field shares the array of the medium, without a copy of a large volume."""
     medium = scenes.medium(scenes.texture((4, 5, 6), 0, 3, 1), 0.5, scenes.placement(), scale=2.0)
     scene = scenes.load({"type": "volpath"}, scenes.boundary(medium))
     params = mi.traverse(scene)
     (key,) = [k for k in params.keys() if k.endswith("sigma_t.data")]
-    assert bake_scene(scene).sigma_t.data.index == params[key].array.index
+    assert compile_scene(scene).visible[0].sigma_t.data.index == params[key].array.index
 
 
 @pytest.mark.parametrize("values", [1.5, (0.5, 1.0, 2.0)])
@@ -63,8 +66,8 @@ def test_homogeneous(scenes, values):
     assert grid.macrocells.count == 1
 
 
-def test_extent_is_the_worlds_box_of_the_grid(scenes):
-    """A grid inside its boundary ends the medium; one around it does not."""
+def test_extent_is_the_world_bounding_box_of_the_grid(scenes):
+    """A grid smaller than the boundary limits the medium; a larger one does not."""
     inner = baked(scenes, scenes.medium(np.ones((2, 2, 2)), 0.5, scenes.placement((1.0, 1.2, 1.4))))
     np.testing.assert_allclose(np.abs(inner.bbox), [[0.5, 0.6, 0.7]] * 2, rtol=1e-6)
     ray = mi.Ray3f(mi.Point3f(-5, 0, 0), mi.Vector3f(1, 0, 0))
@@ -87,7 +90,7 @@ BAD = {
 
 @pytest.mark.parametrize(("change", "message"), BAD.values(), ids=BAD)
 def test_impossible_values_are_refused(scenes, change, message):
-    """The message names the medium's parameter, where the value is, and what it is."""
+    """Invalid values are refused with the parameter, the position and the value."""
     fields = {name: np.full((2, 3, 2), 0.5, np.float32) for name in ("sigma_t", "albedo")}
     for name in fields.keys() & change.keys():
         fields[name][1, 0, 1] = change[name]
@@ -117,7 +120,7 @@ def test_other_media_are_refused(scenes, kind, message):
 
 
 def test_mono_takes_the_luminance(mono, scenes):
-    """As Mitsuba does for RGB data in a mono variant."""
+    """In a mono variant the luminance of RGB data is used, as in Mitsuba."""
     sigma_t = scenes.texture((3, 3, 3, 3), 0, 2, 4)
     medium = scenes.medium(sigma_t, 0.5, scenes.placement())
     grid = baked(scenes, medium)

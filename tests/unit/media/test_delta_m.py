@@ -1,4 +1,4 @@
-"""Media without their forward peaks: similarity, phase functions, and what is refused."""
+"""Delta-M scaling of media: similarity relations, phase functions, and refused settings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import pytest
 
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.media.phase import LARGEST_PEAK, PEAK, Phase
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.transport.path import Media
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -23,8 +24,11 @@ def moments(g: float) -> Phase:
 
 
 @pytest.mark.parametrize("g", [0.6, 0.75, 0.77, 0.85])
-def test_moments_without_the_peak(g):
-    """A delta function forwards and the rest have the moments of before, up to the order."""
+def test_scaled_phase_function_plus_peak_has_the_original_moments(g):
+    """A forward delta function plus the scaled phase function has the original moments.
+
+    They agree up to the order of truncation.
+    """
     whole, rest = moments(g), moments(g).without_peak()
     assert whole.has_peak and rest.moments[0] == 1
     both = rest.forward + (1 - rest.forward) * rest.moments
@@ -34,7 +38,7 @@ def test_moments_without_the_peak(g):
     assert rest.forward <= PEAK or rest.order == 6
 
 
-def test_only_forward_peaks_are_taken_away():
+def test_only_forward_peaks_are_scaled():
     for g in (0.5, -0.8, 0.9, 0.0):
         assert not moments(g).has_peak
 
@@ -63,8 +67,8 @@ FIELDS = {
 
 
 @pytest.mark.parametrize(("sigma_t", "albedo"), FIELDS.values(), ids=FIELDS)
-def test_what_is_absorbed_stays(scenes, sigma_t, albedo):
-    """At the voxel centres: sigma_t (1 - albedo) is as before, sigma_s less by the peak."""
+def test_absorption_is_preserved(scenes, sigma_t, albedo):
+    """Scaling preserves the absorption at voxel centres, and reduces sigma_s by the peak."""
     medium = {"type": "heterogeneous" if np.ndim(sigma_t) > 1 else "homogeneous", "phase": hg(0.8)}
     for name, value in (("sigma_t", sigma_t), ("albedo", albedo)):
         if np.ndim(value) > 1:
@@ -74,9 +78,8 @@ def test_what_is_absorbed_stays(scenes, sigma_t, albedo):
             colour = value if plain else {"type": "rgb", "value": list(value)}
             volume = {"type": "constvolume", "value": colour}
             medium[name] = volume if medium["type"] == "heterogeneous" else colour
-    found = bake_media(
-        scenes.load({"type": "irrcache", "solver": "path"}, scenes.boundary(medium), 8)
-    )[0]
+    scene = scenes.load({"type": "irrcache", "solver": "path"}, scenes.boundary(medium), 8)
+    found = compile_scene(scene).visible[0]
     z, y, x = (np.ravel(i) for i in np.indices((4, 5, 6)))
     centres = np.float32([(x + 0.5) / 3 - 1, (y + 0.5) / 2.5 - 1, (z + 0.5) / 2 - 1])
 
@@ -106,7 +109,9 @@ REFUSED = {
 
 @pytest.mark.parametrize(("settings", "message"), REFUSED.values(), ids=REFUSED)
 def test_settings_are_refused(scenes, settings, message):
-    """Where paths would have to follow the peak, or orders of scattering are told apart."""
+    """Settings are refused for which paths would scale the peak, or that separate scattering
+    orders.
+    """
     scene = scene_of(scenes, settings)
     with pytest.raises(UnsupportedSceneError, match=message):
         scene.integrator().prepare(scene)
@@ -118,8 +123,11 @@ def prepared(scenes, ball: dict) -> mi.Scene:
     return scene
 
 
-def test_sharp_media_around_surfaces_are_refused(scenes):
-    """Paths would have to follow the peak there; beside a surface nothing has to."""
+def test_forward_scattering_media_with_surfaces_are_refused(scenes):
+    """Forward scattering media with surfaces are refused if paths would scale the peak.
+
+    Media without surfaces in them are accepted.
+    """
     ball = {"type": "sphere", "radius": 0.3}
     with pytest.raises(UnsupportedSceneError, match=r'sharply.*0\.80.*"ball".*reaches.*volpath'):
         prepared(scenes, ball)
@@ -127,13 +135,13 @@ def test_sharp_media_around_surfaces_are_refused(scenes):
     assert aside.integrator().cache.samples == 128
 
 
-def test_other_media_keep_their_peaks(scenes):
-    """To paths that know the light of one medium, another one scatters as it is."""
+def test_other_media_are_not_scaled(scenes):
+    """Paths through several media scale one of them; the others are unscaled."""
     place = scenes.placement((1, 1, 1), center=(3, 0, 0))
     other = scenes.boundary(scenes.medium(2.0, 0.5) | {"phase": hg(0.7)}, place)
-    sharp, medium = bake_media(scene_of(scenes, {}, other=other))
-    around = medium.surroundings.media.around(medium).grids
-    assert around == [sharp.with_peak, medium]
+    sharp, medium = compile_scene(scene_of(scenes, {}, other=other)).visible
+    around = Media.around(medium).grids
+    assert around == (sharp.original, medium)
     assert around[0].sigma_t.maximum == pytest.approx(2.0)
     left = 2.0 * (1 - sharp.phase.forward * 0.5)
     assert sharp.sigma_t.maximum == pytest.approx(left, rel=1e-5)

@@ -1,4 +1,4 @@
-"""When a progressive run refines and when it renders, on machines that are made up."""
+"""The schedule of refinement and rendering in progressive runs, on simulated machines."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from mitsuba_irrcache.pipeline.progressive import (
 
 
 def play(schedule, fixed=0.01, each=0.01, image=0.05, compile=0.0, noise=0.0, frames=40):
-    """Runs a schedule where a pass takes ``fixed`` seconds and ``each`` for a sample; yields
-    (elapsed, samples, seconds of images) of every frame.
+    """Run a schedule with passes of ``fixed`` seconds plus ``each`` per sample.
+
+    Yields (elapsed, samples, seconds of images) of every frame.
     """
     rng = random.Random(1)
 
@@ -47,7 +48,7 @@ COSTS = [(0.01, 0.01, 0.05), (0.0, 1e-4, 3.0), (0.2, 0.001, 0.01), (0.0, 0.5, 0.
 
 @pytest.mark.parametrize("costs", COSTS)
 def test_images_take_a_fifth_of_the_time(costs):
-    """Once the first few are there; and every frame shows more samples than the one before."""
+    """After the first frames, images take a fifth of the time, and each shows more samples."""
     frames = list(play(Schedule(), *costs))
     assert len(frames) == 40
     start, _, images = frames[EARLY_FRAMES - 1]
@@ -58,7 +59,7 @@ def test_images_take_a_fifth_of_the_time(costs):
 
 
 def test_compiling_does_not_delay_the_next_frames():
-    """A first pass and image that took 5 s longer are no measure for the second and third."""
+    """Compilation in the first pass and image does not delay the second and third frame."""
     (first, _, _), _, (third, _, _) = play(Schedule(), compile=5.0, frames=3)
     assert third - first < 2
 
@@ -67,8 +68,10 @@ def test_compiling_does_not_delay_the_next_frames():
 @pytest.mark.parametrize("limit", [0.1, 5.0, 60.0, 1000.0])
 @pytest.mark.parametrize("compile", [0.0, 4.0])
 def test_a_time_limit_is_kept(costs, limit, compile):
-    """With costs that vary by 5 %, the run ends in time, unless the first frame alone takes longer;
-    and it does not stop while another batch would fit in easily.
+    """With costs that vary by 5 %, a run ends within its limit, unless the first frame exceeds
+    it.
+
+    It does not stop while another batch would easily fit.
     """
     frames = list(play(Schedule(limit), *costs, compile=compile, noise=0.05, frames=1000))
     assert frames[-1][0] <= limit or len(frames) == 1
@@ -79,7 +82,7 @@ def test_a_time_limit_is_kept(costs, limit, compile):
 
 @pytest.mark.parametrize("each", [0.001, 0.004])
 def test_wanted_times_are_met(each):
-    """To a tenth, where a batch is short against them; and the last one ends the run."""
+    """Frames meet requested times to a tenth if batches are short; the last one ends the run."""
     times = [1.0, 1.5, 12.0, 13.0, 100.0]
     frames = list(play(Schedule(times=times), each=each, noise=0.03))
     assert len(frames) <= len(times) + 2
@@ -88,7 +91,10 @@ def test_wanted_times_are_met(each):
 
 
 def test_times_that_passes_are_too_coarse_for():
-    """Each frame comes with the first batch that reaches its time; the last one ends the run."""
+    """If passes are longer than the intervals, each frame follows the first batch past its time.
+
+    The last one ends the run.
+    """
     frames = list(play(Schedule(times=[1, 2, 30, 31]), each=1.0))
     reached = [next(e for e, _, _ in frames if e >= 0.97 * t) for t in (1, 2, 30, 31)]
     assert reached[0] == reached[1] == frames[0][0]
@@ -105,7 +111,7 @@ def test_needed_samples_are_not_exceeded():
 
 
 def test_a_cache_from_a_file_is_shown_at_once():
-    """No pass has been measured yet: the first one is a small one."""
+    """The first pass on a loaded cache is small, since no pass has been measured yet."""
     schedule = Schedule(limit=10)
     schedule.note_pass(0, 0.01)
     assert schedule.next_pass(512, math.inf) == 0

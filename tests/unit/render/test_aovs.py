@@ -1,4 +1,4 @@
-"""The layers of an image: how they are named, carried by a film, and put together again."""
+"""AOVs: their names, their storage on a film, and the reconstruction of the image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PIXELS = 7
 
 @pytest.fixture(params=["rgb", "mono"])
 def variant(request):
-    """Each variant in turn."""
+    """Run the test in each variant."""
     request.getfixturevalue(request.param)
 
 
@@ -24,7 +24,7 @@ def array(values) -> mi.Float:
 
 
 def random_layers(probes: int = 4) -> Layers:
-    """Layers of `PIXELS` pixels whose values are all different, none of them special."""
+    """Return layers of `PIXELS` pixels with distinct values."""
     rng = np.random.default_rng(1)
 
     def spectrum() -> mi.Spectrum:
@@ -36,7 +36,7 @@ def random_layers(probes: int = 4) -> Layers:
 
 
 def numbers(values) -> np.ndarray:
-    """(channel, pixel), float64."""
+    """Convert to (channel, pixel), float64."""
     return np.array([np.array(v, dtype=np.float64) for v in values])
 
 
@@ -44,7 +44,10 @@ def numbers(values) -> np.ndarray:
 
 
 def test_a_list_of_images_keeps_its_order_and_names():
-    """Would catch an unstripped name, and a type that does not serve as its own name."""
+    """A list of AOVs preserves its order and names.
+
+    Names are stripped, and a type without a name serves as its own name.
+    """
     found = parse_aovs(" light : illumination,colour, a:b:noise ,, depth")
     expected = [
         ("light", "illumination"),
@@ -67,8 +70,10 @@ def test_a_list_of_images_keeps_its_order_and_names():
         ("light:colour,light:noise", '"light" twice'),
     ],
 )
-def test_wrong_lists_are_refused_by_name(text, named):
-    """The message says which entry is wrong; for a wrong type, also what there is."""
+def test_invalid_lists_are_refused(text, named):
+    """Invalid lists are refused; the message names the entry and, for a wrong type, the valid
+    ones.
+    """
     with pytest.raises(IrrcacheError, match=named) as caught:
         parse_aovs(text)
     if "twice" not in named:
@@ -79,8 +84,8 @@ def test_wrong_lists_are_refused_by_name(text, named):
 
 
 @pytest.mark.parametrize("probes", [0, 4])
-def test_channels_come_back_as_they_went(variant, probes):
-    """Every value differs from all others, so any that is lost, doubled or swapped shows."""
+def test_layers_survive_a_round_trip_through_channels(variant, probes):
+    """Layers written to channels and read again are identical; all values are distinct."""
     layers = random_layers(probes)
     channels = layers.channels()
     assert len(channels) == 4 * len(mi.Spectrum(0)) + 2 + probes
@@ -95,14 +100,14 @@ def test_channels_come_back_as_they_went(variant, probes):
 
 
 def test_images_have_the_channels_of_their_names(variant):
-    """As many values as letters in `AOVS`, whatever the variant: a film counts them."""
+    """Each AOV has as many channels as `AOVS` declares, in each variant."""
     for layers in (Layers.background_only(mi.Spectrum(0.5)), random_layers()):
         for kind, names in AOVS.items():
             assert len(layers.aov(kind)) == len(names), kind
 
 
 def test_colours_keep_the_order_of_their_channels(rgb):
-    """RGB images in the film's order, not their luminance or the like."""
+    """RGB channels have the film's order, and are not converted to luminance."""
     layers = random_layers()
     for kind in (kind for kind, names in AOVS.items() if names == "RGB"):
         expected = numbers(getattr(layers, kind))
@@ -113,7 +118,7 @@ def test_colours_keep_the_order_of_their_channels(rgb):
 
 
 def test_colour_times_illumination_plus_background_is_the_image(variant):
-    """Also where there is no colour: there E passes through."""
+    """Colour times illumination plus background is the image, also in pixels without colour."""
     layers = random_layers()
     layers.colour = layers.colour * dr.select(dr.arange(mi.UInt32, PIXELS) % 3 == 0, mi.Float(0), 1)
     expected = numbers(layers.scattered) + numbers(layers.background)
@@ -123,8 +128,9 @@ def test_colour_times_illumination_plus_background_is_the_image(variant):
 
 
 def test_another_illumination_replaces_its_own_only(variant):
-    """Doubled light: twice the scattered radiance, the same background; E where there is no
-    colour.
+    """Replacing the illumination by its double doubles the scattered radiance only.
+
+    The background is unchanged, and so is E in pixels without colour.
     """
     layers = random_layers()
     dark = np.arange(PIXELS) % 3 == 0
@@ -134,9 +140,10 @@ def test_another_illumination_replaces_its_own_only(variant):
     np.testing.assert_allclose(doubled, np.where(dark, 1, 2) * light + background, rtol=3e-7)
 
 
-def test_illumination_needs_a_colour(rgb):
-    """Reconstruction filters with negative lobes leave colours that are tiny, 0 or negative: no
-    light is divided by these, channel by channel.
+def test_illumination_is_zero_without_colour(rgb):
+    """The illumination is 0 where the colour is not safely positive, channel by channel.
+
+    Reconstruction filters with negative lobes give colours that are tiny, 0 or negative.
     """
     layers = random_layers()
     values = np.array([1.0, 2 * LEAST_COLOUR, LEAST_COLOUR, 1e-30, 0.0, -0.0, -0.3], np.float32)
@@ -152,9 +159,10 @@ def test_illumination_needs_a_colour(rgb):
     np.testing.assert_allclose(illumination[1], expected, rtol=3e-7)
 
 
-def test_depth_is_the_mean_over_what_is_seen(variant):
-    """int (-dT/dt) t dt over the opacity 1 - T: a half transparent thing at 3 is at 3, not 1.5; and
-    where nothing is seen, 0.
+def test_depth_is_weighted_by_opacity(variant):
+    """Depth is int (-dT/dt) t dt divided by the opacity 1 - T, and 0 where the opacity is 0.
+
+    A half transparent object at 3 has depth 3, not 1.5.
     """
     layers = random_layers()
     opacity = np.linspace(0, 1, PIXELS)
@@ -166,7 +174,7 @@ def test_depth_is_the_mean_over_what_is_seen(variant):
 
 
 def test_noise_is_the_root_mean_square_of_the_probes(variant):
-    """And 0, of the width of the image, where there is none."""
+    """``noise`` is the root mean square of the probes, and an image of zeros without probes."""
     layers = random_layers()
     expected = np.sqrt((numbers(layers.probes) ** 2).mean(axis=0))
     np.testing.assert_allclose(np.array(layers.noise), expected, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Media seen in several parts: through null surfaces within them, and behind each other."""
+"""Media that a camera sees in several parts: with null surfaces, and behind one another."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import pytest
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
-#: Without scattering nothing but extinction matters.
+#: Without scattering only the extinction matters.
 SETTINGS = {"type": "irrcache", "solver": "auto", "max_depth": 1}
 
 
 def ahead(scenes) -> dict:
-    """An orthographic sensor at z = -5 that looks along +z at a small square."""
+    """Return an orthographic sensor at z = -5 that looks along +z at a small square."""
     look = mi.ScalarTransform4f().look_at([0.02, 0.03, -5], [0.02, 0.03, 0], [0, 1, 0])
     film = scenes.description({}, None, 2)["sensor"]["film"]
     return {"type": "orthographic", "to_world": look.scale(0.02), "film": film}
@@ -21,8 +21,9 @@ def ahead(scenes) -> dict:
 
 @pytest.mark.parametrize("varies", [False, True])
 def test_null_surfaces_within_a_medium_change_nothing(scenes, varies):
-    """A null sphere and a null sheet in the way, in a scene with an opaque surface that is not
-    seen: e^-tau of the sky, once.
+    """Null surfaces in a medium do not change the image, which is e^-tau of the sky.
+
+    They are a sphere and a rectangle; the scene also has an opaque surface outside of the image.
     """
     density = 0.6 * np.ones((4, 4, 4), np.float32) if varies else 0.6
     place = scenes.placement()
@@ -41,8 +42,9 @@ def test_null_surfaces_within_a_medium_change_nothing(scenes, varies):
 
 
 def test_depth_of_a_medium_behind_another(scenes):
-    """int (-dT/dt) t dt over the opacity, for two thin slabs of optical depths 0.7 and 1.1 at the
-    distances 4 and 6.
+    """The depth of two slabs is int (-dT/dt) t dt over the total opacity.
+
+    The optical depths are 0.7 and 1.1 at the distances 4 and 6.
     """
     slabs = []
     for z, depth in ((-1.0, 0.7), (1.0, 1.1)):

@@ -1,7 +1,7 @@
-"""The bilateral filter on synthetic images whose truth is known, and the choice of its strength.
+"""The bilateral filter on synthetic images with known truth, and the choice of its strength.
 
-Noise has the statistics of a cache's: blotches as large as the image of a voxel, and random errors
-(probes) drawn from the same model, but not the same errors.
+The noise is like a cache's: blotches as large as the image of a voxel, and random errors (probes)
+drawn from the same model, but not the same errors.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ def rms(values) -> float:
 
 
 def planes(image: np.ndarray) -> mi.Spectrum:
-    """A spectrum of an image (y, x) or (y, x, channel)."""
+    """Return the channels of an image (y, x) or (y, x, channel) as a spectrum."""
     image = image[..., None] if image.ndim == 2 else image
     channels = [mi.Float(np.float32(image[..., c]).ravel()) for c in range(image.shape[2])]
     return mi.Spectrum(*(channels * 3)[: len(mi.Spectrum(0))])
 
 
 def image_of(spectrum: mi.Spectrum, shape) -> np.ndarray:
-    """(y, x, channel), float64."""
+    """Return (y, x, channel), float64."""
     values = [np.broadcast_to(np.float64(c), np.prod(shape)) for c in spectrum]
     return np.stack(values, axis=-1).reshape(*shape, -1)
 
 
 def layers_of(illumination, probes, colour=None) -> Layers:
-    """Layers with this illumination, no background, and these errors of its luminance (k, y, x)."""
+    """Return layers with this illumination, without background, and luminance errors (k, y, x)."""
     colour = planes(np.ones(illumination.shape[:2]) if colour is None else colour)
     seen = np.mean(image_of(colour, illumination.shape[:2]), axis=-1)
     zero = dr.zeros(mi.Float, dr.width(colour))
@@ -56,18 +56,18 @@ def layers_of(illumination, probes, colour=None) -> Layers:
 
 
 def filtered(kind: str, layers: Layers, shape) -> np.ndarray | None:
-    """The illumination (y, x, channel) after the filter."""
+    """Return the filtered illumination (y, x, channel)."""
     result = filter_illumination(kind, layers, shape[::-1])
     return None if result is None else image_of(result, shape)
 
 
 def blotches(rng, size: int, block: int) -> np.ndarray:
-    """Noise of unit variance whose correlation reaches over ``block`` pixels, (y, x)."""
+    """Return noise of unit variance, correlated over ``block`` pixels, (y, x)."""
     coarse = rng.normal(size=(size // block + 3,) * 2)
     fine = zoom(coarse, block, order=1, mode="nearest", grid_mode=True) if block > 1 else coarse
     dy, dx = rng.integers(0, block, 2)
     fine = fine[dy : dy + size, dx : dx + size]
-    # Interpolation leaves a variance of (2/3)^2 in two dimensions.
+    # Interpolation reduces the variance to (2/3)^2 in two dimensions.
     return fine * (1.5 if block > 1 else 1.0)
 
 
@@ -75,8 +75,11 @@ def blotches(rng, size: int, block: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_noise_on_a_constant_goes(rgb, channels):
-    """Independent noise of 10 %: to below a quarter (a Gaussian of the same reach leaves 11 %)."""
+def test_noise_on_a_constant_is_removed(rgb, channels):
+    """Independent noise of 10 % on a constant decreases below a quarter.
+
+    A Gaussian of the same radius gives 11 %.
+    """
     rng = np.random.default_rng(1)
     noise = 0.1 * rng.normal(size=(SIZE, SIZE, 1))
     image = np.float32((1 + noise) * np.ones(channels))
@@ -86,16 +89,19 @@ def test_noise_on_a_constant_goes(rgb, channels):
     assert abs(result.mean() - image.mean()) < 0.003
 
 
-def test_nothing_is_done_where_there_is_no_noise(rgb):
-    """The very same numbers, for a standard error of 0 and for one of 1e-4 of the light."""
+def test_noiseless_images_are_unchanged(rgb):
+    """Without noise the image is unchanged bit by bit, for errors of 0 and of 1e-4 of the
+    radiance.
+    """
     image = np.random.default_rng(2).uniform(0.5, 1.5, (9, 13, 3)).astype(np.float32)
     for error in (0.0, 1e-4):
         np.testing.assert_array_equal(denoise(image, np.full((9, 13), error)), image)
 
 
-def test_pure_structure_is_left_alone(rgb):
-    """Rough structure 20 times the noise: Stein's estimate may choose a weak filter or none, which
-    may add no more than a fifth of the noise.
+def test_structure_is_preserved(rgb):
+    """On structure 20 times the noise, the filter adds at most a fifth of the noise.
+
+    Stein's unbiased risk estimate may select a weak filter or none.
     """
     rng = np.random.default_rng(3)
     truth = rng.uniform(0.0, 2.0, (SIZE, SIZE, 1))
@@ -104,9 +110,10 @@ def test_pure_structure_is_left_alone(rgb):
     assert rms(result - truth) < 1.2 * rms(image - truth)
 
 
-def test_an_edge_stays(rgb):
-    """A step of 20 standard errors between flat sides: its height from one pixel to the next is
-    kept to 5 %, while the noise falls to a third. A Gaussian of the same reach takes 84 % of it.
+def test_edges_are_preserved(rgb):
+    """A step of 20 standard errors preserves its height to 5 %, with a third of the noise.
+
+    A Gaussian of the same radius removes 84 % of the step between two pixels.
     """
     rng = np.random.default_rng(4)
     truth = np.where(np.arange(SIZE) < SIZE // 2, 1.0, 2.0) * np.ones((SIZE, 1))
@@ -123,7 +130,7 @@ def test_an_edge_stays(rgb):
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1), (2, 3)])
 def test_small_images(rgb, shape):
-    """Windows that reach beyond the image on all sides."""
+    """Windows may extend beyond the image on all sides."""
     image = 1 + 0.2 * np.random.default_rng(5).normal(size=(*shape, 1)).astype(np.float32)
     result = denoise(image, np.full(shape, 0.2))
     assert result.shape == image.shape and np.isfinite(result).all()
@@ -134,8 +141,8 @@ def test_small_images(rgb, shape):
 
 
 @pytest.mark.parametrize("kind", ["bilateral", "fixed"])
-def test_pixels_without_illumination_neither_receive_nor_give(rgb, kind):
-    """Their neighbours are filtered to the bit as they would be if E there were anything else."""
+def test_invalid_pixels_are_ignored(rgb, kind):
+    """Invalid pixels are not filtered and do not affect others, bit by bit."""
     rng = np.random.default_rng(6)
     hole = np.zeros((SIZE, SIZE), bool)
     hole[10:14, 8:30] = hole[0, :5] = True
@@ -159,8 +166,10 @@ def test_pixels_without_illumination_neither_receive_nor_give(rgb, kind):
 
 @pytest.mark.parametrize("kind", ["bilateral", "fixed"])
 def test_channels_without_albedo_do_not_darken_others(rgb, kind):
-    """Half of the medium scatters no blue: beside it, blue keeps its light. Zeros in its place
-    would take up to half of it near the border.
+    """Channels without albedo do not darken their neighbours.
+
+    Half of the medium scatters no blue; zeros there would remove up to half of the blue near the
+    border.
     """
     rng = np.random.default_rng(7)
     colour = np.full((SIZE, SIZE, 3), 0.5)
@@ -178,8 +187,8 @@ def test_channels_without_albedo_do_not_darken_others(rgb, kind):
 
 
 @pytest.mark.parametrize("kind", ["bilateral", "fixed"])
-def test_nothing_to_filter(rgb, kind):
-    """No pixel with a colour, or no error known: None, not a crash or NaN."""
+def test_filter_without_valid_pixels_returns_none(rgb, kind):
+    """Without valid pixels, or without a known error, the result is None."""
     shape = (5, 6)
     light, probes = np.ones(shape), np.full((4, *shape), 0.1)
     assert filter_illumination("none", layers_of(light, probes), shape[::-1]) is None
@@ -188,7 +197,7 @@ def test_nothing_to_filter(rgb, kind):
         assert filter_illumination(kind, layers_of(light, []), (6, 5)) is None
 
 
-# Choice of strength
+# Choice of the filter strength
 
 
 def smooth(rng) -> np.ndarray:
@@ -209,24 +218,24 @@ TRUTHS = {"smooth": smooth, "edges": edges, "texture": texture}
 
 
 class Trial:
-    """A noisy image of known truth, and what each filter makes of it."""
+    """A noisy image with known truth, and the results of all filters."""
 
     def __init__(self, truth, level: float, block: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.truth = truth(rng)
-        # More noise on the one side than on the other, as behind a dense part.
+        # Noise differs between the two sides, as behind a dense part of a medium.
         self.deviation = level * np.linspace(0.5, 1.5, SIZE) * self.truth
         self.noisy = self.truth + self.deviation * blotches(rng, SIZE, block)
         self.probes = [self.deviation * blotches(rng, SIZE, block) for _ in range(4)]
         self.unfiltered = rms(self.noisy - self.truth)
 
     def chosen(self) -> float:
-        """The error of the filter that is chosen."""
+        """Return the error of the selected filter."""
         result = filtered("bilateral", layers_of(self.noisy, self.probes), (SIZE, SIZE))
         return self.unfiltered if result is None else self._error(result)
 
     def best(self) -> float:
-        """The least error among all choices, none included."""
+        """Return the minimum error of all choices, including no filter."""
         error = mi.Float(np.float32(np.sqrt(np.mean(np.square(self.probes[1:]), axis=0))).ravel())
         packed = filtering._pack([planes(self.noisy)], error)
         everywhere = dr.arange(mi.UInt32, SIZE * SIZE)
@@ -251,13 +260,15 @@ class Trial:
 @pytest.mark.parametrize("block", [1, 6])
 @pytest.mark.parametrize("truth", TRUTHS.values(), ids=TRUTHS)
 def test_the_choice_is_near_the_best(mono, truth, block):
-    """Over 4 images each at 2, 8 and 30 % of noise: the chosen filter's error is on average within
-    8 % of the least of all 19 choices (measured: 0.1 to 5 %), and not above the unfiltered one's:
-    by 2 % on average at any level, by 15 % in single images (64 blotches are few).
+    """The selected filter's error is near the minimum of all 19 choices.
 
-    A wrong sign or factor of Stein's term fails by tens of %; so does noise taken for independent
-    where it comes in blotches, and an error estimate that contains the probe for the response (25 %
-    on the smooth image).
+    Over 4 images each at 2, 8 and 30 % of noise it is on average within 8 % (measured: 0.1 to 5 %),
+    and not above the unfiltered one's: by 2 % on average at any level, by 15 % in single images (64
+    blotches are few).
+
+    A wrong sign or factor of Stein's term fails by tens of %; so does noise assumed to be
+    independent although it is blotchy, and an error estimate that contains the probe for the
+    response (25 % on the smooth image).
     """
     trials = [[Trial(truth, level, block, seed) for seed in range(4)] for level in LEVELS]
     chosen = np.array([[t.chosen() for t in row] for row in trials])
@@ -269,8 +280,9 @@ def test_the_choice_is_near_the_best(mono, truth, block):
 
 
 def test_more_noise_is_filtered_more(mono):
-    """The error left, in units of the noise, falls or stays as the noise grows; where noise is
-    2 %, structure counts, where it is 30 %, most of it goes.
+    """The error relative to the noise decreases as the noise increases.
+
+    At 2 % of noise structure dominates; at 30 % most of the noise is removed.
     """
     left = []
     for level in LEVELS:
@@ -280,9 +292,9 @@ def test_more_noise_is_filtered_more(mono):
     assert left[2] < 0.35
 
 
-def test_fading(mono):
-    """``bilateral`` changes the image by less than the noise, so by nothing in the end; ``fixed``
-    goes on changing it.
+def test_bilateral_filter_fades_out(mono):
+    """The change by ``bilateral`` is less than the noise, so it vanishes; that by ``fixed`` does
+    not.
     """
     for kind, fades in (("bilateral", True), ("fixed", False)):
         changes = []
@@ -298,7 +310,7 @@ def test_fading(mono):
 
 
 def test_the_scale_of_the_light_does_not_matter(rgb):
-    """1e-6 or 1e6 times the light, the same filter; thresholds in absolute units would show."""
+    """Scaling the radiance by 1e-6 or 1e6 does not change the filter."""
     rng = np.random.default_rng(8)
     light = 1 + 0.1 * rng.normal(size=(SIZE, SIZE))
     probes = 0.1 * rng.normal(size=(4, SIZE, SIZE))
@@ -309,8 +321,8 @@ def test_the_scale_of_the_light_does_not_matter(rgb):
         np.testing.assert_allclose(scaled / scale, plain, rtol=2e-4)
 
 
-def test_larger_images_are_judged_by_a_sample(rgb, monkeypatch):
-    """With 500 of 2304 pixels, the same choice as with all of them, for one image."""
+def test_choice_from_a_sample_of_pixels(rgb, monkeypatch):
+    """The choice from 500 of 2304 pixels equals that from all of them, for one image."""
     rng = np.random.default_rng(9)
     image = np.float32(1 + 0.1 * rng.normal(size=(SIZE, SIZE, 1)))
     error = np.full((SIZE, SIZE), 0.1)
@@ -320,9 +332,9 @@ def test_larger_images_are_judged_by_a_sample(rgb, monkeypatch):
 
 
 def test_other_images_compile_nothing(rgb, kernels):
-    """Another number of valid pixels, another size, other noise: the kernels of the first image.
+    """Images of other sizes, noise and numbers of valid pixels reuse all kernels.
 
-    But for the copy of dr.concat, 8 operations, which knows how long its parts are.
+    The exception is the copy of dr.concat, 8 operations, which embeds the lengths of its parts.
     """
 
     def prepared(size: int, hole: int, seed: int) -> Layers:
@@ -332,7 +344,7 @@ def test_other_images_compile_nothing(rgb, kernels):
         light = 1 + 0.2 * rng.normal(size=(size, size))
         probes = 0.2 * rng.normal(size=(4, size, size))
         layers = layers_of(light, probes, colour)
-        # Copies: kernels depend on the alignment of NumPy's memory.
+        # Copied, because kernels depend on the alignment of NumPy's memory.
         layers = Layers.of([c * dr.opaque(mi.Float, 1) for c in layers.channels()])
         dr.eval(layers)
         return layers

@@ -1,5 +1,5 @@
-"""The filter of the illumination: alike along rows and columns, for all spacings of its window, and
-not applied where it cannot help.
+"""The illumination filter is symmetric in rows and columns, and is rejected where it cannot
+help.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def flat(values: np.ndarray) -> mi.Float:
 
 
 def layers_of(illumination: np.ndarray, probes: list[np.ndarray], colour: np.ndarray) -> Layers:
-    """What a camera sees of grey images (y, x)."""
+    """Return layers of grey images (y, x)."""
     seen = mi.Spectrum(flat(colour))
     nothing = mi.Spectrum(flat(np.zeros_like(colour)))
     errors = [flat(colour * probe) for probe in probes]
@@ -33,7 +33,7 @@ def layers_of(illumination: np.ndarray, probes: list[np.ndarray], colour: np.nda
 
 @pytest.mark.parametrize("stride", STRIDES)
 def test_rows_are_filtered_as_columns(stride):
-    """The filter of a transposed image is the transposed filter, whatever lies between two taps."""
+    """Filtering commutes with transposition of the image, for all spacings of the taps."""
     rng = np.random.default_rng(3)
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     image = 1 + 0.3 * np.sin(0.5 * x + 0.2 * y) + 0.2 * rng.normal(size=(HEIGHT, WIDTH))
@@ -53,8 +53,10 @@ def test_rows_are_filtered_as_columns(stride):
 
 
 def test_an_error_that_all_pixels_share_is_not_filtered():
-    """No mean over pixels makes such an error less, and every mean blurs the image: by Stein's
-    estimate each filter is worse than none, so none is applied.
+    """An error that all pixels share is not filtered.
+
+    Averages over pixels do not reduce it but blur the image: by Stein's unbiased risk estimate each
+    filter is worse than none.
     """
     rng = np.random.default_rng(4)
     y, x = np.mgrid[:HEIGHT, :WIDTH]
@@ -62,15 +64,16 @@ def test_an_error_that_all_pixels_share_is_not_filtered():
     shared = [np.full((HEIGHT, WIDTH), 0.2)] * 4
     layers = layers_of(image, shared, np.ones((HEIGHT, WIDTH)))
     assert filter_illumination("bilateral", layers, (WIDTH, HEIGHT)) is None
-    # Errors as large that differ from pixel to pixel are.
+    # Independent errors of the same size are filtered.
     own = [0.2 * rng.normal(size=(HEIGHT, WIDTH)) for _ in range(4)]
     layers = layers_of(image + own.pop(), [*own, own[0]], np.ones((HEIGHT, WIDTH)))
     assert filter_illumination("bilateral", layers, (WIDTH, HEIGHT)) is not None
 
 
 def test_a_fixed_filter_does_not_depend_on_empty_pixels():
-    """The paper's filter of an image, alone and with as much empty space again beside it: the same
-    where the window does not reach the border between the two.
+    """Adding empty pixels to an image does not change the paper's fixed filter.
+
+    Pixels whose window reaches the border between both are excluded.
     """
     rng = np.random.default_rng(5)
     image = 1 + 0.3 * rng.normal(size=(HEIGHT, WIDTH))

@@ -1,4 +1,4 @@
-"""The film: images put on it and taken off it again."""
+"""Writing images to a film and reading them back."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 
 
 def rendering():
-    """The module; it can be imported only once a variant is set."""
+    """Import the module, which requires a variant."""
     from mitsuba_irrcache.render import film as module
 
     return module
@@ -34,7 +34,7 @@ def film_of(pixel_format: str, **properties) -> mi.Film:
 
 
 def values(count: int, film: mi.Film) -> list[np.ndarray]:
-    """A different number for each pixel and channel, row by row."""
+    """Return a distinct number for each pixel and channel, row by row."""
     pixels = int(film.crop_size().x) * int(film.crop_size().y)
     rng = np.random.default_rng(1)
     return [rng.uniform(0.1, 2, pixels).astype(np.float32) for _ in range(count)]
@@ -47,15 +47,17 @@ def filled(film: mi.Film, image: list[np.ndarray], alpha, further: list[np.ndarr
 
 
 def expected_colour(image: list[np.ndarray], pixel_format: str) -> list[np.ndarray]:
-    """What a film of this format makes of an RGB image."""
+    """Return the film's colour channels of an RGB image in this format."""
     return [LUMINANCE @ np.array(image)] if pixel_format.startswith("lum") else image
 
 
 @pytest.mark.parametrize("pixel_format", ["rgb", "rgba", "luminance", "luminance_alpha"])
 @pytest.mark.parametrize("crop", [{}, CROP], ids=["whole", "crop"])
-def test_a_film_gives_back_what_was_put_on_it(rgb, pixel_format, crop):
-    """Bit for bit in colour, alpha and further channels, whatever the reconstruction filter; a
-    wrong place for the weight's channel, a transposed image or a second reconstruction show.
+def test_film_round_trip(rgb, pixel_format, crop):
+    """Images read from a film equal those written bit by bit, for every reconstruction filter.
+
+    This covers colour, alpha and further channels: a misplaced weight channel, a transposition or a
+    second reconstruction would be detected.
     """
     film = film_of(pixel_format, **crop)
     image, further = values(6, film)[:3], values(6, film)[3:]
@@ -71,7 +73,7 @@ def test_a_film_gives_back_what_was_put_on_it(rgb, pixel_format, crop):
 
 
 def test_the_image_has_rows_and_columns(rgb):
-    """The developed tensor: (height, width, channel), x fastest."""
+    """The developed tensor is (height, width, channel), with x varying fastest."""
     film = film_of("rgb", **CROP)
     image, further = values(6, film)[:3], values(6, film)[3:]
     filled(film, image, None, further)
@@ -82,9 +84,7 @@ def test_the_image_has_rows_and_columns(rgb):
 
 @pytest.mark.parametrize("pixel_format", ["rgba", "luminance", "luminance_alpha"])
 def test_mono(mono, pixel_format):
-    """One luminance, and the rest as in RGB; alpha where the film has it, whatever it was asked
-    for.
-    """
+    """In mono variants there is one luminance channel, and alpha only if the film has it."""
     film = film_of(pixel_format)
     image, further = values(1, film), values(4, film)[1:]
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
@@ -97,7 +97,7 @@ def test_mono(mono, pixel_format):
 
 
 def test_filling_replaces_an_image_and_its_channels(rgb):
-    """Nothing of the samples that were on the film before is left, their channels neither."""
+    """Writing an image replaces all previous samples and channels of the film."""
     film = film_of("rgb")
     before = values(8, film)
     film.prepare([f"old.{i}" for i in range(5)])
@@ -111,8 +111,8 @@ def test_filling_replaces_an_image_and_its_channels(rgb):
     assert [field.name for field in film.bitmap().struct_()] == ["R", "G", "B", *NAMES]
 
 
-def test_numbers_that_do_not_vary_fill_the_image(rgb):
-    """A literal, as the alpha of a scene under a sky is one."""
+def test_literals_fill_the_image(rgb):
+    """A literal, such as the alpha of a scene under a sky, is broadcast to all pixels."""
     film = film_of("rgba")
     rendering().fill_film(film, mi.Color3f(0.5), mi.Float(1), {"noise.Y": mi.Float(0.25)})
     tensor = np.array(film.develop())
@@ -121,8 +121,9 @@ def test_numbers_that_do_not_vary_fill_the_image(rgb):
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian", "lanczos"])
 def test_further_channels_are_reconstructed_like_the_colour(rgb, rfilter):
-    """A channel that carries the red radiance is the red of the image to the bit, so layers add up
-    after any reconstruction.
+    """Further channels are reconstructed exactly like the colour.
+
+    A channel with the red radiance equals the image's red bit by bit, so that layers add up.
     """
     film = film_of("rgba", rfilter={"type": rfilter})
     sensor = mi.load_dict({"type": "perspective", "film": film, "sampler": {"type": "independent"}})
@@ -140,7 +141,7 @@ def test_further_channels_are_reconstructed_like_the_colour(rgb, rfilter):
 
 
 def positions(spp: int, seed: int = 3, pixels: int = 4096) -> np.ndarray:
-    """Positions in their pixels, (sample, pixel, axis)."""
+    """Return positions within pixels, (sample, pixel, axis)."""
     sampler = mi.load_dict({"type": "independent"})
     spread = rendering().PixelPositions(sampler, seed, spp)
     lane = dr.arange(mi.UInt32, pixels * spp)
@@ -150,7 +151,7 @@ def positions(spp: int, seed: int = 3, pixels: int = 4096) -> np.ndarray:
 
 @pytest.mark.parametrize("spp", [1, 2, 5, 16])
 def test_samples_mirror_each_other(rgb, spp):
-    """In pairs, at the centre of the pixel, where the last of an odd number lies."""
+    """Samples are in pairs that are mirrored at the pixel centre; the last odd one lies there."""
     found = positions(spp)
     paired = spp - spp % 2
     np.testing.assert_allclose(found[0:paired:2] + found[1:paired:2], 1, atol=2e-7)
@@ -159,7 +160,10 @@ def test_samples_mirror_each_other(rgb, spp):
 
 
 def test_each_sample_of_a_pair_is_uniform(rgb):
-    """Over pixels and seeds: moments within 4 standard errors, and other seeds lie elsewhere."""
+    """Each sample of a pair is uniform over pixels and seeds, and differs between seeds.
+
+    The moments agree within 4 standard errors.
+    """
     for sample in positions(4):
         assert np.abs(sample.mean(axis=0) - 1 / 2).max() < 4 * np.sqrt(1 / 12 / 4096)
         assert np.abs((sample**2).mean(axis=0) - 1 / 3).max() < 4 * np.sqrt(4 / 45 / 4096)

@@ -1,4 +1,4 @@
-"""From samples to pixels, beside Mitsuba's own image blocks."""
+"""Reconstruction of pixels from samples without Mitsuba's image blocks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def film_of(name: str, **properties) -> mi.Film:
 @pytest.mark.parametrize("crop", [{}, CROP, CROP | {"sample_border": True}], ids=str)
 @pytest.mark.parametrize("per_pixel", [1, 3])
 def test_sums_are_those_of_mitsuba(name, crop, per_pixel):
-    """All of Mitsuba's filters, within rounding: 1e-5 of the largest."""
+    """Sums for all of Mitsuba's filters agree within 1e-5 of the largest."""
     from mitsuba_irrcache.render.pixel_filter import reconstructed
 
     film = film_of(name, **crop)

@@ -1,4 +1,4 @@
-"""Emission of a segment of a ray in matter whose extinction changes along it."""
+"""Emission of a ray segment along which the extinction varies."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ DEPTHS = [0.0, 1e-4, 0.1, 1.0, 3.0, 10.0, 20.0]
 @pytest.mark.parametrize("tau_b", DEPTHS)
 @pytest.mark.parametrize("tau_a", DEPTHS)
 def test_weights_are_the_integral(tau_a, tau_b):
-    """int_0^1 (1 - u | u) e^-tau(u) du with extinction linear along the segment, by adaptive
-    quadrature. Where it is constant their sum is exact, and each of them within 0.6 % of it; else
-    within 4.2 %.
+    """The weights approximate int_0^1 (1 - u | u) e^-tau(u) du with linear extinction.
+
+    The reference is adaptive quadrature. For constant extinction their sum is exact, and each is
+    within 0.6 %; otherwise within 4.2 %.
     """
     length = 2.5
     ends = mi.Float(tau_a / length), mi.Float(tau_b / length)

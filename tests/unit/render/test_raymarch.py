@@ -1,6 +1,4 @@
-"""The quadratures of the ray march: their weights, their orders of convergence, skipping and early
-stop.
-"""
+"""Quadratures of the ray march: weights, orders of convergence, skipping and early termination."""
 
 from __future__ import annotations
 
@@ -26,7 +24,7 @@ LENGTH = 2.0
 
 
 def march(projection, origin, direction, background=0.0, offset=1.0, lanes=1):
-    """Radiance and transmittance of one ray per lane; the offset may be one per lane."""
+    """Return radiance and transmittance of one ray per lane, with an offset per lane or for all."""
     shift = mi.Float(np.broadcast_to(np.float32(offset), lanes))
     ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
     _, near, far = projection.medium.intersect(ray)
@@ -46,10 +44,10 @@ DEPTHS = [0.0, 1e-38, 1e-8, 1e-4, 0.01, 0.0999, 0.1001, 0.5, 1.0, 5.0, 20.0, 80.
 @pytest.mark.parametrize("tau_b", DEPTHS)
 @pytest.mark.parametrize("tau_a", DEPTHS)
 def test_exponential_weights_are_the_integral(tau_a, tau_b):
-    """int_0^1 (1 - u | u) sigma(u) e^-tau(u) du with sigma linear, in float64 by adaptive
-    quadrature.
+    """The weights approximate int_0^1 (1 - u | u) sigma(u) e^-tau(u) du with linear sigma.
 
-    Their sum is exact; each alone is good to 2e-3 up to an optical depth of 5 and to 0.06 beyond.
+    The reference is adaptive quadrature in float64. Their sum is exact; each alone is accurate to
+    2e-3 up to an optical depth of 5 and to 0.06 beyond.
     """
     ends, depth = (mi.Float(tau_a), mi.Float(tau_b)), 0.5 * (tau_a + tau_b)
     near, far = (float(w[0]) for w in segment("exponential", ends, mi.Float(1))[0])
@@ -67,7 +65,7 @@ def test_exponential_weights_are_the_integral(tau_a, tau_b):
 
 @pytest.mark.parametrize("quadrature", QUADRATURES)
 def test_constant_segment_far_and_near_opaque(quadrature):
-    """A constant source S in a constant medium adds S (1 - e^-tau)."""
+    """A constant source S in a constant medium adds S (1 - e^-tau), up to large optical depths."""
     sigma, source, length = mi.Float(3.0), mi.Float(0.7), mi.Float([0.0, 1e-4, 0.01, 1.0, 1e30])
     (near, far), passed = segment(quadrature, (sigma, sigma), length)
     added = near * source + far * source
@@ -80,7 +78,7 @@ def test_constant_segment_far_and_near_opaque(quadrature):
 
 
 class Analytic:
-    """A smooth field along x, in place of a grid's."""
+    """A smooth field along x that replaces a grid's."""
 
     channels, maximum, minimum = 1, 4.0, 0.0
 
@@ -95,7 +93,8 @@ class Analytic:
 def analytic_projection(quadrature: str, step: float) -> Projection:
     boundary = Boundary("box", np.diag([LENGTH / 2, 1, 1, 1.0]))
     medium = MediumGrid(ConstantField(np.array([4.0])), ConstantField(np.array([1.0])), boundary)
-    medium.sigma_t = Analytic(lambda x: 1.5 + dr.sin(3 * x))
+    sigma_t = Analytic(lambda x: 1.5 + dr.sin(3 * x))
+    medium = medium.replaced(sigma_t=sigma_t, macrocells=medium.macrocells)
     irradiance = Analytic(lambda x: 4 * dr.pi * (1 + 0.8 * dr.cos(2 * x + 0.5)))
     projection = Projection(medium, irradiance, quadrature, 1.0)
     projection.step = dr.opaque(mi.Float, step)
@@ -104,7 +103,7 @@ def analytic_projection(quadrature: str, step: float) -> Projection:
 
 @pytest.fixture(scope="module")
 def exact() -> float:
-    """The radiance of the analytic medium by an adaptive Runge-Kutta method, to 1e-10."""
+    """Return the radiance of the analytic medium by an adaptive Runge-Kutta method, to 1e-10."""
 
     def slope(t, state):
         x = t - LENGTH / 2
@@ -118,8 +117,9 @@ def exact() -> float:
     ("quadrature", "order"), [("riemann", 1), ("trapezoid", 2), ("exponential", 3)]
 )
 def test_order_of_convergence(exact, quadrature, order, monkeypatch):
-    """Jitter off: halving the step divides the error by 2^order, measured over 8 to 64 steps, all
-    of the same length.
+    """Without jitter, halving the step divides the error by 2^order.
+
+    This is measured over 8 to 64 steps of equal length.
     """
     monkeypatch.setattr(module, "COARSER", 0)
     monkeypatch.setattr(module, "COARSEST", 0)
@@ -134,8 +134,9 @@ def test_order_of_convergence(exact, quadrature, order, monkeypatch):
 
 @pytest.mark.parametrize("count", [16, 32, 64])
 def test_longer_steps_in_what_hardly_shows(exact, count):
-    """Twice and four times the step where less than a fifth of the light and less than 3 % is
-    still to come: as good as single steps would be everywhere, to 2e-4.
+    """Longer steps behind most of the opacity add an error of at most 2e-4.
+
+    Steps are twice and four times as long where less than a fifth, or 3 %, of the radiance remains.
     """
     value = march(analytic_projection("exponential", LENGTH / count), (-3, 0, 0), (1, 0, 0))[0][0]
     assert value == pytest.approx(exact, rel=2e-4 + 0.5 / count**2)
@@ -143,7 +144,7 @@ def test_longer_steps_in_what_hardly_shows(exact, count):
 
 @pytest.mark.parametrize("quadrature", ["trapezoid", "exponential"])
 def test_jitter_keeps_the_order(exact, quadrature):
-    """The mean over all offsets is as accurate as the unshifted lattice: of order 2 in the step."""
+    """The mean over all offsets has order 2 in the step, like the unshifted steps."""
     offsets = (np.arange(4096) + 1.0) / 4096
     errors = []
     for count in (8, 16, 32):
@@ -155,11 +156,11 @@ def test_jitter_keeps_the_order(exact, quadrature):
     assert errors[-1] < 2e-3 * exact
 
 
-# Empty space and early stop
+# Empty space and early termination
 
 
 def sparse_medium() -> tuple[MediumGrid, Grid]:
-    """Two blobs in an empty, turned grid of 24 x 20 x 28 voxels."""
+    """Return two blobs in an empty, rotated grid of 24 x 20 x 28 voxels."""
     density = np.zeros((24, 20, 28), np.float32)
     rng = np.random.default_rng(5)
     density[3:8, 4:9, 2:7] = rng.uniform(0, 3, (5, 5, 5))
@@ -179,9 +180,7 @@ def sparse_medium() -> tuple[MediumGrid, Grid]:
 
 
 def test_skipping_empty_macrocells_changes_nothing():
-    """The same lattice without skipping (every macrocell claimed to be occupied) gives the same
-    radiance.
-    """
+    """Skipping empty macrocells gives the radiance of the same march without skipping."""
     medium, grid = sparse_medium()
     phi = np.random.default_rng(6).uniform(1, 4, grid.voxel_count).astype(np.float32)
     irradiance = GridField(grid, mi.Float(phi), 1)
@@ -204,8 +203,8 @@ def test_skipping_empty_macrocells_changes_nothing():
     near, offset = dr.maximum(near, 0), mi.Float(rng.uniform(0.01, 1, count).astype(np.float32))
     results = []
     for cells in (medium.macrocells, occupied):
-        medium.macrocells = cells
-        projection = Projection(medium, irradiance, "exponential", 1.0)
+        divided = medium.replaced(macrocells=cells)
+        projection = Projection(divided, irradiance, "exponential", 1.0)
         radiance, passed, *_ = projection.march(ray, near, far, mi.Spectrum(1), offset, hit)
         results.append([np.array(v.x) for v in (radiance, passed)])
     assert results[0][0].max() > 0.1
@@ -213,7 +212,10 @@ def test_skipping_empty_macrocells_changes_nothing():
 
 
 def test_clearance_is_the_distance_to_matter():
-    """In macrocells, in the maximum norm, up to REACH: against all pairs of cells."""
+    """The clearance of macrocells is their distance to occupied ones, up to REACH.
+
+    The distance in the maximum norm is compared with a search over all pairs of cells.
+    """
     medium, _ = sparse_medium()
     cells = medium.macrocells
     place = np.argwhere(np.ones(cells.shape))
@@ -224,9 +226,9 @@ def test_clearance_is_the_distance_to_matter():
 
 
 def test_early_stop_with_a_bright_light_behind():
-    """T = 0.005 in front of a radiance of 1e5: 500 shine through, and nothing of them may be lost.
+    """A radiance of 1e5 behind T = 0.005 contributes 500, in spite of early termination.
 
-    Without a light behind, the march may stop, but within EARLY_STOP of the exact radiance.
+    Without a background, the march may terminate within EARLY_STOP of the exact radiance.
     """
     boundary = Boundary("box", np.eye(4))
     grid = Grid((1, 1, 64), np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]]))
@@ -245,7 +247,7 @@ def test_early_stop_with_a_bright_light_behind():
 @pytest.mark.parametrize("sigma", [0.0, 1e-38, 1e-12, 1e4, 1e30])
 @pytest.mark.parametrize("quadrature", QUADRATURES)
 def test_extreme_extinction_stays_finite(quadrature, sigma):
-    """Nothing, almost nothing, and a wall."""
+    """Radiance is finite for zero, tiny and huge extinction."""
     boundary = Boundary("box", np.eye(4))
     grid = Grid((1, 1, 8), np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]]))
     medium = MediumGrid(
@@ -264,7 +266,7 @@ def test_extreme_extinction_stays_finite(quadrature, sigma):
 )
 @pytest.mark.parametrize("where", [(0, 0, 0), (0.25, 0.5, 0.75), (0.999, 1, 0)])
 def test_rays_along_axes_faces_and_edges(direction, where):
-    """In a constant medium the optical depth is the length, whatever wall the ray lies in."""
+    """Rays along axes, in faces and through edges have the optical depth of their length."""
     boundary = Boundary("box", np.diag([2, 2, 2, 1.0]))
     frame = np.array([[4, 0, 0, -2], [0, 4, 0, -2], [0, 0, 4, -2], [0, 0, 0, 1.0]])
     grid = Grid((16, 16, 16), frame)

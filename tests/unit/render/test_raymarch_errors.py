@@ -1,4 +1,4 @@
-"""Errors of the cache, projected along rays: those of the light that is seen from each place."""
+"""Cache errors projected along rays, weighted by the radiance that each point contributes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 class Errors:
-    """Relative errors that rise along x, and that fall, in place of those of voxels."""
+    """Relative errors that rise or fall along x, in place of those of voxels."""
 
     count = 2
 
@@ -28,9 +28,11 @@ class Errors:
 
 @pytest.mark.parametrize("offset", [1.0, 0.5])
 @pytest.mark.parametrize("quadrature", ["trapezoid", "exponential"])
-def test_errors_weigh_as_the_light_of_their_place(quadrature, offset):
-    """int T sigma_s Phi / (4 pi) e dt, with few steps of even matter: within 1 %. Errors taken from
-    one end of a segment are off by several.
+def test_errors_are_weighted_by_radiance(quadrature, offset):
+    """Projected errors are int T sigma_s Phi / (4 pi) e dt within 1 %.
+
+    The medium is homogeneous and the steps are few; errors of one end of a segment would be off by
+    several %.
     """
     sigma, steps = 1.2, 12
     place = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]])

@@ -1,4 +1,4 @@
-"""Where the segments of a ray march begin and end, and what their ends count."""
+"""Ends of ray-marching segments: their positions and their weights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def rays(count: int, reach: float) -> mi.Ray3f:
-    """From a sphere around the origin to places near it."""
+    """Return rays from a sphere around the origin to points near it."""
     rng = np.random.default_rng(7)
     origin = rng.normal(size=(3, count))
     origin *= 4 / np.linalg.norm(origin, axis=0)
@@ -31,13 +31,13 @@ def rays(count: int, reach: float) -> mi.Ray3f:
 
 
 def box(place: np.ndarray) -> Boundary:
-    """The ``to_world`` of the unit cube of this placement."""
+    """Return the ``to_world`` of the unit cube of this placement."""
     unit = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
     return Boundary("box", place @ unit)
 
 
 def blobs(scenes) -> MediumGrid:
-    """Matter in two places of a grid that is empty elsewhere, longer along x than along z."""
+    """Return two blobs in an otherwise empty grid, longer along x than along z."""
     rng, density = np.random.default_rng(5), np.zeros((10, 14, 22), np.float32)
     density[2:6, 3:8, 2:7] = rng.uniform(0.5, 9, (4, 5, 5))
     density[5:9, 8:12, 14:21] = rng.uniform(0.5, 3, (4, 4, 7))
@@ -46,14 +46,16 @@ def blobs(scenes) -> MediumGrid:
     return MediumGrid(field, ConstantField(np.array([1.0])), box(place))
 
 
-# The ends of segments
+# Segment ends
 
 
 @pytest.mark.parametrize("quadrature", ["riemann", "exponential"])
 @pytest.mark.parametrize("elsewhere", [0.0, 0.3])
-def test_light_of_voxels_without_matter_does_not_count(scenes, quadrature, elsewhere):
-    """White matter in even light is as bright as it is opaque, 1 - T, whatever a cache holds at
-    voxels that no lookup in matter reads: nothing, as a rule.
+def test_empty_voxels_do_not_contribute(scenes, quadrature, elsewhere):
+    """Cache values at empty voxels do not contribute.
+
+    With albedo 1 in a constant radiance field, the image is the opacity 1 - T, although the cache
+    is usually zero at voxels that no lookup in the medium reads.
     """
     medium = blobs(scenes)
     grid = Grid((7, 9, 12), medium.boundary.frame)
@@ -69,7 +71,7 @@ def test_light_of_voxels_without_matter_does_not_count(scenes, quadrature, elsew
     radiance, passed, *_ = projection.march(ray, near, far, mi.Spectrum(0), offset, hit)
     opacity = 1 - np.array(passed.x)[np.array(hit)]
     assert 0.1 < opacity.mean() < 0.9
-    # Rays end early where less than a part in 10^4 can be added.
+    # Rays terminate when at most 1e-4 can be added.
     np.testing.assert_allclose(np.array(radiance.x)[np.array(hit)], opacity, atol=2e-4)
 
 
@@ -77,7 +79,7 @@ def test_light_of_voxels_without_matter_does_not_count(scenes, quadrature, elsew
 
 
 class Along:
-    """A smooth field of x, in place of a grid's."""
+    """A smooth field along x that replaces a grid's."""
 
     channels, grid, minimum = 1, None, 0.0
 
@@ -89,10 +91,11 @@ class Along:
 
 
 @pytest.mark.parametrize("offset", [1.0, 0.37])
-def test_waves_behind_what_hides_them(offset):
-    """Behind matter that leaves 1.5 % of the light, waves of 24 steps' length in extinction and
-    light: the radiance to 5e-4, where the waves as a whole add 1 %. Steps may be longer there, but
-    not longer than a wave.
+def test_long_steps_resolve_variation_behind_opaque_parts(offset):
+    """Longer steps behind an opaque part are still shorter than the variation of the medium.
+
+    Behind a transmittance of 1.5 %, extinction and irradiance are waves of 24 steps, which
+    contribute 1 %: the radiance is accurate to 5e-4.
     """
     steps, wave = 192, 2 * np.pi / (24 * 2.0 / 192)
 
@@ -117,7 +120,8 @@ def test_waves_behind_what_hides_them(offset):
         ConstantField(np.array([1.0])),
         Boundary("box", np.eye(4)),
     )
-    medium.sigma_t = Along(lambda x: extinction(x, dr), 12.0)
+    sigma_t = Along(lambda x: extinction(x, dr), 12.0)
+    medium = medium.replaced(sigma_t=sigma_t, macrocells=medium.macrocells)
     irradiance = Along(lambda x: 4 * dr.pi * light(x, dr), 4 * np.pi * 1.9)
     projection = Projection(medium, irradiance, "exponential", 1.0)
     projection.step = dr.opaque(mi.Float, 2.0 / steps)
@@ -127,11 +131,11 @@ def test_waves_behind_what_hides_them(offset):
     assert float(radiance.x[0]) == pytest.approx(exact.y[1, -1], rel=5e-4)
 
 
-# Where a medium emits
+# Emission
 
 
 def flame(scenes) -> Emission:
-    """A few voxels that emit, far from the border of a grid that is askew to all others."""
+    """Return a few emissive voxels inside of a grid that is rotated relative to all others."""
     values = np.zeros((20, 20, 24), np.float32)
     values[9:11, 9:11, 17:19] = 2.0
     place = scenes.placement((2.4, 2.0, 2.0), turn=-20, center=(0.3, 0.2, 0.1))
@@ -139,9 +143,7 @@ def flame(scenes) -> Emission:
 
 
 def test_emission_begins_and_ends_within_the_ray(scenes):
-    """The interval in which a ray may meet emission is part of the ray, and holds all places with
-    emission that are on the ray.
-    """
+    """The emission interval lies within the ray and contains all points with emission on it."""
     emission, ray = flame(scenes), rays(4096, 0.8)
     rng = np.random.default_rng(9)
     near = mi.Float(np.float32(rng.uniform(2, 5, 4096)))
@@ -161,8 +163,9 @@ def test_emission_begins_and_ends_within_the_ray(scenes):
 
 
 def test_macrocells_that_emission_reaches(scenes):
-    """Each cell of a medium that holds a place with emission is known to hold one, and most of the
-    others are known to be dark: in a grid with sides of different lengths.
+    """Each macrocell with emission is marked, and most others are not.
+
+    The grid has sides of different lengths.
     """
     medium, emission = blobs(scenes), flame(scenes)
     cells = Macrocells.build(medium.sigma_t, medium.boundary, 2)

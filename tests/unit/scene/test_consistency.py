@@ -1,4 +1,4 @@
-"""Shapes that contradict each other about which medium is where are refused, and no others."""
+"""Shapes that disagree about which medium is where are refused, and no others."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NULL, GLASS = {"type": "null"}, {"type": "dielectric"}
 
 
 def fog(extinction: float = 1.0) -> dict:
-    """A homogeneous medium; equal ones would be merged into one when the scene is loaded."""
+    """Return a homogeneous medium; Mitsuba would merge equal ones."""
     return {"type": "homogeneous", "sigma_t": extinction}
 
 
@@ -37,7 +37,7 @@ def load(**objects) -> mi.Scene:
 
 
 def refusal(scene: mi.Scene) -> str:
-    """The message that a scene is refused with; empty where it is not."""
+    """Return the message with which a scene is refused; empty if it is accepted."""
     try:
         check_media_agree(scene)
     except UnsupportedSceneError as error:
@@ -46,7 +46,7 @@ def refusal(scene: mi.Scene) -> str:
 
 
 class Body:
-    """A cube or a sphere at a random place; ``inside`` says which points it contains."""
+    """A cube or a sphere at a random position."""
 
     def __init__(self, rng: np.random.Generator, size: float, reach: float) -> None:
         self.kind = rng.choice(["cube", "sphere"])
@@ -61,12 +61,12 @@ class Body:
         return (points - self.place[:3, 3]) @ np.linalg.inv(self.place[:3, :3]).T
 
     def inside(self, points: np.ndarray, size: float = 1.0) -> np.ndarray:
-        """Whether points are in the body enlarged by this factor."""
+        """Return whether points are in the body enlarged by this factor."""
         order = np.inf if self.kind == "cube" else 2
         return np.linalg.norm(self.local(points), ord=order, axis=1) < size
 
     def points(self, rng: np.random.Generator, count: int = 20000) -> np.ndarray:
-        """Evenly in the body."""
+        """Return points evenly distributed in the body."""
         local = rng.uniform(-1, 1, (4 * count, 3))
         points = local @ self.place[:3, :3].T + self.place[:3, 3]
         return points[self.inside(points)][:count]
@@ -74,13 +74,14 @@ class Body:
 
 @pytest.mark.parametrize("seed", range(24))
 def test_random_pairs(seed):
-    """Pairs of bodies, whose true relation is known from their volumes: those apart are accepted,
-    those that overlap are refused with both media by name, and one within the other is accepted
-    if, and only if, it has the outer medium as its exterior.
+    """Random pairs of bodies are accepted or refused according to their overlap.
+
+    Disjoint ones are accepted; overlapping ones are refused with both media by name; one inside the
+    other is accepted if and only if its exterior is the outer medium.
     """
     rng = np.random.default_rng(seed)
     share = np.nan
-    while np.isnan(share):  # until the volumes tell how they lie
+    while np.isnan(share):  # until their relation is clear from the points
         a, b = Body(rng, 1.2, 0.0), Body(rng, [0.15, 0.5, 1.2][seed % 3], [0.4, 1.6][seed % 2])
         points = b.points(rng)
         least, share, most = (a.inside(points, size).mean() for size in (0.97, 1.0, 1.03))
@@ -102,7 +103,7 @@ def test_random_pairs(seed):
 
 
 def tin(bsdf: dict, **more) -> dict:
-    """A cylinder closed by two disks, which only together bound the medium "A"."""
+    """Return a cylinder and two disks, which only together bound the medium "A"."""
     lid = np.diag([1.0, -1.0, -1.0, 1.0])
     top, base, side = scaled((0, 0, 1)), scaled((0, 0, -1)) @ lid, np.diag([1.0, 1.0, 2.0, 1.0])
     side[2, 3] = -1
@@ -143,7 +144,7 @@ ACCEPTED = {
 
 
 @pytest.mark.parametrize("build", ACCEPTED.values(), ids=ACCEPTED)
-def test_sound_scenes_are_accepted(build):
+def test_consistent_scenes_are_accepted(build):
     check_media_agree(load(**build()))
 
 
@@ -191,7 +192,7 @@ REFUSED = {
 
 @pytest.mark.parametrize(("build", "message"), REFUSED.values(), ids=REFUSED)
 def test_contradictions_are_refused(build, message):
-    """With a remedy: to move, close, mirror or declare something."""
+    """Contradictions are refused with a remedy: to move, close, mirror or declare something."""
     with pytest.raises(UnsupportedSceneError, match=f"(?s){message}") as caught:
         check_media_agree(load(**build()))
     assert "volpath" in str(caught.value)

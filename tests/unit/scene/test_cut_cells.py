@@ -1,4 +1,4 @@
-"""Lookups beside surfaces, and where voxels are."""
+"""Lookups in cells that surfaces cut, and the classification of voxels."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.cut_cells import CutCells
-from mitsuba_irrcache.scene.voxel_classes import neighbourhood
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses, neighbourhood
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -24,7 +24,7 @@ def unit(rgb) -> Grid:
 
 
 def wall() -> mi.Scene:
-    """A plane through the unit cube, at ``DISTANCE`` along ``NORMAL``."""
+    """Return a plane through the unit cube, at ``DISTANCE`` along ``NORMAL``."""
     center = DISTANCE * NORMAL
     place = mi.ScalarTransform4f().look_at(list(center), list(center + NORMAL), [0, 0, 1])
     shape = {"type": "rectangle", "to_world": place.scale(3)}
@@ -32,14 +32,16 @@ def wall() -> mi.Scene:
 
 
 def points(count: int = 4096) -> tuple[mi.Point3f, np.ndarray]:
-    """Places in the unit cube, and their distances from the wall."""
+    """Return points in the unit cube and their distances from the wall."""
     p = np.random.default_rng(1).uniform(0.07, 0.93, (3, count)).astype(np.float32)
     return mi.Point3f(p), NORMAL @ p - DISTANCE
 
 
-def test_light_does_not_pass_a_wall(unit):
-    """1 on one side, 4 on the other: exactly that everywhere, but for what borders take from
-    beyond; without edges, lookups near the wall mix the two.
+def test_lookups_do_not_cross_a_wall(unit):
+    """Lookups beside a wall use values of their own side only.
+
+    The field is 1 on one side and 4 on the other; without cut cells, lookups near the wall would
+    mix them.
     """
     centers = np.array(unit.centers(dr.arange(mi.UInt32, unit.voxel_count)))
     roots = np.where(NORMAL @ centers > DISTANCE, 2.0, 1.0).astype(np.float32)
@@ -55,8 +57,8 @@ def test_light_does_not_pass_a_wall(unit):
     assert np.abs(np.array(plain) - expected)[inner].max() > 0.5
 
 
-def test_colours_and_uncut_cells(unit):
-    """Far from the wall nothing changes, to the bit, in any channel."""
+def test_uncut_cells_are_unchanged(unit):
+    """Lookups in uncut cells do not change by a bit, in any channel."""
     rng = np.random.default_rng(2)
     roots = rng.uniform(0.5, 1.5, unit.voxel_count * 3).astype(np.float32)
     field = RootField(unit, mi.Float(roots), 3)
@@ -74,8 +76,8 @@ def test_empty_space_has_no_edges(unit):
     assert CutCells(mi.load_dict({"type": "scene", "a": ball, "b": null}), unit).count == 0
 
 
-def test_neighbourhood():
-    """Means over valid neighbours, weighted by their distance squared."""
+def test_means_over_valid_neighbours():
+    """Means over valid neighbours are weighted by the squared distance."""
     rng = np.random.default_rng(3)
     values, valid = rng.uniform(0, 1, (4, 5, 6)).astype(np.float32), rng.random((4, 5, 6)) < 0.5
     grid = Grid((4, 5, 6), np.eye(4))
@@ -91,9 +93,9 @@ def test_neighbourhood():
     np.testing.assert_allclose(np.array(weights).reshape(4, 5, 6), expected[1], rtol=1e-5)
 
 
-def test_survey(scenes):
-    """Of a cube with a null sphere of another medium on one side, and an opaque ball on the
-    other.
+def test_voxels_are_classified(scenes):
+    """Voxels of a cube, in part another medium in a null sphere or an opaque ball, are
+    classified.
     """
     fog = scenes.medium(0.5, 0.9) | {"id": "fog"}
     inner = {
@@ -103,18 +105,19 @@ def test_survey(scenes):
     ball = {"type": "sphere", "center": [0.5, 0, 0], "radius": 0.4}
     outer = scenes.boundary({"type": "ref", "id": "fog"})
     scene = scenes.load({"type": "volpath"}, outer, fog=fog, inner=inner, ball=ball)
-    grids = {grid.name: grid for grid in bake_media(scene)}
+    description = compile_scene(scene)
+    grids = {grid.name: grid for grid in description.visible}
     assert len(grids) == 2
     medium = grids["fog"]
     grid = Grid.near_cubic(medium.frame, 16)
-    survey = medium.surroundings.survey(scene, grid, medium)
+    classes = VoxelClasses(scene, description.media, medium, grid)
     centers = np.array(grid.centers(dr.arange(mi.UInt32, grid.voxel_count)))
     in_sphere = np.linalg.norm(centers - [[-0.5], [0], [0]], axis=0) < 0.4
     in_ball = np.linalg.norm(centers - [[0.5], [0], [0]], axis=0) < 0.4
-    order = [g.name for g in medium.surroundings.media.grids]
+    order = [g.name for g in description.media.grids]
     expected = np.where(in_sphere, 2 - order.index("fog"), order.index("fog") + 1)
-    np.testing.assert_array_equal(np.array(survey.place), expected)
-    np.testing.assert_array_equal(np.array(survey.enclosed), in_ball)
+    np.testing.assert_array_equal(np.array(classes.medium_number), expected)
+    np.testing.assert_array_equal(np.array(classes.enclosed), in_ball)
     deep = np.linalg.norm(centers - [[-0.5], [0], [0]], axis=0) < 0.4 - 2 * 3**0.5 * 0.125
-    assert not np.array(survey.reach)[deep].any()
-    assert np.array(survey.reach)[~in_sphere].all()
+    assert not np.array(classes.readable)[deep].any()
+    assert np.array(classes.readable)[~in_sphere].all()

@@ -1,4 +1,4 @@
-"""What makes a cache stale, and what does not."""
+"""Which scene changes invalidate a cache, and which do not."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_scene
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.fingerprint import Snapshot, digests
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -42,8 +42,11 @@ EDITS = {
 
 
 @pytest.mark.parametrize("ending", EDITS)
-def test_edits_of_the_light_are_seen(scenes, ending):
-    """By name, and by nothing else than that name (and what Mitsuba derives from it)."""
+def test_edits_of_emitters_are_detected(scenes, ending):
+    """Each edit that affects the irradiance is reported by its parameter's name and no other.
+
+    Parameters that Mitsuba derives from it are excepted.
+    """
     scene = cloud_scene(scenes)
     before = Snapshot(scene)
     assert Snapshot(scene).changes(before) == []
@@ -56,7 +59,7 @@ def test_edits_of_the_light_are_seen(scenes, ending):
 @pytest.mark.parametrize(
     ("ending", "value"), [("sensor.x_fov", 12.0), ("sensor.film.size", [8, 8])]
 )
-def test_edits_of_the_camera_are_not(scenes, ending, value):
+def test_edits_of_the_camera_are_ignored(scenes, ending, value):
     scene = cloud_scene(scenes)
     before = Snapshot(scene)
     params, key = named(scene, ending)
@@ -72,11 +75,12 @@ def test_comparing_snapshots_runs_no_kernel(scenes, kernels):
 
 
 def digest(scene) -> dict[str, str]:
-    return digests(scene, bake_scene(scene))
+    media = compile_scene(scene).media
+    return digests(scene, media, media.grids[0])
 
 
 def test_digests_are_those_of_the_contents(scenes):
-    """Equal for the same scene loaded twice, whatever its integrator or sensor."""
+    """A scene loaded twice has equal fingerprints, whatever its integrator or sensor."""
     first = digest(cloud_scene(scenes))
     assert first == digest(cloud_scene(scenes))
     sensor = scenes.description({}, None, size=5)["sensor"] | {"fov": 10.0}
@@ -96,19 +100,19 @@ OTHERS = {
 
 
 @pytest.mark.parametrize(("change", "parts"), OTHERS.values(), ids=OTHERS)
-def test_digests_tell_media_apart(scenes, change, parts):
+def test_digests_distinguish_media(scenes, change, parts):
     a, b = digest(cloud_scene(scenes)), digest(cloud_scene(scenes, **change))
     assert {k for k in a if a[k] != b[k]} == parts
 
 
 @pytest.mark.parametrize("change", SUNS.values(), ids=SUNS)
-def test_digests_tell_emitters_apart(scenes, change):
+def test_digests_distinguish_emitters(scenes, change):
     a = digest(cloud_scene(scenes, emitter=scenes.sky, sun=scenes.sun))
     b = digest(cloud_scene(scenes, emitter=scenes.sky, sun=scenes.sun | change))
     assert {k for k in a if a[k] != b[k]} == {"emitters"}
 
 
-def test_digests_know_the_environment_map(scenes):
+def test_digests_include_the_environment_map(scenes):
     pixels = scenes.texture((4, 8, 3), 0, 1, 1)
     maps = [{"type": "envmap", "bitmap": mi.Bitmap(p)} for p in (pixels, pixels[::-1].copy())]
     turned = maps[0] | {"to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 90)}

@@ -1,6 +1,4 @@
-"""Whether a cache file belongs to a scene: every property of every plugin that can change the
-radiance changes a digest.
-"""
+"""Each property of each plugin that can change the radiance changes the scene's digest."""
 
 from __future__ import annotations
 
@@ -265,7 +263,9 @@ CASES = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two meshes with vertex normals and texture coordinates, in two formats."""
+    """Return a folder with two meshes with vertex normals and texture coordinates, in two
+    formats.
+    """
     path = tmp_path_factory.mktemp("meshes")
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
@@ -285,7 +285,7 @@ def called(value):
 
 
 def loaded(folder, group: str, plugin: str, changes: dict) -> mi.Scene:
-    """A scene of this plugin with its properties of before, but for the ``changes``."""
+    """Load a scene with this plugin, its initial properties and the ``changes``."""
     base, _ = GROUPS[group][plugin]
     properties = called(base) | {name: called(value) for name, value in changes.items()}
     if "filename" in properties:
@@ -301,7 +301,7 @@ def loaded(folder, group: str, plugin: str, changes: dict) -> mi.Scene:
 
 
 def digest(scene: mi.Scene) -> dict[str, str]:
-    """What needs no kernel."""
+    """Return the digest of the parts that need no kernel."""
     return {"emitters": digest_of_emitters(scene), "surfaces": digest_of_surfaces(scene)}
 
 
@@ -321,7 +321,7 @@ def test_the_same_scene_has_the_same_digests(folder, group):
         assert first == second, plugin
 
 
-def test_names_and_order_are_no_part_of_a_digest():
+def test_digests_ignore_names_and_order():
     objects = [
         {"type": "cube", "to_world": mi.ScalarTransform4f().translate([4, 0, 0])},
         {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": RED}},
@@ -354,8 +354,10 @@ LIT_BY_A_LAMP = {
     ids=["flipped", "two-sided", "another BSDF", "another radiance"],
 )
 def test_cache_files_of_other_scenes_are_refused(scenes, tmp_path_factory, change):
-    """A lamp that emits to the other side illuminates nothing: with the file of the first one its
-    image would be bright.
+    """The cache file of a scene is refused after its emitter was turned around.
+
+    Such an emitter does not illuminate the medium, so the image with the old file would be too
+    bright.
     """
     lamp = LIT_BY_A_LAMP | {"to_world": mi.ScalarTransform4f(LIT_BY_A_LAMP["to_world"])}
     file = tmp_path_factory.getbasetemp() / "lamp.cache"
@@ -365,7 +367,7 @@ def test_cache_files_of_other_scenes_are_refused(scenes, tmp_path_factory, chang
         first = scenes.load(settings, shape, emitter=lamp, default_solver="path")
         first.integrator().prepare(first)
     same = scenes.load(settings | {"cache_spp": 16}, shape, emitter=lamp, default_solver="path")
-    same.integrator().prepare(same)  # goes on with the file
+    same.integrator().prepare(same)  # continues the file
     assert same.integrator().cache.streams == {0: 16}
     other = scenes.load(settings, shape, emitter=lamp | change, default_solver="path")
     with pytest.raises(CacheFileError, match=r"surfaces|emitters"):
@@ -373,8 +375,11 @@ def test_cache_files_of_other_scenes_are_refused(scenes, tmp_path_factory, chang
 
 
 @pytest.mark.parametrize("position", [[0, 0, 4], [0, 3, 0]], ids=str)
-def test_cache_files_know_where_a_point_light_is(scenes, tmp_path, position):
-    """Points have an attribute ``matrix``, a swizzle that is zero wherever the point is."""
+def test_digests_include_the_position_of_a_point_light(scenes, tmp_path, position):
+    """The digest depends on the position of a point light.
+
+    Mitsuba's points have an attribute ``matrix``, a swizzle that is zero for all positions.
+    """
     file = tmp_path / "light.cache"
     settings = {"type": "irrcache", "resolution": 2, "cache_spp": 8, "cache_file": str(file)}
     shape = scenes.boundary(scenes.medium(1.0, 0.8))

@@ -27,8 +27,8 @@ def test_h_function(albedo):
     np.testing.assert_allclose(found, PUBLISHED[albedo], atol=6e-6)
 
 
-def test_h_of_albedo_1_conserves_energy():
-    """Half of the integral of H is 1: all that enters a white half-space leaves it."""
+def test_h_function_of_albedo_1_conserves_energy():
+    """Half of the integral of H is 1 for albedo 1: a white half-space reflects everything."""
     x, w = np.polynomial.legendre.leggauss(200)
     mu = (0.5 * (x + 1)) ** 2
     assert 0.5 * (0.5 * w * 2 * np.sqrt(mu) * chandrasekhar_h(1.0, mu)).sum() == pytest.approx(
@@ -57,7 +57,7 @@ SKY = {"type": "constant", "radiance": 1.0}
 
 @pytest.mark.parametrize("kind", ["sphere", "cube"])
 def test_white_furnace(scenes, kind):
-    """Albedo 1 under a sky of radiance 1: every pixel is 1."""
+    """With albedo 1 under a sky of radiance 1, every pixel is 1."""
     image = seen(opaque(scenes, kind, 1.0, {}, emitter=SKY), 64)
     assert image.mean() == pytest.approx(1, abs=0.003)
     assert np.sqrt(np.square(image - 1).mean()) < 0.012  # the noise of 64 samples per pixel
@@ -65,8 +65,9 @@ def test_white_furnace(scenes, kind):
 
 @pytest.mark.parametrize(("depth", "albedo"), [(-1, 0.8), (2, 0.8), (2, 0.3)])
 def test_radiance_of_a_face(scenes, depth, albedo):
-    """A cube face under an even sky: 1 - sqrt(1 - w) H(mu), or the integral of
-    w / 2 mu0 / (mu + mu0) for single scattering.
+    """The radiance of a cube face under a uniform sky has the closed form.
+
+    It is 1 - sqrt(1 - w) H(mu), or the integral of w / 2 mu0 / (mu + mu0) for single scattering.
     """
     look = mi.ScalarTransform4f().look_at([0.0, 0.0, -60.0], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 4, "height": 4, "component_format": "float32"}
@@ -82,8 +83,10 @@ def test_radiance_of_a_face(scenes, depth, albedo):
 
 @pytest.mark.parametrize("kind", ["sun", "point"])
 def test_single_scattering_is_exact(scenes, kind):
-    """Against quadrature along the rays of 16 x 16 places in each pixel, in double precision, for a
-    sphere of radius 1 and 400 mean free paths per unit.
+    """Single scattering of an opaque sphere agrees with quadrature in double precision.
+
+    The quadrature is along the rays of 16 x 16 points in each pixel; the sphere has a radius of 1
+    and 400 mean free paths per unit.
     """
     position = np.array([2.0, 2.5, -3.0])
     direction = -np.array(scenes.sun["direction"]) / np.linalg.norm(scenes.sun["direction"])
@@ -125,13 +128,13 @@ def test_three_orders_lie_between(scenes):
     assert np.diff(images).min() > 0.004
 
 
-def test_a_resolution_asks_for_a_cache(scenes):
+def test_explicit_resolution_selects_the_cache(scenes):
     scene = opaque(scenes, "sphere", 0.8, {"resolution": 16, "max_depth": 2}, size=4)
     mi.render(scene, spp=1)
     assert scene.integrator().cache is not None
 
 
-def test_a_sensor_inside_of_the_medium_gets_a_cache_or_an_error(scenes):
+def test_sensor_inside_the_medium_selects_the_cache_or_is_refused(scenes):
     scene = opaque(scenes, "sphere", 0.8, {"max_depth": 2}, size=4)
     inside = mi.load_dict(
         {
@@ -144,15 +147,17 @@ def test_a_sensor_inside_of_the_medium_gets_a_cache_or_an_error(scenes):
         scene.integrator().render(scene, inside, spp=1)
 
 
-def test_a_light_inside_of_the_medium_gets_a_cache(scenes):
+def test_emitter_inside_the_medium_selects_the_cache(scenes):
     light = {"type": "point", "position": [0.1, 0.2, 0.3], "intensity": 1.0}
     scene = opaque(scenes, "sphere", 0.8, {"max_depth": 2, "cache_spp": 1}, size=4, lamp=light)
     mi.render(scene, spp=1)
     assert scene.integrator().cache is not None
 
 
-def test_layers_and_progressive_images(scenes):
-    """Colour times illumination plus background is the image; no samples of a cache are awaited."""
+def test_aovs_and_progressive_images(scenes):
+    """Colour times illumination plus background is the image, and no cache samples are
+    requested.
+    """
     scene = opaque(
         scenes, "sphere", 0.8, {"aovs": "colour,illumination,background,noise"}, 8, emitter=SKY
     )

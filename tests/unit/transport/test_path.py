@@ -1,4 +1,4 @@
-"""Light transport among surfaces and media, where the answer is known."""
+"""Path tracing with surfaces and media, in cases with known results."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.path.estimator import contributions
 from mitsuba_irrcache.transport.path import power_heuristic, visibility
 
@@ -18,15 +18,17 @@ INFINITE = 0xFFFFFFFF
 
 
 def irradiance(scene, position, max_depth=INFINITE, count=COUNT) -> tuple[np.ndarray, ...]:
-    """Mean irradiance at a position in the first medium, uncollided and scattered, and the standard
-    error of their sum.
+    """Return the mean irradiance at a position in the first medium, and its standard error.
+
+    It is separated into uncollided and scattered; the error is that of their sum.
     """
-    medium = bake_media(scene)[0]
+    description = compile_scene(scene)
+    medium = description.visible[0]
     rng = mi.PCG32(count)
     spread = [rng.next_float32() for _ in range(4)]
     found = contributions(
         scene,
-        medium.surroundings.media,
+        description.media,
         mi.Point3f(position),
         medium.pointer,
         spread,
@@ -41,7 +43,7 @@ def irradiance(scene, position, max_depth=INFINITE, count=COUNT) -> tuple[np.nda
 
 
 def room(scenes, extinction, albedo, radiance=1.0, reflectance=0.0, radius=1.5) -> mi.Scene:
-    """A medium in a box in a closed room whose walls glow."""
+    """Return a medium in a box in a closed room with emissive walls."""
     walls = {
         "type": "sphere", "radius": radius, "flip_normals": True,
         "bsdf": {"type": "diffuse", "reflectance": reflectance},
@@ -53,15 +55,16 @@ def room(scenes, extinction, albedo, radiance=1.0, reflectance=0.0, radius=1.5) 
 
 @pytest.mark.parametrize("extinction", [0.0, 3.0, (0.9, 0.4, 0.1)])
 def test_furnace(scenes, extinction):
-    """Nothing absorbs: the radiance is that of the walls everywhere, in all directions."""
+    """Without absorption the radiance is that of the walls everywhere, in all directions."""
     straight, scattered, error = irradiance(room(scenes, extinction, 1.0), (0.2, -0.1, 0.3))
     assert (np.abs(straight + scattered - 4 * np.pi) < 4 * error + 1e-3).all()
     assert ((scattered > 0.1) == (np.array(extinction) > 0)).all()
 
 
-def test_walls_that_reflect(scenes):
-    """Without a medium to speak of each reflection is weaker by the reflectance: a geometric
-    series, which max_depth cuts off. Emission is order 0, of depth 1 at the voxel.
+def test_reflections_form_a_geometric_series(scenes):
+    """In a nearly empty medium, reflections between walls form a geometric series.
+
+    max_depth truncates it; emission is order 0, of depth 1 at the voxel.
     """
     scene = room(scenes, 0.0, 1.0, reflectance=0.5)
     for max_depth, total in ((2, 1.0), (3, 1.5), (4, 1.75), (INFINITE, 2.0)):
@@ -70,8 +73,8 @@ def test_walls_that_reflect(scenes):
         assert (np.abs(straight + scattered - 4 * np.pi * total) < 4 * error + 2e-3).all()
 
 
-def test_a_disc_overhead(scenes):
-    """Of solid angle 2 pi (1 - cos), sampled by both strategies."""
+def test_disk_emitter_above(scenes):
+    """A disk of solid angle 2 pi (1 - cos) is sampled correctly by both strategies."""
     place = mi.ScalarTransform4f().translate([0, 2, 0]).rotate([1, 0, 0], 90)
     disc = {"type": "disk", "to_world": place, "emitter": {"type": "area", "radiance": 3.0}}
     box = scenes.boundary(scenes.medium(0.0, 0.5))
@@ -82,7 +85,10 @@ def test_a_disc_overhead(scenes):
 
 
 def test_visibility(scenes):
-    """Through a medium, another beside it, and a veil of opacity 1/4; not through a wall."""
+    """Transmittance to an emitter includes two media and a null surface of opacity 1/4.
+
+    A wall blocks it.
+    """
     to_world = scenes.placement((1, 1, 1), center=(0, 0, 0))
     objects = {
         "next": scenes.boundary(scenes.medium(0.8, 0.5), scenes.placement(center=(3, 0, 0))),
@@ -94,10 +100,10 @@ def test_visibility(scenes):
     }  # fmt: skip
     shape = scenes.boundary(scenes.medium((0.2, 0.4, 0.6), 0.5), to_world)
     scene = scenes.load({"type": "volpath"}, shape, **objects)
-    medium = next(m for m in bake_media(scene) if m.sigma_t.channels == 3)
+    media = compile_scene(scene).media
+    medium = next(m for m in media.grids if m.sigma_t.channels == 3)
     vertex = dr.zeros(mi.Interaction3f, 2)
     target = mi.Point3f([9.0, 0.0], [0.0, 9.0], [0.0, 0.0])
-    media = medium.surroundings.media
     through, _ = visibility(
         scene, media, vertex, target, mi.MediumPtr(medium.pointer), mi.PCG32(2), mi.Bool(True)
     )
@@ -107,7 +113,7 @@ def test_visibility(scenes):
 
 
 def test_power_heuristic():
-    """Weights of two strategies add up to one; what cannot be sampled weighs nothing."""
+    """The weights of two strategies sum to one; a density of 0 has the weight 0."""
     a, b = mi.Float([1.0, 2.0, 0.0, 3.0]), mi.Float([3.0, 2.0, 1.0, 0.0])
     both = power_heuristic(a, b) + power_heuristic(b, a)
     np.testing.assert_allclose(np.array(both), 1)

@@ -20,8 +20,9 @@ COUNT = 1 << 18
 
 
 def column_medium(channels: int, density: float = 1.0) -> tuple[MediumGrid, np.ndarray]:
-    """Extinction that varies along x only, in [-1, 1]^3, with an empty part; and its values (24,
-    channel).
+    """Return a medium in [-1, 1]^3 that varies along x only, and its values (24, channel).
+
+    A part of it is empty.
     """
     values = (
         density
@@ -36,7 +37,9 @@ def column_medium(channels: int, density: float = 1.0) -> tuple[MediumGrid, np.n
 
 
 def optical_depth(values: np.ndarray, start: float, end: float) -> np.ndarray:
-    """int sigma_t dx along the axis from start to end, by a fine midpoint rule in float64."""
+    """Return int sigma_t dx along the axis from start to end, by a fine midpoint rule in
+    float64.
+    """
     x = start + (end - start) * (np.arange(200000) + 0.5) / 200000
     centers = -1 + (np.arange(24) + 0.5) / 12
     return np.stack([np.interp(x, centers, v).mean() * (end - start) for v in values.T])
@@ -51,8 +54,10 @@ def lanes(start: float):
 @pytest.mark.parametrize("density", [0.3, 1.5])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_transmittance_is_unbiased(channels, density):
-    """4 standard errors of 2^18 estimates, each below 0.4 % of T (here 0.08 to 0.8): 2 % wrong
-    fails for all, 1 % for most; and each estimate lies in [0, 1].
+    """Transmittance estimates are unbiased and lie in [0, 1].
+
+    The bound is 4 standard errors of 2^18 estimates, each below 0.4 % of T (here 0.08 to 0.8): an
+    error of 2 % fails for all, 1 % for most.
     """
     medium, values = column_medium(channels, density)
     ray, near, rng = lanes(-0.9)
@@ -67,8 +72,9 @@ def test_transmittance_is_unbiased(channels, density):
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_free_flights_have_the_density_of_the_medium(channels):
-    """Weighted collisions in each of 10 intervals against T sigma_t, and escapes against T, per
-    channel (4.5 errors).
+    """Collisions of free flights have the density T sigma_t, and escapes the probability T.
+
+    They are compared per channel in 10 intervals, within 4.5 errors.
     """
     medium, values = column_medium(channels)
     ray, near, rng = lanes(-1.0)
@@ -89,8 +95,8 @@ def test_free_flights_have_the_density_of_the_medium(channels):
 
 
 def test_coloured_weights_stay_bounded():
-    """Spectral tracking (Kutz et al.): the weights' sum never exceeds three times the largest
-    initial weight.
+    """The sum of spectral tracking weights (Kutz et al.) is at most three times the initial
+    maximum.
     """
     medium, _ = column_medium(3, 4.0)
     ray, near, rng = lanes(-1.0)
@@ -103,7 +109,7 @@ def test_coloured_weights_stay_bounded():
 
 
 def test_empty_medium():
-    """Majorant 0: nothing collides, nothing is lost, nothing is NaN."""
+    """With majorant 0 there are no collisions, no attenuation and no NaN."""
     field = GridField(Grid((5, 5, 5), CENTERED), dr.zeros(mi.Float, 125), 1)
     medium = MediumGrid(field, ConstantField(np.array([1.0])), Boundary("box", np.eye(4)))
     ray, near, rng = lanes(-1.0)
@@ -113,7 +119,7 @@ def test_empty_medium():
 
 
 def test_emitter_at_infinity_through_a_constant_medium():
-    """Nothing times an infinite distance is nothing."""
+    """Zero extinction times an infinite distance gives transmittance 1."""
     medium = MediumGrid(
         ConstantField(np.array([0.0, 1.0, 2.0])),
         ConstantField(np.array([1.0])),

@@ -1,4 +1,4 @@
-"""What passes between two places in one medium: matter behind the second is not in the way."""
+"""Transmittance between two points in one medium; the medium behind the second is ignored."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.transport.path import visibility
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -15,20 +15,22 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.mark.parametrize("varies", [False, True])
 def test_transmittance_between_two_places(scenes, varies):
-    """e^-tau of the way between them, in a box that goes on behind both; of a grid on average over
-    estimates, to 4 standard errors.
+    """The transmittance is e^-tau of the segment between the points.
+
+    The medium continues behind both; for a grid the mean of estimates agrees to 4 standard errors.
     """
     count, place = 1 << 14, scenes.placement()
     density = 1.5 * np.ones((4, 4, 8), np.float32)
-    density[..., 4:] = 0.5  # beyond x = 0, linear in between over a quarter
+    density[..., 4:] = 0.5  # for x > 0, linear in between over a quarter
     shape = scenes.boundary(scenes.medium(density if varies else 1.1, 0.5, place), place)
     beside = {"type": "sphere", "center": [0, 4, 0]}
     scene = scenes.load({"type": "volpath"}, shape, 2, beside=beside)
-    (medium,) = bake_media(scene)
+    media = compile_scene(scene).media
+    (medium,) = media.grids
     vertex = dr.zeros(mi.Interaction3f, count)
     vertex.p = mi.Point3f(-0.6, 0.1, 0.2)
     through, _ = visibility(
-        scene, medium.surroundings.media, vertex, mi.Point3f(0.5, 0.1, 0.2),
+        scene, media, vertex, mi.Point3f(0.5, 0.1, 0.2),
         mi.MediumPtr(medium.pointer), mi.PCG32(count), mi.Bool(True),
     )  # fmt: skip
     found = np.array(through.x + dr.zeros(mi.Float, count), np.float64)

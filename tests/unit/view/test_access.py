@@ -1,4 +1,4 @@
-"""Who may connect to the viewer, and that its thread wakes when a camera comes to rest."""
+"""Access control of the viewer, and waking of its thread when a camera comes to rest."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CAMERA = Camera((0.0, -5.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
 
 @pytest.fixture(params=["127.0.0.1", "0.0.0.0"])
 def served(request):
-    """A server of viser with what decides about its requests, and its port."""
+    """Return a viser server with access control, and its port."""
     access = Access(request.param)
     with guarded(access):
         server = viser.ViserServer(request.param, 8750, verbose=False)
@@ -41,7 +41,7 @@ def served(request):
 
 
 def page(port: int, path: str = "/", **headers: str) -> tuple[int, str]:
-    """Status and cookie of a page."""
+    """Return status and cookie of a page."""
     request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
     try:
         with urllib.request.urlopen(request, timeout=10) as response:
@@ -51,7 +51,7 @@ def page(port: int, path: str = "/", **headers: str) -> tuple[int, str]:
 
 
 def connects(port: int, path: str = "/", host: str = "", **headers: str) -> bool:
-    """Whether a window's connection is accepted."""
+    """Return whether a window's connection is accepted."""
     protocol = [f"viser-v{viser.__version__}"]
     try:
         with connect(
@@ -88,8 +88,8 @@ def test_a_token_is_needed_where_other_machines_can_connect(served):
         assert not connects(port, Cookie=forged)
 
 
-def test_names_that_another_site_may_have_given_to_this_machine_are_refused(served):
-    """DNS rebinding: the address is ours, the Host header the site's; the token does not help."""
+def test_rebound_host_names_are_refused(served):
+    """Host names that resolve to this machine (DNS rebinding) are refused, even with the token."""
     access, port = served
     for host in ("evil.example.org", "127.0.0.1.example.org", "localhost.example.org", "["):
         assert page(port, f"/{access.query()}", Host=f"{host}:{port}")[0] == 403
@@ -101,7 +101,7 @@ def test_names_that_another_site_may_have_given_to_this_machine_are_refused(serv
 
 
 def test_the_address_has_the_token(monkeypatch):
-    """As it is printed; a wildcard is no address."""
+    """The printed address contains the token; a wildcard is replaced by an address."""
     server = Server.__new__(Server)
     server.host, server.port, server._access = "0.0.0.0", 8080, Access("0.0.0.0")
     query = f"/?token={server._access.token}"
@@ -115,7 +115,9 @@ def test_the_address_has_the_token(monkeypatch):
     "host", ["", "no-such-host.invalid", "300.1.1.1", "192.0.2.7", "a\u0100" * 99]
 )
 def test_hosts_that_cannot_be_listened_on_are_refused(host):
-    """Viser itself would never return."""
+    """Hosts that cannot be listened on are refused, for which viser would search ports
+    endlessly.
+    """
     with pytest.raises(IrrcacheError, match="--host"):
         check_host(host)
     for good in ("127.0.0.1", "localhost", "0.0.0.0"):
@@ -123,7 +125,7 @@ def test_hosts_that_cannot_be_listened_on_are_refused(host):
 
 
 def test_messages_for_a_closed_window_are_no_warnings():
-    """A browser may go while its picture is sent."""
+    """Messages for a closed window cause no warnings; a browser may disconnect at any time."""
     loop = asyncio.new_event_loop()
     buffer = AsyncMessageBuffer(loop, persistent_messages=False)
     buffer.set_done()
@@ -131,7 +133,7 @@ def test_messages_for_a_closed_window_are_no_warnings():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         buffer.push(update)
-        assert len(caught) == 1  # what viser would print
+        assert len(caught) == 1  # viser's own log record
         ignore_closed_connections()
         buffer.push(update)
         warnings.warn("something else", UserWarning, stacklevel=1)
@@ -141,7 +143,7 @@ def test_messages_for_a_closed_window_are_no_warnings():
 
 @pytest.fixture
 def moving(monkeypatch):
-    """A session whose one camera moves, and the timeouts with which its thread waits."""
+    """Record the timeouts of the session's thread while one camera moves."""
     session, waited = Session(None, "llvm_ad_rgb"), []
     window = session.open(lambda picture: None)
     window.want(View(CAMERA, (40, 30)))
@@ -160,9 +162,10 @@ def moving(monkeypatch):
     return session, window, waited
 
 
-def test_a_camera_that_comes_to_rest_during_a_step_is_waited_for(moving, monkeypatch):
-    """The thread must not sleep without end where a camera comes to rest after it was seen to move:
-    the picture would stay as coarse as that of a moving camera.
+def test_thread_wakes_when_a_camera_comes_to_rest(moving, monkeypatch):
+    """The thread wakes when a camera comes to rest after it was last checked.
+
+    Otherwise the image would remain as coarse as that of a moving camera.
     """
     session, window, waited = moving
 
@@ -177,8 +180,10 @@ def test_a_camera_that_comes_to_rest_during_a_step_is_waited_for(moving, monkeyp
 
 
 @pytest.mark.parametrize("looks", range(1, 5))
-def test_a_camera_that_comes_to_rest_while_the_solver_waits(moving, monkeypatch, looks):
-    """The same between launches of the solver, after any number of looks at the camera."""
+def test_solver_pause_ends_when_a_camera_comes_to_rest(moving, monkeypatch, looks):
+    """The solver's wait ends when a camera comes to rest between launches, after any number of
+    checks.
+    """
     session, window, waited = moving
     session._shown, seen = object(), []
 

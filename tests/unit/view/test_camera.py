@@ -1,4 +1,4 @@
-"""Orbiting cameras: their rays are those of Mitsuba's sensors."""
+"""Rays of orbiting cameras equal those of Mitsuba's sensors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sensor(fov_axis: str = "x", up=(0, 0, 1), size=(48, 32)) -> mi.Sensor:
 @pytest.mark.parametrize("fov_axis", ["x", "y", "diagonal", "smaller"])
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0.3, 0.2, 1)])
 def test_rays_are_mitsubas(fov_axis, up):
-    """Directions everywhere in the picture, whatever the field of view is told along."""
+    """Ray directions agree in the whole image, for every field-of-view axis."""
     other = sensor(fov_axis, up)
     mine = camera_of(other, np.zeros(3))
     u = mi.Point2f([0.02, 0.5, 0.9], [0.1, 0.5, 0.95])
@@ -34,7 +34,7 @@ def test_rays_are_mitsubas(fov_axis, up):
     assert dr.all(dr.norm(dr.cross(expected.o - found.o, found.d)) < 1e-4)
 
 
-def test_it_orbits_about_the_point_of_its_sight_next_to_the_centre():
+def test_orbit_centre_is_on_the_optical_axis():
     camera = camera_of(sensor(), np.array([0.5, 0.2, -0.1]))
     np.testing.assert_allclose(camera.target, [0.5, 0.2, -0.1], atol=1e-5)
     assert camera.up == (0, 0, 1)
@@ -46,7 +46,7 @@ def test_a_camera_that_looks_straight_down_has_axes():
     np.testing.assert_allclose(axes[2], [0, 0, -1])
 
 
-def test_placement_is_undone():
+def test_placement_is_inverted():
     place = Placement(np.array([1.0, 2, 3]), 40.0)
     point = np.array([5.0, -6, 7])
     np.testing.assert_allclose(place.to_scene(place.to_browser(point)), point)
@@ -54,7 +54,7 @@ def test_placement_is_undone():
 
 
 def test_the_scenes_sensors_by_name(scenes):
-    """Those that a camera can stand for."""
+    """The scene's sensors that an orbiting camera can represent are listed by name."""
     film = {"type": "hdrfilm", "width": 1, "height": 1}
     meter = {"type": "distant", "film": film}
     second = {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0}

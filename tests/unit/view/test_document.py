@@ -1,4 +1,4 @@
-"""The scene as a document: what is edited, and what is saved, is what is rendered."""
+"""The scene document: the edited XML is what is rendered and saved."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def path(tmp_path, scenes) -> Path:
 
 
 def values(scene: mi.Scene) -> dict[str, np.ndarray]:
-    """All numbers of a scene, by the order of their objects."""
+    """Return all numbers of a scene, in the order of their objects."""
     params = mi.traverse(scene)
     plain = {k: getattr(v, "matrix", v) for k, v in params}
     return {
@@ -59,8 +59,10 @@ def values(scene: mi.Scene) -> dict[str, np.ndarray]:
     }
 
 
-def test_the_text_is_the_scene(path):
-    """Every number, transforms to the last bit, parameters filled in."""
+def test_document_equals_its_scene(path):
+    """A document equals its scene in every number, with transforms bit by bit and parameters
+    resolved.
+    """
     expected = values(mi.load_file(str(path), strength=5))
     found = values(scene_of_text(scene_text(path, {"strength": "5"}), path.parent))
     assert found.keys() == expected.keys()
@@ -68,8 +70,8 @@ def test_the_text_is_the_scene(path):
         np.testing.assert_array_equal(found[key], value, err_msg=key)
 
 
-def test_edits(path):
-    """Density, depth and light are factors of what the scene has, and can be taken back."""
+def test_scene_edits(path):
+    """Density, depth and illumination are relative to the scene, and can be restored."""
     document = Document.load(path, {}, "irrcache")
     assert document.settings.max_depth == 3
     assert document.lighting.sun == pytest.approx(2)
@@ -93,7 +95,7 @@ def test_edits(path):
     assert document.density == 1 and document.settings.max_depth == 3
 
 
-def test_a_sun_comes_and_goes(path):
+def test_sun_is_added_and_removed(path):
     document = Document.load(path, {}, "irrcache")
     count = len(document.scene().emitters())
     document.set_lighting(Lighting(sun=0))
@@ -111,9 +113,10 @@ SUNS = {
 
 @pytest.mark.parametrize("given", SUNS)
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, -1, 0), (0.3, 0.2, 1)])
-def test_the_sun_stays_where_it_is(path, given, up):
-    """Whatever axis is up, and however its direction is told, its angles are those it has; and it
-    rises towards the upward axis.
+def test_angles_of_the_sun_are_preserved(path, given, up):
+    """The angles of the scene's sun are right for every up axis and definition of its direction.
+
+    A larger elevation moves the sun towards the upward axis.
     """
     path.write_text(SCENE.replace(SUNS["direction"], SUNS[given]))
     document = Document.load(path, {}, "irrcache")
@@ -145,8 +148,11 @@ def test_impossible_values_are_refused(path, change):
         change(Document.load(path, {}, "irrcache"))
 
 
-def test_saved_scenes_load_from_elsewhere(path, tmp_path_factory):
-    """With the camera, and the files that they need: their own where they are, others with them."""
+def test_saved_scenes_load_from_another_folder(path, tmp_path_factory):
+    """Saved scenes load from another folder, with the camera and all files.
+
+    Existing files are referred to; the others are written beside the scene.
+    """
     document = Document.load(path, {}, "irrcache")
     document.set_density(2)
     folder = tmp_path_factory.mktemp("elsewhere")

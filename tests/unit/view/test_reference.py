@@ -1,4 +1,4 @@
-"""The reference beside a picture: it is what ``volpath`` renders of the scene that is saved."""
+"""The viewer's reference is what ``volpath`` renders of the saved scene."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def squares(image: np.ndarray) -> np.ndarray:
     ],
     indirect=["document"],
 )
-def test_it_is_volpaths_image_of_the_saved_scene(document, tmp_path, position):
-    """From outside and inside of the medium."""
+def test_reference_equals_volpath_of_the_saved_scene(document, tmp_path, position):
+    """The reference agrees with volpath for cameras outside and inside of the medium."""
     camera = Camera(position, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
     inside = position[1] > -1
     saved = tmp_path / "saved.xml"
@@ -83,8 +83,11 @@ def test_it_is_volpaths_image_of_the_saved_scene(document, tmp_path, position):
     assert np.abs(found.mean() / np.mean(several) - 1) < 0.02
 
 
-def test_errors_are_told_without_its_own_noise(document):
-    """Of an image that is off by a known amount, with few samples."""
+def test_reported_error_excludes_the_reference_noise(document):
+    """The reported error excludes the noise of the reference.
+
+    An image with a known error is compared with few samples.
+    """
     camera = Camera((0.5, -5.0, 1.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
     exact = reference_of(document, camera, 96).radiance()
     few = Reference(Light(document.scene(), document.settings, document.seeing), camera, SIZE)
@@ -98,9 +101,11 @@ def test_errors_are_told_without_its_own_noise(document):
     assert resolved < 0.5 * noise
 
 
-def test_it_is_beside_the_picture_until_something_changes(document):
-    """The same image on both sides, with its error; anew for another camera or scene, and while a
-    camera moves there is none.
+def test_reference_is_displayed_until_something_changes(document):
+    """The reference is displayed beside the image until camera or scene change.
+
+    The same image on both sides is reported with its error; while a camera moves there is no
+    reference.
     """
     session = Session(document)
     session.target_error = 0.02
@@ -116,7 +121,7 @@ def test_it_is_beside_the_picture_until_something_changes(document):
         assert np.corrcoef(left.ravel(), right.ravel())[0, 1] > 0.95
         count = len(screen.pictures)
         moving: list[Picture] = []
-        for degrees in range(1, 200):  # as a mouse would
+        for degrees in range(1, 200):  # like a mouse
             session.look(window, replace(view, camera=turned(front(session), degrees)))
             time.sleep(0.02)
             moving = [p for p in screen.pictures[count:] if p.moving]
@@ -136,8 +141,10 @@ def test_it_is_beside_the_picture_until_something_changes(document):
 
 
 @pytest.mark.parametrize("document", list(SCENES), indirect=True)
-def test_light_that_is_not_seen_any_more_is_freed(document, uncollected):
-    """With its medium, once there is other light, in a window that has compared it before."""
+def test_previous_caches_are_freed(document, uncollected):
+    """Previous caches are freed with their medium after an edit, also in windows with a
+    reference.
+    """
     session = Session(document)
     session.target_error = 0.05
     session.start()
@@ -163,14 +170,12 @@ def test_light_that_is_not_seen_any_more_is_freed(document, uncollected):
 
 @pytest.fixture
 def uncollected() -> Iterator[None]:
-    """Python does not look for cycles of references of its own accord, as in a large program it
-    hardly does.
-    """
+    """Disable garbage collection, which rarely runs in a large program."""
     gc.disable()
     yield
     gc.enable()
 
 
 def _samples(picture: Picture) -> int:
-    """Of the reference, as told."""
+    """Return the reported samples of the reference."""
     return int(picture.comparison.split()[1])

@@ -1,4 +1,4 @@
-"""The session: who is shown what, and when the solver may work. No browser is needed."""
+"""Viewer sessions without a browser: displayed images, and scheduling of the solver."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ def final(picture: Picture) -> bool:
 
 
 def test_a_window_at_rest_gets_the_image_that_render_gives(session, path, tmp_path):
-    """And files that reproduce it: the PNG is what was shown, the scene renders to it."""
+    """A window at rest displays the image of ``irrcache render``, and saves files that reproduce
+    it.
+    """
     screen = Screen()
     window = session.open(screen.show)
     view = View(turned(front(session), 40), SIZE)
@@ -73,7 +75,7 @@ def test_a_window_at_rest_gets_the_image_that_render_gives(session, path, tmp_pa
 
 
 def test_no_solver_works_while_a_camera_moves(session):
-    """By the session's own history, and the light is better afterwards."""
+    """While a camera moves no solver pass runs; afterwards the caches improve."""
     session.call(lambda: setattr(session, "target_error", 1e-6))
     screen = Screen()
     window = session.open(screen.show)
@@ -90,7 +92,7 @@ def test_no_solver_works_while_a_camera_moves(session):
     assert rest.pixels.shape == (*SIZE[::-1], 3)
     moving = [p for p in screen.pictures if p.moving]
     assert len(moving) > 5
-    # A pass that was at work when the mouse moved goes on when it rests: it is interrupted.
+    # A pass that was running when the mouse moved is interrupted, and continues when it rests.
     history = list(session.history)
     paused = [(a, b) for what, a, b in history if what == "interruption"]
     worked = [(a, b) for what, a, b in history if what == "solver" and b > began + 0.1]
@@ -102,8 +104,10 @@ def test_no_solver_works_while_a_camera_moves(session):
     assert session.status.samples > before
 
 
-def test_a_picture_at_rest_gives_way_to_a_camera_that_moves(session, monkeypatch):
-    """It is begun in bands, and left when the mouse moves again; in the end it is there."""
+def test_moving_camera_interrupts_an_image_at_rest(session, monkeypatch):
+    """An image at rest is rendered in bands and aborted when a camera moves; it is completed
+    later.
+    """
     monkeypatch.setattr(picture, "BAND", 64)
     traced: list[Camera] = []
     screen, original = Screen(), Samples._trace
@@ -154,10 +158,8 @@ def test_no_kernel_is_compiled_for_another_camera_or_size(session, kernels):
     assert used and all(k["cache_hit"] for k in used)
 
 
-def test_an_edit_shows_new_light_and_never_black(session):
-    """As bright as the scene with that density; every picture in between is as bright as one of
-    both.
-    """
+def test_edits_display_no_black_images(session):
+    """After an edit, every image is as bright as the old or the new scene."""
     screen = Screen()
     window = session.open(screen.show)
     session.look(window, View(front(session), SIZE))
@@ -171,8 +173,8 @@ def test_an_edit_shows_new_light_and_never_black(session):
     assert min(means) > low - 1 and max(means) < high + 1
 
 
-def test_light_that_is_put_out_is_out(path):
-    """There is nothing to improve then, but something to show."""
+def test_removed_emitters_give_a_black_image(path):
+    """Without emitters the session has nothing to refine, and displays a black image."""
     sky = '<emitter type="constant"> <rgb name="radiance" value="0.3, 0.4, 0.5"/> </emitter>'
     assert sky in SCENE
     path.write_text(SCENE.replace(sky, ""))
@@ -207,7 +209,7 @@ def test_a_refused_edit_changes_nothing(session):
 
 
 def test_windows_have_cameras_of_their_own(session):
-    """On one cache; closing one leaves the other."""
+    """Windows have independent cameras on one cache; closing one does not affect the other."""
     screens = Screen(), Screen()
     windows = [session.open(s.show) for s in screens]
     for k, window in enumerate(windows):
@@ -223,7 +225,7 @@ def test_windows_have_cameras_of_their_own(session):
 
 
 def test_a_closed_window_holds_nothing(session):
-    """Though it is held itself: its controls are in cycles of references."""
+    """A closed window releases its arrays, although its controls are part of reference cycles."""
     screen = Screen()
     window = session.open(screen.show)
     session.look(window, View(front(session), SIZE))
@@ -235,8 +237,8 @@ def test_a_closed_window_holds_nothing(session):
     assert samples() is None
 
 
-def test_all_that_can_be_shown(session):
-    """Every kind of picture has content, and differs from the others."""
+def test_all_kinds_of_images(session):
+    """Every kind of displayed image is nonempty and differs from the others."""
     screen = Screen()
     window = session.open(screen.show)
     found = []
@@ -250,12 +252,12 @@ def test_all_that_can_be_shown(session):
 
 
 @pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "", "a" * 100, "/etc/passwd", "a\n"])
-def test_names_that_lead_elsewhere_are_refused(session, tmp_path, name):
+def test_file_names_outside_the_folder_are_refused(session, tmp_path, name):
     with pytest.raises(IrrcacheError, match="no name"):
         keep(session, View(front(session), SIZE), tmp_path, name)
 
 
-def test_what_cannot_be_viewed_is_said(path, tmp_path):
+def test_unsupported_scenes_raise_errors(path, tmp_path):
     text = path.read_text().replace('<ref name="interior" id="cloud"/>', "")
     (tmp_path / "empty.xml").write_text(text)
     session = Session(Document.load(tmp_path / "empty.xml"))

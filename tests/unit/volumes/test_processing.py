@@ -1,4 +1,4 @@
-"""Crop, clip, resample and bake keep the place, the range and the mean of what they work on."""
+"""Crop, clip, resample and bake preserve positions, range and mean of the values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def noise(shape=(8, 9, 10)) -> np.ndarray:
 
 
 def linear_in_world(shape=(8, 9, 10)) -> VolumeData:
-    """The value at every voxel centre is an affine function of its world position."""
+    """Return a volume whose values are an affine function of the world position."""
     placed = volume(np.zeros(shape))
     z, y, x = np.indices(shape)
     index = np.stack([x, y, z, np.ones_like(x)], axis=-1)
@@ -33,7 +33,7 @@ def linear_in_world(shape=(8, 9, 10)) -> VolumeData:
     return volume((world @ (1.0, -2.0, 3.0, 7.0)).astype(np.float64))
 
 
-def test_crop_does_not_move_what_it_keeps():
+def test_crop_preserves_world_positions():
     whole = linear_in_world()
     part = processing.crop(whole, [(2, 7), (None, 4), (3, None)])
     assert part.size == (5, 4, 5)
@@ -65,8 +65,8 @@ def test_rescale():
 
 
 @pytest.mark.parametrize("size", [(5, 5, 4), (20, 27, 8), (7, 18, 3), (10, 9, 8)])
-def test_resampling_keeps_an_affine_function_in_place(size):
-    """Away from the border, where smoothing and clamping bend it."""
+def test_resampling_preserves_an_affine_function(size):
+    """Resampling preserves an affine function, except at the border, where it is clamped."""
     resampled = processing.resample(linear_in_world((24, 27, 30)), size)
     x, y, z = (n // 2 for n in size)
     world = resampled.index_to_world @ (x, y, z, 1)
@@ -86,7 +86,7 @@ def test_resampling_stays_in_range_and_in_its_box(size):
 
 
 def test_downsampling_is_antialiased():
-    """A checkerboard at the limit of resolution becomes grey, not a moire pattern."""
+    """A checkerboard at the limit of resolution becomes grey, without a moire pattern."""
     board = (np.indices((24, 24, 24)).sum(axis=0) % 2).astype(np.float32)
     assert processing.resample(VolumeData(board), (8, 8, 8)).values.std() < 0.02
 
@@ -107,7 +107,7 @@ def test_sizes_give_near_cubic_voxels():
             call(source, 0)
 
 
-def test_isolation_removes_the_table_and_keeps_the_lungs():
+def test_isolation_removes_the_table_and_preserves_the_lungs():
     chest = np.full((12, 40, 40), -1000, dtype=np.int16)
     chest[:, 5:25, 5:35] = 40
     chest[:, 10:20, 10:18] = -850
@@ -127,7 +127,7 @@ def test_flip_mirrors_in_place():
     np.testing.assert_array_equal(flipped.to_world, source.to_world)
 
 
-def test_supersampling_a_linear_mapping_keeps_its_mean():
+def test_supersampling_a_linear_mapping_preserves_its_mean():
     source = VolumeData(noise((6, 6, 6)))
     plain = processing.bake(source, DensityMapping(), source.size)[1]
     fine = processing.bake(source, DensityMapping(), source.size, supersample=4)[1]
@@ -135,7 +135,9 @@ def test_supersampling_a_linear_mapping_keeps_its_mean():
 
 
 def test_supersampling_converges_to_the_exact_average():
-    """A ramp crosses a step transfer function: each voxel's extinction is its share above it."""
+    """With a ramp and a step transfer function, a voxel's extinction is its share above the
+    step.
+    """
     ramp = np.broadcast_to(np.arange(0.0, 200.0, 15.0), (3, 3, 14)).copy()
     source = VolumeData(ramp)
     crossing = 100.0 / 15.0 + 0.5  # in voxels from the face, so voxel 7 lies above by 0.83
@@ -148,14 +150,14 @@ def test_supersampling_converges_to_the_exact_average():
 
 
 def test_averaged_albedo_is_weighted_by_extinction():
-    """Where only one side of a voxel is occupied, its albedo is that side's."""
+    """The albedo of a voxel of which only one side is occupied is that side's."""
     ramp = np.broadcast_to(np.arange(0.0, 200.0, 15.0), (3, 3, 14)).copy()
     albedo = processing.bake(VolumeData(ramp), STEP, (14, 3, 3), supersample=16)[2]
     assert (albedo <= 1).all()
     assert albedo[1, 1, 7, 0] > STEP.albedo(np.array([100.0]))[0, 0]
 
 
-def test_bake_returns_the_grid_it_is_for():
+def test_bake_returns_the_resampled_grid():
     source = volume(noise())
     for size in [source.size, (5, 5, 4), (20, 20, 20)]:
         resampled, sigma_t, albedo = processing.bake(source, DensityMapping(), size, 2)
@@ -166,8 +168,12 @@ def test_bake_returns_the_grid_it_is_for():
 
 
 @pytest.mark.parametrize("supersample", [1, 10**20])
-def test_more_voxels_than_memory_holds_are_refused(supersample):
-    """In bytes and with the remedy, before anything is made of them; of any number of digits."""
+def test_grids_larger_than_memory_are_refused(supersample):
+    """More voxels than fit in memory are refused before allocation, in bytes and with the
+    remedy.
+
+    Sizes of any number of digits are tested.
+    """
     volume = VolumeData(np.ones((4, 4, 4), np.float32), (1.0, 1.0, 1.0))
     size = (4, 4, 4) if supersample > 1 else (10**6, 10**6, 10**6)
     with pytest.raises(IrrcacheError, match=r"needs \d+\.\d GiB, and \d+\.\d GiB are free; ask"):
@@ -175,7 +181,7 @@ def test_more_voxels_than_memory_holds_are_refused(supersample):
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf, 5e-324])
-def test_voxels_of_no_size_are_refused(size):
+def test_invalid_voxel_sizes_are_refused(size):
     volume = VolumeData(np.ones((4, 4, 4), np.float32), (1.0, 1.0, 1.0))
     with pytest.raises(IrrcacheError, match="give a positive length"):
         processing.size_for_voxel(volume, size)

@@ -1,4 +1,4 @@
-"""Files come in whole, in the right order and place, or are refused with the reason."""
+"""Files are read completely, in the right order and position, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def write_image(path: Path, values: np.ndarray, compress: bool = False) -> Path:
 
 
 def write_dicom(folder: Path, positions, uid="1.2.826.0.1.9", tag="a", shear=0.0) -> None:
-    """Slices of the value 20 times their position, stored as (value + 1000) / 2.
+    """Write DICOM slices of the value 20 times their position, stored as (value + 1000) / 2.
 
     File names do not follow the positions.
     """
@@ -100,7 +100,7 @@ def test_impossible_placement_is_refused(changes):
 
 @pytest.mark.parametrize("name", ["a.nrrd", "a.nii", "a.nii.gz", "a.mha", "a.mhd"])
 @pytest.mark.parametrize("compress", [False, True])
-def test_image_keeps_values_and_placement(tmp_path, name, compress):
+def test_image_values_and_placement_are_read(tmp_path, name, compress):
     volume = read_volume(write_image(tmp_path / name, ramp(), compress))
     np.testing.assert_array_equal(volume.values, ramp())
     np.testing.assert_allclose(volume.spacing, SPACING, rtol=1e-6)
@@ -123,8 +123,10 @@ def test_dicom_is_sorted_by_position_and_rescaled(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["data", "about the file"])
-def test_dicom_that_promises_more_than_it_has(tmp_path, how):
-    """One wrong byte in a slice of a kilobyte took gigabytes; it is refused by name now."""
+def test_dicom_elements_beyond_the_end_are_refused(tmp_path, how):
+    """A DICOM slice of a kilobyte with one wrong byte, which would allocate gigabytes, is
+    refused.
+    """
     write_dicom(tmp_path / "ct", [0.0, 1.0, 2.0])
     file = tmp_path / "ct" / "a07.dcm"
     content = file.read_bytes()
@@ -143,15 +145,15 @@ def test_dicom_that_promises_more_than_it_has(tmp_path, how):
 
 
 @pytest.mark.parametrize("count", [0, -3, 11, 2147483648])
-def test_meta_images_of_impossible_dimensions(tmp_path, count):
-    """2^31 of them ended the process."""
+def test_meta_images_of_invalid_dimensions_are_refused(tmp_path, count):
+    """MetaImages of impossible dimensions are refused; 2^31 crashed the process."""
     file = write_image(tmp_path / "a.mha", ramp())
     file.write_bytes(file.read_bytes().replace(b"NDims = 3", b"NDims = %d" % count))
     with pytest.raises(IrrcacheError, match=rf"a\.mha says that it has {count} dimensions"):
         read_volume(file)
 
 
-def test_tilted_gantry_is_placed_as_it_was(tmp_path):
+def test_tilt_of_the_gantry_is_preserved(tmp_path):
     write_dicom(tmp_path / "ct", [0.0, 2.0, 4.0], shear=0.5)
     volume = read_volume(tmp_path / "ct")
     last = volume.index_to_world @ (0, 0, 2, 1)
@@ -291,7 +293,7 @@ def test_vol_is_placed_by_its_bounding_box(tmp_path):
         (lambda b: b[:-1], "truncated"),
         (lambda b: b[:20], "truncated"),
         (lambda b: b + b"0", "too long"),
-        (lambda b: b"VOX" + b[3:], "no Mitsuba volume"),
+        (lambda b: b"VOX" + b[3:], "not a Mitsuba volume"),
         (lambda b: b[:3] + b"\x04" + b[4:], "version 4"),
         (lambda b: b[:4] + struct.pack("<i", 2) + b[8:], "encoding 2"),
         (lambda b: b[:20] + struct.pack("<i", 2) + b[24:], "2 channels"),
@@ -319,7 +321,7 @@ def test_failed_write_leaves_the_old_file_alone(tmp_path):
     assert os.listdir(tmp_path) == ["a.vol"]
 
 
-# Damage
+# Damaged files
 
 
 @pytest.mark.parametrize("name", ["a.nrrd", "a.nii", "a.nii.gz", "a.mha"])
@@ -339,7 +341,7 @@ def test_missing_file_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
-def test_header_that_promises_too_much_is_refused_before_allocation(tmp_path, name):
+def test_header_of_a_too_large_image_is_refused_before_allocation(tmp_path, name):
     path = write_image(tmp_path / "a.nii", ramp())
     content = bytearray(path.read_bytes())
     content[42:48] = struct.pack("<hhh", 30000, 30000, 30000)
@@ -349,7 +351,7 @@ def test_header_that_promises_too_much_is_refused_before_allocation(tmp_path, na
         read_volume(tmp_path / name)
 
 
-def test_compressed_nrrd_that_promises_too_much_is_refused(tmp_path):
+def test_compressed_nrrd_of_a_too_large_image_is_refused(tmp_path):
     path = write_image(tmp_path / "a.nrrd", ramp(), compress=True)
     path.write_bytes(path.read_bytes().replace(b"sizes: 5 4 3", b"sizes: 50000 40000 30000"))
     with pytest.raises(IrrcacheError, match="promises"):
@@ -374,7 +376,7 @@ def test_nan_is_counted_and_located_or_replaced(tmp_path):
         (np.zeros((2, 3, 4, 5), np.int16), "frame"),
     ],
 )
-def test_what_is_no_volume_is_refused(tmp_path, values, message):
+def test_images_that_are_no_volumes_are_refused(tmp_path, values, message):
     image = SimpleITK.GetImageFromArray(values, isVector=False)
     SimpleITK.WriteImage(image, str(tmp_path / "a.nrrd"))
     with pytest.raises(IrrcacheError, match=message):
@@ -387,11 +389,11 @@ def test_unsupported_extension_is_named(tmp_path):
         read_volume(tmp_path / "a.png")
 
 
-# Data of others
+# Third-party data
 
 
 @pytest.mark.data
-def test_oblique_head_is_placed_as_its_affine_says():
+def test_oblique_head_is_placed_by_its_affine():
     """The NIfTI affine (RAS) with x and y negated (LPS) is ``index_to_world``."""
     path = data_folder() / "niivue_ct" / "CT_pitch.nii.gz"
     with gzip.open(path) as stream:
@@ -409,6 +411,6 @@ def test_unc_head_is_read_in_order():
     )
     assert volume.values.max() == 3272
     np.testing.assert_allclose(volume.values.mean(), 379.5, atol=0.1)
-    # Neighbouring slices look alike in the right order only.
+    # Neighbouring slices are similar in the right order only.
     flat = volume.values.reshape(113, -1).astype(float)
     assert np.abs(np.diff(flat, axis=0)).mean() < 100

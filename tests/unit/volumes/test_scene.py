@@ -1,4 +1,4 @@
-"""The imported folder: whole or absent, placed as the data say, and rendered by stock Mitsuba."""
+"""The imported folder is complete or absent, placed as the data, and rendered by stock Mitsuba."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ def variant():
 
 
 def blob(shape=(6, 8, 10)) -> VolumeData:
-    """A ball, less than the grid, in a turned and mirrored grid of anisotropic voxels."""
+    """Return a ball, smaller than the grid, in a rotated and mirrored grid of anisotropic
+    voxels.
+    """
     z, y, x = np.indices(shape)
     distance = np.sqrt((x - 5) ** 2 + (y - 4) ** 2 + (1.5 * (z - 3)) ** 2)
     values = np.where(distance < 3.5, 100.0, 0.0).astype(np.float32)
@@ -58,13 +60,13 @@ def test_stock_mitsuba_renders_the_scene(tmp_path):
     scene = mi.load_file(str(tmp_path / "out" / "scene.xml"), width=16, height=16)
     image = np.array(mi.render(scene, spp=32, seed=1))
     assert image.shape == (16, 16, 3) and np.isfinite(image).all()
-    # The ball takes light away in the middle; almost nothing does in the corners.
+    # The ball attenuates the middle of the image, and hardly the corners.
     assert image[7:9, 7:9].mean() < 0.9
     np.testing.assert_allclose(image[[0, 0, -1, -1], [0, -1, 0, -1]], 1.0, atol=0.05)
 
 
-def test_mirrored_grid_looks_the_same(tmp_path):
-    """Slices in the other order, with the axis turned round, are the same volume.
+def test_mirrored_grid_renders_the_same_image(tmp_path):
+    """Slices in reverse order with a mirrored axis are the same volume.
 
     Stock Mitsuba takes the outside of a mirrored cube for the medium.
     """
@@ -118,8 +120,8 @@ def test_settings_are_parameters(tmp_path):
 
 
 @pytest.mark.parametrize("up", ["z", "y"])
-def test_camera_frames_what_is_occupied(up):
-    """Everything is inside the field of view, and something comes near its edge."""
+def test_camera_frames_the_occupied_voxels(up):
+    """All nonempty voxels are inside the field of view, and some are near its edge."""
     volume = blob()
     origin, target, up_vector = camera(volume, volume.values, up)
     z, y, x = np.nonzero(volume.values)
@@ -161,10 +163,10 @@ def test_grey_albedo_has_one_channel(tmp_path, albedo, channels):
     assert read_vol(tmp_path / "out" / "albedo.vol")[0].shape == (6, 8, 10, channels)
 
 
-# Whole or absent
+# Atomic creation
 
 
-def test_earlier_result_is_kept_unless_overwritten(tmp_path):
+def test_earlier_result_is_replaced_only_with_overwrite(tmp_path):
     write(tmp_path / "out")
     before = (tmp_path / "out" / "sigma_t.vol").read_bytes()
     with pytest.raises(IrrcacheError, match="not empty"):
@@ -175,7 +177,7 @@ def test_earlier_result_is_kept_unless_overwritten(tmp_path):
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_files_of_others_are_never_replaced(tmp_path):
+def test_unrelated_files_are_never_replaced(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years of work")
     with pytest.raises(IrrcacheError, match=r"thesis.tex"):
@@ -184,7 +186,7 @@ def test_files_of_others_are_never_replaced(tmp_path):
     assert set(os.listdir(tmp_path / "out")) == FILES | {"thesis.tex"}
 
 
-def test_scene_file_beside_other_files(tmp_path):
+def test_scene_file_in_a_folder_with_other_files(tmp_path):
     (tmp_path / "ct.nrrd").write_text("data")
     write(tmp_path / "bone.xml")
     assert set(os.listdir(tmp_path)) == FILES - {"scene.xml"} | {"bone.xml", "ct.nrrd"}
@@ -292,7 +294,7 @@ def test_import_of_the_cloud(tmp_path):
     assert sigma_t.shape == (32, 40, 48, 1) and 11 < sigma_t.max() <= 12
     scene = mi.load_file(str(tmp_path / "out" / "scene.xml"), width=16, height=16)
     image = np.array(mi.render(scene, spp=32, seed=1))
-    # The cloud fills the middle and is framed: the corners show the sky.
+    # The cloud is in the middle; the corners show the sky.
     assert image[7:9, 7:9].mean() < 0.7
     np.testing.assert_allclose(image[[0, 0, -1, -1], [0, -1, 0, -1]], 1.0, atol=0.05)
 
@@ -322,7 +324,7 @@ def test_bad_requests_leave_nothing_behind(tmp_path, monkeypatch, arguments, mes
     assert os.listdir(tmp_path) == ["a.vol"]
 
 
-def test_values_that_are_no_hounsfield_units_are_mentioned(tmp_path, capsys):
+def test_values_that_are_not_hounsfield_units_cause_a_warning(tmp_path, capsys):
     write_vol(tmp_path / "a.vol", np.linspace(0, 3000, 27).reshape(3, 3, 3))
     importer.run(parse(tmp_path / "a.vol", "--preset", "ct-bone", "-o", tmp_path / "out"))
     assert "--rescale 1,-1000" in capsys.readouterr().err
@@ -341,7 +343,7 @@ def test_values_that_are_no_hounsfield_units_are_mentioned(tmp_path, capsys):
         ["--density", "--isolate", "nan"],
     ],
 )
-def test_malformed_arguments_end_in_usage(arguments, capsys):
+def test_malformed_arguments_print_the_usage(arguments, capsys):
     with pytest.raises(SystemExit):
         parse("a.vol", "-o", "out", *arguments)
     assert "usage" in capsys.readouterr().err

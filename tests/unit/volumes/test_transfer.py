@@ -1,4 +1,4 @@
-"""Transfer functions: what they map to, and which documents are refused, by index."""
+"""Transfer functions: their mapping, and refusal of invalid documents with the index."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def parse(**changes) -> TransferFunction:
     return parse_transfer_function(json.dumps(document(**changes)))
 
 
-def test_opacity_is_what_is_lost_over_the_stated_length():
+def test_opacity_refers_to_the_stated_length():
     sigma_t = parse().sigma_t(np.array([-5.0, 0.0, 50.0, 100.0, 1e6]))
     lost = 1 - np.exp(-sigma_t * 2.0)
     np.testing.assert_allclose(lost, [0, 0, 0.4, 0.8, 0.8], atol=1e-6)
@@ -63,7 +63,7 @@ def test_values_too_far_apart_for_a_table():
 
 @given(scale=st.floats(1e-3, 1e3), shift=st.floats(-1e3, 1e3), seed=st.integers(0, 2**16))
 @settings(max_examples=25, deadline=None)
-def test_percentile_functions_do_not_care_about_units(scale, shift, seed):
+def test_percentile_functions_are_independent_of_units(scale, shift, seed):
     function = parse(
         value_range="percentile",
         percentiles=[2, 98],
@@ -110,7 +110,7 @@ def test_percentiles_that_coincide_are_refused():
         ({"percentiles": [1, 99]}, "needs"),
     ],
 )
-def test_what_is_no_transfer_function_is_refused(changes, message):
+def test_invalid_transfer_functions_are_refused(changes, message):
     with pytest.raises(IrrcacheError, match=message):
         parse(**changes)
 
@@ -123,7 +123,7 @@ def test_missing_key_is_named():
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{not json", "3"])
-def test_no_json_object(text):
+def test_other_json_values_are_refused(text):
     with pytest.raises(IrrcacheError, match=r"JSON|object"):
         parse_transfer_function(text)
 
@@ -146,7 +146,7 @@ def test_presets_are_usable_and_survive_a_round_trip(name, tmp_path):
     np.testing.assert_array_equal(loaded.sigma_t(values), preset.sigma_t(values))
     np.testing.assert_array_equal(loaded.albedo(values), preset.albedo(values))
     assert (loaded.unit, loaded.percentiles) == (preset.unit, preset.percentiles)
-    # Air is empty, and the mean free path stays above 1 mm: caches have voxels of 2 to 4 mm.
+    # Air is empty, and the mean free path is above 1 mm: caches have voxels of 2 to 4 mm.
     assert preset.sigma_t(np.array([-1000.0]))[0] == 0
     assert preset.sigma_t(values).max() < 1.0
 
@@ -158,7 +158,7 @@ def test_bone_preset_shows_bone_only():
     assert air == lung == fat == muscle == 0 and bone > 0.3
 
 
-def test_unknown_preset_lists_the_known():
+def test_unknown_preset_lists_the_presets():
     with pytest.raises(IrrcacheError, match="ct-bone, ct-chest"):
         load_preset("ct-bones")
 
@@ -177,6 +177,6 @@ def test_negative_density_is_refused():
 
 
 @pytest.mark.parametrize("arguments", [(-1.0,), (math.inf,), (1.0, (0.5, 0.5, 1.2))])
-def test_impossible_density_mapping(arguments):
+def test_invalid_density_mapping(arguments):
     with pytest.raises(IrrcacheError, match=r"scale|albedo"):
         DensityMapping(*arguments)

@@ -1,4 +1,4 @@
-"""Where light comes from: every set of directions integrates what it should, and all are fair."""
+"""Angular quadrature: direction sets integrate low orders exactly and are unbiased."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 @pytest.mark.parametrize("count", [8, 16, 33])
 def test_moments(count):
-    """Unit vectors whose weights, all positive, integrate 1 and every product of two coordinates
-    over the hemisphere pairs: 2 pi, 2 pi / 3 and 0. Equal weights miss the latter by up to 20 %,
-    and light inside dense matter would depend on the turn.
+    """Weights are positive and integrate 1 and all products of two coordinates exactly.
+
+    Over the hemisphere of pairs the integrals are 2 pi, 2 pi / 3 and 0. Equal weights would miss
+    the latter by up to 20 %, and the fluence in dense media would depend on the rotation.
     """
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -30,24 +31,27 @@ def test_moments(count):
 
 
 def test_every_direction_is_uniform():
-    """Each of 8 over 3000 turns: means, second and fourth moments to 4.5 standard errors. A turn
-    that favours an axis, as a QR factor whose signs are not drawn, biases each batch alike.
+    """Each of 8 directions is uniform over 3000 random rotations.
+
+    Means, second and fourth moments agree to 4.5 standard errors. A rotation that favours an axis,
+    as a QR factor without random signs does, would bias all batches alike.
     """
     rng = np.random.default_rng(2)
     d = np.array([hemisphere_ordinates(8, rng)[0] for _ in range(3000)])
     for values, mean in ((d, 0), (d**2, 1 / 3), (d * np.roll(d, 1, axis=2), 0), (d**4, 1 / 5)):
         error = values.std(axis=0) / np.sqrt(len(d))
         assert (np.abs(values.mean(axis=0) - mean) < 4.5 * error).all()
-    # The set is turned as a whole, so the angle between two of it never changes.
+    # The set is rotated as a whole, so the angles within it are constant.
     between = (d[:, 0] * d[:, 5]).sum(axis=1)
     np.testing.assert_allclose(between, between[0], atol=1e-12)
 
 
 @pytest.mark.parametrize(("sets", "count"), [(2, 8), (4, 8), (16, 8), (4, 32)])
-def test_sets_are_even_together(sets, count):
-    """Each has the moments of one alone; all of them together integrate (d . e)^6 and (d . e)^8
-    over directions d, for 50 unit vectors e, with less than two thirds of the error, by root mean
-    square, that as many independent sets leave.
+def test_sets_of_several_passes_are_stratified(sets, count):
+    """Sets of several passes together have a smaller quadrature error than independent sets.
+
+    Each set has exact low moments; together they integrate (d . e)^6 and (d . e)^8 over directions
+    d, for 50 unit vectors e, with less than two thirds of the root mean square error.
     """
     rng, errors = np.random.default_rng(5), {"together": [], "apart": []}
     for _ in range(20):
@@ -70,7 +74,7 @@ def test_sets_are_even_together(sets, count):
 
 
 def lights(scenes, batches: int, **emitters) -> list[list[tuple]]:
-    """The rows of passes of 8 pairs, under these emitters."""
+    """Return the ordinates of passes of 8 pairs, under these emitters."""
     sky = DistantIllumination(
         scenes.load({"type": "irrcache", "solver": "path"}, None, size=2, **emitters)
     )
@@ -79,9 +83,10 @@ def lights(scenes, batches: int, **emitters) -> list[list[tuple]]:
     return rows
 
 
-def test_a_constant_sky_and_a_sun_have_no_noise(scenes):
-    """All directions together carry 4 pi and the sun's irradiance in every pass, the sun's on one
-    way only.
+def test_constant_environment_and_sun_have_no_noise(scenes):
+    """A constant environment and a sun are integrated exactly in every pass.
+
+    The weights sum to 4 pi; the sun's irradiance is in one direction.
     """
     sun = {"type": "directional", "direction": [1, -2, 2], "irradiance": 3.0}
     for directions, light, weights, offsets in lights(
@@ -96,9 +101,11 @@ def test_a_constant_sky_and_a_sun_have_no_noise(scenes):
 
 @pytest.mark.parametrize("bright", [0.0, 300.0])
 def test_an_environment_is_sampled_without_bias(scenes, bright):
-    """Irradiance and net flux of a sky with a small bright patch, on average over 64 x 4 passes,
-    against sums over its directions: 4 standard errors, each below 3 %. A density that counts
-    one of the ways to draw a direction, or not its opposite's, is off by a third.
+    """Irradiance and net flux of an environment with a small bright patch are unbiased.
+
+    The means over 64 x 4 passes agree with sums over its directions: 4 standard errors, each below
+    3 %. A density that counts one of the sampling strategies, or not that of the opposite
+    direction, is off by a third.
     """
     image = np.full((16, 32, 3), 0.2, np.float32)
     image[3:8] = 0.7

@@ -1,4 +1,4 @@
-"""Light that arrives along lines: which line gets which."""
+"""Boundary radiance of tracks: which track gets which value."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.discrete_ordinates import boundary_condition
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import (
     IncomingRadiance,
@@ -24,13 +24,13 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 
 
 class Nothing:
-    """What is around a medium where that does not matter."""
+    """Surroundings of a medium, not used here."""
 
     has_sources, angular_basis = False, None
 
 
 def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, offset) -> np.ndarray:
-    """What the lines of direction ``i`` bring to the voxels of ``lattice``, through nothing."""
+    """Return the radiance at voxels of tracks in direction ``i`` without extinction."""
     dark, rows = np.zeros((1, 2)), np.array([i])
 
     def entering(table):
@@ -42,7 +42,7 @@ def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, of
 
 @pytest.fixture
 def alone(monkeypatch):
-    """Arrivals without anything to be followed."""
+    """Return incoming radiance without surfaces."""
     monkeypatch.setattr(
         boundary_condition, "_trace_cells", lambda *args: (None, None, None, mi.UInt32(0), None)
     )
@@ -51,10 +51,12 @@ def alone(monkeypatch):
 @pytest.mark.parametrize("way", [0, 1])
 @pytest.mark.parametrize("cells", [1 << 14, 30], ids=["lines", "blocks"])
 @pytest.mark.parametrize("coarse", [False, True])
-def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way, cells, coarse):
-    """A quantity that is constant along lines, told at the points of entry, is found at all voxels
-    of the box as it is there: in a turned, stretched grid, on a coarser one, and if some lines
-    share a cell, within its size.
+def test_tracks_carry_the_radiance_of_their_entry(scenes, monkeypatch, alone, way, cells, coarse):
+    """Radiance at a track's entry reaches all voxels on it.
+
+    A quantity that is constant along tracks is given at the entry points and compared at the
+    voxels: in a rotated, stretched grid, on a coarser grid, and, if several tracks share a boundary
+    cell, within its size.
     """
     monkeypatch.setattr(boundary_condition, "PATH_CELLS", cells)
     place = scenes.placement((1.0, 3.0, 2.0), turn=35, mirror=True)
@@ -88,20 +90,22 @@ def test_lines_bring_what_arrives_at_their_entry(scenes, monkeypatch, alone, way
         share = 1 if cells > 30 else found._edge.max()
         error = np.abs(brought - (centres @ across + 10))
         assert error.max() < 0.9 * edge * share
-        # Lines are not at centres, but on all sides of them.
+        # Tracks pass on all sides of the centres.
         assert abs((brought - (centres @ across + 10)).mean()) < 0.5 * edge * share
 
 
-def test_what_returns_is_linear_in_phi(scenes):
-    """White walls all around a medium in the dark: nothing is emitted, and what returns is what
-    left, so that with phi everywhere 4 pi no more than radiance 1 arrives, and that along lines
-    which meet the medium again; the places are voxels of it.
+def test_reflected_radiance_is_linear_in_phi(scenes):
+    """Radiance reflected by surfaces is linear in phi.
+
+    With white walls around a medium and no emitters, the incoming radiance is what left the medium:
+    with phi = 4 pi everywhere it is at most 1, and 1 along tracks that intersect the medium again;
+    the points are voxels of it.
     """
     wall = {"type": "sphere", "radius": 4.0, "flip_normals": True}
     wall["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
     shape = scenes.boundary(scenes.medium(40.0, 1.0))
     scene = scenes.load({"type": "irrcache", "solver": "path"}, shape, 4, emitter=None, wall=wall)
-    (medium,) = bake_media(scene)
+    (medium,) = compile_scene(scene).visible
     grid = Grid((8, 8, 8), medium.frame)
     lattice = Tracks(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)
     offsets = np.random.default_rng(1).random((len(DIRECTIONS), 2))

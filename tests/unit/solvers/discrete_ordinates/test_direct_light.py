@@ -1,4 +1,4 @@
-"""Light of small lamps that are sampled from each voxel: of all of them, however many."""
+"""Direct illumination by area emitters that are sampled from each voxel."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.scene.compile import bake_media
+from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
     EmitterSampling,
     is_area_emitter,
@@ -17,9 +17,11 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 20])
-def test_lamps_add_up(scenes, count):
-    """Balls of all kinds of brightness around clear air: 2 pi (1 - cos) times the radiance of each,
-    on average over 4096 estimates, to 4 standard errors, these below 2 %.
+def test_sampled_emitters_add_up(scenes, count):
+    """Many emitters sampled one at a time give the sum of all.
+
+    Emissive spheres of different radiance, without extinction: 2 pi (1 - cos) times the radiance of
+    each, on average over 4096 estimates, to 4 standard errors, these below 2 %.
     """
     rng, objects, expected = np.random.default_rng(5), {}, 0.0
     for i in range(count):
@@ -34,7 +36,7 @@ def test_lamps_add_up(scenes, count):
     scene = scenes.load(
         {"type": "irrcache", "solver": "path"}, shape, 2, emitter=None, sun=None, **objects
     )
-    (medium,) = bake_media(scene)
+    (medium,) = compile_scene(scene).visible
     small = [e for e in scene.emitters() if is_area_emitter(e)]
     assert len(small) == count
     centre = mi.Point3f(dr.zeros(mi.Float, 4096), 0, 0)

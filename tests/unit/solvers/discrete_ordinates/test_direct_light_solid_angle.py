@@ -1,4 +1,4 @@
-"""Which lamps are small as seen from a medium: by the solid angle that they fill."""
+"""Classification of small emitters by their solid angle as seen from a medium."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def seen(lamp: dict, scale: float) -> tuple[float, list, list]:
-    """The solid angle of a lamp from a small box about the origin, and whether it is small, or
-    large; all lengths times ``scale``.
+    """Return an emitter's solid angle from a small box at the origin, and whether it is small or
+    large.
+
+    All lengths are multiplied by ``scale``.
     """
     place = lamp.pop("to_world")
     to_world = mi.ScalarTransform4f().scale(scale) @ place
@@ -33,7 +35,7 @@ def seen(lamp: dict, scale: float) -> tuple[float, list, list]:
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("distance", [0.7, 1.5, 4.0])
 def test_solid_angle_of_a_disc(distance, scale):
-    """2 pi (1 - cos) of a disc of radius 1, whatever the unit of length."""
+    """The solid angle of a disk of radius 1 is 2 pi (1 - cos), whatever the unit of length."""
     place = mi.ScalarTransform4f().translate([0, 0, distance])
     angle, small, large = seen({"type": "disk", "to_world": place}, scale)
     expected = 2 * np.pi * (1 - distance / np.hypot(distance, 1))

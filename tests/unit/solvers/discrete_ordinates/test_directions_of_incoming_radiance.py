@@ -1,4 +1,4 @@
-"""The direction of light that lines carry: each way, against the axis too."""
+"""Angular moments of the radiance along tracks have the right direction and sign."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 SHAPE = (5, 7, 5)
 MIDDLE = (2, 3, 2)
-#: Two of each octant, of all dominant axes.
+#: Two per octant, with all dominant axes.
 WAYS = np.array(
     [
         s * np.roll([0.8, 0.5, 0.3], k)
@@ -41,16 +41,17 @@ def lines(extinction: float) -> Tracks:
 
 
 def harmonics(moments: Moments, towards: np.ndarray) -> np.ndarray:
-    """What light from there adds to each moment."""
+    """Return the contribution of radiance from a direction to each moment."""
     basis = moments.basis(mi.Vector3f(*towards.tolist()))
     return np.array([np.array(y).ravel()[0] for y in basis], np.float64)
 
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda w: ",".join(f"{x:.1f}" for x in w))
 @pytest.mark.parametrize("back", [False, True])
-def test_moments_of_light_through_nothing(way, back):
-    """Light that goes along a direction comes from its opposite, whichever of both is named first
-    and whatever the sign of its largest component.
+def test_moments_without_extinction(way, back):
+    """Moments refer to the direction from which radiance comes, opposite to that of propagation.
+
+    This holds for either direction of a pair and any sign of its largest component.
     """
     moments, light = moments_of(0.5), np.array([[0.0, 2.0]] if back else [[2.0, 0.0]])
     found = moments.sweep_uncollided(lines(0.0), way[None], light, np.array([[0.3, 0.6]]))
@@ -60,8 +61,9 @@ def test_moments_of_light_through_nothing(way, back):
 
 
 def centred(level: AnisotropicMultigridLevel, ways: np.ndarray) -> np.ndarray:
-    """Offsets with which the lines of these directions go through the middle of the middle voxel:
-    the set of all lines is symmetric about it.
+    """Return offsets for which tracks pass through the centre of the central voxel.
+
+    The set of all tracks is then symmetric about it.
     """
     velocities = ways @ level.grid.coordinates.matrix[:3, :3].T
     offsets = []
@@ -73,10 +75,11 @@ def centred(level: AnisotropicMultigridLevel, ways: np.ndarray) -> np.ndarray:
     return np.array(offsets)
 
 
-def test_light_that_a_voxel_scatters_goes_on_forward():
-    """One voxel, illuminated along an oblique direction, scatters forwards with g = 0.5 along all
-    lines: what voxels receive is mirrored about it if the light comes from the
-    opposite side, and the voxels ahead receive 4 pi p of the angle, those behind likewise.
+def test_scattering_voxel_radiates_forward():
+    """A voxel with g = 0.5, irradiated from one direction, scatters forward along all tracks.
+
+    Reversing the irradiation mirrors the result; the voxels ahead receive 4 pi p of the angle, and
+    so do those behind.
     """
     moments, of_matter = moments_of(0.5), lines(0.2)
     fields = (
@@ -98,7 +101,7 @@ def test_light_that_a_voxel_scatters_goes_on_forward():
     cosine = (at * level.grid.voxel_size) @ heading
     forwards = (cosine > 0) & (ahead > 0)
     assert ahead[forwards].sum() > 3 * behind[forwards].sum()
-    # What lines see of the voxel is in proportion to p truncated to the moments that there are.
+    # Tracks receive p truncated to the available moments.
     lit = ahead + behind > 1e-6
     lit[MIDDLE] = False
     share = (ahead - behind)[lit] / (ahead + behind)[lit]
@@ -108,14 +111,15 @@ def test_light_that_a_voxel_scatters_goes_on_forward():
 
 
 class Nothing:
-    """What is around a medium where that does not matter."""
+    """Surroundings of a medium, not used here."""
 
     has_sources, angular_basis = False, None
 
 
-def test_paths_begin_on_their_lines(scenes, monkeypatch):
-    """Followed on from where its path begins, each line passes the middle of all slices at the
-    places of the lattice: a whole number of voxels from the first line.
+def test_paths_continue_their_tracks(scenes, monkeypatch):
+    """A path that continues a track passes the centres of all slices at points of the lattice.
+
+    These are a whole number of voxels from the first track.
     """
     monkeypatch.setattr(
         "mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition._trace_cells",

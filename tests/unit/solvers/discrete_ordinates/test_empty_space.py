@@ -1,6 +1,4 @@
-"""What lines of a lattice may skip: distances by brute force, and light that is the same to
-rounding.
-"""
+"""Skipping of empty space along tracks: distances by brute force, and unchanged results."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ SIDES = SHAPE[::-1]
 
 
 def sparse(share: float = 1e-3) -> np.ndarray:
-    """A few occupied voxels (z, y, x), and a solid ball."""
+    """Return a few occupied voxels (z, y, x), and a solid ball."""
     occupied = np.random.default_rng(2).random(SHAPE) < share
     at = np.moveaxis(np.indices(SHAPE), 0, -1) - [14, 8, 20]
     return occupied | (np.linalg.norm(at, axis=-1) < 3.5)
@@ -37,12 +35,13 @@ def found(occupied: np.ndarray, lower, upper) -> np.ndarray | None:
     return np.array(emptiness.slices).reshape(shape)
 
 
-def test_lines_skip_what_is_empty_and_no_more():
-    """Within the slices that may be skipped from any voxel of a cell there is no occupied voxel,
-    and no side of the box; the first cell that stops it is nearer than two cells behind them.
+def test_tracks_skip_only_empty_slices():
+    """Slices that tracks may skip contain no occupied voxel and no side of the box.
+
+    The first cell that prevents a longer skip is nearer than two cells behind them.
     """
     occupied = sparse()
-    lower, upper = (2, 1, 3), (31, 20, 26)  # odd sides among them
+    lower, upper = (2, 1, 3), (31, 20, 26)  # including odd sizes
     occupied[:3] = occupied[:, :1] = occupied[:, 20:] = occupied[..., :2] = occupied[..., 31:] = 0
     slices = found(occupied, lower, upper)
     blocked = np.pad(occupied[3:26, 1:20, 2:31], 40, constant_values=True)
@@ -62,16 +61,17 @@ def test_lines_skip_what_is_empty_and_no_more():
     assert longest > 2 * CELL
 
 
-def test_nothing_is_skipped_where_it_gains_too_little():
+def test_skipping_is_disabled_where_it_saves_little():
     assert found(np.ones(SHAPE, bool), (0, 0, 0), SIDES) is None
     assert found(sparse(), (0, 0, 0), SIDES) is not None
 
 
 @pytest.mark.parametrize("box", [((0, 0, 0), (32, 21, 26)), ((3, 1, 2), (32, 20, 25))])
 @pytest.mark.parametrize("detailed", [False, True])
-def test_light_is_the_same(monkeypatch, box, detailed):
-    """Whichever way lines go, and where they enter, with voxels of the medium and its detail: of
-    light that enters, and what voxels scatter besides.
+def test_skipping_does_not_change_the_radiance(monkeypatch, box, detailed):
+    """Skipping does not change the result, for all directions and entry points.
+
+    Both incoming and scattered radiance are compared, with voxels of the medium and its detail.
     """
     monkeypatch.setattr(tracks, "SMALL_GRID", 0)
     monkeypatch.setattr(tracks, "SECOND_DIFFERENCE", 0.0)
@@ -88,7 +88,7 @@ def test_light_is_the_same(monkeypatch, box, detailed):
         coarse = np.add.reduceat(density, np.arange(0, 26, 2), axis=0)
         coarse = np.add.reduceat(coarse, np.arange(0, 21, 3), axis=1)
         density = np.add.reduceat(coarse, np.arange(0, 32, 2), axis=2)
-        # What a line sees of a value reaches as far as its neighbours.
+        # A track depends on a value as far as the value's neighbours, through interpolation.
         seen = np.kron(density > 0, np.ones((2, 3, 2))) > 0
         occupied = keep & (_dilated(seen, 3))
     else:

@@ -1,4 +1,4 @@
-"""Moments of the radiance along lines of sweeps: one direction, furnaces, the operator's norm."""
+"""Angular moments of the radiance along tracks: one direction, furnace, operator norm."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIDES = (6, 9, 7)
 
 @pytest.fixture(params=["together", "apart"], autouse=True)
 def mode(request, monkeypatch):
-    """All pairs of directions in one launch, or one in each."""
+    """Launch all pairs of directions at once, or one by one."""
     if request.param == "apart":
         monkeypatch.setattr(tracks, "SMALL_GRID", 0)
         monkeypatch.setattr(tracks, "MAX_COPIED_VOXELS", 1)
@@ -39,7 +39,7 @@ def values(flat: mi.Float, count: int) -> np.ndarray:
 
 
 def matter(seed: int = 0, empty: float = 0.0) -> np.ndarray:
-    """Extinction (z, y, x), some voxels without any."""
+    """Return an extinction (z, y, x) with some empty voxels."""
     rng = np.random.default_rng(seed)
     sigma_t = rng.uniform(0.5, 8.0, SIDES)
     return np.float32(np.where(rng.random(SIDES) < empty, 0, sigma_t))
@@ -63,15 +63,15 @@ def level(sigma_t: np.ndarray, albedo: float, moments: Moments | None) -> Multig
 
 
 def rows(pairs: int, light: float = 0.0, seed: int = 1) -> tuple[np.ndarray, ...]:
-    """Even directions; the same radiance enters along all of them."""
+    """Return ordinates along all of which the same radiance enters."""
     rng = np.random.default_rng(seed)
     directions, weights = hemisphere_ordinates(pairs, rng)
     entering = np.repeat(light * weights[:, None], 2, axis=1)
     return directions, entering, weights, rng.random((pairs, 2))
 
 
-def test_light_of_one_direction():
-    """Its moments are its irradiance times the harmonics of where it comes from."""
+def test_moments_of_one_direction():
+    """Moments of a single direction are its irradiance times the spherical harmonics."""
     moments, of_matter = moments_of(0.5, 4), lines(matter())
     way = np.array([[0.3, -0.5, 0.6]]) / np.sqrt(0.7)
     offsets = np.array([[0.2, 0.7]])
@@ -85,8 +85,8 @@ def test_light_of_one_direction():
         np.testing.assert_allclose(found, basis[:, None] * irradiance, atol=2e-6)
 
 
-def test_isotropic_scattering_is_that_of_levels():
-    """Without further moments, light is scattered as `MultigridLevel` has it."""
+def test_isotropic_scattering_equals_the_multigrid_level():
+    """Without higher moments, scattering is that of `MultigridLevel`."""
     sigma_t, none = matter(empty=0.3), moments_of(0.0, 1)
     isotropic, directional = level(sigma_t, 0.8, None), level(sigma_t, 0.8, none)
     rng = np.random.default_rng(4)
@@ -102,8 +102,9 @@ def test_isotropic_scattering_is_that_of_levels():
 @pytest.mark.parametrize("order", [1, 3])
 @pytest.mark.parametrize("scale", [0.1, 5.0, 100.0])
 def test_furnace(order, scale):
-    """Where nothing absorbs and light is the same from all sides, it stays so: irradiance 4 pi, no
-    moments, of light received and of collisions.
+    """Without absorption a constant radiance is preserved: irradiance 4 pi, higher moments 0.
+
+    This holds for the incoming radiance and for collisions.
     """
     moments = moments_of(0.5, order)
     white = level(matter() * np.float32(scale), 1.0, moments)
@@ -117,9 +118,10 @@ def test_furnace(order, scale):
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-def test_white_matter_is_no_source(order):
-    """Light that is scattered again and again, among voxels many of which are empty, fades: lines
-    that find no matter where others do must not weigh on it.
+def test_scattering_without_absorption_decays(order):
+    """With albedo 1 and many empty voxels, repeatedly scattered radiance decays.
+
+    Tracks without medium in a voxel in which others have some must not contribute to it.
     """
     moments = moments_of(0.58, order)
     white = level(matter(seed=2, empty=0.6), 1.0, moments)
@@ -132,8 +134,8 @@ def test_white_matter_is_no_source(order):
     assert sizes[-1] / sizes[-2] < 0.97
 
 
-def test_solution():
-    """What the hierarchy of grids finds solves phi = A phi + b."""
+def test_multigrid_solves_the_equation():
+    """The multigrid solution satisfies phi = A phi + b."""
     rng = np.random.default_rng(7)
     grid = Grid((24, 24, 24), np.diag([1.0, 1, 1, 1]))
     sigma_t = mi.Float(rng.uniform(0, 40, grid.voxel_count).tolist())

@@ -1,4 +1,4 @@
-"""All orders of scattering: light of several channels that goes the same ways."""
+"""The multigrid solution for all orders of scattering, with several channels per track."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SHAPE, VOXELS, PAIRS = (9, 8, 10), 720, 6
 
 @pytest.fixture(params=["together", "apart"], autouse=True)
 def mode(request, monkeypatch):
-    """One launch for all directions, or one for each; three levels."""
+    """Launch all directions at once, or one by one; three levels."""
     monkeypatch.setattr(multigrid, "COARSEST", 4)
     if request.param == "apart":
         monkeypatch.setattr(tracks, "SMALL_GRID", 0)
@@ -33,7 +33,7 @@ def random():
 
 
 def level(random, evenly: bool):
-    """A function that makes a level of the channels that it is given, and their albedos."""
+    """Return a function that makes a level of the given channels, and their albedos."""
     sigma_t = mi.Float(random.uniform(0, 20, VOXELS).tolist())
     albedos = random.uniform(0.5, 1, (3, VOXELS))
     grid = Grid(SHAPE, np.eye(4))
@@ -46,13 +46,13 @@ def level(random, evenly: bool):
 
 
 def rows(random) -> tuple:
-    """Directions, no light, weights and offsets."""
+    """Return directions without incoming radiance, weights and offsets."""
     directions, weights = hemisphere_ordinates(PAIRS, random)
     return directions, np.zeros((PAIRS, 2)), weights, random.random((PAIRS, 2))
 
 
 def flat(values: np.ndarray) -> mi.Float:
-    """Channels (n, voxels) next to each other."""
+    """Concatenate channels (n, voxels)."""
     return mi.Float(values.T.ravel().tolist())
 
 
@@ -60,13 +60,13 @@ def stacked(values: mi.Float) -> np.ndarray:
     return np.array(values).reshape(VOXELS, -1).T
 
 
-def test_channels_that_are_swept_together_do_not_mix(random):
-    """Each is what it is alone, with light that arrives along the lines besides."""
+def test_channels_of_a_sweep_do_not_mix(random):
+    """Channels that share a sweep do not mix, also with incoming radiance."""
     of, of_rows = level(random, False), rows(random)
     phi = random.uniform(0, 3, (3, VOXELS))
     phi[1] *= 1e-3
     light = random.uniform(0, 1, (3, 2 * PAIRS))
-    # One cell with two values for each pair: its lines are all within.
+    # One boundary cell with two values per pair; its tracks are all inside.
     places = np.tile([1e-4, 0.5, 0.5, 0, 0], (PAIRS, 1))
     cells = np.column_stack([2 * np.arange(PAIRS), np.ones(PAIRS, int), np.ones(PAIRS, int)])
 
@@ -85,16 +85,17 @@ def test_channels_that_are_swept_together_do_not_mix(random):
 
 
 class Arriving(BoundarySource):
-    """Light that does not depend on phi."""
+    """Incoming radiance that does not depend on phi."""
 
     def update(self, phi: mi.Float) -> None:
-        """Nothing."""
+        """Ignore phi."""
 
 
 @pytest.mark.parametrize("evenly", [False, True])
-def test_channels_are_solved_together_as_alone(random, evenly):
-    """Three, of which one is nearly dark and one has no light at all: within what is left of the
-    error of each.
+def test_channels_solved_together_equal_separate_solutions(random, evenly):
+    """Three channels solved together equal separate solutions within the tolerance of each.
+
+    One channel is nearly dark, and one is zero.
     """
     of, of_rows = level(random, evenly), rows(random)
     b = random.uniform(0, 3, (3, VOXELS))
@@ -107,8 +108,8 @@ def test_channels_are_solved_together_as_alone(random, evenly):
         assert alone.sum() >= 1.2 * b[c].sum()
 
 
-def test_light_without_voxels_sending_is_carried_in_all_channels(random):
-    """Straight along the lines, sharpened: each channel as alone."""
+def test_unscattered_radiance_is_carried_in_all_channels(random):
+    """Unscattered radiance is carried in all channels as in each alone, including sharpening."""
     of, (directions, dark, _, offsets) = level(random, False), rows(random)
     light = random.uniform(0, 1, (3, 2 * PAIRS))
     places = np.tile([1e-4, 0.5, 0.5, 0, 0], (PAIRS, 1))
@@ -129,9 +130,10 @@ def test_light_without_voxels_sending_is_carried_in_all_channels(random):
 
 
 @pytest.mark.parametrize("evenly", [False, True])
-def test_voxels_without_matter_need_not_be_known(random, evenly):
-    """Of a grid most of which is empty, light where matter is, and around it, is what it is on the
-    whole grid: of every order of scattering, to what is left of the error of each.
+def test_solution_needs_occupied_voxels_only(random, evenly):
+    """In a mostly empty grid, the solution on occupied voxels equals that on the whole grid.
+
+    All orders of scattering agree within the tolerance of each.
     """
     matter = np.zeros(SHAPE)
     matter[1:4, 2:5, 3:9] = random.uniform(0, 30, (3, 3, 6))
@@ -161,9 +163,10 @@ def test_voxels_without_matter_need_not_be_known(random, evenly):
     assert found[1][0].mean() > b.mean()
 
 
-def test_mixing_goes_where_a_slow_error_leads():
-    """Of an iteration whose error falls by 0.9 a step, and of another by 0.3, in two channels: both
-    are solved by the third step.
+def test_anderson_acceleration_removes_a_slow_error():
+    """Anderson acceleration removes a slowly decaying error.
+
+    Two channels whose errors decay by 0.9 and by 0.3 per step are solved by the third step.
     """
     solution, phi = mi.Float([3.0, 5.0] * 4), mi.Float([0.0, 1.0] * 4)
     rates, mixing = mi.Float([0.9, 0.3] * 4), AndersonAcceleration(by_channel)

@@ -1,6 +1,4 @@
-"""Coarser grids of the hierarchy: they lie where the finer one does, hold as much matter, and what
-goes there and back stays where it was; of voxels of any proportions.
-"""
+"""Coarse multigrid levels: placement, conservation of mass, and transfer between levels."""
 
 from __future__ import annotations
 
@@ -34,15 +32,16 @@ def level_of(scenes, shape, edges, sigma_t: np.ndarray, evenly: bool) -> Multigr
 
 
 def centres(level: MultigridLevel) -> np.ndarray:
-    """World positions of the voxels (n, 3)."""
+    """Return the world positions of the voxels (n, 3)."""
     return np.array(level.grid.centers(level.tracks.active), np.float64).T
 
 
 @pytest.mark.parametrize("evenly", [False, True])
 @pytest.mark.parametrize(("shape", "edges"), GRIDS.values(), ids=GRIDS)
-def test_matter_stays_where_it_is(scenes, shape, edges, evenly):
-    """The mass of each coarse voxel, extinction times volume, is that of the fine voxels whose
-    centres lie in it: in the world, beyond the end of odd sides too.
+def test_coarse_levels_conserve_mass_and_position(scenes, shape, edges, evenly):
+    """Each coarse voxel has the mass of the fine voxels whose centres lie in it.
+
+    Mass is extinction times volume; world positions are compared, also beyond the end of odd sides.
     """
     sigma_t = np.random.default_rng(3).uniform(0.0, 2.0, shape)
     level = level_of(scenes, shape, edges, sigma_t, evenly)
@@ -60,10 +59,8 @@ def test_matter_stays_where_it_is(scenes, shape, edges, evenly):
 
 @pytest.mark.parametrize("evenly", [False, True])
 @pytest.mark.parametrize(("shape", "edges"), GRIDS.values(), ids=GRIDS)
-def test_what_changes_evenly_comes_back(scenes, shape, edges, evenly):
-    """A linear function of the position, in even matter, restricted to the coarser grid and
-    interpolated: itself, but for the voxels beside the border.
-    """
+def test_transfer_between_levels_preserves_linear_functions(scenes, shape, edges, evenly):
+    """Restriction followed by interpolation preserves linear functions, except at the border."""
     level = level_of(scenes, shape, edges, np.ones(shape), evenly)
     values = centres(level) @ np.array([0.5, -0.3, 0.8])
     values = np.float32(values - values.min() + 1)

@@ -1,4 +1,4 @@
-"""Sweeps along parallel lines, line by line: NumPy knows where each line passes each voxel."""
+"""Sweeps along parallel tracks, compared with NumPy track by track."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, values_at_centres
 
 SHAPES = [(8, 8, 8), (7, 12, 5), (1, 6, 9), (5, 1, 1), (9, 4, 1)]
-#: Along axes, edges and diagonals, almost along them, and between.
+#: Directions along axes, edges and diagonals, almost along them, and between.
 DIRECTIONS = np.array(
     [
         [1, 0, 0],
@@ -34,7 +34,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 @pytest.fixture(params=["together", "apart"], autouse=True)
 def mode(request, monkeypatch, rgb):
-    """One launch for all directions, or one for each; voxels hold what lines leave in them."""
+    """Launch all directions at once, or one by one, with voxels accumulating over tracks."""
     monkeypatch.setattr(tracks, "SECOND_DIFFERENCE", 0.0)
     if request.param == "apart":
         monkeypatch.setattr(tracks, "SMALL_GRID", 0)
@@ -46,21 +46,23 @@ def offsets(count: int, seed: int = 0) -> np.ndarray:
 
 
 def lines(grid: Grid, sigma_t, box=None) -> Tracks:
-    """The lattice of a medium (z, y, x), in a box (lower, upper) of (x, y, z)."""
+    """Return the tracks of a medium (z, y, x), in a box (lower, upper) of (x, y, z)."""
     values = np.broadcast_to(np.float32(sigma_t), grid.shape).ravel()
     lower, upper = ([0, 0, 0], grid.resolution) if box is None else box
     return Tracks(grid, mi.Float(values), np.array(lower), np.array(upper))
 
 
 def carried(lines: Tracks, light, places: np.ndarray, directions=DIRECTIONS) -> np.ndarray:
-    """Irradiance (z, y, x) of light (n, 2) along pairs of directions."""
+    """Return the irradiance (z, y, x) of radiance (n, 2) along pairs of directions."""
     light = np.broadcast_to(light, (len(directions), 2))
     volume = lines.uncollided(directions, light, places)
     return np.array(volume, dtype=np.float64).reshape(lines.grid.shape)
 
 
 def passages(grid: Grid, direction: np.ndarray, offset, box=None) -> np.ndarray:
-    """Where the line of each voxel passes its middle slice: voxel coordinates (z, y, x, 3)."""
+    """Return where the track of each voxel crosses its middle slice: voxel coordinates (z, y, x,
+    3).
+    """
     lower = np.zeros(3, int) if box is None else np.array(box[0])
     velocity = grid.coordinates.matrix[:3, :3] @ direction
     axis = int(np.abs(velocity).argmax())
@@ -75,7 +77,9 @@ def passages(grid: Grid, direction: np.ndarray, offset, box=None) -> np.ndarray:
 
 
 def lengths(grid: Grid, at: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """World distance from the places ``at`` back along ``direction`` to the side of entry."""
+    """Return the world distance from points ``at`` back along ``direction`` to the side of
+    entry.
+    """
     velocity = grid.coordinates.matrix[:3, :3] @ direction
     ways = [
         (at[..., k] - (0 if v > 0 else grid.resolution[k])) / v
@@ -85,13 +89,15 @@ def lengths(grid: Grid, at: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.min(ways, axis=0)
 
 
-# Where lines pass
+# Positions of tracks
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_each_voxel_once_per_way(shape):
-    """Each way carries a power of two of its own through nothing: every voxel holds exactly their
-    sum. A voxel that is skipped, or crossed twice, tells by which way.
+def test_each_voxel_is_crossed_once_per_direction(shape):
+    """Each voxel is crossed exactly once per direction.
+
+    Each direction carries its own power of two without extinction, so that the sum identifies
+    directions that are missing or counted twice.
     """
     light = 2.0 ** np.arange(2 * len(DIRECTIONS)).reshape(-1, 2)
     for seed in range(3):
@@ -101,9 +107,11 @@ def test_each_voxel_once_per_way(shape):
         np.testing.assert_array_equal(found, light.sum())
 
 
-def test_each_voxel_of_a_box_once_per_way(scenes):
-    """In a turned, stretched, mirrored grid: all light inside of the box, nothing written outside
-    of it.
+def test_each_voxel_of_a_box_is_crossed_once_per_direction(scenes):
+    """In a rotated, stretched, mirrored grid, each voxel of the box is crossed once per
+    direction.
+
+    Nothing is written outside of the box.
     """
     grid = Grid((9, 8, 7), scenes.placement((1.0, 3.0, 0.5), turn=35, mirror=True))
     light = 2.0 ** np.arange(2 * len(DIRECTIONS)).reshape(-1, 2)
@@ -114,10 +122,11 @@ def test_each_voxel_of_a_box_once_per_way(scenes):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_batch_of_launches_is_the_work(mode, kernels):
-    """Eight pairs: one launch for each axis together, and one to add up what they left; else one
-    for each pair, and one for each axis for its corners. And one for each axis to sharpen, and one
-    that lays back what is by slices.
+def test_launches_per_batch(mode, kernels):
+    """The number of launches per batch is bounded.
+
+    Eight pairs at once take a launch per axis and one to add up; otherwise one per pair, and one
+    per axis for its corners. One per axis sharpens, and one restores the order of slices.
     """
     grid = Grid((8, 8, 8), np.eye(4))
     medium = lines(grid, 1.0)
@@ -128,15 +137,16 @@ def test_a_batch_of_launches_is_the_work(mode, kernels):
     assert all(k["cache_hit"] for k in history)
 
 
-# What is left of the light
+# Attenuation
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("depth", [0.05, 0.31, 1.25])
-def test_homogeneous_matter_is_exact_along_each_line(scenes, shape, depth):
-    """exp(-sigma_t d) from the very point of entry to where the line of a voxel passes it, for each
-    way alone and every voxel; ``depth`` is the optical depth of a voxel. A line that enters at the
-    slice, not between two, is off by up to ``depth`` / 2; one of a wrong length by more.
+def test_homogeneous_medium_is_exact_along_each_track(scenes, shape, depth):
+    """In a homogeneous medium, transmittance is exp(-sigma_t d) from the exact point of entry.
+
+    It is compared for each direction and voxel; ``depth`` is the optical depth of a voxel. A track
+    that enters at the slice instead of between two is off by up to ``depth`` / 2.
     """
     edges = np.array(shape[::-1]) * [0.1, 0.13, 0.08]
     grid = Grid(shape, scenes.placement(edges, turn=20))
@@ -147,7 +157,8 @@ def test_homogeneous_matter_is_exact_along_each_line(scenes, shape, depth):
         for light, way in (([[1, 0]], d), ([[0, 1]], -d)):
             expected = np.exp(-sigma_t * lengths(grid, at, way))
             found = carried(medium, light, place[None], d[None])
-            # Positions are known to 2^-24 of a voxel, and slopes: a near-axis line enters late.
+            # Positions are known to 2^-24 of a voxel, and so are slopes: a near-axis track enters
+            # late.
             near_axis = (np.abs(way) < 1e-5).any() and (np.abs(way) > 0).all()
             if not near_axis:
                 np.testing.assert_allclose(found, expected, rtol=3e-5, atol=1e-7)
@@ -156,15 +167,16 @@ def test_homogeneous_matter_is_exact_along_each_line(scenes, shape, depth):
 
 
 def smooth(p: np.ndarray) -> np.ndarray:
-    """Extinction at places (..., 3) of the unit cube; not empty at its sides."""
+    """Return the extinction at points (..., 3) of the unit cube; nonzero at its sides."""
     x, y, z = np.moveaxis(p, -1, 0)
     return 5 * (1 + 0.5 * np.sin(4 * x + 1) * np.cos(3 * y) + 0.4 * z * np.sin(5 * z + x))
 
 
-def test_heterogeneous_matter_is_of_order_two():
-    """Where lines pass, the light that a fine march through the smooth medium itself finds: the
-    mean error over voxels and ways falls as the square of the voxels' size, in mean and in RMS, as
-    interpolation does. Entering at slices, not between, is of order 1.
+def test_heterogeneous_medium_is_of_order_two():
+    """In a smooth medium, the error decreases with the square of the voxel size.
+
+    The reference is a fine march through the smooth medium along the tracks; mean and RMS error
+    over voxels and directions are compared. Entering at slices instead of between is of order 1.
     """
     errors = []
     directions = DIRECTIONS[[3, 7, 8, 9]]
@@ -190,9 +202,11 @@ def test_heterogeneous_matter_is_of_order_two():
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("side", [0, -1])
 def test_no_shadow_through_the_opposite_face(axis, side):
-    """An opaque voxel beside each face, else nothing: a line is dimmed if and only if it has come
-    through that voxel's slice within a voxel of its centre, *after* it has entered. Lines go on at
-    the opposite side; a shadow that they take along darkens voxels there.
+    """An opaque voxel beside a face shadows only voxels behind it on the same track.
+
+    A track is attenuated if and only if it passed that voxel's slice within a voxel of its centre
+    *after* its entry. Tracks that leave continue at the opposite side, where a shadow must not
+    persist.
     """
     grid = Grid((9, 9, 9), np.eye(4))
     dense = np.full(3, 4)
@@ -217,8 +231,9 @@ def test_no_shadow_through_the_opposite_face(axis, side):
 
 
 def test_both_modes_agree(monkeypatch):
-    """A random medium in a cropped box: irradiance to rounding, whatever the launches; and of
-    scattered light all that is tallied.
+    """Both launch modes agree on a random medium in a cropped box.
+
+    Irradiance agrees to rounding, and so do all tallies of scattered radiance.
     """
     grid = Grid((7, 12, 5), np.eye(4))
     rng = np.random.default_rng(6)
@@ -243,9 +258,11 @@ def test_both_modes_agree(monkeypatch):
 # Quantised extinction
 
 
-def test_zero_is_zero_and_the_maximum_exact():
-    """Half of a grid is empty, the other has its largest extinction: the light is that of full
-    precision in both, whatever rounding does between.
+def test_quantisation_is_exact_at_zero_and_maximum():
+    """Quantisation represents zero and the maximum exactly.
+
+    Half of a grid is empty, the other half has the largest extinction: the irradiance has full
+    precision in both.
     """
     grid = Grid((6, 4, 4), np.eye(4))
     sigma_t = np.zeros(grid.shape)
@@ -259,10 +276,12 @@ def test_zero_is_zero_and_the_maximum_exact():
     )
 
 
-def test_fog_beside_an_opaque_voxel():
-    """Fog of optical depth 1e-3 in all, and a voxel of 1e6 that light does not meet: transmittance
-    to 2e-3 along each line, and its mean over 900 lines to 5 % of what is lost. Rounded down, or to
-    the nearest level of the densest voxel, the fog would vanish.
+def test_quantisation_preserves_fog_beside_an_opaque_voxel():
+    """Quantisation preserves thin fog in a grid with an opaque voxel.
+
+    The fog has an optical depth of 1e-3, the voxel of 1e6 lies beside the tracks: transmittance is
+    accurate to 2e-3 along each track, and its mean over 900 tracks to 5 % of the loss. Rounding
+    down, or to the nearest level of the densest voxel, would remove the fog.
     """
     grid = Grid((32, 32, 64), np.eye(4))
     sigma_t = np.full(grid.shape, 1e-3)
@@ -274,14 +293,16 @@ def test_fog_beside_an_opaque_voxel():
     assert 1 - end.mean() == pytest.approx(1 - expected, rel=0.05)
 
 
-# Grids that are not the medium's
+# Track grids other than the medium's
 
 
 @pytest.mark.parametrize("detail", [(5, 12, 6), (10, 3, 12), (5, 4, 3), (4, 7, 9)], ids=str)
 @pytest.mark.parametrize("axis", range(3))
-def test_detail_of_the_medium_is_kept(detail, axis):
-    """On a grid of (5, 6, 6) voxels, lines along an axis lose what the medium's own interpolation
-    takes from them, whether it is finer, coarser or the same along each axis.
+def test_tracks_integrate_the_detail_of_the_medium(detail, axis):
+    """Tracks on a coarse grid integrate the medium's own interpolation.
+
+    On a grid of (5, 6, 6) voxels, the attenuation along an axis is that of the medium, whether its
+    grid is finer, coarser or the same along each axis.
     """
     grid, medium = Grid((5, 6, 6), np.eye(4)), Grid(detail, np.eye(4))
     sigma_t = np.random.default_rng(0).uniform(0, 8, detail)
@@ -306,13 +327,14 @@ def test_detail_of_the_medium_is_kept(detail, axis):
 
 
 def laid(values: np.ndarray, axis: int) -> mi.Float:
-    """(z, y, x) in the order of slices across ``axis``: x slowest for those across it."""
+    """Return (z, y, x) in the order of slices across ``axis``: x slowest for those across it."""
     return mi.Float((np.moveaxis(values, 2, 0) if axis == 0 else values).ravel())
 
 
-def test_sharpening_takes_back_a_mean(monkeypatch):
-    """Means of a quadratic over the cross sections of voxels become its values at their centres
-    inside of the box, whatever lies outside of it; a constant stays, its borders too.
+def test_sharpening_recovers_values_from_means(monkeypatch):
+    """Sharpening converts means of a quadratic over voxels to its values at their centres.
+
+    Values outside of the box do not matter; a constant is unchanged, at the borders too.
     """
     monkeypatch.undo()
     grid, box = Grid((8, 5, 7), np.eye(4)), (np.array([1, 0, 2]), np.array([7, 4, 8]))
@@ -337,15 +359,18 @@ def test_sharpening_takes_back_a_mean(monkeypatch):
 
 @pytest.mark.parametrize(("scale", "halves"), [(1.0, True), (0.01, False)])
 def test_dense_voxels_have_two_halves(scale, halves):
-    """Lines collide where the medium is, linear between its voxels: in each of these, an eighth of
-    it as in either neighbour. Thin ones have a single value, which is half the work.
+    """Dense voxels have two halves, so that tracks collide where the linear interpolant is.
+
+    Each voxel has an eighth of either neighbour. Thin voxels have a single value, which halves the
+    work.
     """
     grid, layers = Grid((8, 8, 8), np.eye(4)), scale * np.array([0, 1, 5, 8, 2, 0, 3, 1.0])
     sweep = lines(grid, np.broadcast_to(layers[:, None, None], grid.shape))
     volume = dr.opaque(mi.Float, 0, grid.voxel_count * 4)
     directions = np.array([[0.0, 0.0, 1.0]])
     sweep.sweep(volume, sweep.table(directions, np.zeros((1, 2)), np.ones(1), offsets(1)))
-    depth = np.array(volume).reshape(*grid.shape, 4)[..., 3]  # both ways, over the cross section
+    # The sum of both directions, over the cross section.
+    depth = np.array(volume).reshape(*grid.shape, 4)[..., 3]
     beside = np.concatenate([layers[:1], layers, layers[-1:]])
     expected = (beside[:-2] + 6 * layers + beside[2:]) / 8 if halves else layers
     wanted = np.broadcast_to(2 * expected[:, None, None], grid.shape)

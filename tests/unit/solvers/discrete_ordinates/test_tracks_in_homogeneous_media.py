@@ -1,4 +1,4 @@
-"""What lines leave in voxels while they scatter, in even matter, where each line is known."""
+"""Tallies of tracks in homogeneous media, where each track is known."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ WAYS /= np.linalg.norm(WAYS, axis=1, keepdims=True)
 
 @pytest.fixture(params=["together", "apart"], autouse=True)
 def mode(request, monkeypatch):
-    """One launch for all directions, or one for each."""
+    """Launch all directions at once, or one by one."""
     if request.param == "apart":
         monkeypatch.setattr(tracks, "SMALL_GRID", 0)
 
 
 def behind_the_entry(grid: Grid, way: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """World lengths (z, y, x) of the lines from where they enter the grid up to the middle of each
+    """Return the world lengths (z, y, x) of the tracks from their entry to the middle of each
     slice.
     """
     velocity = grid.coordinates.matrix[:3, :3] @ way
@@ -45,9 +45,10 @@ def behind_the_entry(grid: Grid, way: np.ndarray, offset: np.ndarray) -> np.ndar
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda w: ",".join(f"{x:.1f}" for x in w))
 @pytest.mark.parametrize("back", [0, 1])
-def test_light_that_enters_is_less_by_what_it_has_passed(way, back):
-    """e^-tau from the point of entry, which may be between two slices, and in proportion to it the
-    light that collides: with sigma_t of 0.5 to 1 per voxel.
+def test_incoming_radiance_is_attenuated(way, back):
+    """Incoming radiance is attenuated by e^-tau, and collisions are proportional to it.
+
+    Tracks may enter between two slices; sigma_t is 0.5 to 1 per voxel.
     """
     grid, sigma_t = Grid(SHAPE, np.diag([1.4, 1.8, 1.2, 1])), 4.0
     count = grid.voxel_count

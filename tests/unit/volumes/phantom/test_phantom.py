@@ -29,10 +29,10 @@ from mitsuba_irrcache.volumes.phantom.vessels import MURRAY_EXPONENT, vessel_tre
 
 SIZE = np.array([380.0, 240.0, 330.0])
 
-# Voxels of 2.5 mm and of 5/3 mm: both are blocked to 5 mm where they are compared.
+# Voxels of 2.5 mm and of 5/3 mm: both are averaged to 5 mm where they are compared.
 COARSE, FINE = (132, 96, 152), (198, 144, 228)
 
-# Place (LPS, mm), radius of the ball averaged over in mm, and the HU expected there.
+# Position (LPS, mm), radius in mm of the ball that is averaged, and the expected HU.
 PLACES = {
     "air beside the patient": ((-180, -100, 20), 8, (-1000, -1000)),
     "trachea": ((0, -4, 290), 4, (-1024, -850)),
@@ -59,7 +59,7 @@ def fine():
 
 
 def axes(volume):
-    """Open grid of the voxel centres in mm, read from the volume's own placement."""
+    """Return the open grid of the voxel centres in mm, from the volume's own placement."""
     matrix = volume.index_to_world
     x, y, z = (matrix[i, i] * np.arange(n) + matrix[i, 3] for i, n in enumerate(volume.size))
     return x[None, None, :], y[None, :, None], z[:, None, None]
@@ -77,7 +77,7 @@ def blocked(volume, factor):
 
 
 def lungs(volume):
-    """Masks of the two largest connected pieces of lung, the patient's right one first."""
+    """Return masks of the two largest connected parts of lung, the patient's right one first."""
     tissue = (volume.values > -960) & (volume.values < -650)
     labels, count = ndimage.label(ndimage.binary_erosion(tissue))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
@@ -104,7 +104,7 @@ def test_shape_and_placement(shape):
 
 
 @pytest.mark.parametrize("name", PLACES)
-def test_tissue_is_where_anatomy_has_it(name, coarse, fine):
+def test_tissue_is_at_its_anatomical_position(name, coarse, fine):
     place, radius, (low, high) = PLACES[name]
     means = [mean_about(volume, place, radius) for volume in (coarse, fine)]
     assert all(low <= mean <= high for mean in means)
@@ -180,7 +180,7 @@ def test_ribs_run_between_pleura_and_skin(rib):
     assert course[-1, 2] < course[0, 2]
 
 
-def test_ribs_keep_their_distance():
+def test_ribs_do_not_touch():
     points = [skeleton.rib_course(rib, anatomy.LEFT, 60) for rib in skeleton.RIBS]
     for upper, lower in pairwise(points):
         # Centre lines stay further apart than a rib is high.
@@ -243,7 +243,7 @@ def test_drum_has_its_height_and_radius():
 
 
 @pytest.mark.parametrize("radius", [0.2, 0.5, 1.0, 2.0, 4.0])
-def test_a_thin_bar_neither_vanishes_nor_swells(radius):
+def test_a_thin_bar_preserves_its_cross_section(radius):
     canvas = Canvas((40, 40, 40), (-40, -40, -40), (40, 40, 40), Tissue(0))
     bar = Segment(np.array([-30.0, 0.3, 0.6]), np.array([30.0, -0.4, 0.9]), radius, radius)
     canvas.paint_solids([bar], Tissue(1))
@@ -255,19 +255,19 @@ def test_a_thin_bar_neither_vanishes_nor_swells(radius):
     "shape",
     [(7, 64, 64), (64, 64), (64, 64, 64, 64), (64, 64, 64.5), (64, "64", 64), 64, (-9,) * 3],
 )
-def test_refuses_what_is_no_shape(shape):
+def test_invalid_shapes_are_refused(shape):
     with pytest.raises(IrrcacheError, match=r"shape is .*three integers .* at least 8"):
         thorax(shape)
 
 
-def test_refuses_what_memory_cannot_hold():
+def test_shapes_larger_than_memory_are_refused():
     with pytest.raises(IrrcacheError, match=rf"{BYTES_PER_VOXEL * 10**15} bytes.*smaller shape"):
         thorax((100_000, 100_000, 100_000))
     with pytest.raises(IrrcacheError, match="memory_limit"):
         thorax((64, 64, 64), memory_limit=10**6)
 
 
-def test_memory_stays_within_what_is_promised():
+def test_memory_stays_within_the_estimate():
     tracemalloc.start()
     try:
         thorax(COARSE)
@@ -291,7 +291,7 @@ def test_equal_shapes_give_equal_clouds():
 
 
 @pytest.mark.parametrize("shape", [(32, 32, 32), (33, 64, 48), (64, 40, 96), (300, 32, 35)])
-def test_cloud_lies_about_the_origin_within_empty_borders(shape):
+def test_cloud_is_centred_with_empty_borders(shape):
     volume = cloud(shape)
     assert volume.values.shape == shape
     assert volume.values.dtype == np.float32
@@ -334,17 +334,17 @@ def test_cloud_is_flat_below_and_round_above(cumulus):
 
 
 @pytest.mark.parametrize("shape", [(31, 64, 64), (64, 64), (64, 64, 64.5), 64, (-64,) * 3])
-def test_cloud_refuses_what_is_no_shape(shape):
+def test_cloud_of_an_invalid_shape_is_refused(shape):
     with pytest.raises(IrrcacheError, match=r"shape is .*three integers .* at least 32"):
         cloud(shape)
 
 
-def test_cloud_refuses_what_memory_cannot_hold():
+def test_cloud_larger_than_memory_is_refused():
     with pytest.raises(IrrcacheError, match=r"bytes.*smaller shape"):
         cloud((100_000, 100_000, 100_000))
 
 
-def test_cloud_takes_no_more_memory_than_promised():
+def test_cloud_memory_stays_within_the_estimate():
     shape = (128, 160, 192)
     tracemalloc.start()
     try:

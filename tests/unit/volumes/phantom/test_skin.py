@@ -1,5 +1,6 @@
-"""The phantom's skin has no rings: its optical depth does not depend on where the surface lies
-between voxel centres.
+"""The optical depth of the phantom's skin does not depend on its position between voxel centres.
+
+Otherwise rings would be visible.
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ DEPTH = 10.0
     [((165, 120, 190), 0.05), ((96, 72, 112), 0.1)],
     ids=["make demo", "coarse"],
 )
-def test_the_optical_depth_of_the_skin_is_even(shape, bound):
-    """Along x at the flank, through matter as ``make demo`` imports it: what differs between
-    neighbouring rays, relative to the mean.
+def test_optical_depth_of_the_skin_is_uniform(shape, bound):
+    """The optical depth of the skin along x at the flank varies little between neighbouring
+    rays.
+
+    The transfer function is that of ``make demo``; the variation is relative to the mean.
     """
     volume = thorax(shape)
     z, y, x = shape
@@ -35,4 +38,4 @@ def test_the_optical_depth_of_the_skin_is_even(shape, bound):
     depths = np.take_along_axis(sigma_t.cumsum(axis=2), surface[..., None], 2)[..., 0]
     rings = depths - ndimage.gaussian_filter(depths, 4, mode="nearest")
     assert rings.std() < bound * depths.mean()
-    assert depths.mean() > 0  # there is skin
+    assert depths.mean() > 0  # where there is skin

@@ -1,0 +1,39 @@
+"""Objects whose attributes are set by their constructor and never again."""
+
+from __future__ import annotations
+
+from functools import wraps
+from typing import Any
+
+
+class Immutable:
+    """Base of classes whose instances do not change after construction.
+
+    Not a frozen dataclass: Dr.Jit takes the fields of dataclasses that a symbolic loop reads for
+    state variables of the loop, copies them, and fails to assign the frozen ones.
+    """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__init__" not in cls.__dict__:
+            return
+        initialise = cls.__init__
+
+        @wraps(initialise)
+        def construct(self: Immutable, *args: Any, **kwargs: Any) -> None:
+            initialise(self, *args, **kwargs)
+            if type(self) is cls:  # else the constructor of a derived class goes on
+                self.__dict__["_is_complete"] = True
+
+        cls.__init__ = construct
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if "_is_complete" in self.__dict__:
+            raise AttributeError(
+                f"{type(self).__name__}.{name} cannot be set: the object is immutable, construct "
+                "another one"
+            )
+        super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"{type(self).__name__}.{name} cannot be deleted")

@@ -1,0 +1,34 @@
+"""What irrcache knows of a scene: the result of `compile_scene`, on which all later stages work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from mitsuba_irrcache.lights.emitters import EmittersByKind
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.transport.path import Media
+
+
+@dataclass(frozen=True, eq=False)
+class SceneDescription:
+    """The media and emitters of a scene. It does not hold the scene itself.
+
+    Attributes:
+        media: all media, in the order in which the scene's shapes name them.
+        visible: those that a camera may see other than through a surface; each gets a cache.
+        emitters: the emitters by their kind.
+        brightest: radiance that no emitter exceeds; None where no rays are traced, see
+            `MediumGrid.is_traced`.
+    """
+
+    media: Media
+    visible: tuple[MediumGrid, ...]
+    emitters: EmittersByKind
+    brightest: mi.Float | None = None
+
+    @property
+    def emits(self) -> bool:
+        """Whether there is any source of radiance."""
+        return bool(self.emitters) or self.media.is_emissive

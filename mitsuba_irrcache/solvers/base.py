@@ -1,0 +1,171 @@
+"""What a solver is to the rest of the program, and the list of all solvers.
+
+A solver fills the cache of one medium. To add one, derive a class from `Solver`, decorate it with
+`register`, and import its module in ``solvers/__init__.py``: the property ``solver``, the choice of
+``auto``, memory checks, progressive rendering and cache files know it then.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
+from mitsuba_irrcache.solvers.grid_size import SizeRule
+from mitsuba_irrcache.transport.path import Media
+
+#: called with (samples done, samples in all), both in voxels times samples
+Progress = Callable[[int, int], None]
+
+
+def _no_pause() -> None:
+    """Does nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class SolverTask:
+    """What a solver works on.
+
+    Attributes:
+        scene: Mitsuba's scene.
+        description: what `compile_scene` found in it.
+        medium: one of its visible media.
+        cache: the cache over this medium that is to be filled.
+        seed: number of the random stream.
+        rr_depth: depth from which Russian roulette ends paths.
+        pause: called often between kernel launches; what it raises ends the work on a batch.
+    """
+
+    scene: mi.Scene
+    description: SceneDescription
+    medium: MediumGrid
+    cache: IrradianceCache
+    seed: int = 0
+    rr_depth: int = 5
+    pause: Callable[[], None] = _no_pause
+
+
+class Preview(ABC):
+    """The first two batches of a cache while they are incomplete, for early images."""
+
+    size: int  #: samples of each batch so far
+
+    @abstractmethod
+    def grow(self, size: int, progress: Progress | None = None) -> None:
+        """Adds samples until there are ``size`` in each batch."""
+
+    @abstractmethod
+    def fill(self, cache: IrradianceCache) -> None:
+        """Puts both batches into an empty ``cache`` for batches of this size."""
+
+
+class Solver(ABC):
+    """Fills a cache. What has to be known before there is a cache are class methods."""
+
+    #: value of the integrator's property ``solver``
+    name: ClassVar[str]
+    #: voxels of a cache with ``resolution`` 0
+    size_rule: ClassVar[SizeRule]
+    #: whether all voxels share their samples, and so their errors
+    is_correlated: ClassVar[bool] = False
+    #: whether one instance should be kept for all samples, since it holds tables that take a while
+    #: to be made; the others do not outlive a call, so that they do not hold the scene
+    is_kept: ClassVar[bool] = False
+    #: whether the first batches may be shown while they are incomplete, see `preview`
+    has_preview: ClassVar[bool] = False
+    #: whether it solves for media with delta-M scaling (see `delta_m`)
+    supports_delta_m: ClassVar[bool] = False
+
+    @classmethod
+    @abstractmethod
+    def why_not(
+        cls, scene: mi.Scene, medium: MediumGrid, max_depth: int, resolution: int
+    ) -> str | None:
+        """Why it does not support ``medium`` in its scene; None where it does."""
+
+    @classmethod
+    @abstractmethod
+    def why(cls, medium: MediumGrid) -> str:
+        """Why ``auto`` chooses it for ``medium``, where no solver with precedence was refused."""
+
+    @classmethod
+    @abstractmethod
+    def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
+        """Samples per voxel in a cache with so many active voxels, unless the user set them."""
+
+    @classmethod
+    @abstractmethod
+    def batch_size(
+        cls, medium: MediumGrid, max_depth: int, samples: int, basis: AngularBasis | None
+    ) -> int:
+        """Samples of a batch of a cache with so many ``samples`` (0: the default)."""
+
+    @classmethod
+    @abstractmethod
+    def numbers_per_voxel(
+        cls, medium: MediumGrid, max_depth: int, moments: int, voxels: int, channels: int
+    ) -> int:
+        """Single precision numbers per voxel that it takes to fill a cache."""
+
+    @classmethod
+    def voxel_classes(
+        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid
+    ) -> VoxelClasses | None:
+        """Where the voxels of ``grid`` are; None where no surface can be among them."""
+        return None
+
+    @classmethod
+    def knows_direct_lights(
+        cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
+    ) -> bool:
+        """Whether it leaves the irradiance of `DirectLight` to these."""
+        return True
+
+    @abstractmethod
+    def __init__(self, task: SolverTask) -> None: ...
+
+    @abstractmethod
+    def refine(self, samples: int, progress: Progress | None = None) -> None:
+        """Adds ``samples`` per voxel, a multiple of the cache's batch.
+
+        The random stream goes on where it stopped. If ``progress`` raises, batches that are
+        complete stay in the cache.
+        """
+
+    def preview(self) -> Preview:
+        """The first two batches, empty, where it `has_preview`."""
+        raise NotImplementedError
+
+
+_REGISTRY: dict[str, type[Solver]] = {}
+
+
+def register(solver: type[Solver]) -> type[Solver]:
+    """Adds a solver to those of the property ``solver``; ``auto`` prefers earlier ones."""
+    if solver.name in _REGISTRY or solver.name == "auto":
+        raise ValueError(f'there is a solver "{solver.name}" already')
+    _REGISTRY[solver.name] = solver
+    return solver
+
+
+def registered() -> tuple[type[Solver], ...]:
+    """All solvers in the order in which ``auto`` tries them."""
+    return tuple(_REGISTRY.values())
+
+
+def solver_named(name: str) -> type[Solver]:
+    """The solver of this name; raises IrrcacheError where there is none."""
+    if name not in _REGISTRY:
+        names = ", ".join(f'"{known}"' for known in ("auto", *_REGISTRY))
+        raise IrrcacheError(f'irrcache: there is no solver "{name}"; set solver to one of {names}.')
+    return _REGISTRY[name]

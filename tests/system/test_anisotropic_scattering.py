@@ -1,0 +1,186 @@
+"""Anisotropically scattering media against ``volpath`` and closed forms."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import CacheFileError
+from tests.support.surfaces import check, diffuse, fog, ground, images, lamp
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+POINT = {"type": "point", "position": [1.5, 2.0, -1.0], "intensity": 20.0}
+RAYLEIGH = {"type": "rayleigh"}
+
+
+def hg(g: float) -> dict:
+    return {"type": "hg", "g": g}
+
+
+def envmap(sun: float) -> dict:
+    """Return an environment that is brighter above, with a bright texel."""
+    texels = np.float32(np.ones((32, 64, 3)) * [0.5, 0.6, 0.8])
+    texels[:16] *= 3
+    texels[10, 52] = sun
+    return {"emitter": {"type": "envmap", "bitmap": mi.Bitmap(texels)}, "sun": None}
+
+
+SCENES = {
+    "hg 0.3, single": (hg(0.3), 2, {}, {}),
+    "hg 0.5": (hg(0.5), -1, {}, {}),
+    "hg -0.3, two orders": (hg(-0.3), 3, {}, {}),
+    "rayleigh": (RAYLEIGH, -1, {}, {}),
+    "rayleigh, point": (RAYLEIGH, 3, {"emitter": POINT, "sun": None}, {"tolerance": 0.04}),
+    "hg 0.5, sun of an envmap": (hg(0.5), -1, "envmap", {"tolerance": 0.03}),
+    "hg 0.75": (hg(0.75), -1, {}, {}),
+    "hg 0.85, sun of an envmap": (hg(0.85), -1, "envmap", {"tolerance": 0.03}),
+}
+BY_PATH = "hg 0.3, single", "hg 0.5, sun of an envmap"
+CASES = [("sweep", name) for name in SCENES] + [("path", name) for name in BY_PATH]
+
+
+@pytest.mark.parametrize(("solver", "name"), CASES)
+def test_phase_functions(scenes, solver, name):
+    phase, depth, lights, bounds = SCENES[name]
+    lights = envmap(800.0) if lights == "envmap" else lights
+    medium = scenes.medium((1.0, 1.2, 1.4), (0.9, 0.8, 0.95)) | {"phase": phase}
+    objects = {"cloud": scenes.boundary(medium)} | lights
+    depths, ours = {"max_depth": depth, "rr_depth": 1000}, {"cache_spp": 128, "solver": solver}
+    check(*images(scenes, objects, ours, depths, (64, 512)), **bounds)
+
+
+def two_kinds(scenes) -> dict:
+    return {
+        "a": scenes.boundary(fog(), scenes.placement((0.9, 1.6, 1.6), center=(-0.5, 0, 0))),
+        "b": scenes.boundary(
+            fog() | {"phase": hg(0.5)}, scenes.placement((0.9, 1.6, 1.6), center=(0.5, 0, 0))
+        ),
+    }
+
+
+@pytest.mark.parametrize("solver", ["path", "sweep"])
+def test_two_media_of_two_kinds(scenes, solver):
+    depth, ours = {"max_depth": -1, "rr_depth": 50}, {"solver": solver}
+    check(*images(scenes, two_kinds(scenes), ours, depth, (64, 256)))
+
+
+def sharp_beside(scenes) -> dict:
+    """Return a strongly forward scattering medium beside another one, over the ground."""
+    thin = fog() | {"phase": hg(0.7)}
+    beside = scenes.boundary(thin, scenes.placement((0.9, 1.6, 1.6), center=(0.8, 0, 0)))
+    place = scenes.placement((1.0, 1.6, 1.6), center=(-0.5, 0, 0))
+    cloud = scenes.medium(scenes.texture((6, 6, 6), 0, 4, 4), 0.95, place) | {"phase": hg(0.85)}
+    return {"cloud": scenes.boundary(cloud, place), "beside": beside, "ground": ground()}
+
+
+def lamps(scenes) -> dict:
+    """Return two area lights, one large and close, one small, and a point light above a medium."""
+    return {
+        "cloud": scenes.boundary(scenes.medium((1.0, 1.2, 1.4), 0.9) | {"phase": hg(0.5)}),
+        "wide": lamp((0.2, 1.6, 0.1), (0, 0, 0), 0.6, (3, 3, 3)),
+        "small": lamp((-1.5, 1.6, -1.0), (0, 0, 0), 0.1, (60, 50, 40)),
+        "emitter": POINT | {"intensity": 5.0}, "sun": None, "ground": ground(),
+    }  # fmt: skip
+
+
+AMONG_SURFACES = {
+    "hg 0.85, hg 0.7, sun": (sharp_beside, -1, {}),
+    "lamps, single": (lamps, 2, {}),
+    "lamps": (lamps, -1, {}),
+}
+
+
+@pytest.mark.parametrize(("build", "depth", "bounds"), AMONG_SURFACES.values(), ids=AMONG_SURFACES)
+def test_with_surfaces(scenes, build, depth, bounds):
+    """``sweep`` agrees with volpath if the ground and another medium scatter radiance back."""
+    depths, ours = {"max_depth": depth, "rr_depth": 50}, {"cache_spp": 128, "solver": "sweep"}
+    check(*images(scenes, build(scenes), ours, depths, (64, 512)), **bounds)
+
+
+def test_furnace_with_surfaces(scenes):
+    """With an albedo of 1 everywhere, a forward scattering medium on the ground is invisible."""
+    medium = scenes.medium(3.0, 1.0) | {"phase": hg(0.8)}
+    objects = {"emitter": {"type": "constant", "radiance": 1.0}, "sun": None}
+    objects["ground"] = ground(bsdf=diffuse(1.0, 1.0, 1.0))
+    integrator = {"type": "irrcache", "solver": "auto", "resolution": 12, "rr_depth": 1000}
+    scene = scenes.load(integrator, scenes.boundary(medium), 16, **objects, default_solver="path")
+    image = scenes.image(scene, spp=64)
+    assert image.mean() == pytest.approx(1, abs=5e-3) and np.abs(image - 1).max() < 0.1
+
+
+@pytest.mark.parametrize("g", [0.5, -0.4])
+def test_thin_slab(scenes, g):
+    """A thin slab scatters once: its radiance is sigma_s p(cos) E t, to 1 %."""
+    sun = scenes.sun | {"irradiance": 2.0, "direction": [1.0, 0.0, 1.0]}
+    medium = scenes.medium(1e-3, 0.8) | {"phase": hg(g)}
+    shape = scenes.boundary(medium, scenes.placement((4.0, 4.0, 0.5)))
+    sensor = scenes.description({}, None, 4)["sensor"]
+    look = mi.ScalarTransform4f().look_at([0, 0, -50], [0, 0, 0], [0, 1, 0])
+    sensor = sensor | {"to_world": look, "fov": 0.5}
+    scene = scenes.load(
+        {"type": "irrcache", "solver": "path", "resolution": 8, "cache_spp": 16}, shape, 4,
+        emitter=sun, sun=None, sensor=sensor,
+    )  # fmt: skip
+    cosine = -(0.5**0.5)  # of both path segments
+    p = (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cosine) ** 1.5)
+    expected = 0.8e-3 * p * 2.0 * 0.5
+    np.testing.assert_allclose(scenes.image(scene, spp=16), expected, rtol=0.01)
+
+
+def test_furnace(scenes):
+    """With albedo 1 under a white sky, all pixels are 1."""
+    medium = scenes.medium(1.0, 1.0) | {"phase": hg(0.5)}
+    sky = {"type": "constant", "radiance": 1.0}
+    integrator = {"type": "irrcache", "resolution": 10, "cache_spp": 512, "rr_depth": 100000}
+    scene = scenes.load(
+        integrator, scenes.boundary(medium), 16, emitter=sky, sun=None, default_solver="path"
+    )
+    image = scenes.image(scene, spp=16)
+    assert image.mean() == pytest.approx(1, abs=3e-3) and np.abs(image - 1).max() < 0.05
+
+
+def loaded(scenes, phase: dict, **settings) -> mi.Scene:
+    integrator = {"type": "irrcache", "max_depth": 3, "resolution": 6, "cache_spp": 16} | settings
+    shape = scenes.boundary(scenes.medium(1.0, 0.9) | {"phase": phase})
+    return scenes.load(integrator, shape, 8, default_solver="path")
+
+
+def test_files(scenes, tmp_path):
+    """Angular moments are saved, loaded and merged; a file of another phase function is refused."""
+    file = str(tmp_path / "light.npz")
+    first = loaded(scenes, hg(0.4), cache_file=file)
+    before = scenes.image(first, spp=2)
+    again = loaded(scenes, hg(0.4), cache_file=file)
+    np.testing.assert_array_equal(scenes.image(again, spp=2), before)
+    other = loaded(scenes, hg(0.4), cache_seed=1, cache_file=str(tmp_path / "other.npz"))
+    other.integrator().prepare(other)
+    cache, more = first.integrator().cache, other.integrator().cache
+    means = [np.array(m) for m in (cache._moments[3], more._moments[3])]
+    cache.merge(more)
+    np.testing.assert_allclose(np.array(cache._moments[3]), sum(means), rtol=1e-5)
+    foreign = loaded(scenes, hg(0.3), cache_file=file)
+    with pytest.raises(CacheFileError, match="medium"):
+        foreign.integrator().prepare(foreign)
+
+
+@pytest.mark.parametrize("g", [0.4, 0.75])
+def test_equilibrium(scenes, g):
+    """With emission equal to absorption and a sky of 1, all radiance is 1."""
+    medium = scenes.medium(2.0, 0.6) | {"phase": hg(g)}
+    integrator = {"type": "irrcache", "solver": "auto", "emission": 0.8, "resolution": 10}
+    sky = {"type": "constant", "radiance": 1.0}
+    scene = scenes.load(
+        integrator, scenes.boundary(medium), 16, emitter=sky, sun=None, default_solver="path"
+    )
+    image = scenes.image(scene, spp=16)
+    assert scene.integrator()._builder.solver == "sweep"
+    assert image.mean() == pytest.approx(1, abs=3e-3) and np.abs(image - 1).max() < 0.05
+
+
+def test_layers_add_up(scenes):
+    scene = loaded(scenes, hg(0.4), aovs="colour,illumination,background,noise")
+    values = scenes.image(scene, spp=8)
+    image, colours, illumination, background = (values[..., i : i + 3] for i in (0, 3, 6, 9))
+    np.testing.assert_allclose(colours * illumination + background, image, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,111 @@
+"""Images converge to exact references, for each kind of emitter and phase function and both
+solvers.
+
+The media are coarse grids of high contrast. The references are those of
+experiments/validation/limits: quadrature of single scattering, and paths of all orders, which share
+no code with irrcache.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from experiments.validation.limits.cases import Case
+from experiments.validation.limits.reference import orders, single
+
+pytestmark = pytest.mark.usefixtures("mono")
+
+SPP = 64
+#: Delta lights, for which ``sweep`` has hardly any noise.
+POINTS = [
+    Case(emitter, phase)
+    for phase in ("isotropic", "hg 0.58", "rayleigh")
+    for emitter in ("point outside", "point beside", "point inside", "spot wide", "spot narrow")
+]
+POINTS += [Case("point outside", phase) for phase in ("hg 0.3", "hg -0.4")]
+#: Resolution, samples per voxel, and the largest relative error of the mean: 0.1 % where the
+#: discretisation and the noise of the directions are small enough.
+SWEEP = {
+    Case("directional"): (128, 256, 0.001),
+    Case("directional", "rayleigh"): (96, 128, 0.003),
+    Case("constant"): (96, 512, 0.003),
+    Case("constant", "rayleigh"): (64, 512, 0.003),
+    Case("rectangle far"): (64, 512, 0.003),
+    Case("rectangle near"): (64, 512, 0.003),
+    Case("sphere near"): (64, 512, 0.003),
+    Case("disk near"): (64, 512, 0.003),
+    Case("point outside", grid="3x5x2"): (64, 32, 0.001),
+    Case("point outside", grid="1x1x6"): (64, 32, 0.001),
+}
+PATH = {
+    Case("constant"): (64, 64, 0.003),
+    Case("point inside"): (64, 64, 0.002),
+    Case("point outside"): (64, 64, 0.003),
+    Case("rectangle near"): (64, 32, 0.003),
+}
+#: All orders of scattering, solver ``sweep``.
+ORDERS = {
+    Case("constant", max_depth=-1): (64, 128, 0.003),
+    Case("point outside", max_depth=-1): (64, 128, 0.003),
+}
+
+
+@lru_cache
+def exact(case: Case) -> float:
+    """Return the mean of the image of single scattering."""
+    return single(case, 4, 1 if case.has_direction else 32, 64).mean()
+
+
+def error(case: Case, expected: float, **integrator) -> float:
+    """Return the relative error of the mean of the image."""
+    image = mi.render(case.scene(**integrator), spp=SPP)
+    return float(np.mean(np.array(image)[..., 0], dtype=np.float64) / expected - 1)
+
+
+@pytest.mark.parametrize("case", POINTS, ids=lambda case: case.name)
+def test_sweep_of_delta_lights(case):
+    """With delta lights, the error of ``sweep`` decreases with the square of the voxel size.
+
+    Both the extrapolation of two resolutions and the finer one are compared with the reference.
+    """
+    settings = {"solver": "sweep", "cache_spp": 32}
+    coarse, fine = (error(case, exact(case), resolution=n, **settings) for n in (32, 64))
+    assert abs(fine + (fine - coarse) / 3) < 0.001
+    assert abs(fine) < 0.0015
+
+
+@pytest.mark.parametrize("case", SWEEP, ids=lambda case: case.name)
+def test_sweep(case):
+    resolution, samples, bound = SWEEP[case]
+    settings = {"solver": "sweep", "resolution": resolution, "cache_spp": samples}
+    assert abs(error(case, exact(case), **settings)) < bound
+
+
+@pytest.mark.parametrize("case", PATH, ids=lambda case: case.name)
+def test_path(case):
+    resolution, samples, bound = PATH[case]
+    settings = {"solver": "path", "resolution": resolution, "cache_spp": samples}
+    assert abs(error(case, exact(case), **settings)) < bound
+
+
+@pytest.mark.parametrize("case", ORDERS, ids=lambda case: case.name)
+def test_all_orders(case):
+    resolution, samples, bound = ORDERS[case]
+    expected, noise = orders(case, 1 << 21)
+    assert noise < bound / 2 * expected, "too noisy to say"
+    settings = {"solver": "sweep", "resolution": resolution, "cache_spp": samples}
+    assert abs(error(case, expected, **settings)) < bound
+
+
+@pytest.mark.parametrize(
+    "case", [Case("directional", "hg 0.58"), Case("constant", "rayleigh", "3x5x2")]
+)
+def test_the_references_agree(case):
+    """The two references agree: quadrature, and paths that end after their first collision."""
+    expected, noise = orders(case, 1 << 20, with_control=False)
+    assert noise < 2e-3 * expected, "too noisy to say"
+    assert abs(expected - exact(case)) < 3 * noise

@@ -1,0 +1,70 @@
+"""The description of a scene is complete once it is made, and does not change."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.lights.emitters import EmitterKind
+from mitsuba_irrcache.media.bake_emission import bake_emission
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.transport.path import Media
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+def several(scenes) -> mi.Scene:
+    """Three cubes beside each other, the last within glass and so not visible."""
+    boxes = {
+        name: scenes.boundary(
+            scenes.medium(1.0 + i, 0.5), scenes.placement((1, 1, 1), center=(3 * i, 0, 0))
+        )
+        for i, name in enumerate("abc")
+    }
+    boxes["c"]["bsdf"] = {"type": "dielectric"}
+    return scenes.load({"type": "volpath"}, None, **boxes)
+
+
+def test_several_media(scenes):
+    description = compile_scene(several(scenes))
+    grids = description.media.grids
+    assert [grid.number for grid in grids] == [0, 1, 2]
+    assert len({grid.name for grid in grids}) == 3
+    assert [grid in description.visible for grid in grids].count(True) == 2
+    for grid in grids:
+        assert grid.is_traced and not grid.is_isolated and grid.has_exact_boundary
+        around = Media.around(grid).grids
+        assert around[grid.number] is grid
+        assert [other.name for other in around] == [other.name for other in grids]
+    assert float(description.brightest[0]) > 0
+
+
+def test_isolated_medium(scenes):
+    scene = scenes.load({"type": "volpath"}, scenes.boundary(scenes.medium(1.0, 0.5)))
+    emission = bake_emission(0.25, 2.0)
+    description = compile_scene(scene, emission)
+    (medium,) = description.visible
+    assert description.media.grids == (medium,)
+    assert medium.is_isolated and not medium.is_traced and medium.others == ()
+    assert medium.emission is emission
+    assert description.emitters.of(EmitterKind.CONSTANT_ENVIRONMENT)
+    assert description.emits and description.brightest is None
+
+
+def test_nothing_can_be_changed(scenes):
+    description = compile_scene(several(scenes))
+    medium = description.visible[0]
+    with pytest.raises(FrozenInstanceError):
+        description.visible = ()
+    for made in (medium, description.media, description.emitters):
+        for name in vars(made):
+            with pytest.raises(AttributeError, match="immutable"):
+                setattr(made, name, None)
+    other = medium.replaced(emission=bake_emission(1.0, 1.0))
+    assert medium.emission is None and other.emission is not None
+    assert other.macrocells is medium.macrocells
+    denser = medium.replaced(sigma_t=type(medium.sigma_t)(np.array([9.0])))
+    assert denser.macrocells is not medium.macrocells

@@ -1,0 +1,138 @@
+"""Defaults for parameters that the user left unset: resolution of the cache, and directions."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.fields import ConstantField, GridField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers import grid_size
+from mitsuba_irrcache.solvers.base import solver_named
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
+from mitsuba_irrcache.solvers.grid_size import choose_grid
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+def medium(values: np.ndarray, edges=(1.0, 1.0, 1.0)) -> MediumGrid:
+    """Return a medium of these extinctions (z, y, x) in a box of these edges (x, y, z)."""
+    frame = np.diag([*edges, 1.0])
+    field = GridField(Grid(values.shape, frame), mi.Float(values.astype(np.float32).ravel()), 1)
+    unit = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1.0]])
+    boundary = Boundary("box", frame @ np.linalg.inv(unit))
+    return MediumGrid(field, ConstantField(np.array([0.5])), boundary)
+
+
+def chosen(values: np.ndarray, edges=(1.0, 1.0, 1.0), solver="sweep") -> tuple[int, ...]:
+    return choose_grid(medium(values, edges), 0, solver_named(solver).size_rule)[0].shape
+
+
+def in_air(count: int, sigma_t: float) -> np.ndarray:
+    """Return a cube of medium surrounded by empty voxels, so that the boundary does not cut it."""
+    values = np.zeros((count, count, count))
+    inner = slice(count // 8, -(count // 8))
+    values[inner, inner, inner] = sigma_t
+    return values
+
+
+def test_thin_media_use_the_resolution_of_the_data():
+    assert chosen(in_air(40, 2.0)) == (40, 40, 40)  # optical depth per voxel
+    assert chosen(np.zeros((40, 48, 56))) == (40, 48, 56)
+    assert chosen(np.full((40, 48, 56), 1.0)) == (40, 48, 56)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (4, 6, 8)])
+def test_small_grids_get_more_voxels(shape):
+    """Small grids get more voxels: irradiance has more detail than the data, at a negligible
+    cost.
+    """
+    assert chosen(np.full(shape, 1.0)) == (32, 32, 32)
+    assert chosen(np.full(shape, 1.0), (1.0, 0.5, 0.25)) == (max(8, shape[0]), 16, 32)
+
+
+def test_dense_grids_are_refined_by_optical_depth():
+    """Dense grids are refined per axis by the optical depth, by a factor of six at most.
+
+    For ``path`` they are not, since its noise exceeds the discretisation error.
+    """
+    thin, dense, opaque = (chosen(in_air(40, 40 * depth)) for depth in (0.1, 1.0, 1000.0))
+    assert thin == (40, 40, 40)
+    assert dense == (64, 64, 64)  # 1 / 0.7 for each data voxel would be 57
+    assert chosen(in_air(40, 48.0)) == (68, 68, 68)
+    assert chosen(in_air(40, 40.0 * 1.2 * 4)) == (127, 127, 127)  # 4^0.45 times as many
+    assert opaque == (200, 200, 200)
+    assert chosen(in_air(20, 20000.0)) == (120, 120, 120)
+    assert chosen(in_air(40, 40000.0), solver="path") == (40, 40, 40)
+    assert chosen(np.full((4, 4, 4), 500.0), solver="path") == (32, 32, 32)
+    assert chosen(np.full((1, 1, 1), 1.0), solver="path") == (16, 16, 16)
+
+
+def test_contrast_and_a_cut_boundary_need_more_voxels():
+    """High contrast requires five voxels per mean free path, up to 64; a cut boundary up to 128."""
+    speck = np.zeros((4, 4, 4))
+    speck[1:3, 1:3, 1:3] = 8.0
+    assert chosen(speck) == (40, 40, 40)
+    assert chosen(100 * speck) == (64, 64, 64)
+    assert chosen(np.full((4, 4, 4), 15.0)) == (75, 75, 75)
+    assert chosen(np.full((4, 4, 4), 500.0)) == (128, 128, 128)
+
+
+def test_homogeneous_media_get_the_resolution_of_an_equal_grid():
+    """A homogeneous medium gets the resolution of the same medium on a grid."""
+    rule = solver_named("sweep").size_rule
+    for sigma_t in (0.5, 10.0, 1000.0):
+        grid = medium(np.full((4, 4, 4), sigma_t))
+        same = MediumGrid(ConstantField(np.array([sigma_t])), grid.albedo, grid.boundary)
+        shapes = [choose_grid(m, 0, rule)[0].shape for m in (same, grid)]
+        assert shapes[0] == shapes[1]
+
+
+def test_resolution_depends_on_where_collisions_happen():
+    """The resolution depends on the extinction where collisions happen, not on the volume's
+    mean.
+    """
+    values = np.full((40, 40, 40), 0.01)
+    values[16:24, 16:24, 16:24] = 40.0
+    assert chosen(values) == (64, 64, 64)
+
+
+def test_finer_voxels_have_a_limit(monkeypatch):
+    monkeypatch.setattr(grid_size, "MOST_REFINED", 70000)
+    assert chosen(in_air(40, 40000.0)) == (41, 41, 41)
+    monkeypatch.setattr(grid_size, "MOST_VOXELS", 30000)
+    assert chosen(in_air(40, 40000.0)) == (31, 31, 31)
+
+
+@pytest.mark.parametrize(
+    ("samples", "batch"),
+    [(1, 32), (32, 32), (33, 64), (96, 96), (128, 128), (256, 256), (257, 160), (1000, 256)],
+)
+def test_size_of_batches(samples, batch):
+    """A batch holds all directions, or equal parts of up to 256."""
+    assert sn_solver.batch_of(samples, sn_solver.BATCH) == batch
+
+
+def test_directions_by_default(scenes):
+    """The default is 128 directions in one batch, twice as many for single scattering.
+
+    If an error estimate is required, there are two batches; directions requested later count.
+    """
+    shape = scenes.boundary(scenes.medium(scenes.texture((4, 4, 4), 0.5, 3.0, 1), 0.9))
+    for wanted, asked, expected in (
+        ({}, 0, (128, 128)),
+        ({"max_depth": 2}, 0, (256, 256)),
+        ({"filter": "bilateral"}, 0, (128, 64)),
+        ({}, 64, (64, 64)),
+    ):
+        scene = scenes.load(
+            {"type": "irrcache", "max_depth": -1, "solver": "auto"} | wanted, shape, size=2
+        )
+        if asked:
+            scene.integrator().cache_spp = asked
+        scene.integrator().prepare(scene)
+        cache = scene.integrator().cache
+        assert (cache.samples, cache.batch) == expected
