@@ -20,7 +20,7 @@ from experiments.support.options import begin
 from mitsuba_irrcache.compare import style
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.render.raymarch import COARSER, COARSEST
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 SIDE = 8
 #: What is drawn beside lines: text, arrows.
@@ -51,8 +51,8 @@ def tracks(path: Path) -> None:
     lattice = Tracks(grid, sigma_t, np.zeros(3, int), grid.resolution)
     direction = np.array([[0.9, 0.405, 0.0]])
     direction /= np.linalg.norm(direction)
-    rows = lattice.table(direction, np.zeros((1, 2)), np.ones(1), np.full((1, 2), 0.3)).rows
-    slope, start = rows.slopes[0, 0], rows.starts[0, 0]
+    geometry = lattice.table(direction, np.zeros((1, 2)), np.ones(1), np.full((1, 2), 0.3)).geometry
+    slope, start = geometry.slopes[0, 0], geometry.starts[0, 0]
     with style.figure(path, figsize=(4.6, 4.6)) as (_, axes):
         ax = axes[0, 0]
         for k in range(SIDE + 1):

@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.sequences import GOLDEN_STEP, lattice_points
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import kind_of
@@ -39,8 +40,8 @@ MIN_SPOT_SHARE, MAX_SPOTS = 0.02, 4
 ENCLOSED_ENERGY = 0.97
 #: Maximum root mean square radius of spots that are treated as points.
 MAX_POINT_RADIUS = float(np.deg2rad(1))
-#: Number of environment samples used to find spots; step of their golden-ratio sequence.
-SPOT_SAMPLES, GOLDEN = 1 << 16, (5**0.5 - 1) / 2
+#: Number of environment samples used to find spots.
+SPOT_SAMPLES = 1 << 16
 #: Maximum number of narrow lamps, and surface samples that determine the extent of each.
 MAX_LAMPS, LAMP_SAMPLES = 8, 1024
 #: Legendre series are truncated behind the last coefficient larger than this.
@@ -349,8 +350,7 @@ def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
     Also returns the irradiance (1 + n, channels) from outside of all spots, and from each spot.
     """
     rng = np.random.default_rng(3)
-    number = np.arange(SPOT_SAMPLES)
-    points = np.stack([(number + 0.5) / SPOT_SAMPLES, number * GOLDEN % 1])
+    points = lattice_points(SPOT_SAMPLES, GOLDEN_STEP)
     samples = mi.Point2f(np.float32((points + rng.random((2, 1))) % 1))
     record, colours = environment.sample_direction(
         dr.zeros(mi.Interaction3f, SPOT_SAMPLES), samples

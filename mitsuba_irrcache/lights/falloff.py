@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import kronecker_points
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import point_lights, position_of
 
@@ -189,8 +190,7 @@ def _of_point(emitter: mi.Emitter, grid: Grid) -> list[tuple[np.ndarray, float, 
 
 def _of_area(shape: mi.Shape, grid: Grid) -> list[tuple[np.ndarray, float, float]]:
     """Points that stand for the parts of an area light, if it is small and near."""
-    i = np.arange(MOST_POINTS) + 0.5
-    sample = mi.Point2f(np.float32([i * 0.7548776662466927 % 1, i * 0.5698402909980532 % 1]))
+    sample = mi.Point2f(np.float32(kronecker_points(np.arange(MOST_POINTS) + 0.5, 2)))
     found = shape.sample_position(0.0, sample)
     area, edge = float(dr.max(shape.surface_area())[0]), float(grid.voxel_size.max())
     positions = np.array(found.p, dtype=np.float64)

@@ -16,6 +16,7 @@ from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.cache.uncertainty import uncertainty_of
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import random_stream
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import give_back
@@ -334,5 +335,4 @@ def _added(gathered: list, sums: list, transmittance: mi.Spectrum, scale: mi.Flo
 def _stream(sampler: mi.Sampler, active: mi.Bool) -> mi.PCG32:
     """Create a random stream per lane, seeded by two numbers of the sampler."""
     a, b = (dr.reinterpret_array(mi.UInt32, sampler.next_1d(active)) for _ in range(2))
-    state, sequence = mi.sample_tea_32(a, b, 8)
-    return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+    return random_stream(mi.sample_tea_32(a, b, 8))

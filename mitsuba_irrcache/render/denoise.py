@@ -17,6 +17,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.uncertainty import PROBES, ROUNDS
 from mitsuba_irrcache.core.jit import Divisor, symbolic
+from mitsuba_irrcache.core.sequences import golden_words
 from mitsuba_irrcache.core.spectrum import interleaved, luminance
 from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.pixel_filter import pixel_of
@@ -137,7 +138,7 @@ def _least_risk(
     available = dr.width(places)
     count = min(available, RISK_PIXELS)
     # Select pixels by multiples of the golden ratio, which are uniformly distributed.
-    turn = mi.UInt64(dr.arange(mi.UInt32, count) * mi.UInt32(2654435769))
+    turn = mi.UInt64(golden_words(dr.arange(mi.UInt32, count)))
     nth = mi.UInt32((turn * dr.opaque(mi.UInt64, available)) >> 32)
     chosen = dr.gather(mi.UInt32, places, nth)
     settings = [(stride, strength) for stride in STRIDES for strength in STRENGTHS]

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.jit import Divisor
+from mitsuba_irrcache.core.sequences import kronecker_words, unit_floats
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import require_memory
@@ -182,10 +183,6 @@ class PixelPositions:
     one sample per pixel do not depend on the seed. Other samplers are used unchanged.
     """
 
-    #: 2^32 divided by the root of x^3 = x + 1 and by its square: a two-dimensional golden-ratio
-    #: sequence (Roberts 2018)
-    STEPS = (3242174889, 2447445414)
-
     def __init__(self, sampler: mi.Sampler, seed: int, spp: int) -> None:
         self.sampler = sampler
         self.independent = sampler.class_name() == "IndependentSampler"
@@ -202,10 +199,10 @@ class PixelPositions:
         shifts = mi.sample_tea_32(pixel, self.seed, 8)
         number = self.first + sample
         pair = number // 2
-        bits = [s + pair * mi.UInt32(k) for s, k in zip(shifts, self.STEPS, strict=True)]
+        bits = kronecker_words(pair, shifts)
         bits = [dr.select(number % 2 == 1, ~b, b) for b in bits]
         bits = [dr.select(number < self.paired, b, 1 << 31) for b in bits]
-        return mi.Point2f([mi.Float(b >> 8) * 2.0**-24 for b in bits])
+        return mi.Point2f(unit_floats(bits))
 
 
 def camera_ray(

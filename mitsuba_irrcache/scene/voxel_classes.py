@@ -8,6 +8,7 @@ import numpy as np
 
 from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import fibonacci_direction, kronecker
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.cut_cells import CutCells
@@ -78,13 +79,7 @@ def _probed(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
     within, backs = mi.UInt32(0), mi.UInt32(0)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, RAYS)
     while dr.hint(k < count, label="voxel classes"):
-        # Points of the generalised golden ratio: directions, and positions in the voxel.
-        u = [mi.Float(k) * g for g in (0.8191725134, 0.6710436067, 0.5497004779)]
-        u = [v - dr.floor(v) for v in u]
-        z = (mi.Float(k) + 0.5) * (2 / RAYS) - 1
-        around = dr.sqrt(1 - z * z)
-        sine, cosine = dr.sincos(2.3999632297 * mi.Float(k) + 0.4)
-        direction = mi.Vector3f(around * cosine, around * sine, z)
+        u, direction = kronecker(k, 3), fibonacci_direction(k, RAYS, azimuth=0.4)
         pointer = probe(scene, grid.world.point(corner + 0.5), direction)
         meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction)
         backs += dr.select(meets_back, mi.UInt32(1), 0)

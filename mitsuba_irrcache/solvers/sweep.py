@@ -1,4 +1,4 @@
-"""The solver ``sweep``: discrete ordinates along long characteristics, see `sn`."""
+"""The solver ``sweep``: discrete ordinates along long characteristics, see `discrete_ordinates`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
+from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, least_batch
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.grid_size import TARGET_ERROR, SizeRule, choose_grid
-from mitsuba_irrcache.solvers.sn import solver as sn_solver
-from mitsuba_irrcache.solvers.sn.anisotropic import AnisotropicSweep, least_batch
-from mitsuba_irrcache.solvers.sn.solver import Sweep
 
 #: Kinds of emitters whose radiance can enter along tracks or be sampled from the voxels.
 EMITTERS = frozenset(EmitterKind) - {EmitterKind.DIRECTIONAL_AREA, EmitterKind.UNKNOWN}

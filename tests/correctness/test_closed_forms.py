@@ -19,9 +19,9 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.base import SolverTask
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
+from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, least_batch
 from mitsuba_irrcache.solvers.path.solver import PathSolver
-from mitsuba_irrcache.solvers.sn import solver as sn_solver
-from mitsuba_irrcache.solvers.sn.anisotropic import AnisotropicSweep, least_batch
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

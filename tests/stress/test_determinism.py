@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from experiments.robustness.stability.worlds import WHITE_SKY, Camera, Matter, World, blob, scene
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import SMALL_GRID
 from mitsuba_irrcache.solvers.path import solver as path_solver
-from mitsuba_irrcache.solvers.sn.tracks import SMALL
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -24,7 +24,7 @@ KINDS = {
     "single sweep": {"solver": "sweep", "resolution": 24, "max_depth": 2},
     "path": {"solver": "path", "resolution": 12},
 }
-assert 24**3 < SMALL < 42**3
+assert 24**3 < SMALL_GRID < 42**3
 
 
 def look(kind: str, **settings) -> tuple[np.ndarray, np.ndarray]:

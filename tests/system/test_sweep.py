@@ -15,8 +15,8 @@ from experiments.performance.kinds.run import box, smoke
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.base import solver_named
-from mitsuba_irrcache.solvers.sn import multigrid, tracks
-from mitsuba_irrcache.solvers.sn import solver as sn_solver
+from mitsuba_irrcache.solvers.discrete_ordinates import multigrid, tracks
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -99,8 +99,8 @@ def test_white_furnace(scenes, monkeypatch, kind, tolerance):
     """
     if tolerance:
         monkeypatch.setattr(multigrid, "TOLERANCE", tolerance)
-        monkeypatch.setattr(multigrid, "FEW_TOLERANCE", tolerance / 10)
-        monkeypatch.setattr(multigrid, "CORRECTIONS", 40)
+        monkeypatch.setattr(multigrid, "COARSEST_TOLERANCE", tolerance / 10)
+        monkeypatch.setattr(multigrid, "MAX_CYCLES", 40)
     if kind == "homogeneous":
         shape = scenes.boundary(scenes.medium(25.0, 1.0))
     else:
@@ -395,7 +395,7 @@ def test_seeds_and_batches_differ(scenes):
 @pytest.mark.parametrize("small", [0, 40**3])
 def test_more_batches_compile_nothing(scenes, kernels, monkeypatch, max_depth, small):
     """More batches, another seed and other densities of equal shape compile no kernels."""
-    monkeypatch.setattr(tracks, "SMALL", small)
+    monkeypatch.setattr(tracks, "SMALL_GRID", small)
     to_world = scenes.placement()
 
     def fill(seed, count):
@@ -416,7 +416,7 @@ def test_launches_of_a_batch(scenes, kernels, monkeypatch):
     These are one for each of 16 pairs of directions, and three per axis: gathering its input, a
     volume for its result, and sharpening.
     """
-    monkeypatch.setattr(tracks, "SMALL", 0)
+    monkeypatch.setattr(tracks, "SMALL_GRID", 0)
     counts = []
     for count in (2, 6):
         history = kernels(

@@ -9,7 +9,7 @@ import pytest
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import compile_scene
-from mitsuba_irrcache.solvers.sn import solver as sweep
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sweep
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -51,7 +51,7 @@ from mitsuba_irrcache.compare.tables import Table, percent, seconds
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.scene_files import load_scene, parse_integrator
 from mitsuba_irrcache.machine.llvm import require_llvm
-from mitsuba_irrcache.solvers.sn.solver import BATCH
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import BATCH
 
 #: Variant and further parameters of each scene: clouds are grey.
 SCENES = {

@@ -37,7 +37,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.io.scene_files import load_scene
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
-from mitsuba_irrcache.solvers.sn.solver import BATCH, LARGEST_BATCH
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import BATCH, LARGEST_BATCH
 
 VARIANT = "llvm_ad_mono"
 #: Source and voxels along its longest side; 0: as the source has it.

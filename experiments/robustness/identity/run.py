@@ -27,6 +27,8 @@ from mitsuba_irrcache.errors import IrrcacheError
 SIZE, SPP = 32, 4
 SOLVERS = ("path", "sweep")
 SMALL = {"resolution": 16, "cache_spp": 32}
+#: Enough voxels for several multigrid levels, and for a kernel launch for each pair of ordinates.
+FINE = {"resolution": 48, "solver": "sweep", "cache_spp": 32}
 #: All AOVs.
 AOVS = "colour, illumination, background, transmittance, depth, noise, bias"
 
@@ -41,6 +43,14 @@ def cloud(*emitters: dict, **more) -> dict:
     """Return a heterogeneous medium with these emitters."""
     lights = {f"light{i}": emitter for i, emitter in enumerate(emitters)}
     return {"box": kinds.box(kinds.smoke(16, **more))} | lights
+
+
+def apart(scale: float) -> dict:
+    """Return two balls at opposite corners of the cube [-1, 1]^3, most of which is empty."""
+    places = np.moveaxis(np.indices((48,) * 3) + 0.5, 0, -1) / 24 - 1
+    distances = [np.linalg.norm(places - centre, axis=-1) for centre in (-0.6, 0.6)]
+    density = np.clip(1.5 - 4 * np.minimum(*distances), 0, 1)[..., None]
+    return {"box": kinds.box(kinds.medium(density, scale, (0.95, 0.9, 0.8)))}
 
 
 def environment() -> dict:
@@ -125,6 +135,13 @@ SCENES: dict[str, tuple[Callable[[], dict], dict]] = {
     ),
     "images_ground": (kinds.kind_ground, {"aovs": AOVS, "filter": "fixed", "hide_emitters": True}),
     "defaults": (kinds.kind_cloud, {"solver": "auto", "resolution": 0, "cache_spp": 0}),
+    "fine": (lambda: cloud(kinds.sky(), kinds.sun()), FINE),
+    "fine_chromatic": (lambda: cloud(kinds.sky(), scale=8.0, tint=np.array([0.1, 0.4, 1.0])), FINE),
+    "fine_hg": (lambda: cloud(kinds.sky(), point(), phase=hg(0.5)), FINE),
+    "fine_ground": (kinds.kind_ground, FINE),
+    "fine_ground_hg": (kinds.kind_forward_ground, FINE),
+    "fine_sparse": (lambda: apart(20.0) | {"sky": kinds.sky(), "sun": kinds.sun()}, FINE),
+    "fine_dense": (lambda: apart(400.0) | {"sky": kinds.sky()}, FINE),
 }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ SWEEP = "tests/system/test_sweep.py"
 UNBIASED = "tests/system/test_path_is_unbiased.py"
 PROJECTION = "tests/unit/render/test_raymarch.py"
 CACHE = "tests/unit/cache/test_volume.py"
-MOMENTS = "tests/unit/solvers/sn/test_moments.py"
+MOMENTS = "tests/unit/solvers/discrete_ordinates/test_moments.py"
 PHASE = "tests/system/test_anisotropic_scattering.py"
 
 
@@ -34,7 +34,7 @@ MUTANTS = (
     ),
     Mutant(
         "1 % of what is scattered lost (sweep)",
-        "solvers/sn/multigrid.py",
+        "solvers/discrete_ordinates/multigrid.py",
         "phi * self.albedo * dr.inv_four_pi",
         "phi * self.albedo * (0.99 * dr.inv_four_pi)",
         (SWEEP,),
@@ -69,45 +69,45 @@ MUTANTS = (
     ),
     Mutant(
         "extinction of coarse caches shifted by half a voxel (sweep)",
-        "solvers/sn/tracks.py",
-        "self.lower[k] * ratio[k] - 0.5, last",
-        "self.lower[k] * ratio[k], last",
+        "solvers/discrete_ordinates/tracks.py",
+        "self.lower[k] * ratio - 0.5,",
+        "self.lower[k] * ratio,",
         (SWEEP,),
     ),
     Mutant(
         "the cosine of the slope forgotten: length of a line in a slice (sweep)",
-        "solvers/sn/tracks.py",
-        "[1 / abs(velocity[axis]), weights[i]",
-        "[1 / np.linalg.norm(velocity), weights[i]",
+        "solvers/discrete_ordinates/tracks.py",
+        "length=1 / np.abs(along)",
+        "length=1 / np.linalg.norm(velocities, axis=1)",
         (SWEEP,),
     ),
     Mutant(
         "the cosine of the slope forgotten: area of a line (sweep)",
-        "solvers/sn/kernel.py",
+        "solvers/discrete_ordinates/kernel.py",
         "mi.Vector4f(0, middle, lost * area, count * tau * area)",
         "mi.Vector4f(0, middle, lost, count * tau)",
         (SWEEP,),
     ),
     Mutant(
         "the albedo of a voxel is its plain mean, not that of its collisions (sweep)",
-        "solvers/sn/resampling.py",
+        "solvers/discrete_ordinates/resampling.py",
         "sigma_t = mi.Spectrum(medium.sigma_t.at_world(p)) * weight",
         "sigma_t = mi.Spectrum(weight)",
-        ("tests/unit/solvers/sn/test_resampling.py",),
+        ("tests/unit/solvers/discrete_ordinates/test_resampling.py",),
     ),
     Mutant(
         "lines that leave through a side go on with their light (sweep)",
-        "solvers/sn/kernel.py",
-        "return voxel, position, dr.select(outside, self.since(position), 1.0)",
+        "solvers/discrete_ordinates/kernel.py",
+        "return voxel, position, dr.select(outside, self.since_entry(position), 1.0)",
         "return voxel, position, dr.select(outside, mi.Float(1.0), 1.0)",
         (SWEEP,),
     ),
     Mutant(
         "every other pair of directions forgotten (sweep)",
-        "solvers/sn/kernel.py",
+        "solvers/discrete_ordinates/kernel.py",
         "place += step",
         "place += 2 * step",
-        ("tests/unit/solvers/sn/test_tracks.py",),
+        ("tests/unit/solvers/discrete_ordinates/test_tracks.py",),
     ),
     Mutant(
         "samples on the wrong side of their pixel's row (film)",
@@ -118,14 +118,14 @@ MUTANTS = (
     ),
     Mutant(
         "sharpening with the wrong sign (sweep)",
-        "solvers/sn/tracks.py",
+        "solvers/discrete_ordinates/tracks.py",
         "2 * here - below - above, 0)",
         "below + above - 2 * here, 0)",
         (SWEEP,),
     ),
     Mutant(
         "light of an environment from the other side (sweep)",
-        "solvers/sn/incident.py",
+        "solvers/discrete_ordinates/incident.py",
         "interaction.wi = mi.Vector3f(directions.T",
         "interaction.wi = mi.Vector3f(-directions.T",
         (SWEEP,),
@@ -244,21 +244,21 @@ MUTANTS = (
     ),
     Mutant(
         "light in the voxel of a lamp as in its middle (sweep)",
-        "solvers/sn/solver.py",
-        "else irradiance[channel] * self._spread",
+        "solvers/discrete_ordinates/solver.py",
+        "else irradiance[channel] * self._inverse_square_mean",
         "else irradiance[channel]",
         ("tests/system/test_point_lights.py",),
     ),
     Mutant(
         "light from the opposite side (moments)",
-        "solvers/sn/moments.py",
-        "even, odd = there + back, there - back",
-        "even, odd = there + back, back - there",
+        "solvers/discrete_ordinates/moments.py",
+        "even, odd = forward + backward, forward - backward",
+        "even, odd = forward + backward, backward - forward",
         (MOMENTS,),
     ),
     Mutant(
         "what lines lose not per depth (moments)",
-        "solvers/sn/moments.py",
+        "solvers/discrete_ordinates/moments.py",
         "dr.select(v.w > 0, v.z / v.w, 0)",
         "v.z",
         (PHASE,),
@@ -272,7 +272,7 @@ MUTANTS = (
     ),
     Mutant(
         "light that comes back to a medium seen from any side (moments)",
-        "solvers/sn/moments.py",
+        "solvers/discrete_ordinates/moments.py",
         "for factor in basis[: self.moments.count - 1]:",
         "for factor in ():",
         (PHASE,),
@@ -294,23 +294,23 @@ MUTANTS = (
     ),
     Mutant(
         "suns of skies as bright as directions met them",
-        "solvers/sn/incident.py",
-        "light[number == k] *= factor",
-        "light[number == k] *= 1",
+        "solvers/discrete_ordinates/incident.py",
+        "incoming[number == k] *= factor",
+        "incoming[number == k] *= 1",
         ("tests/system/test_sweep.py",),
     ),
     Mutant(
         "light passes a sliver of its medium on its way in (arrivals)",
-        "solvers/sn/boundary_condition.py",
-        "around.scene, around.others, ray, pointer",
-        "around.scene, around.media, ray, pointer",
+        "solvers/discrete_ordinates/boundary_condition.py",
+        "boundary.scene, boundary.other_media, ray, pointer",
+        "boundary.scene, boundary.media, ray, pointer",
         ("tests/stress/test_stability.py",),
     ),
     Mutant(
         "moments of lamps forgotten (directional sweep)",
-        "solvers/sn/anisotropic.py",
-        "moments.part(smooth, k) + sum(light[k] for light in others)",
-        "moments.part(smooth, k)",
+        "solvers/discrete_ordinates/anisotropic.py",
+        "moments.moment(smooth, k) + sum(values[k] for values in others)",
+        "moments.moment(smooth, k)",
         (PHASE,),
     ),
     Mutant(
@@ -336,9 +336,9 @@ MUTANTS = (
     ),
     Mutant(
         "directions of passes not even together",
-        "solvers/sn/angular_quadrature.py",
+        "solvers/discrete_ordinates/angular_quadrature.py",
         "points = points @ _rotation(rng).T",
         "points = points",
-        ("tests/unit/solvers/sn/test_angular_quadrature.py",),
+        ("tests/unit/solvers/discrete_ordinates/test_angular_quadrature.py",),
     ),
 )

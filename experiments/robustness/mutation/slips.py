@@ -7,12 +7,12 @@ from __future__ import annotations
 from experiments.robustness.mutation.mutants import CACHE, PROJECTION, UNBIASED, Mutant
 
 BOUNDS = "tests/system/test_out_of_bounds_access.py"
-LATTICE = "tests/unit/solvers/sn/test_tracks.py"
-SCATTERING = "tests/unit/solvers/sn/test_multigrid.py"
-LINE_DIRECTIONS = "tests/unit/solvers/sn/test_directions_of_incoming_radiance.py"
-SKIES = "tests/unit/solvers/sn/test_distant_illumination.py"
-COARSER = "tests/unit/solvers/sn/test_multigrid_levels.py"
-MEANS = "tests/unit/solvers/sn/test_resampling_to_larger_voxels.py"
+LATTICE = "tests/unit/solvers/discrete_ordinates/test_tracks.py"
+SCATTERING = "tests/unit/solvers/discrete_ordinates/test_multigrid.py"
+LINE_DIRECTIONS = "tests/unit/solvers/discrete_ordinates/test_directions_of_incoming_radiance.py"
+SKIES = "tests/unit/solvers/discrete_ordinates/test_distant_illumination.py"
+COARSER = "tests/unit/solvers/discrete_ordinates/test_multigrid_levels.py"
+MEANS = "tests/unit/solvers/discrete_ordinates/test_resampling_to_larger_voxels.py"
 LAMPS = "tests/unit/lights/test_falloff.py"
 SURFACES = "tests/system/test_surfaces.py"
 AMONG_SURFACES = "tests/system/test_sweep_with_surfaces.py"
@@ -28,101 +28,101 @@ METRICS_OF_RUNS = "tests/unit/compare/test_metrics_common_error.py"
 SLIPS = (
     Mutant(
         "the way back begins a slice too far (lattice)",
-        "solvers/sn/tracks.py",
-        "(int(self.sides[axis]) - 1) * slope",
-        "int(self.sides[axis]) * slope",
+        "solvers/discrete_ordinates/tracks.py",
+        "(size[axis] - 1) * slope",
+        "size[axis] * slope",
         (LATTICE,),
     ),
     Mutant(
         "sharpening takes the last voxel of a box for an inner one (lattice)",
-        "solvers/sn/tracks.py",
+        "solvers/discrete_ordinates/tracks.py",
         "(stride, lower[k], upper[k] - 1)",
         "(stride, lower[k], upper[k])",
         (BOUNDS,),
     ),
     Mutant(
         "directions of lines against their axis not turned (lattice)",
-        "solvers/sn/tracks.py",
-        "directions[i] * np.sign(velocity[axis])",
-        "directions[i]",
+        "solvers/discrete_ordinates/tracks.py",
+        "directions * np.sign(along)[:, None]",
+        "directions",
         (LINE_DIRECTIONS,),
     ),
     Mutant(
         "lines that begin next to a side pass half a slice at least (lines)",
-        "solvers/sn/kernel.py",
-        "dr.select(voxel == self.entry, least(near, 0.5), 0.5)",
-        "dr.select(voxel == self.entry, dr.maximum(near, 0.5), 0.5)",
+        "solvers/discrete_ordinates/kernel.py",
+        "dr.select(voxel == self.entry, least(nearest, 0.5), 0.5)",
+        "dr.select(voxel == self.entry, dr.maximum(nearest, 0.5), 0.5)",
         (LATTICE,),
     ),
     Mutant(
         "lines that enter between slices collide in half a slice (lines)",
-        "solvers/sn/kernel.py",
-        "to_middle = dr.select(since < 1, since, 0.5) * first",
-        "to_middle = 0.5 * first",
-        ("tests/unit/solvers/sn/test_tracks_in_homogeneous_media.py",),
+        "solvers/discrete_ordinates/kernel.py",
+        "dr.select(state.since_entry < 1, state.since_entry, 0.5) * first",
+        "0.5 * first",
+        ("tests/unit/solvers/discrete_ordinates/test_tracks_in_homogeneous_media.py",),
     ),
     Mutant(
         "passes take the rows of the pass behind them (passes)",
-        "solvers/sn/ordinates.py",
-        "np.cumsum([0] + [len(row[0]) for row in rows])",
-        "np.cumsum([len(row[0]) for row in rows])",
+        "solvers/discrete_ordinates/ordinates.py",
+        "np.cumsum([0] + [len(each.directions) for each in sets])",
+        "np.cumsum([len(each.directions) for each in sets])",
         (AMONG_SURFACES,),
     ),
     Mutant(
         "coarse extinction as if made of eight voxels always (scattering)",
-        "solvers/sn/multigrid.py",
+        "solvers/discrete_ordinates/multigrid.py",
         "total / len(children)",
         "total / 8",
         (COARSER,),
     ),
     Mutant(
         "coarser grids of odd sides squeezed into the box (scattering)",
-        "solvers/sn/multigrid.py",
+        "solvers/discrete_ordinates/multigrid.py",
         "scale = ratio * sides / grid.resolution",
         "scale = np.ones(3)",
         (COARSER,),
     ),
     Mutant(
         "coarse corrections moved by half a voxel (scattering)",
-        "solvers/sn/multigrid.py",
+        "solvers/discrete_ordinates/multigrid.py",
         "(mi.Float(at) + 0.5) * dr.opaque",
         "mi.Float(at) * dr.opaque",
         (COARSER,),
     ),
     Mutant(
         "voxels send the same light both ways (moments)",
-        "solvers/sn/moments.py",
+        "solvers/discrete_ordinates/moments.py",
         "even - odd, place + step",
         "even + odd, place + step",
         (LINE_DIRECTIONS,),
     ),
     Mutant(
         "even directions without their own weights beside bright ones (directions)",
-        "solvers/sn/incident.py",
+        "solvers/discrete_ordinates/incident.py",
         "            angle[: len(plain)] *= weights * uniform\n",
         "",
         (SKIES,),
     ),
     Mutant(
         "density of bright directions without that of their opposites (directions)",
-        "solvers/sn/incident.py",
+        "solvers/discrete_ordinates/incident.py",
         "for sign in (1, -1):",
         "for sign in (1,):",
         (SKIES,),
     ),
     Mutant(
         "solid angle of lamps by the distance, not its square (lamps of the sweep)",
-        "solvers/sn/direct_light.py",
+        "solvers/discrete_ordinates/direct_light.py",
         "cosine / (dr.square(distance) * found.pdf)",
         "cosine / (distance * found.pdf)",
-        ("tests/unit/solvers/sn/test_direct_light_solid_angle.py",),
+        ("tests/unit/solvers/discrete_ordinates/test_direct_light_solid_angle.py",),
     ),
     Mutant(
         "each lamp as bright as their mean (lamps of the sweep)",
-        "solvers/sn/direct_light.py",
+        "solvers/discrete_ordinates/direct_light.py",
         "weight = mi.Float(count) / mi.Float(samples)",
         "weight = 1 / mi.Float(samples)",
-        ("tests/unit/solvers/sn/test_direct_light.py",),
+        ("tests/unit/solvers/discrete_ordinates/test_direct_light.py",),
     ),
     Mutant(
         "places pushed away from lamps from where they are (lamps)",
@@ -133,28 +133,28 @@ SLIPS = (
     ),
     Mutant(
         "halves of slices exchanged (extinction)",
-        "solvers/sn/extinction.py",
+        "solvers/discrete_ordinates/extinction.py",
         "halves[0] | halves[1] << 16",
         "halves[1] | halves[0] << 16",
         (LATTICE,),
     ),
     Mutant(
         "extinction at the border interpolated with the next row's (extinction)",
-        "solvers/sn/extinction.py",
+        "solvers/discrete_ordinates/extinction.py",
         "int(sides[k]) - 1)",
         "int(sides[k]))",
         (LATTICE,),
     ),
     Mutant(
         "blocks of voxels with their axes exchanged (baking)",
-        "solvers/sn/resampling.py",
+        "solvers/discrete_ordinates/resampling.py",
         "np.ndindex(*block[::-1])",
         "np.ndindex(*block)",
         (MEANS,),
     ),
     Mutant(
         "blocks of voxels that do not fill the grid (baking)",
-        "solvers/sn/resampling.py",
+        "solvers/discrete_ordinates/resampling.py",
         "block = np.where(data.resolution % block == 0, block, 1)",
         "block = np.where(data.resolution % block >= 0, block, 1)",
         (MEANS,),
@@ -231,9 +231,9 @@ SLIPS = (
     ),
     Mutant(
         "lines enter half a slice later (arrivals)",
-        "solvers/sn/boundary_condition.py",
-        "b, c = dr.fma(a - 0.5, slope_b, b)",
-        "b, c = dr.fma(a, slope_b, b)",
+        "solvers/discrete_ordinates/boundary_condition.py",
+        "b, c = dr.fma(a - 0.5, read.slope_b, b)",
+        "b, c = dr.fma(a, read.slope_b, b)",
         (LINE_DIRECTIONS,),
     ),
     Mutant(

@@ -21,15 +21,16 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.volume import BATCH, LAYERS, IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import kronecker, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import hole_in
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask, register
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import occupied_box
 from mitsuba_irrcache.solvers.grid_size import SizeAmongSurfaces, SizeRule
 from mitsuba_irrcache.solvers.path import estimator as volume_path
-from mitsuba_irrcache.solvers.sn.solver import occupied_box
 from mitsuba_irrcache.transport.path import Media
 from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 
@@ -398,13 +399,11 @@ def _random_numbers(
     batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32, seed: mi.UInt32
 ) -> tuple[mi.PCG32, list[mi.Float]]:
     """The random stream of a sample, and its point of a four-dimensional low-discrepancy set."""
-    shift_a, shift_b = mi.sample_tea_32(voxel, mi.sample_tea_32(seed, batch)[0])
-    rng = mi.PCG32(
-        initstate=mi.UInt64(shift_a) << 32 | mi.UInt64(shift_b), initseq=mi.UInt64(within) + 1
-    )
+    first, second = mi.sample_tea_32(voxel, mi.sample_tea_32(seed, batch)[0])
+    rng = random_stream((first, second), mi.UInt64(within) + 1)
     # A batch shares one random shift of a low-discrepancy set; each point alone is uniform.
-    shifts = mi.PCG32(initstate=mi.UInt64(shift_b) << 32 | mi.UInt64(shift_a), initseq=mi.UInt64(0))
-    return rng, [_fraction(shifts.next_float32() + _kronecker(within, axis)) for axis in range(4)]
+    shifts = random_stream((second, first), 0)
+    return rng, kronecker(within, 4, [shifts.next_float32() for _ in range(4)])
 
 
 def direct_light(
@@ -440,15 +439,3 @@ def direct_light(
     through, rng = transmittance(medium, ray, near, far, rng, contributes & hit)
     through = dr.select(hit & (near < far), through, 1)
     return dr.select(contributes, radiance * through, 0), rng
-
-
-def _kronecker(index: mi.UInt32, axis: int) -> mi.Float:
-    """Point ``index`` of the four-dimensional Kronecker sequence of the generalised golden
-    ratio.
-    """
-    golden = 1.1673039782614187  # root of x^5 = x + 1
-    return mi.Float(index) * (golden ** -(axis + 1) % 1.0)
-
-
-def _fraction(x: mi.Float) -> mi.Float:
-    return x - dr.floor(x)

@@ -13,8 +13,8 @@ from mitsuba_irrcache.cache import uncertainty
 from mitsuba_irrcache.lights import falloff
 from mitsuba_irrcache.render import denoise, raymarch
 from mitsuba_irrcache.solvers import grid_size
+from mitsuba_irrcache.solvers.discrete_ordinates import anderson, multigrid
 from mitsuba_irrcache.solvers.path.solver import PathSolver
-from mitsuba_irrcache.solvers.sn import anderson, multigrid
 from mitsuba_irrcache.solvers.sweep import SweepSolver
 
 PACKAGE = Path(mitsuba_irrcache.__file__).parent
@@ -98,9 +98,9 @@ def test_links_and_images_lead_to_files(page):
 
 CONSTANTS = [
     ("2-representation", r"\\frac\{\((\d+) h\)\^2\}", (falloff.REACH,)),
-    ("4-sweep", r"4\\pi \\cdot ([\d.]+)\) < 1", (multigrid.HARDLY,)),
+    ("4-sweep", r"4\\pi \\cdot ([\d.]+)\) < 1", (multigrid.THIN,)),
     ("4-sweep", r"of at most (\d+) voxels along a side", (multigrid.COARSEST,)),
-    ("4-sweep", r"\$\[-0.5, (\d+)\]\$", (anderson.FARTHEST,)),
+    ("4-sweep", r"\$\[-0.5, (\d+)\]\$", (anderson.MAX_EXTRAPOLATION,)),
     ("4-sweep", r"is below (\S+) of the field", (multigrid.TOLERANCE,)),
     ("5-projection", r"by more than (\S+) of what", (raymarch.EARLY_STOP,)),
     (

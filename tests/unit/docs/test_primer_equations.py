@@ -11,8 +11,8 @@ import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.render import quadrature
-from mitsuba_irrcache.solvers.sn import anderson
-from mitsuba_irrcache.solvers.sn.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates import anderson
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -68,7 +68,7 @@ def swept() -> tuple[np.ndarray, np.ndarray]:
         grid, dr.full(mi.Float, SIGMA, grid.voxel_count), np.zeros(3, int), grid.resolution
     )
     unit = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-    lattice.scatter(volume, lattice.table(unit, LIGHT, WEIGHTS, OFFSETS))
+    lattice.sweep(volume, lattice.table(unit, LIGHT, WEIGHTS, OFFSETS))
     return source, np.array(volume).reshape(*SHAPE, 4)[..., 1:]
 
 
@@ -143,7 +143,7 @@ def test_anderson_acceleration():
             last_residual, last_image = before
             change = image - phi - last_residual
             theta = -(weight * (image - phi)) @ change / ((weight * change) @ change)
-            assert -0.5 < theta < anderson.FARTHEST
+            assert -0.5 < theta < anderson.MAX_EXTRAPOLATION
             expected = image + theta * (image - last_image)
         found = np.array(steps.next(mi.Float(phi), mi.Float(image)))
         np.testing.assert_allclose(found, expected, rtol=2e-4)

@@ -12,8 +12,8 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers import grid_size
 from mitsuba_irrcache.solvers.base import solver_named
+from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 from mitsuba_irrcache.solvers.grid_size import choose_grid
-from mitsuba_irrcache.solvers.sn import solver as sn_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

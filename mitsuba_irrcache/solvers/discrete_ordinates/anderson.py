@@ -1,0 +1,66 @@
+"""Anderson acceleration of fixed-point iterations.
+
+D. G. Anderson, *Iterative procedures for nonlinear integral equations*, Journal of the ACM 12,
+1965; H. F. Walker and P. Ni, *Anderson acceleration for fixed-point iterations*, SIAM Journal on
+Numerical Analysis 49, 2011.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
+
+#: Smaller than any quantity that is divided by.
+TINY = 1e-300
+#: Times the last change of the images by which a step may extrapolate beyond its own image.
+MAX_EXTRAPOLATION = 20.0
+
+
+class AndersonAcceleration:
+    """Acceleration of depth 1 for large arrays: the two last steps tell how the slowest error
+    decays, and so what remains of it.
+    """
+
+    def __init__(self, sums: Callable[[mi.Float], np.ndarray]) -> None:
+        """``sums``: (weighted) sums over an array for each of its interleaved channels."""
+        self._sums = sums
+        self._last: tuple[mi.Float, mi.Float] | None = None
+
+    def next(self, phi: mi.Float, image: mi.Float) -> mi.Float:
+        """The point to continue from, after a step from ``phi`` to its ``image``."""
+        # docs/primer, eq. (4.11)
+        residual = image - phi
+        dr.eval(residual)
+        last, self._last = self._last, (residual, image)
+        if last is None:
+            return image
+        change = residual - last[0]
+        along, square = self._sums(residual * change), self._sums(change * change)
+        with np.errstate(invalid="ignore", over="ignore"):
+            share = -along / np.maximum(square, TINY)
+        # Squares of very large radiance are not finite.
+        share = np.clip(np.where(np.isfinite(share), share, 0), -0.5, MAX_EXTRAPOLATION)
+        channel = voxel_and_channel(dr.width(phi) // len(share), len(share))[1]
+        # One more, since kernels that read an array of a single value are different ones.
+        factor = dr.gather(mi.Float, mi.Float([*share, 0.0]), channel)
+        result = dr.fma(image - last[1], factor, image)
+        dr.eval(result)
+        return result
+
+
+def accelerated(history: list, channel: int) -> np.ndarray:
+    """The combination of images with the least residual, in one channel of a short history of
+    points and their images: acceleration of any depth, for small arrays.
+    """
+    points, images = (np.array([x[channel] for x in xs]) for xs in zip(*history, strict=True))
+    residuals = images - points
+    if len(history) == 1:
+        return images[0]
+    differences = (residuals[:-1] - residuals[-1]).T
+    share, *_ = np.linalg.lstsq(differences, -residuals[-1], rcond=1e-8)
+    return images[-1] + share @ (images[:-1] - images[-1])

@@ -1,0 +1,131 @@
+"""Angular quadrature: ordinates (directions) spread evenly over the sphere, and their weights.
+
+Ordinates come in pairs of opposite directions. A set is a Fibonacci spiral on a hemisphere, rotated
+at random, so that every ordinate alone is uniformly distributed. Weights are the nearest to equal
+ones that integrate all polynomials of degree 2 in the direction exactly, and, with the opposite
+ordinates, of degree 3: inside dense matter radiance has no higher terms, whatever the rotation.
+
+The sets of several passes are parts of one larger spiral. Each is even, and so is their union:
+independent rotations would leave three times the noise.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial.legendre import legval
+
+from mitsuba_irrcache.core.sequences import GENERALISED_GOLDEN_RATIOS, fibonacci_hemisphere
+
+#: Weights of the squared integration errors of spherical harmonics, by degree, which are minimised
+#: when the points of a spiral are divided among several sets.
+DEGREES = {2: 4.0, 4: 2.0, 6: 0.5, 8: 0.2}
+#: Rounds of exchange between sets, at most; few are needed.
+ROUNDS = 8
+
+
+class Ordinates(NamedTuple):
+    """Pairs of opposite ordinates, and what enters the medium along them."""
+
+    #: (n, 3), in which radiance travels; that of the opposite ordinate is the negative
+    directions: np.ndarray
+    #: (n, 2, channels), irradiance that enters along an ordinate and along its opposite
+    incoming: np.ndarray
+    #: (n), solid angle [sr] for radiance from the voxels; 0 where only emitters use the ordinate
+    weights: np.ndarray
+    #: (n, 2), random shifts of the tracks in [0, 1)
+    offsets: np.ndarray
+
+    def scattering(self) -> Ordinates:
+        """Those along which voxels emit and scatter, with nothing that enters."""
+        used = self.weights != 0
+        none = np.zeros_like(self.incoming)
+        parts = (self.directions, none, self.weights, self.offsets)
+        return Ordinates(*(part[used] for part in parts))
+
+    def without_incoming(self) -> Ordinates:
+        """The same ordinates where a `BoundarySource` tells what enters."""
+        return self._replace(incoming=np.zeros((len(self.directions), 2)))
+
+
+def merged(sets: list[Ordinates]) -> Ordinates:
+    """Several sets as one."""
+    return Ordinates(*(np.concatenate(parts) for parts in zip(*sets, strict=True)))
+
+
+def hemisphere_ordinates(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """``count`` directions (n, 3), one of each pair, and the solid angle (n) that each of them and
+    each of their opposites stands for.
+    """
+    return joint_ordinates(1, count, rng)[0]
+
+
+def joint_ordinates(
+    sets: int, count: int, rng: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """As many ``sets`` of `hemisphere_ordinates`, whose union is evenly spread, too."""
+    points, members = _divided_spiral(sets, count)
+    points = points @ _rotation(rng).T
+    return [(points[own], _weights(points[own])) for own in members]
+
+
+@lru_cache(maxsize=32)
+def _divided_spiral(sets: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of one hemisphere on a Fibonacci spiral, and the numbers of those in each set."""
+    points, turn = fibonacci_hemisphere(sets * count)
+    members = strata(sets, turn, 1 / GENERALISED_GOLDEN_RATIOS[1])
+    # The squared error of a set's integrals is the sum of this over all pairs of its points, by the
+    # addition theorem. Two sets exchange those two points that lower it most.
+    factors = np.zeros(max(DEGREES) + 1)
+    for degree, weight in DEGREES.items():
+        factors[degree] = weight * (2 * degree + 1)
+    error = legval(points @ points.T, factors)
+    for _ in range(ROUNDS):
+        exchanged = False
+        for a, b in combinations(range(sets), 2):
+            first, second = members[a], members[b]
+            within, beyond = error[np.ix_(first, first)], error[np.ix_(second, second)]
+            mixed = error[np.ix_(first, second)]
+            out = mixed.sum(axis=1) - within.sum(axis=1) + np.diag(within)
+            into = mixed.sum(axis=0) - beyond.sum(axis=1) + np.diag(beyond)
+            change = out[:, None] + into - 2 * mixed
+            i, j = np.unravel_index(change.argmin(), change.shape)
+            if change[i, j] < -1e-9:
+                first[i], second[j], exchanged = second[j], first[i], True
+        if not exchanged:
+            break
+    return points, members
+
+
+def strata(sets: int, coordinate: np.ndarray, step: float) -> np.ndarray:
+    """Numbers (sets, n) of the points in each of so many ``sets``.
+
+    Of each ``sets`` consecutive points every set gets one, by the order of their ``coordinate`` in
+    [0, 1), which is rotated by ``step`` from one run of points to the next.
+    """
+    rows = coordinate.reshape(-1, sets) - step * np.arange(len(coordinate) // sets)[:, None]
+    order = np.argsort(rows % 1, axis=1)
+    return np.ascontiguousarray((order + sets * np.arange(len(order))[:, None]).T)
+
+
+def _weights(points: np.ndarray) -> np.ndarray:
+    """The weights nearest to equal ones that integrate all products of two coordinates exactly."""
+    # docs/primer, eq. (4.1)
+    count = len(points)
+    x, y, z = points.T
+    moments = np.stack([np.ones(count), x * x, y * y, x * y, y * z, z * x])
+    exact = 2 * np.pi * np.array([1, 1 / 3, 1 / 3, 0, 0, 0])
+    equal = np.full(count, 2 * np.pi / count)
+    correction, *_ = np.linalg.lstsq(moments, exact - moments @ equal, rcond=None)
+    weights = equal + correction
+    return weights if weights.min() > 0.25 * equal[0] else equal
+
+
+def _rotation(rng: np.random.Generator) -> np.ndarray:
+    """A uniformly random rotation matrix."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)

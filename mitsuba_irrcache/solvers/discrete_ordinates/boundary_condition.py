@@ -1,0 +1,381 @@
+"""The boundary condition among surfaces: radiance that enters the medium's box along each track.
+
+Where there are surfaces around a medium, what enters is no function of the direction alone. It is
+found by Monte Carlo paths that begin where a track enters the box and run back along it: one for
+each track and way, or one for a few neighbouring tracks (a cell) where there are many. Radiance
+that emitters send straight along a track is known without paths, except for its visibility.
+
+A path that meets the medium again ends at its first collision there. The radiance scattered towards
+it from that voxel is known only when the solver has found it. So what enters is
+``emitted + reflected phi(voxel)``, linear in phi, with voxels and factors that are constant while
+the solver iterates: surfaces become part of the operator A of phi = A phi + b (`multigrid`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.core.jit import Divisor, symbolic
+from mitsuba_irrcache.core.sequences import hashed_seed, random_stream
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.medium_probe import probe
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+from mitsuba_irrcache.transport.path import Media, Start, trace, trace_to_infinity
+
+#: Cells of an ordinate, at most about: a path is traced for one track in each; rays that only test
+#: the visibility of emitters are cheaper. Radiance from surfaces varies more from one direction to
+#: the next than between neighbouring tracks.
+PATH_CELLS, EMITTER_CELLS = 1 << 11, 1 << 16
+#: Paths begin at this distance inside the box [voxels]: surfaces may lie on its faces.
+INSET = 1e-3
+#: Parameters of an ordinate that the kernel reads, see `IncomingRadiance._parameters`.
+_INTEGERS = ("first", "width", "axis", "axis_b")
+_REALS = (
+    "x", "y", "z", "slope_b", "slope_c", "least_b", "least_c", "size_b", "size_c", "slices",
+    "edge", "weight",
+)  # fmt: skip
+
+
+class SurfaceBoundary:
+    """The surroundings of a medium, as far as they send radiance into it.
+
+    ``area_emitters`` are those that tracks meet by chance; what other emitters send straight to a
+    voxel is computed otherwise. ``rr_depth`` is that of paths. ``angular_basis`` is None where the
+    medium scatters isotropically.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        area_emitters: Sequence[mi.EmitterPtr],
+        rr_depth: int,
+        angular_basis: AngularBasis | None = None,
+    ) -> None:
+        self.scene, self.media = scene, Media.around(medium)
+        self.pointer, self.area_emitters = medium.pointer, list(area_emitters)
+        #: without this medium, which is convex: a ray that leaves it straight never meets it again
+        self.other_media = self.media.without(medium)
+        self.angular_basis = angular_basis
+        self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+        self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
+
+    @property
+    def has_sources(self) -> bool:
+        """Whether tracks meet emitters or emissive media by chance."""
+        return bool(self.area_emitters) or self.other_media.is_emissive
+
+
+class IncomingRadiance:
+    """What enters along ``tracks`` in the directions of ``ordinates``.
+
+    Radiance from surfaces enters along ordinates with a weight; without ``paths``, only radiance
+    that comes straight from emitters. Everything is multiplied by solid angle (irradiance).
+    """
+
+    def __init__(
+        self,
+        boundary: SurfaceBoundary,
+        tracks: Tracks,
+        ordinates: Ordinates,
+        paths: bool,
+        seed: tuple[int, int, int],
+    ) -> None:
+        directions, incoming, weights, offsets = ordinates
+        self.tracks = tracks
+        parts = [incoming]
+        if boundary.angular_basis is not None:
+            parts = boundary.angular_basis.apart(directions, incoming)
+        #: ordinates along which radiance may come straight from emitters; with an angular basis
+        #: first from all but narrow sources, then from each of these
+        self.has_emitters = [part.any(axis=(1, 2)) for part in parts]
+        self.has_emitters[0] |= (weights > 0) & boundary.has_sources
+        self._geometry = tracks.table(directions, incoming[..., 0], weights, offsets).geometry
+        self._lay_out_cells(np.where(weights > 0, PATH_CELLS, EMITTER_CELLS))
+        parameters = self._parameters(directions, parts, weights)
+        found = _trace_cells(boundary, self, *parameters, paths, seed)
+        #: for each channel: straight from emitters, in the parts of `has_emitters`; all that does
+        #: not depend on phi; factors of phi. And the voxels of phi, and the directions in which
+        #: radiance leaves these (None for isotropic scattering).
+        self.unscattered, self.emitted, self.reflected, self.voxel, self._direction = found
+        self._voxels: dict[tuple, mi.UInt32] = {tracks.grid.shape: self.voxel}
+
+    @property
+    def spectra(self) -> list[list]:
+        """All spectra that have been found."""
+        return [*self.unscattered, self.emitted, self.reflected]
+
+    def emitter_source(
+        self, channels: Sequence[int], table: TrackTable, numbers: np.ndarray, part: int = 0
+    ) -> BoundarySource:
+        """The boundary source of radiance straight from emitters, that ``part`` of it, for a
+        ``table`` of the same tracks with these ``numbers`` of the ordinates.
+        """
+        values = concatenated([self.unscattered[part][c] for c in channels])
+        cells = self._cells_of(self.tracks, table, numbers)
+        return BoundarySource(*cells, values, len(channels))
+
+    def reflected_source(
+        self,
+        channels: Sequence[int],
+        level: MultigridLevel,
+        table: TrackTable,
+        numbers: np.ndarray,
+        emitted: bool,
+    ) -> ReflectedBoundarySource:
+        """The boundary source of all radiance, with or without what is ``emitted``, for a ``table``
+        with these consecutive ``numbers`` of the ordinates, of the same tracks or of those of a
+        coarser ``level``.
+        """
+        tracks, grid = level.tracks, level.grid
+        if grid.shape not in self._voxels:
+            self._voxels[grid.shape] = _coarse_voxels(self.tracks.grid, grid, self.voxel)
+        transforms, cells = self._cells_of(tracks, table, numbers)
+        start, count = int(cells[0, 0]), int(self._ends[numbers[-1]] - cells[0, 0])
+        cells[:, 0] -= start
+        here = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        values = [
+            concatenated([dr.gather(mi.Float, kind[c], here) for c in channels])
+            for kind in (self.reflected, *([self.emitted] if emitted else []))
+        ]
+        # All matter is in active voxels: others reflect nothing.
+        at = tracks.active_index(dr.gather(mi.UInt32, self._voxels[grid.shape], here))
+        first = dr.minimum(at, dr.opaque(mi.UInt32, tracks.active_count - 1)) * len(channels)
+        dr.eval(first)
+        indices = concatenated([first + c for c in range(len(channels))])
+        direction = None
+        if self._direction is not None:
+            direction = mi.Vector3f(*(dr.gather(mi.Float, x, here) for x in self._direction))
+        dr.eval(values, indices, direction)
+        return ReflectedBoundarySource(
+            level, len(channels), (transforms, cells), indices, direction, *values
+        )
+
+    def sample_rays(
+        self, parameters: tuple[mi.UInt32, mi.Float], seed: tuple[int, int, int]
+    ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Ray3f, mi.PCG32]:
+        """Sample a track of each cell, for both ways: number of the way (two for each ordinate),
+        ordinate weight, whether the track meets the box, the ray from its entry against the
+        direction of travel, and a random generator.
+        """
+        lanes = dr.arange(mi.UInt32, self._count)
+        ordinate, read = self._read(parameters, lanes)
+        within = lanes - read.first
+        back, cell = (within & 1) == 1, within >> 1
+        cell_c = cell // dr.maximum(read.width, 1)
+        cell_b = cell - cell_c * read.width
+        *batch, use = seed
+        stream = hashed_seed(batch)[0] + dr.opaque(mi.UInt32, use)
+        rng = random_stream(mi.sample_tea_32(lanes, stream))
+        b, c, near, far, rng = _sample_track(read, mi.Float(cell_b), mi.Float(cell_c), rng)
+        hit = near < far
+        a = dr.select(back, far, near)
+        b, c = dr.fma(a - 0.5, read.slope_b, b), dr.fma(a - 0.5, read.slope_c, c)
+        sizes = read.slices, read.size_b, read.size_c
+        a, b, c = (dr.clip(x, INSET, n - INSET) for x, n in zip((a, b, c), sizes, strict=True))
+        place = [
+            dr.select(read.axis == k, a, dr.select(read.axis_b == k, b, c))
+            + dr.opaque(mi.Float, float(low))
+            for k, low in enumerate(self.tracks.lower)
+        ]
+        p = self.tracks.grid.world.point(mi.Point3f(place))
+        ray = mi.Ray3f(p, mi.Vector3f(read.x, read.y, read.z) * dr.select(back, 1, -1))
+        return ordinate * 2 + dr.select(back, 1, 0), read.weight, hit, ray, rng
+
+    def _lay_out_cells(self, most: np.ndarray) -> None:
+        """Lays out cells: square blocks of tracks, as small as leaves at most about ``most`` cells
+        in an ordinate.
+        """
+        geometry = self._geometry
+        length = geometry.sizes[:, 2:]
+        # The first slice passes the middle of the first voxels.
+        moved = np.stack([-0.5 * geometry.slopes, (length - 0.5) * geometry.slopes])
+        self._least = np.floor(-geometry.starts - moved.max(axis=0))
+        last = np.ceil(geometry.sizes[:, :2] - geometry.starts - moved.min(axis=0))
+        count = last - self._least + 1
+        self._edge = np.maximum(1, np.ceil(np.sqrt(count.prod(axis=1) / most)))
+        self._sides = np.ceil(count / self._edge[:, None]).astype(np.int64)
+        self._ends = np.cumsum(2 * self._sides.prod(axis=1))
+        self._first, self._count = np.concatenate([[0], self._ends[:-1]]), int(self._ends[-1])
+
+    def _parameters(
+        self, directions: np.ndarray, parts: list[np.ndarray], weights: np.ndarray
+    ) -> tuple[tuple[mi.UInt32, mi.Float], list[mi.Float]]:
+        """For each ordinate what `sample_rays` reads: `_INTEGERS` (index of the first value, cells
+        along b, axes) and `_REALS` (direction along the axis, slopes, first track, size of the box,
+        tracks along the edge of a cell, ordinate weight); and the ``parts`` of what enters from
+        distant emitters, for both ways.
+        """
+        geometry = self._geometry
+        axes = [geometry.axis, geometry.transverse[:, 0]]
+        integers = np.column_stack([self._first, self._sides[:, 0], *axes])
+        sign = np.where(geometry.forward, 1.0, -1.0)
+        columns = [sign[:, None] * directions, geometry.slopes, geometry.starts + self._least]
+        reals = np.column_stack([*columns, geometry.sizes, self._edge, weights])
+        forward = geometry.forward[:, None, None]
+        ways = [np.where(forward, part, part[:, ::-1]).ravel().tolist() for part in parts]
+        as_list = mi.UInt32([*integers.ravel().tolist(), 0xFFFFFFFF])  # the end, to be searched for
+        return (as_list, mi.Float(reals.ravel().tolist())), [mi.Float(way) for way in ways]
+
+    def _read(
+        self, parameters: tuple[mi.UInt32, mi.Float], lanes: mi.UInt32
+    ) -> tuple[mi.UInt32, SimpleNamespace]:
+        """The ordinate of each value, and its parameters by their names."""
+        integers, reals = parameters
+        ordinate = dr.binary_search(
+            0,
+            len(self._first) - 1,
+            lambda i: dr.gather(mi.UInt32, integers, (i + 1) * len(_INTEGERS)) <= lanes,
+        )
+        first, begin = ordinate * len(_INTEGERS), ordinate * len(_REALS)
+        read = {n: dr.gather(mi.UInt32, integers, first + i) for i, n in enumerate(_INTEGERS)}
+        read |= {n: dr.gather(mi.Float, reals, begin + i) for i, n in enumerate(_REALS)}
+        return ordinate, SimpleNamespace(**read)
+
+    def _cells_of(
+        self, tracks: Tracks, table: TrackTable, numbers: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The first arguments of `BoundarySource`."""
+        mine, geometry = self.tracks, table.geometry
+        ratio = float(round((tracks.grid.voxel_size / mine.grid.voxel_size)[0]))
+        lower, across, n = mine.lower, geometry.transverse, np.arange(len(numbers))
+        # Coordinate 0 in the first slice of the finest grid, seen from the coarser one.
+        ahead = (lower[geometry.axis] + 0.5) / ratio - tracks.lower[geometry.axis] - 0.5
+        shifts = ratio * (tracks.lower[across] + geometry.slopes * ahead[n, None]) - lower[across]
+        shifts = shifts - self._geometry.starts[numbers] - self._least[numbers] + 0.5
+        edge = self._edge[numbers, None]
+        transforms = np.hstack([ratio / edge, shifts / edge, geometry.slopes])
+        return transforms, np.column_stack([self._first[numbers], self._sides[numbers]])
+
+
+class ReflectedBoundarySource(BoundarySource):
+    """A boundary source ``emitted + reflected phi(index)``, with the radiance of phi in a
+    ``direction``.
+    """
+
+    def __init__(
+        self,
+        level: MultigridLevel,
+        channels: int,
+        cells: tuple[np.ndarray, np.ndarray],
+        index: mi.UInt32,
+        direction: mi.Vector3f | None,
+        reflected: mi.Float,
+        emitted: mi.Float | None = None,
+    ) -> None:
+        super().__init__(*cells, None, channels)
+        self._level, self._index, self._direction = level, index, direction
+        self._reflected, self._emitted = reflected, emitted
+
+    def update(self, phi: mi.Float | None) -> None:
+        """Sets the values for a mean irradiance of collisions ``phi`` (None: 0)."""
+        # docs/primer, eq. (4.13)
+        values = dr.zeros(mi.Float, dr.width(self._index))
+        if phi is not None:
+            radiance = self._level.scattered_radiance(phi, self._index, self._direction)
+            values = self._reflected * radiance
+        self.values = values if self._emitted is None else values + self._emitted
+        dr.eval(self.values)
+
+
+@symbolic
+def _sample_track(read, cell_b, cell_c, rng):
+    """Choose one of those tracks of a cell that meet the box, uniformly (reservoir sampling): where
+    it passes the first slice, and where along the axis it enters the box and leaves it.
+    """
+    b, c = mi.Float(0), mi.Float(0)
+    near, far = mi.Float(1) + 0 * read.slices, 0 * read.slices
+    k, found = mi.Float(0), mi.Float(0)
+    while dr.hint(k < read.edge * read.edge, label="tracks of a cell"):
+        row = dr.floor(k / read.edge)
+        at_b = read.least_b + cell_b * read.edge + (k - row * read.edge)
+        at_c = read.least_c + cell_c * read.edge + row
+        begin, end = mi.Float(0), mi.Float(read.slices)
+        begin, end = _clipped(begin, end, at_b, read.slope_b, read.size_b)
+        begin, end = _clipped(begin, end, at_c, read.slope_c, read.size_c)
+        meets = begin < end
+        found += dr.select(meets, 1.0, 0.0)
+        chosen = meets & (rng.next_float32() * found < 1)
+        b, c = dr.select(chosen, at_b, b), dr.select(chosen, at_c, c)
+        near, far = dr.select(chosen, begin, near), dr.select(chosen, end, far)
+        k += 1
+    return b, c, near, far, rng
+
+
+def _clipped(begin, end, at, slope, size) -> tuple[mi.Float, mi.Float]:
+    """The part of a track between two opposite sides of the box."""
+    first, last = -at / slope + 0.5, (size - at) / slope + 0.5
+    begin = dr.maximum(begin, dr.minimum(first, last))
+    return begin, dr.minimum(end, dr.maximum(first, last))
+
+
+def _coarse_voxels(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
+    """The voxels of a coarser grid of the hierarchy that contain those of the fine one."""
+    ratio = Divisor(round((coarse.voxel_size / fine.voxel_size)[0]))
+    result = coarse.index(*(ratio.split(place)[0] for place in fine.places(voxel)))
+    dr.eval(result)
+    return result
+
+
+def _trace_cells(
+    boundary: SurfaceBoundary,
+    incoming: IncomingRadiance,
+    parameters: tuple[mi.UInt32, mi.Float],
+    distant: list[mi.Float],
+    paths: bool,
+    seed: tuple[int, int, int],
+) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
+    """What enters along the tracks of all cells, both ways in turn; see `IncomingRadiance`."""
+    way, weight, hit, ray, rng = incoming.sample_rays(parameters, seed)
+    pointer = probe(boundary.scene, ray.o, ray.d)
+
+    parts = [dr.gather(mi.Spectrum, each, way) for each in distant]
+    visible = hit & (dr.max(sum(parts)) > 0)
+    if boundary.has_sources:
+        visible |= hit & (weight > 0)
+    transmittance, radiance, rng = trace_to_infinity(
+        boundary.scene, boundary.other_media, ray, pointer, boundary.area_emitters, rng, visible
+    )
+    parts = [irradiance * transmittance for irradiance in parts]
+    parts[0] += weight * radiance
+    unscattered = [dr.select(visible, irradiance, 0) for irradiance in parts]
+    emitted, reflected, voxel = sum(unscattered), mi.Spectrum(0), mi.UInt32(0)
+    direction = mi.Vector3f(0, 0, 1)
+    if paths:
+        begin = Start(ray, pointer, depth=1, pdf=0.0, clear=pointer == boundary.pointer)
+        _, scattered, _, end, _ = trace(
+            boundary.scene, boundary.media, begin, boundary.max_depth, boundary.rr_depth, False,
+            rng, hit & (weight > 0), lambda medium: medium == boundary.pointer,
+        )  # fmt: skip
+        emitted = emitted + weight * scattered
+        direction = end.direction
+        reflected = weight * end.weight * dr.inv_four_pi
+        voxel = _voxel_at(incoming.tracks.grid, end.p)
+    none = dr.zeros(mi.Float, dr.width(weight))
+    unscattered = [[v + none for v in part] for part in unscattered]
+    emitted, reflected = ([v + none for v in spectrum] for spectrum in (emitted, reflected))
+    voxel = voxel + dr.zeros(mi.UInt32, dr.width(weight))
+    direction = None if boundary.angular_basis is None else direction + none
+    dr.eval(unscattered, emitted, reflected, voxel, direction)
+    return unscattered, emitted, reflected, voxel, direction
+
+
+def _voxel_at(grid: Grid, p: mi.Point3f) -> mi.UInt32:
+    """Flat index of the voxel that contains a world position, or of the nearest one."""
+    u = grid.coordinates.point(p)
+    at = (
+        mi.Int32(dr.clip(dr.floor(v), 0, mi.Float(n - 1)))
+        for v, n in zip(u, grid.sides, strict=True)
+    )
+    return grid.index(*at)

@@ -1,0 +1,150 @@
+"""Direct illumination among surfaces by small area emitters and point-like lights, sampled from
+each voxel (next event estimation).
+
+The tracks that all voxels share hit a small emitter rarely, and then in many voxels at once. So
+points on it are sampled from each voxel instead, and tracks ignore it. Emitters that fill much of
+the solid angle are left to the tracks: few points on them matter to a voxel close by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.transport.path import Media, visibility
+from mitsuba_irrcache.transport.tracking import medium_transmittance
+
+#: Solid angle of an emitter, the mean over the voxels, from which on tracks are relied upon to hit
+#: it [sr].
+LARGE = 2.0
+#: Points in the voxels' box, and as many on an emitter, from which its solid angle is estimated.
+POINTS = 1024
+#: Points that are sampled from each voxel in a batch, on all area emitters; one on each, if there
+#: are more of these, but never more than the latter.
+SAMPLES, MOST_SAMPLES = 4, 16
+
+
+def is_area_emitter(emitter: mi.Emitter) -> bool:
+    """Whether it is an area emitter that emits in all directions."""
+    return kind_of(emitter) is EmitterKind.AREA
+
+
+def split_by_solid_angle(
+    scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray
+) -> tuple[list[mi.Emitter], list[mi.Emitter]]:
+    """Area emitters that are small, and that are large, as seen from the box of voxels of ``grid``
+    between ``lower`` and ``upper`` (x, y, z).
+    """
+    small, large = [], []
+    for emitter in scene.emitters():
+        if is_area_emitter(emitter):
+            angle = _solid_angle(emitter, grid, lower, upper)
+            (small if angle < LARGE else large).append(emitter)
+    return small, large
+
+
+def _solid_angle(emitter: mi.Emitter, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> float:
+    """A rough mean over positions in the box, without regard to occlusion."""
+    rng = np.random.default_rng(POINTS)
+    u = np.float32(rng.random((5, POINTS)))
+    found = emitter.get_shape().sample_position(0.0, mi.Point2f(u[:2]))
+    box = np.float32(lower[:, None] + u[2:] * (upper - lower)[:, None])
+    way = found.p - grid.world.point(mi.Point3f(box))
+    distance = dr.norm(way)
+    cosine = dr.abs(dr.dot(way, found.n)) / distance
+    angle = cosine / (dr.square(distance) * found.pdf)
+    return float(dr.mean(dr.minimum(angle, 2 * dr.pi))[0])
+
+
+class EmitterSampling:
+    """Irradiance at world positions ``p`` in ``medium``: from ``small`` area emitters, with moments
+    if there is an angular basis, and from ``point_lights``.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        small: Sequence[mi.Emitter],
+        point_lights: Sequence[mi.Emitter],
+        p: mi.Point3f,
+        angular_basis: AngularBasis | None = None,
+    ) -> None:
+        self.scene, self.medium, self.p = scene, medium, p
+        self.angular_basis = angular_basis
+        self._other_media = Media.around(medium).without(medium)
+        self._small = len(small)
+        if small:
+            pointers = [mi.EmitterPtr(e) for e in small]
+            self._emitters = dr.zeros(mi.EmitterPtr, len(small) + 1)
+            for i, emitter in enumerate(pointers):
+                dr.scatter(self._emitters, emitter, mi.UInt32(i))
+            dr.eval(self._emitters)
+        self._from_points = [self._from(light) for light in point_lights]
+
+    def irradiance(self, seed: tuple[int, int]) -> list[list[mi.Spectrum]]:
+        """Irradiance from each point-like light; and a random estimate of that from all small area
+        emitters, and of its moments.
+        """
+        if not self._small:
+            return self._from_points
+        samples = min(max(SAMPLES, self._small), MOST_SAMPLES)
+        lane = dr.arange(mi.UInt32, dr.width(self.p))
+        rng = random_stream(mi.sample_tea_32(lane, hashed_seed(seed)[1]))
+        count, samples = (dr.opaque(mi.UInt32, n) for n in (self._small, samples))
+        found = _mean_irradiance(self, self._emitters, count, samples, rng)
+        dr.eval(found)
+        return [*self._from_points, found]
+
+    def sample(
+        self, emitter: mi.EmitterPtr, sample: mi.Point2f, rng: mi.PCG32
+    ) -> tuple[mi.Spectrum, mi.Vector3f, mi.PCG32]:
+        """One sample of the irradiance straight from an emitter, the direction it comes from, and
+        the random generator.
+        """
+        medium, p = self.medium, self.p
+        vertex = dr.zeros(mi.Interaction3f, dr.width(p))
+        vertex.p = p
+        record, irradiance = emitter.sample_direction(vertex, sample)
+        visible = dr.max(irradiance) > 0
+        # The transmittance of this medium is integrated separately, without noise.
+        passed, rng = visibility(
+            self.scene, self._other_media, vertex, record.p, medium.pointer, rng, visible
+        )
+        visible &= dr.max(passed) > 0
+        passed *= medium_transmittance(medium, mi.Ray3f(p, record.d), record.dist, visible)
+        return dr.select(visible, irradiance * passed, 0), record.d, rng
+
+    def _from(self, emitter: mi.Emitter) -> list[mi.Spectrum]:
+        """Irradiance from a point-like light."""
+        irradiance, *_ = self.sample(emitter, mi.Point2f(0.5), mi.PCG32(dr.width(self.p)))
+        dr.eval(irradiance)
+        return [irradiance]
+
+
+@symbolic
+def _mean_irradiance(sampling, emitters, count, samples, rng):
+    """The mean of samples of the irradiance from all ``count`` emitters, and of its moments."""
+    shift = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    total, k = nothing(sampling.angular_basis), mi.UInt32(0)
+    weight = mi.Float(count) / mi.Float(samples)
+    while dr.hint(k < samples, label="area emitters"):
+        # The same number on each emitter, as far as possible, and evenly spread over it.
+        which = mi.UInt32((mi.Float(k) + shift.z) / mi.Float(samples) * mi.Float(count))
+        emitter = dr.gather(mi.EmitterPtr, emitters, dr.minimum(which, count - 1))
+        sample = mi.Point2f(kronecker(k, 2, (shift.x, shift.y)))
+        irradiance, towards, rng = sampling.sample(emitter, sample, rng)
+        total = added(
+            total, sampling.p, towards, irradiance * weight, mi.Spectrum(0), sampling.angular_basis
+        )
+        k += 1
+    return total

@@ -1,0 +1,240 @@
+"""Radiance that enters the medium from distant emitters: suns and environments, and the ordinates
+that their directions add to a set.
+
+Suns have ordinates of their own. An environment map that varies is sampled in proportion to its
+luminance beside the even ordinates (balance heuristic, Veach and Guibas 1995).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.angular import spots_of
+from mitsuba_irrcache.cache.direct_light import DirectLight
+from mitsuba_irrcache.core.sequences import kronecker_steps, lattice_points
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
+    Ordinates,
+    joint_ordinates,
+    strata,
+)
+from mitsuba_irrcache.transport.tracking import medium_transmittance
+
+#: What the second coordinate of lattices of points advances by.
+STEP = kronecker_steps(2)[0]
+#: Pairs of ordinates of a pass for each set of tracks of a sun, and for each direction that is
+#: sampled from an environment.
+PAIRS_PER_SUN_TRACKS, PAIRS_PER_SAMPLE = 8, 2
+
+
+class DistantIllumination:
+    """The emitters of a scene, seen from the medium: an environment, suns (infinitely distant, of
+    one direction), and point-like lights nearby, which are left to others.
+    """
+
+    def __init__(self, scene: mi.Scene, has_other_sources: bool = False) -> None:
+        """``has_other_sources``: the medium emits, in colours of its own."""
+        self._has_other_sources = has_other_sources
+        self._environment = scene.environment()
+        self._bright_regions: tuple | None = None
+        self._suns, self.point_lights = [], []
+        for emitter in scene.emitters():
+            kind = kind_of(emitter)
+            if kind is EmitterKind.SUN:
+                self._suns.append(_sun(emitter))
+            elif kind.is_point_like:
+                self.point_lights.append(emitter)
+
+    def factored_ordinates(
+        self, passes: int, pairs: int, channels: int, rng: np.random.Generator, first: int = 0
+    ) -> tuple[list[Ordinates], np.ndarray]:
+        """Ordinates of a number of passes, as of `ordinates`; before these, on request, those of a
+        ``first`` pass of so many pairs. And factors (channels) of their results: where channels
+        differ by a factor only, ``incoming`` has a single one.
+        """
+        sets = self.ordinates(1, first, rng) if first else []
+        sets += self.ordinates(passes, pairs, rng)
+        incoming = np.concatenate([each.incoming for each in sets])
+        brightest = incoming.max(axis=(0, 1))
+        colour = brightest / brightest.max() if brightest.max() > 0 else np.ones(channels)
+        difference = np.abs(incoming - incoming.max(axis=-1, keepdims=True) * colour)
+        has_others = self.point_lights or self._has_other_sources
+        if not has_others and difference.max() <= 1e-6 * incoming.max():
+            single = [each.incoming.max(axis=-1, keepdims=True) for each in sets]
+            factored = zip(sets, single, strict=True)
+            return [each._replace(incoming=grey) for each, grey in factored], colour
+        return sets, np.ones(channels)
+
+    def ordinates(self, passes: int, pairs: int, rng: np.random.Generator) -> list[Ordinates]:
+        """Ordinates of each pass: an even set, which radiance of the voxels uses too, then those
+        that only emitters use.
+        """
+        even = joint_ordinates(passes, pairs, rng)
+        varies = (
+            self._environment is not None
+            and kind_of(self._environment) is not EmitterKind.CONSTANT_ENVIRONMENT
+        )
+        if varies:
+            found = self._with_samples(even, max(1, pairs // PAIRS_PER_SAMPLE), rng)
+        else:
+            found = [(*own, self._uniform_irradiance(*own)) for own in even]
+        return [self._with_suns(pairs, *own, rng) for own in found]
+
+    def sun_ordinates(self, pairs: int) -> int:
+        """How many of the last ordinates of a pass are those of suns."""
+        return len(self._suns) * self._tracks_per_sun(pairs)
+
+    def point_irradiance(
+        self, medium: MediumGrid, position: mi.Point3f, known: Sequence[DirectLight] = ()
+    ) -> list[mi.Spectrum]:
+        """Irradiance at ``position`` from each point-like light; for those ``known`` already, their
+        values.
+        """
+        values = {id(light.emitter): light.irradiance for light in known}
+        return [
+            values[id(e)] if id(e) in values else _from_point(e, medium, position)
+            for e in self.point_lights
+        ]
+
+    def _uniform_irradiance(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """What enters from a constant environment, or none: (n, 2, channels)."""
+        if self._environment is None:
+            return np.zeros((len(directions), 2, dr.size_v(mi.Spectrum)))
+        return self._both_ways(directions) * weights[:, None, None]
+
+    def _with_suns(
+        self,
+        pairs: int,
+        directions: np.ndarray,
+        weights: np.ndarray,
+        incoming: np.ndarray,
+        rng: np.random.Generator,
+    ) -> Ordinates:
+        """These ordinates, and several sets of tracks in the direction of each sun."""
+        colours, parts = dr.size_v(mi.Spectrum), [(directions, incoming, weights)]
+        count = self._tracks_per_sun(pairs)
+        for direction, irradiance in self._suns:
+            ways = np.stack([irradiance / count, np.zeros(colours)])
+            parts.append(
+                (np.tile(direction, (count, 1)), np.tile(ways, (count, 1, 1)), count * [0])
+            )
+        joined = [np.concatenate(part) for part in zip(*parts, strict=True)]
+        offsets = rng.random((len(joined[0]), 2))
+        for k in range(len(self._suns)):
+            # The last ordinates: tracks of one direction are evenly spread over the voxels.
+            end = len(offsets) - k * count
+            offsets[end - count : end] = (offsets[end - 1] + lattice_points(count, STEP).T) % 1
+        return Ordinates(*joined, offsets)
+
+    def _tracks_per_sun(self, pairs: int) -> int:
+        return max(1, pairs // PAIRS_PER_SUN_TRACKS)
+
+    def _with_samples(
+        self, even: list[tuple], count: int, rng: np.random.Generator
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """The ``even`` ordinates and weights of each pass, ``count`` directions that are sampled by
+        the luminance of an environment, and what enters along all.
+
+        A direction may result from either strategy, and as the opposite of one: the solid angle it
+        stands for is one over the sum of all densities (balance heuristic).
+        """
+        # docs/primer, eq. (4.2)
+        sets = []
+        chosen = self._samples(len(even), count, rng)
+        for (plain, weights), sampled in zip(even, chosen, strict=True):
+            directions = np.concatenate([plain, sampled])
+            uniform = len(plain) / (2 * np.pi)
+            angle = 1 / (uniform + count * self._density(directions))
+            angle[: len(plain)] *= weights * uniform
+            incoming = self._both_ways(directions) * angle[:, None, None]
+            sets.append((directions, np.concatenate([weights, np.zeros(count)]), incoming))
+        self._normalise_regions(sets)
+        return sets
+
+    def _normalise_regions(self, sets: list[tuple]) -> None:
+        """Scales what enters from each bright region, and from outside all of them, to its exact
+        irradiance: how many directions hit a region is random.
+        """
+        if self._bright_regions is None:
+            self._bright_regions = spots_of(self._environment)
+        regions, irradiance = self._bright_regions
+        numbers = []
+        for directions, *_ in sets:
+            towards = np.stack([-directions, directions], axis=1)
+            number = np.zeros(towards.shape[:2], int)
+            for k, region in enumerate(regions, 1):
+                number[(number == 0) & region.covers(towards)] = k
+            numbers.append(number)
+        for k, exact in enumerate(irradiance):
+            own = [incoming[n == k] for (*_, incoming), n in zip(sets, numbers, strict=True)]
+            found = np.concatenate(own).sum(axis=0) / len(sets)
+            known = (found > 0) & np.isfinite(exact)
+            factor = np.where(known, exact / np.where(known, found, 1), 1)
+            for (*_, incoming), number in zip(sets, numbers, strict=True):
+                incoming[number == k] *= factor
+
+    def _both_ways(self, directions: np.ndarray) -> np.ndarray:
+        """Radiance (n, 2, channels) along directions and their opposites."""
+        both = [environment_radiance(self._environment, s * directions) for s in (1, -1)]
+        return np.stack(both, axis=1)
+
+    def _samples(self, sets: int, count: int, rng: np.random.Generator) -> list[np.ndarray]:
+        """Sets of directions (n, 3) from the environment's own sampling density; their union is
+        evenly spread, too.
+        """
+        points = lattice_points(sets * count, STEP)
+        members = strata(sets, points[1], STEP)
+        samples = ((points + rng.random((2, 1))) % 1).astype(np.float32)
+        record, _ = self._environment.sample_direction(
+            dr.zeros(mi.Interaction3f, sets * count), mi.Point2f(samples)
+        )
+        directions = -np.array(record.d, dtype=np.float64).T
+        return [directions[own] for own in members]
+
+    def _density(self, directions: np.ndarray) -> np.ndarray:
+        """Density (n) with which the environment samples directions or their opposites [1/sr]."""
+        total = np.zeros(len(directions))
+        for sign in (1, -1):
+            record = dr.zeros(mi.DirectionSample3f, len(directions))
+            record.d = mi.Vector3f((-sign * directions).T.astype(np.float32))
+            at = dr.zeros(mi.Interaction3f, len(directions))
+            total += np.array(self._environment.pdf_direction(at, record), dtype=np.float64)
+        return total
+
+
+def environment_radiance(environment: mi.Emitter, directions: np.ndarray) -> np.ndarray:
+    """Radiance (n, channels) that travels from the environment along ``directions`` (n, 3)."""
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    interaction.wi = mi.Vector3f(directions.T.astype(np.float32))
+    return _values(environment.eval(interaction), len(directions))
+
+
+def _values(spectrum: mi.Spectrum, count: int) -> np.ndarray:
+    """A spectrum as an array (count, channels), float64."""
+    channels = [np.broadcast_to(np.array(v, dtype=np.float64), count) for v in spectrum]
+    return np.stack(channels, axis=1)
+
+
+def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -> mi.Spectrum:
+    """Irradiance from a point-like emitter, attenuated by the medium."""
+    at = dr.zeros(mi.Interaction3f, dr.width(position))
+    at.p = position
+    record, irradiance = emitter.sample_direction(at, mi.Point2f(0.5))
+    visible = dr.max(irradiance) > 0
+    ray = mi.Ray3f(position, record.d)
+    irradiance = irradiance * medium_transmittance(medium, ray, record.dist, visible)
+    irradiance = dr.select(visible, irradiance, 0)
+    dr.eval(irradiance)
+    return irradiance
+
+
+def _sun(emitter: mi.Emitter) -> tuple[np.ndarray, np.ndarray]:
+    """Direction (3) and irradiance (channels) of an emitter that is infinitely distant."""
+    record, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1), mi.Point2f(0.5))
+    direction = -np.array(record.d, dtype=np.float64).ravel()
+    return direction / np.linalg.norm(direction), _values(weight, 1)[0]

@@ -1,0 +1,530 @@
+"""The sweep kernel: the transport equation solved along tracks, slice by slice.
+
+Along a track of length s the equation of radiative transfer is ordinary (method of characteristics,
+Askew 1972): dL/ds = sigma_t (S - L). With a source S that is constant in a voxel of optical depth
+tau, L' = L e^-tau + S (1 - e^-tau), the step characteristic scheme (Lewis and Miller,
+*Computational Methods of Neutron Transport*, 1984).
+
+All radiance in this module is multiplied by the solid angle of its ordinate (ordinate weight), so
+that adding it up over ordinates gives irradiance (fluence rate).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.core.fast_math import absorbed, clipped, decay, least
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import CELL
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
+    FIXED_POINT_BITS,
+    FIXED_POINT_ONE,
+    TrackRecord,
+    TransverseFields,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
+
+
+@dataclass(frozen=True)
+class SweptMedium:
+    """What tracks read of the medium.
+
+    ``corners`` and ``words`` are those of `Extinction.corners`; ``empty`` holds the slices that may
+    be skipped (`EmptySpace`), None where none are.
+    """
+
+    corners: mi.UInt32
+    words: int
+    empty: mi.UInt32 | None = None
+
+
+@dataclass(frozen=True)
+class SweptVolume:
+    """Where a sweep writes, and the source that it reads.
+
+    Without ``source`` (no voxel emits or scatters), ``values`` has one value for each voxel and
+    channel, to which the irradiance is added. With a source, it has the four values of
+    `Tracks.sweep`; ``source`` is this same volume, or another one where ``values`` is a copy that
+    begins at voxel ``begin``. Channels of a voxel are next to each other.
+
+    With ``begin_backward`` the two ways of a pair are separate: values of the ordinates against the
+    axis are written from that voxel on and nothing is added; ``source`` has one value for each
+    voxel and way in the same layout; optical depths are not multiplied by solid angles, and the
+    irradiance does not include what the voxel itself emits.
+    """
+
+    values: mi.Float
+    source: mi.Float | None
+    begin: mi.UInt32
+    channels: int = 1
+    begin_backward: mi.UInt32 | None = None
+
+
+@symbolic
+def sweep_tracks(
+    medium: SweptMedium, volume: SweptVolume, table: TrackTable, pair: mi.UInt32, track: mi.UInt32
+):
+    """Sweep pairs of opposite ordinates: lane by lane the ``track`` of a ``pair`` of the table,
+    both ways at once. Two independent chains of arithmetic hide each other's latency.
+    """
+    sweep = _PairSweep(medium, volume, table, pair)
+    # An array that the loop reads and writes has to be one of its variables.
+    values, (forward, backward) = volume.values, sweep.begin(mi.Int32(track))
+    while dr.hint(forward.active | backward.active, label="slices"):
+        forward, backward = sweep.cross_slice(values, forward, backward)
+
+
+@symbolic
+def add_copies(volume: mi.Float, copies: mi.Float, voxels: int, count: int, kind: type) -> None:
+    """Adds ``count`` copies, one after the other, to the ``voxels`` of ``volume``, whose values are
+    of this ``kind``.
+    """
+    index = dr.arange(mi.UInt32, voxels)
+    step, end = dr.opaque(mi.UInt32, voxels), dr.opaque(mi.UInt32, voxels * count)
+    total, place = dr.gather(kind, volume, index), mi.UInt32(index)
+    while dr.hint(place < end, label="copies"):
+        total += dr.gather(kind, copies, place)
+        place += step
+    dr.scatter(volume, total, index)
+
+
+# One way of a pair
+
+
+@dataclass
+class _TrackState:
+    """Where the tracks of one way are, and what they carry: the state of the loop over slices."""
+
+    #: voxels along the transverse axes, and positions within them (fixed point)
+    b: mi.Int32
+    c: mi.Int32
+    position_b: mi.Int32
+    position_c: mi.Int32
+    #: flat indices at which the slice begins: of the volume, of the extinction
+    offset: mi.Int32
+    extinction_offset: mi.Int32
+    #: slices since entry into the box; 1 unless the track has just entered
+    since_entry: mi.Float
+    #: radiance in each channel, times the solid angle
+    radiance: list[mi.Float]
+    #: quantised extinction in the second half of the previous slice
+    previous: mi.Float
+    #: slices crossed, and whether there are more
+    crossed: mi.Int32
+    active: mi.Bool
+
+    @property
+    def at(self) -> tuple:
+        """Voxels and positions, as of `BoundarySource.irradiance`."""
+        return self.b, self.c, self.position_b, self.position_c
+
+
+class _TransverseMotion:
+    """How tracks of one way move along one of the transverse axes."""
+
+    def __init__(self, fields: TransverseFields, slope: mi.Int32) -> None:
+        self.size, self.slope = fields.size, slope
+        self.extinction_stride = fields.extinction_stride
+        self.ratio, self.origin = fields.extinction_ratio, fields.extinction_origin
+        self.last = fields.extinction_last
+        forward = slope > 0
+        #: voxel at the side through which tracks enter
+        self.entry = dr.select(forward, 0, self.size - 1)
+        # Distance to the side of entry, in slices: (zero + sign * position) * scale.
+        self.zero = dr.select(forward, mi.Float(0), mi.Float(1))
+        self.sign = dr.select(forward, mi.Float(1), mi.Float(-1)) * (1 / FIXED_POINT_ONE)
+        self.scale = FIXED_POINT_ONE / mi.Float(dr.abs(slope))
+
+    def since_entry(self, position: mi.Int32) -> mi.Float:
+        """Slices since the side of entry, for tracks in the voxel next to it."""
+        return dr.fma(mi.Float(position), self.sign, self.zero) * self.scale
+
+    def start(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
+        """Slices since entry in the first slice: half of one, or less through a side."""
+        nearest = self.since_entry(position)
+        return dr.select(voxel == self.entry, least(nearest, 0.5), 0.5)
+
+    def advance(self, voxel: mi.Int32, position: mi.Int32, slices: mi.Int32 | int) -> tuple:
+        """Voxel and position after some ``slices``, and the slices since entry: 1 unless new."""
+        moved = position + self.slope * slices
+        position = moved & (FIXED_POINT_ONE - 1)
+        voxel = voxel + (moved >> FIXED_POINT_BITS)
+        outside = mi.UInt32(voxel) >= mi.UInt32(self.size)
+        voxel = dr.select(outside, self.entry, voxel)
+        return voxel, position, dr.select(outside, self.since_entry(position), 1.0)
+
+    def lower(self, voxel: mi.Int32, position: mi.Int32, per_voxel: bool) -> tuple:
+        """Index of the lower of the two extinction values around the track, and the weight of the
+        upper one. ``per_voxel``: each voxel has exactly one value.
+        """
+        if per_voxel:
+            before = position < FIXED_POINT_ONE // 2
+            weight = dr.fma(mi.Float(position), 1 / FIXED_POINT_ONE, dr.select(before, 0.5, -0.5))
+            lower = dr.maximum(voxel - dr.select(before, 1, 0), 0)
+            return lower * self.extinction_stride, dr.select(before & (voxel == 0), 0, weight)
+        x = dr.fma(mi.Float(position), 1 / FIXED_POINT_ONE, mi.Float(voxel))
+        u = clipped(dr.fma(x, self.ratio, self.origin), 0.0, self.last)
+        lower = mi.Int32(u)
+        return lower * self.extinction_stride, u - mi.Float(lower)
+
+    def to_upper(self, index: mi.Int32) -> mi.Int32:
+        """Step from the ``index`` of the lower value to the upper one; 0 at the grid's end."""
+        last = mi.Int32(self.last) * self.extinction_stride
+        return dr.select(index < last, self.extinction_stride, 0)
+
+
+class _Way:
+    """One of the two opposite ordinates of a pair: ``number`` 0 runs along the axis, 1 against."""
+
+    def __init__(self, record: TrackRecord, number: int) -> None:
+        self.number, self.record = number, record
+        b, c = record.transverse
+        self.b = _TransverseMotion(b, -b.slope if number else b.slope)
+        self.c = _TransverseMotion(c, -c.slope if number else c.slope)
+
+    def begin(self, track: mi.Int32, channels: int) -> _TrackState:
+        """The state before the first slice that this way crosses."""
+        record, (fields_b, fields_c) = self.record, self.record.transverse
+        # The divisor is 0 where a vector of lanes is not filled.
+        c = track // dr.maximum(fields_b.size, 1)
+        b = track - c * fields_b.size
+        active = (c < fields_c.size) & (record.slices > 0)
+        zero = 0 * track  # makes uniform values as wide as the lanes
+        position_b, position_c = fields_b.start + zero, fields_c.start + zero
+        offset, extinction_offset = record.first_voxel + zero, record.first_extinction + zero
+        if self.number:
+            last = record.slices - 1
+            b, c = b + fields_b.last_shift, c + fields_c.last_shift
+            b = dr.select(b >= fields_b.size, b - fields_b.size, b)
+            c = dr.select(c >= fields_c.size, c - fields_c.size, c)
+            position_b, position_c = fields_b.last_position + zero, fields_c.last_position + zero
+            offset = record.first_voxel + record.stride * last + zero
+            extinction_offset = record.first_extinction + record.extinction_stride * last + zero
+        return _TrackState(
+            b=b,
+            c=c,
+            position_b=position_b,
+            position_c=position_c,
+            offset=offset,
+            extinction_offset=extinction_offset,
+            since_entry=least(self.b.start(b, position_b), self.c.start(c, position_c)),
+            radiance=[mi.Float(0) for _ in range(channels)],
+            previous=mi.Float(0),
+            crossed=mi.Int32(0),
+            active=active,
+        )
+
+    def advance(
+        self, state: _TrackState, slices: mi.Int32 | int, radiance: list, previous: mi.Float
+    ) -> _TrackState:
+        """The state some ``slices`` on, with what tracks carry behind this one."""
+        record = self.record
+        b, position_b, since_b = self.b.advance(state.b, state.position_b, slices)
+        c, position_c, since_c = self.c.advance(state.c, state.position_c, slices)
+        step = record.stride * slices
+        extinction_step = record.extinction_stride * slices
+        crossed = state.crossed + slices
+        return _TrackState(
+            b=b,
+            c=c,
+            position_b=position_b,
+            position_c=position_c,
+            offset=state.offset - step if self.number else state.offset + step,
+            extinction_offset=state.extinction_offset - extinction_step
+            if self.number
+            else state.extinction_offset + extinction_step,
+            since_entry=least(since_c, since_b),
+            radiance=radiance,
+            previous=previous,
+            crossed=crossed,
+            active=state.active & (crossed < record.slices),
+        )
+
+    def slice_of(self, state: _TrackState) -> mi.Int32:
+        """Number of the slice along the axis."""
+        return self.record.slices - 1 - state.crossed if self.number else state.crossed
+
+    def voxel(self, state: _TrackState) -> mi.UInt32:
+        """Flat index of the voxel."""
+        b, c = self.record.transverse
+        return mi.UInt32(state.b * b.stride + state.c * c.stride + state.offset)
+
+    def empty_slices(self, empty: mi.UInt32, state: _TrackState) -> mi.Int32:
+        """Slices that may be skipped from here on, 0 where this one is needed."""
+        b, c = self.record.transverse
+        strides = b.empty_stride, c.empty_stride, self.record.empty_stride
+        at = state.b, state.c, self.slice_of(state)
+        cell = sum(n * mi.Int32(mi.UInt32(i) // CELL) for n, i in zip(strides, at, strict=True))
+        return mi.Int32(dr.gather(mi.UInt32, empty, mi.UInt32(cell), state.active))
+
+    def extinction(self, medium: SweptMedium, state: _TrackState, active: mi.Bool) -> tuple:
+        """Quantised extinction in the half of the slice that this way crosses first, and in the
+        other one; bilinear across the track.
+        """
+        lower, upper = self._extinction(medium, state, active)
+        return (upper, lower) if self.number else (lower, upper)
+
+    def _extinction(self, medium: SweptMedium, state: _TrackState, active: mi.Bool) -> tuple:
+        words, per_voxel = medium.words, medium.words < 4
+        index_b, weight_b = self.b.lower(state.b, state.position_b, per_voxel)
+        index_c, weight_c = self.c.lower(state.c, state.position_c, per_voxel)
+
+        def bilinear(v00, v10, v01, v11):
+            rows = [dr.fma(high - low, weight_b, low) for low, high in ((v00, v10), (v01, v11))]
+            return dr.fma(rows[1] - rows[0], weight_c, rows[0])
+
+        index = mi.UInt32(state.extinction_offset + index_b + index_c)
+        if words == 1:
+            above = index + mi.UInt32(self.c.to_upper(index_c))
+            found = [dr.gather(mi.UInt32, medium.corners, i, active) for i in (index, above)]
+        else:
+            kind = mi.Vector2u if words == 2 else mi.Array4u
+            found = dr.gather(kind, medium.corners, index, active)
+        if per_voxel:
+            value = bilinear(*(mi.Float(v) for w in found for v in (w & 0xFFFF, w >> 16)))
+            return value, value
+        first, second = ([mi.Float(w & 0xFFFF) for w in found], [mi.Float(w >> 16) for w in found])
+        return bilinear(*first), bilinear(*second)
+
+
+# Both ways of a pair
+
+
+class _Visit:
+    """The voxels in which the tracks of one way are: their indices, in the whole volume and in the
+    copy that is written, and whether they are needed. Values of all channels of a voxel are next to
+    each other.
+    """
+
+    def __init__(self, voxel: mi.UInt32, copy: mi.UInt32, active: mi.Bool) -> None:
+        self.voxel, self.copy, self.active = voxel, copy, active
+
+    def read(self, kind: type, volume: mi.Float, channels: int) -> list:
+        """The values of the copy."""
+        return [
+            dr.gather(kind, volume, self._at(self.copy, c), self.active) for c in range(channels)
+        ]
+
+    def read_sources(self, volume: mi.Float, channels: int) -> list:
+        """The first of the four values of the voxels of a whole volume."""
+        return [
+            dr.gather(mi.Float, volume, self._at(self.voxel, c) * 4, self.active)
+            for c in range(channels)
+        ]
+
+    def write(self, volume: mi.Float, values: list) -> None:
+        """Replaces the values of the copy."""
+        for c, value in enumerate(values):
+            dr.scatter(volume, value, self._at(self.copy, c), self.active)
+
+    @staticmethod
+    def _at(index: mi.UInt32, channel: int) -> mi.UInt32:
+        return index + channel if channel else index
+
+
+class _PairSweep:
+    """Both ways of pairs of opposite ordinates through a medium and a volume."""
+
+    def __init__(
+        self, medium: SweptMedium, volume: SweptVolume, table: TrackTable, pair: mi.UInt32
+    ) -> None:
+        self.medium, self.volume = medium, volume
+        record = table.records.read(pair)
+        self.ways = _Way(record, 0), _Way(record, 1)
+        self.separate = volume.begin_backward is not None
+        self.begins = (
+            volume.begin,
+            volume.begin if volume.begin_backward is None else volume.begin_backward,
+        )
+        self.incoming = [table.incoming(pair, way, volume.channels) for way in range(2)]
+        self.boundary_source = table.boundary_source
+        if self.boundary_source is not None:
+            self._cells = self.boundary_source.read_pair(pair)
+            self._offsets = self.boundary_source.channel_offsets()
+        self._source_elsewhere = volume.source is not volume.values
+        self.weight, self.scale = record.weight, record.quantum * record.length
+        # Cross section of a track over that of a voxel, times voxel length over track length.
+        self.area = dr.rcp(record.length)
+        #: what optical depths are multiplied by
+        self.solid_angle = mi.Float(1) if self.separate else record.weight
+
+    def begin(self, track: mi.Int32) -> tuple[_TrackState, _TrackState]:
+        forward, backward = (way.begin(track, self.volume.channels) for way in self.ways)
+        return forward, backward
+
+    def cross_slice(
+        self, values: mi.Float, forward: _TrackState, backward: _TrackState
+    ) -> tuple[_TrackState, _TrackState]:
+        """Cross a slice, or skip empty ones, both ways; read and write the ``values`` of its voxels
+        in the volume.
+        """
+        states = forward, backward
+        slices, needed = self._needed(states)
+        voxels = [way.voxel(state) for way, state in zip(self.ways, states, strict=True)]
+        if self.volume.channels > 1:
+            voxels = [voxel * self.volume.channels for voxel in voxels]
+        extinction = [
+            way.extinction(self.medium, state, active)
+            for way, state, active in zip(self.ways, states, needed, strict=True)
+        ]
+        radiance = [self._entered(way, state) for way, state in zip(self.ways, states, strict=True)]
+        visits = [
+            _Visit(voxel, voxel + begin, active)
+            for voxel, begin, active in zip(voxels, self.begins, needed, strict=True)
+        ]
+        # In the middle slice both ways are in the same voxel: the first to write writes for both.
+        middle = forward.offset == backward.offset
+        if self.volume.source is None:
+            radiance = self._attenuate(values, states, radiance, extinction, visits, middle)
+        else:
+            radiance = self._collide(values, states, radiance, extinction, visits, middle)
+        forward, backward = (
+            way.advance(state, n, light, second)
+            for way, state, n, light, (_, second) in zip(
+                self.ways, states, slices, radiance, extinction, strict=True
+            )
+        )
+        if self.medium.empty is None:
+            backward = replace(backward, crossed=forward.crossed, active=forward.active)
+        return forward, backward
+
+    def _needed(self, states: tuple) -> tuple[list, list]:
+        """For both ways the slices to advance by, and whether this one is not skipped."""
+        if self.medium.empty is None:
+            return [1, 1], [state.active for state in states]
+        empty = [
+            way.empty_slices(self.medium.empty, state)
+            for way, state in zip(self.ways, states, strict=True)
+        ]
+        needed = [state.active & (n == 0) for state, n in zip(states, empty, strict=True)]
+        return [dr.maximum(n, 1) for n in empty], needed
+
+    def _entered(self, way: _Way, state: _TrackState) -> list[mi.Float]:
+        """Radiance before the slice: that of the boundary for tracks that have just entered."""
+        entered = state.since_entry < 1
+        if self.boundary_source is None:
+            return _select(entered, self.incoming[way.number], state.radiance)
+        entered = state.active & entered
+        found = self.boundary_source.irradiance(
+            self._cells, self._offsets, way.number, way.slice_of(state), state.at, entered
+        )
+        return _select(entered, found, state.radiance)
+
+    def _attenuate(
+        self,
+        values: mi.Float,
+        states: tuple,
+        radiance: list,
+        extinction: list,
+        visits: list[_Visit],
+        middle: mi.Bool,
+    ) -> list[list[mi.Float]]:
+        """Attenuates the radiance up to the middle of the slice and adds it to the voxels."""
+        radiance = [
+            _scale(light, _transmittance(state, first, self.scale))
+            for state, light, (first, _) in zip(states, radiance, extinction, strict=True)
+        ]
+        if self.separate:
+            for light, visit in zip(radiance, visits, strict=True):
+                visit.write(values, light)
+        else:
+            before = [visit.read(mi.Float, values, self.volume.channels) for visit in visits]
+            self._add_both(values, before, radiance, visits, middle)
+        return radiance
+
+    def _collide(
+        self,
+        values: mi.Float,
+        states: tuple,
+        radiance: list,
+        extinction: list,
+        visits: list[_Visit],
+        middle: mi.Bool,
+    ) -> list[list[mi.Float]]:
+        """Carries the radiance through the slice, whose voxels emit, and adds up irradiance and
+        collisions.
+        """
+        source, channels = self.volume.source, self.volume.channels
+        if self.separate:
+            sources = [visit.read(mi.Float, source, channels) for visit in visits]
+        else:
+            before = [visit.read(mi.Vector4f, values, channels) for visit in visits]
+            if self._source_elsewhere:
+                sources = [visit.read_sources(source, channels) for visit in visits]
+            else:
+                sources = [[value.x for value in voxel] for voxel in before]
+        sources = [_scale(sent, self.weight) for sent in sources]
+        crossed = [
+            self._cross_voxel(state, light, sent, halves)
+            for state, light, sent, halves in zip(
+                states, radiance, sources, extinction, strict=True
+            )
+        ]
+        radiance, tallies = ([way[i] for way in crossed] for i in range(2))
+        if self.separate:
+            for visit, tally, sent in zip(visits, tallies, sources, strict=True):
+                own = [t - mi.Vector4f(0, s, 0, 0) for t, s in zip(tally, sent, strict=True)]
+                visit.write(values, own)
+        else:
+            self._add_both(values, before, tallies, visits, middle)
+        return radiance
+
+    def _add_both(
+        self, values: mi.Float, before: list, added: list, visits: list[_Visit], middle: mi.Bool
+    ) -> None:
+        """Writes what both ways add to the values ``before``."""
+        forward, backward = visits
+        both = _add(added[0], _select(middle, added[1], self.volume.channels * [0]))
+        forward.write(values, _add(before[0], both))
+        backward.active = backward.active & ~middle
+        backward.write(values, _add(before[1], added[1]))
+
+    def _cross_voxel(
+        self, state: _TrackState, radiance: list, source: list, extinction: tuple
+    ) -> tuple[list, list]:
+        """Radiance behind a slice, and what its voxel adds up: (0, irradiance in its middle,
+        radiance lost, optical depth), for a source that is constant in it.
+        """
+        # docs/primer, eqs. (4.6), (4.7)
+        # A track stands for a cross section that is the less the longer it stays in a voxel.
+        area, count = self.area, self.solid_angle
+        first, second = (half * self.scale for half in extinction)
+        to_middle = dr.select(state.since_entry < 1, state.since_entry, 0.5) * first
+        tau = dr.fma(second, 0.5, to_middle)
+        transmittance = decay(tau)
+        # Thin voxels lose little, but what they scatter is known from just that.
+        share = absorbed(tau, transmittance)
+        to_centre = decay(to_middle)
+        behind, tally = [], []
+        for x, sent in zip(radiance, source, strict=True):
+            lost, middle = (x - sent) * share, dr.fma(x - sent, to_centre, sent)
+            behind.append(x - lost)
+            tally.append(mi.Vector4f(0, middle, lost * area, count * tau * area))
+        return behind, tally
+
+
+def _transmittance(state: _TrackState, here: mi.Float, scale: mi.Float) -> mi.Float:
+    """Transmittance from the middle of the previous slice to that of this one, or from the point of
+    entry; ``here`` is the extinction in the half of this one that is crossed first.
+    """
+    # docs/primer, eq. (4.4)
+    since = state.since_entry
+    return decay(dr.select(since < 1, here * since, 0.5 * (state.previous + here)) * scale)
+
+
+# All channels of a voxel
+
+
+def _select(condition: mi.Bool, values: list, others: list) -> list:
+    return [dr.select(condition, a, b) for a, b in zip(values, others, strict=True)]
+
+
+def _add(first: list, second: list) -> list:
+    return [a + b for a, b in zip(first, second, strict=True)]
+
+
+def _scale(values: list, factor: mi.Float) -> list:
+    return [value * factor for value in values]

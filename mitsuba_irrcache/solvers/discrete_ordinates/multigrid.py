@@ -1,0 +1,367 @@
+"""Multiple scattering: source iteration on a hierarchy of grids (multigrid).
+
+The mean irradiance of collisions phi solves phi = A phi + b. The operator A is one transport sweep
+over a fixed set of ordinates with the source albedo phi / (4 pi); b is the irradiance that has been
+scattered once. Source iteration (phi <- A phi + b) adds one order of scattering per sweep: in dense
+media with an albedo near 1, thousands. The slowly converging errors are smooth, and are corrected
+on coarser grids by the same operator: a sweep on each grid, then the correction of its error from
+the next coarser one (multigrid; for acceleration of discrete-ordinates methods in general see
+Adams and Larsen, *Fast iterative methods for discrete-ordinates particle transport calculations*,
+Progress in Nuclear Energy 40, 2002). Anderson acceleration (`anderson`) combines the cycles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.grids.grid import Grid, stencil
+from mitsuba_irrcache.solvers.discrete_ordinates.anderson import (
+    TINY,
+    AndersonAcceleration,
+    accelerated,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+
+#: Voxels along the longest side of the coarsest grid, at most.
+COARSEST = 20
+#: Multigrid cycles on the finest grid, at most; there is one on the others.
+MAX_CYCLES = 12
+#: Optical depth of a voxel from which on the radiance that tracks lose in it tells its collisions.
+THIN = 1e-2
+#: Relative error that remains in the finest solution; and changes at which the iteration on the
+#: coarsest grid ends, if that is the only one, and if it only corrects finer ones.
+TOLERANCE = 2e-3
+COARSEST_TOLERANCE, CORRECTION_TOLERANCE = 2e-4, 3e-2
+#: Iterations on the coarsest grid, at most, and points from which each is accelerated.
+MAX_ITERATIONS, HISTORY = 200, 6
+
+
+class MultigridLevel:
+    """A grid of the hierarchy: extinction, albedo, tracks, and the next coarser level.
+
+    ``sigma_t`` and ``albedo``, as all fields of irradiance, have a value for each active voxel of
+    the ``tracks``, outside of which there is no matter. Where several channels are swept together,
+    albedo and irradiance have those of a voxel next to each other. Coarser levels have half the
+    voxels along those axes along which voxels are shortest, or along all axes (``all_axes``):
+    sweeps reduce errors that vary over long distances along an ordinate, and only coarser grids
+    those between near voxels.
+    """
+
+    def __init__(
+        self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks, all_axes: bool = False
+    ) -> None:
+        self.sigma_t, self.albedo, self.tracks = sigma_t, albedo, tracks
+        self.grid, self.all_axes = tracks.grid, all_axes
+        self.channels = dr.width(albedo) // tracks.active_count
+        # voxels of this level in one of the next, along x, y, z
+        self._ratio = np.array([2, 2, 2]) if all_axes else _coarsening(self.grid)
+        self._coarser: MultigridLevel | None = None
+        self._tolerance = COARSEST_TOLERANCE
+        self._children: list[tuple[mi.UInt32, mi.Float]] = []
+
+    @property
+    def coarsest(self) -> bool:
+        """Whether there is no coarser level."""
+        return max(self.grid.shape) <= COARSEST
+
+    @property
+    def coarser(self) -> MultigridLevel:
+        """The next level, made when it is first asked for."""
+        if self._coarser is None:
+            grid, fine = _coarse_grid(self.grid, self._ratio), self.tracks
+            active = None if fine.all_active else self._interpolated_from(grid)
+            children = []
+            for voxel, inside in _children_of(self.grid, grid, self._ratio):
+                place = fine.active_index(voxel)
+                inside &= place < dr.opaque(mi.UInt32, fine.active_count)
+                extinction = dr.gather(mi.Float, self.sigma_t, place, inside)
+                children.append((dr.select(inside, place, 0), extinction))
+            total = sum(s for _, s in children)
+            sigma_t = total / len(children)
+            # The weights of all other means are shares of the extinction.
+            shares = [(i, dr.select(total > 0, s / total, 0)) for i, s in children]
+            dr.eval(sigma_t, shares)
+            box = np.zeros(3, int), grid.resolution
+            tracks = Tracks(grid, sigma_t, *box, None, active, fine.sparse, fine.pause)
+            active = tracks.active
+            sigma_t = dr.gather(mi.Float, sigma_t, active)
+            self._children = [
+                (dr.gather(mi.UInt32, i, active), dr.gather(mi.Float, w, active)) for i, w in shares
+            ]
+            dr.eval(sigma_t, self._children)
+            self._coarser = self._new_level(sigma_t, self._restricted(self.albedo, tracks), tracks)
+            self._coarser._tolerance = CORRECTION_TOLERANCE
+        return self._coarser
+
+    def _new_level(self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks) -> MultigridLevel:
+        return MultigridLevel(sigma_t, albedo, tracks, self.all_axes)
+
+    # Transfer between levels
+
+    def _interpolated_from(self, coarse: Grid) -> mi.UInt32:
+        """The voxels of a ``coarse`` grid from which active ones are interpolated."""
+        marks = dr.opaque(mi.Bool, False, coarse.voxel_count)
+        axes = [ends for ends, _ in self._stencil(coarse, self.tracks.active)]
+        for at in product(*axes):
+            dr.scatter(marks, mi.Bool(True), coarse.index(*at))
+        return dr.compress(marks)
+
+    def _stencil(self, coarse: Grid, voxel: mi.UInt32) -> list[tuple]:
+        """Along x, y, z the two voxels of a ``coarse`` grid around each ``voxel``, and the weight
+        of the upper.
+        """
+        axes, places = [], self.grid.places(voxel)
+        for at, n, sides in zip(places, self._ratio, coarse.sides, strict=True):
+            lower, weight, more = stencil((mi.Float(at) + 0.5) * dr.opaque(mi.Float, 1 / n), sides)
+            axes.append(((lower, lower + dr.select(more, 1, 0)), weight))
+        return axes
+
+    def restrict(self, values: mi.Float) -> mi.Float:
+        """Means over the voxels of the coarser level, weighted by extinction."""
+        return self._restricted(values, self.coarser.tracks)
+
+    def _restricted(self, values: mi.Float, coarse: Tracks) -> mi.Float:
+        place, channel = voxel_and_channel(coarse.active_count, self.channels)
+        result = mi.Float(0)
+        for i, w in self._children:
+            child = dr.gather(mi.UInt32, i, place) * self.channels + channel
+            result += dr.gather(mi.Float, values, child) * dr.gather(mi.Float, w, place)
+        dr.eval(result)
+        return result
+
+    def prolong(self, values: mi.Float) -> mi.Float:
+        """Values of the coarser level at the voxels of this one, by trilinear interpolation."""
+        place, channel = voxel_and_channel(self.tracks.active_count, self.channels)
+        return self._interpolated(values, place, self.channels, channel)
+
+    def _interpolated(
+        self, values: mi.Float, place: mi.UInt32, step: int, begin: mi.UInt32
+    ) -> mi.Float:
+        """Every ``step``-th of the coarser level's values, from ``begin`` on, at active voxels of
+        this level, by trilinear interpolation.
+        """
+        coarse = self.coarser.tracks
+        voxel = dr.gather(mi.UInt32, self.tracks.active, place)
+        (xs, wx), (ys, wy), (zs, wz) = self._stencil(coarse.grid, voxel)
+
+        def along_x(y, z):
+            at = (coarse.active_index(coarse.grid.index(x, y, z)) for x in xs)
+            return dr.lerp(*(dr.gather(mi.Float, values, p * step + begin) for p in at), wx)
+
+        return dr.lerp(*(dr.lerp(*(along_x(y, z) for y in ys), wy) for z in zs), wz)
+
+    # The operator A
+
+    def sweep(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
+        """A phi and what enters along the ``table``: the irradiance, and the mean irradiance of
+        collisions, which is what is scattered again.
+
+        ``phi``, a mean irradiance of collisions, may be None for 0.
+        """
+        # docs/primer, eq. (4.8)
+        tracks = self.tracks
+        place, channel = voxel_and_channel(tracks.active_count, self.channels)
+        slot = dr.gather(mi.UInt32, tracks.active, place) * self.channels + channel
+        volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * self.channels * 4)
+        if phi is not None:
+            source = phi * self.albedo * dr.inv_four_pi
+            dr.scatter(volume, mi.Vector4f(source, 0, 0, 0), slot)
+            dr.eval(volume)
+            if table.boundary_source is not None:
+                table.boundary_source.update(phi)
+        tracks.sweep(volume, table)
+        source, phi, lost, depth = dr.gather(mi.Vector4f, volume, slot)
+        # Radiance of collisions times 4 pi, the integral of 1 over directions.
+        collided = 4 * dr.pi * (source + lost / dr.select(depth > 0, depth, 1))
+        collided = self.collided_irradiance(depth, collided, phi)
+        dr.eval(phi, collided)
+        return phi, collided
+
+    def collided_irradiance(
+        self, depth: mi.Float, collided: mi.Float, irradiance: mi.Float
+    ) -> mi.Float:
+        """The mean irradiance of collisions: from what tracks lose, ``collided``, or, where they
+        find hardly any matter, the ``irradiance``; ``depth`` is their optical depth integrated over
+        directions.
+
+        In such voxels the tracks of suns find other matter than those of the quadrature, so that
+        their ratio is unreliable; and the irradiance is nearly constant there.
+        """
+        size = float(self.grid.voxel_size.min()) / (4 * np.pi * THIN)
+        found = dr.square(depth * dr.opaque(mi.Float, size))
+        return dr.select(found < 1, dr.lerp(irradiance, collided, found), collided)
+
+    def scattered_radiance(
+        self, phi: mi.Float, index: mi.UInt32, direction: mi.Vector3f | None
+    ) -> mi.Float:
+        """4 pi times the radiance scattered from ``phi`` that reaches rays along ``direction`` from
+        active voxel ``index``, divided by the albedo.
+        """
+        return dr.gather(mi.Float, phi, index)
+
+    def propagated_change(self, phi: mi.Float, ordinates: Ordinates, sets: int) -> mi.Float:
+        """About A phi, irradiance, along the ``ordinates`` of so many ``sets``: found on the
+        coarser level, if there is one.
+        """
+        directions, incoming, weights, offsets = ordinates
+        coarse = self if self.coarsest else self.coarser
+        table = coarse.tracks.table(directions, incoming, weights / sets, offsets)
+        if self.coarsest:
+            return self.sweep(phi, table)[0]
+        return self.prolong(coarse.sweep(self.restrict(phi), table)[0])
+
+    def tables(
+        self, ordinates: Ordinates, boundary_source: Callable | None = None
+    ) -> list[TrackTable]:
+        """Tables of this level and all coarser ones for ``ordinates`` along which nothing enters,
+        or what ``boundary_source`` makes of a level and its table, depending on phi.
+        """
+        tables, level = [], self
+        while True:
+            tables.append(level.tracks.table(*ordinates))
+            if boundary_source is not None:
+                tables[-1].boundary_source = boundary_source(level, tables[-1])
+            if level.coarsest:
+                return tables
+            level = level.coarser
+
+    # Solution of phi = A phi + b
+
+    def solve(
+        self,
+        b: mi.Float,
+        ordinates: Ordinates,
+        boundary_source: Callable | None = None,
+        tolerance: float = 1.0,
+    ) -> mi.Float:
+        """Solve phi = A phi + b by accelerated multigrid cycles, for ``ordinates`` and
+        ``boundary_source`` as in `tables`, to ``tolerance`` times the relative error `TOLERANCE`.
+        """
+        # docs/primer, eq. (4.9)
+        tables = self.tables(ordinates, boundary_source)
+        phi = self._initial_guess(b, tables)
+        change, nonzero = np.inf, self._scattered_sums(dr.abs(b)).max() > 0
+        acceleration = AndersonAcceleration(self._scattered_sums)
+        for _ in range(MAX_CYCLES if not self.coarsest and nonzero else 0):
+            image = self.cycle(phi, b, tables)
+            scale = self._scattered_sums(dr.abs(image))
+            last, change = change, self._scattered_sums(dr.abs(image - phi))
+            # Errors decay by about the same factor each time. It is bounded from below, since the
+            # first factors may be small: what converges slowest shows last.
+            factor = np.clip(change / np.maximum(last, TINY), 0.5, 0.95)
+            error = (change * factor / (1 - factor) / np.maximum(scale, TINY)).max()
+            mi.Log(mi.LogLevel.Debug, f"irrcache: multiple scattering known to {error:.1e}")
+            phi = acceleration.next(phi, image)
+            if error <= TOLERANCE * tolerance:
+                break
+        else:
+            if not self.coarsest and nonzero:
+                mi.Log(
+                    mi.LogLevel.Warn,
+                    f"irrcache: light of high orders of scattering is known to {error:.1e} only",
+                )
+        return phi
+
+    def _scattered_sums(self, values: mi.Float) -> np.ndarray:
+        """Sums of ``values`` for each channel, weighted by the scattering coefficient."""
+        channels, voxels = self.channels, dr.opaque(mi.UInt32, self.tracks.active_count)
+        place = dr.arange(mi.UInt32, dr.width(values) // channels)
+        voxel = place % voxels
+        weight, sums = dr.gather(mi.Float, self.sigma_t, voxel), []
+        for c in range(channels):
+            value = dr.gather(mi.Float, values, place * channels + c)
+            albedo = dr.gather(mi.Float, self.albedo, voxel * channels + c)
+            sums.append(dr.sum(value * albedo * weight))
+        dr.eval(sums)
+        return np.array([float(total[0]) for total in sums])
+
+    def cycle(self, phi: mi.Float, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
+        """A multigrid cycle: a step of source iteration, and the coarse correction of its error."""
+        return self.coarse_corrected(phi, self.sweep(phi, tables[0])[1] + b, tables[1:])
+
+    def coarse_corrected(
+        self, phi: mi.Float, swept: mi.Float, coarse: list[TrackTable]
+    ) -> mi.Float:
+        """The result ``swept`` of a sweep of ``phi``, with the remaining error corrected on the
+        coarser level; ``coarse`` are the tables of that and those below.
+        """
+        # docs/primer, eq. (4.10)
+        if self.coarsest:
+            return swept
+        _, residual = self.coarser.sweep(self.restrict(swept - phi), coarse[0])
+        result = swept + self.prolong(self.coarser._approximate_solution(residual, coarse))
+        dr.eval(result)
+        return result
+
+    def _approximate_solution(self, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
+        """About the solution, by a single cycle on each level."""
+        return self._source_iteration(b, tables[0]) if self.coarsest else self.cycle(b, b, tables)
+
+    def _initial_guess(self, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
+        """The solution of the coarser level; on the coarsest, the solution."""
+        if self.coarsest:
+            return self._source_iteration(b, tables[0])
+        coarser = self.coarser  # made before anything is restricted to it
+        return self.prolong(coarser._approximate_solution(self.restrict(b), tables[1:]))
+
+    def _source_iteration(self, b: mi.Float, table: TrackTable) -> mi.Float:
+        """Source iteration with Anderson acceleration, for few voxels."""
+        first = np.array(b, dtype=np.float64).reshape(-1, self.channels).T
+        phi, history = first.copy(), []
+        scale = np.abs(first).mean(axis=1)
+        for _ in range(MAX_ITERATIONS):
+            # As lists: NumPy's memory would be borrowed, and kernels differ with its alignment.
+            scattered = np.array(self.sweep(mi.Float(phi.T.ravel().tolist()), table)[1])
+            image = scattered.reshape(-1, self.channels).T + first
+            history.append((phi, image))
+            history = history[-HISTORY:]
+            residual = image - phi
+            if not np.isfinite(residual).all():
+                raise IrrcacheError(
+                    "irrcache: the light in the medium is not finite in single precision; lower "
+                    "the radiance of the emitters (light of the first order: "
+                    f"{scale.max():.1e} on average)."
+                )
+            if (np.abs(residual).mean(axis=1) <= self._tolerance * scale).all():
+                break
+            phi = np.array([accelerated(history, c) for c in range(self.channels)])
+        return mi.Float(image.T.ravel().tolist())
+
+
+def _coarsening(grid: Grid) -> np.ndarray:
+    """Voxels along x, y, z that one voxel of the next level replaces: two where they are less than
+    twice as long as the shortest, of those axes that have several.
+    """
+    several = grid.resolution > 1
+    shortest = grid.voxel_size[several].min() if several.any() else 0.0
+    return np.where(several & (grid.voxel_size < 2 * shortest), 2, 1)
+
+
+def _coarse_grid(grid: Grid, ratio: np.ndarray) -> Grid:
+    """The grid of voxels so many times as large; it may reach beyond the end of ``grid``."""
+    sides = -(-grid.resolution // ratio)
+    scale = ratio * sides / grid.resolution
+    return Grid(tuple(int(n) for n in sides[::-1]), grid.to_world @ np.diag([*scale, 1.0]))
+
+
+def _children_of(fine: Grid, coarse: Grid, ratio: np.ndarray) -> list[tuple[mi.UInt32, mi.Bool]]:
+    """For each position of a fine voxel within a coarse one: the fine voxels there, and whether
+    they exist.
+    """
+    at = coarse.places(dr.arange(mi.UInt32, coarse.voxel_count))
+    nx, ny, nz = (int(n) for n in fine.resolution)
+    result = []
+    for steps in np.ndindex(*(int(n) for n in ratio[::-1])):
+        x, y, z = (int(n) * a + d for n, a, d in zip(ratio, at, steps[::-1], strict=True))
+        inside = (x < nx) & (y < ny) & (z < nz)
+        result.append((dr.select(inside, fine.index(x, y, z), 0), inside))
+    return result

@@ -1,0 +1,231 @@
+"""Ordinate sets: the directions of one pass of the solver, and the sweeps along them.
+
+A pass sweeps one set of ordinates. `OrdinateSet` is for a medium with distant emitters only;
+`BoundaryOrdinateSet` for a medium among surfaces, whose radiance enters track by track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
+    Ordinates,
+    hemisphere_ordinates,
+    joint_ordinates,
+    merged,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import (
+    IncomingRadiance,
+    SurfaceBoundary,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+
+#: Ordinates of a pass along which radiance enters among surfaces: it varies more from one direction
+#: to the next than the radiance between voxels.
+BOUNDARY_ORDINATES = 64
+
+
+class OrdinateSet:
+    """Ordinates along which both the radiance of distant emitters and that of voxels travel, in
+    some ``channels``, or alike in all.
+    """
+
+    def __init__(self, ordinates: Ordinates, channels: Sequence[int], suns: int = 0) -> None:
+        """``suns`` of the last ordinates are those of suns, whose irradiance is to be separate."""
+        count, incoming = len(ordinates.weights), ordinates.incoming
+        self._is_sun = np.arange(count) >= count - suns if suns else None
+        own = incoming if incoming.shape[-1] == 1 else incoming[..., list(channels)]
+        self.ordinates = ordinates._replace(incoming=own)
+
+    @staticmethod
+    def uncollided(
+        sets: Sequence[OrdinateSet], angular_basis: AngularBasis | None = None
+    ) -> list[tuple]:
+        """Arguments of `Tracks.uncollided` for the radiance of distant emitters along all ``sets``.
+
+        With an ``angular_basis``, first for all but the narrow sources, then for each of these;
+        where the irradiance of suns is to be separate, it comes last.
+        """
+        directions, incoming, _, offsets = merged([each.ordinates for each in sets])
+        parts = [incoming] if angular_basis is None else angular_basis.apart(directions, incoming)
+        if sets[0]._is_sun is not None:
+            is_sun = np.concatenate([each._is_sun for each in sets])[:, None, None]
+            parts = [np.where(is_sun, 0, incoming), np.where(is_sun, incoming, 0)]
+        used = [part.any(axis=(1, 2)) for part in parts]
+        return [
+            (directions[rows], part[rows], offsets[rows])
+            for part, rows in zip(parts, used, strict=True)
+        ]
+
+    def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        """`MultigridLevel.sweep` with the radiance that enters."""
+        return level.sweep(phi, level.tracks.table(*self.ordinates))
+
+    def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
+        """All orders of scattering, of which ``b`` is the first, for so many further ``passes``:
+        these correct the remaining error, and divide it by their number.
+        """
+        return level.solve(b, self.scattering, tolerance=max(1.0, passes / 2))
+
+    def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
+        """`MultigridLevel.coarse_corrected` for a sweep along the ordinates of this set."""
+        coarse = [] if level.coarsest else level.coarser.tables(self.scattering)
+        return level.coarse_corrected(phi, swept, coarse)
+
+    @property
+    def scattering(self) -> Ordinates:
+        """The ordinates of radiance that voxels emit and scatter."""
+        return self.ordinates.scattering()
+
+
+class BoundaryOrdinateSet:
+    """Among surfaces: radiance enters along more ordinates than it is exchanged between voxels
+    along, the ``scattering`` ones.
+
+    ``incoming`` is the radiance that enters along the ``ordinates``, which begin at number
+    ``start`` there. ``reflected`` is that which leaves the medium and returns to it along the
+    scattering ordinates while all orders are solved for, if this set does so. Some ``channels`` are
+    taken of both.
+    """
+
+    def __init__(
+        self,
+        ordinates: Ordinates,
+        scattering: Ordinates,
+        incoming: IncomingRadiance,
+        start: int,
+        reflected: IncomingRadiance | None,
+        channels: Sequence[int],
+    ) -> None:
+        self.ordinates, self.scattering = ordinates, scattering
+        self.incoming, self.reflected, self.channels = incoming, reflected, channels
+        self.numbers = np.arange(start, start + len(ordinates.directions))
+
+    @staticmethod
+    def uncollided(
+        sets: Sequence[BoundaryOrdinateSet], angular_basis: AngularBasis | None = None
+    ) -> list[tuple]:
+        """As `OrdinateSet.uncollided`."""
+        directions, unused, _, offsets = merged([each.ordinates for each in sets])
+        incoming, channels = sets[0].incoming, sets[0].channels
+        numbers = np.concatenate([each.numbers for each in sets])
+        parts = []
+        for part, mask in enumerate(incoming.has_emitters):
+            used = mask[numbers]
+            source = partial(incoming.emitter_source, channels, numbers=numbers[used], part=part)
+            parts.append((directions[used], unused[used], offsets[used], source))
+        return parts
+
+    def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        """`MultigridLevel.sweep` with the radiance that enters."""
+        table = self._table(level)
+        table.boundary_source.update(phi)
+        found = level.sweep(None, table)
+        if phi is None:
+            return found
+        # Separately: the collisions of either balance what its own tracks lose.
+        scattered = level.sweep(phi, level.tracks.table(*self.scattering))
+        both = tuple(a + b for a, b in zip(found, scattered, strict=True))
+        dr.eval(both)
+        return both
+
+    def _table(self, level: MultigridLevel) -> TrackTable:
+        """The ordinates, with the radiance that enters along them."""
+        table = level.tracks.table(*self.ordinates)
+        of_table = self.channels, level, table, self.numbers
+        table.boundary_source = self.incoming.reflected_source(*of_table, emitted=True)
+        return table
+
+    def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
+        """The sweep unchanged: what differs between passes here is the radiance that enters."""
+        return swept
+
+    def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
+        """All orders, of which ``b`` is the first; between two, radiance may leave the medium."""
+        numbers = np.arange(len(self.scattering.directions))
+        return level.solve(
+            b,
+            self.scattering,
+            lambda *of_table: self.reflected.reflected_source(
+                self.channels, *of_table, numbers, emitted=False
+            ),
+        )
+
+
+class JointOrdinateSet(BoundaryOrdinateSet):
+    """For anisotropic scattering: radiance that enters and radiance of voxels use the same
+    ordinates, so that quadrature errors of both cancel where their sum is isotropic.
+    """
+
+    def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
+        table = self._table(level)
+        if phi is None:
+            table.boundary_source.update(phi)
+        return level.sweep(phi, table)
+
+
+def boundary_ordinate_sets(
+    boundary: SurfaceBoundary,
+    illumination: DistantIllumination,
+    tracks: Tracks,
+    passes: int,
+    pairs: int,
+    rng: np.random.Generator,
+    seed: tuple[int, int],
+) -> tuple[Callable[[Sequence[int]], list[BoundaryOrdinateSet]], list[list[mi.Float]]]:
+    """Ordinate sets of passes among surfaces, as a function of the channels that are swept
+    together; and all spectra that may differ between channels. If there are several passes, the
+    first one can solve for all orders. ``pairs`` are those of scattering ordinates.
+    """
+    several, joint = passes > 1, boundary.angular_basis is not None
+    many = max(BOUNDARY_ORDINATES // 2, pairs) if several else pairs
+    # The first one is independent, the union of the others is even.
+    sets = illumination.ordinates(1, many, rng)
+    if several:
+        sets += illumination.ordinates(passes - 1, many, rng)
+    if joint:
+        scattering = [each.scattering() for each in sets]
+    else:
+        scattering = _scattering_ordinates(passes, pairs, rng)
+    incoming = IncomingRadiance(boundary, tracks, merged(sets), several, (*seed, 0))
+    reflected = None
+    if several:
+        reflected = IncomingRadiance(boundary, tracks, scattering[0], several, (*seed, 1))
+    starts = np.cumsum([0] + [len(each.directions) for each in sets])
+    spectra = [*incoming.spectra, *(reflected.spectra if several else ())]
+
+    def of(channels: Sequence[int]) -> list[BoundaryOrdinateSet]:
+        kind = JointOrdinateSet if joint else BoundaryOrdinateSet
+        return [
+            kind(
+                each.without_incoming(),
+                own.without_incoming(),
+                incoming,
+                start,
+                None if number else reflected,
+                channels,
+            )
+            for number, (each, own, start) in enumerate(zip(sets, scattering, starts, strict=False))
+        ]
+
+    return of, spectra
+
+
+def _scattering_ordinates(passes: int, pairs: int, rng: np.random.Generator) -> list[Ordinates]:
+    """Ordinates for each pass of the radiance between voxels, along which nothing enters."""
+    none = np.zeros((pairs, 2, dr.size_v(mi.Spectrum)))
+    sets = [hemisphere_ordinates(pairs, rng)]
+    if passes > 1:
+        sets += joint_ordinates(passes - 1, pairs, rng)
+    return [
+        Ordinates(directions, none, weights, rng.random((pairs, 2))) for directions, weights in sets
+    ]

@@ -1,0 +1,137 @@
+"""Resampling of the medium to the voxels of the cache and of the tracks: means that conserve
+optical depth, and the albedo of collisions.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
+from mitsuba_irrcache.grids.fields import Field, GridField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+
+#: Most points along each axis of a voxel over which the medium is averaged.
+FINEST = 4
+#: Quadrature points for collisions along each axis of a voxel or, if it is larger than one of the
+#: data, of parts of it, and their weights: Gauss-Radau points of both halves, exact for products of
+#: fields that are linear in each. Values of the data lie in the middle where grids are the same.
+RADAU = (1 / 6, 3 / 8), (1 / 2, 1 / 4), (5 / 6, 3 / 8)
+#: Values of the extinction along each axis of a voxel that tracks read, about.
+DETAIL = 2
+
+
+def extinction_grid(medium: MediumGrid, grid: Grid) -> Grid:
+    """The grid on which tracks read the extinction. Where ``grid`` lies over the same box as the
+    medium's, it is this one, or, if ``grid`` is much coarser, blocks of its voxels, about `DETAIL`
+    in a voxel along each axis; else it is ``grid``.
+    """
+    data = medium.sigma_t.grid
+    if data is None or not medium.fills(grid) or not medium.fills(data):
+        return grid
+    block = np.maximum(np.rint(data.resolution / (DETAIL * grid.resolution)), 1).astype(int)
+    block = np.where(data.resolution % block == 0, block, 1)
+    sides = data.resolution // block
+    if (sides == grid.resolution).all():
+        return grid
+    return data if (block == 1).all() else Grid(tuple(int(n) for n in sides[::-1]), grid.to_world)
+
+
+def resampled(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
+    """Channels of ``field`` at the voxels of ``grid``: its means over voxels that are larger than
+    the field's, or that the boundary of the medium may cut, outside of which the field is 0.
+    """
+    cut = not medium.fills(grid)
+    if field.grid is not None and not cut:
+        block, rest = np.divmod(field.grid.resolution, grid.resolution)
+        if not rest.any() and np.prod(block) <= FINEST**3 and medium.fills(field.grid):
+            return _blocks(field, grid, block)
+    ratio = 1.0 if field.grid is None else (grid.voxel_size / field.grid.voxel_size).max()
+    points = int(np.clip(np.ceil(ratio - 1e-3), FINEST if cut else 1, FINEST))
+    index = dr.arange(mi.UInt32, grid.voxel_count)
+    values = _mean(medium, field, grid, index, points, cut)
+    dr.eval(values)
+    return values
+
+
+def collision_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[mi.Float]:
+    """Channels of the albedo at these ``voxels`` of ``grid``: means over the collisions in constant
+    radiance, weighted by extinction. At the edge of matter both change together.
+    """
+    albedo, extinction = medium.albedo, medium.sigma_t
+    if albedo.grid is None:
+        none, values = dr.zeros(mi.Float, dr.width(voxels)), mi.Spectrum(albedo.value)
+        return [value + none for value in list(values)[: albedo.channels]]
+    fields = [f.grid for f in (albedo, extinction) if f.grid is not None]
+    ratio = max((grid.voxel_size / data.voxel_size).max() for data in fields)
+    parts = int(np.clip(np.ceil(ratio - 1e-3), 1, FINEST // 2))
+    values = _extinction_weighted_albedo(medium, grid, voxels, parts, not medium.fills(grid))
+    dr.eval(values)
+    return values
+
+
+def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
+    """Means over blocks of so many voxels (x, y, z), which are the voxels of ``grid``."""
+    sums: list = [0.0] * field.channels
+    at = grid.places(dr.arange(mi.UInt32, grid.voxel_count))
+    for dz, dy, dx in np.ndindex(*block[::-1]):
+        voxel = (a * int(n) + d for a, n, d in zip(at, block, (dx, dy, dz), strict=True))
+        place = field.grid.index(*voxel) * field.channels
+        for c in range(field.channels):
+            sums[c] = sums[c] + dr.gather(mi.Float, field.data, place + c)
+    values = [total * (field.scale / int(np.prod(block))) for total in sums]
+    dr.eval(values)
+    return values
+
+
+@symbolic
+def _mean(medium, field, grid, index, points: int, cut: bool):
+    """Means over points^3 positions in the voxels ``index``."""
+    corner, sides = mi.Point3f(*grid.places(index)), [Divisor(points)] * 2
+    points, count = dr.opaque(mi.Float, points), dr.opaque(mi.UInt32, points**3)
+    sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
+    k = mi.UInt32(0)
+    while dr.hint(k < count, label="points in a voxel"):
+        place = mi.Point3f(*unravelled(k, sides)) + 0.5
+        p = grid.world.point(corner + place / points)
+        value = field.at_world(p)
+        if dr.hint(cut, mode="scalar"):
+            value = dr.select(medium.contains(p), value, 0)
+        for c in range(field.channels):
+            part = value if dr.hint(field.channels == 1, mode="scalar") else value[c]
+            sums[c] = sums[c] + part
+        k += 1
+    return [s / mi.Float(count) for s in sums]
+
+
+@symbolic
+def _extinction_weighted_albedo(medium, grid, index, parts: int, cut: bool):
+    """Means of the albedo over the voxels ``index``, weighted by extinction, by `RADAU` in so many
+    ``parts`` along each axis.
+    """
+    channels = max(medium.albedo.channels, medium.sigma_t.channels)
+    corner, sides = mi.Point3f(*grid.places(index)), [Divisor(3 * parts)] * 2
+    parts, count = dr.opaque(mi.Float, parts), dr.opaque(mi.UInt32, (3 * parts) ** 3)
+    scattered = [dr.zeros(mi.Float, dr.width(index)) for _ in range(channels)]
+    collided = [dr.zeros(mi.Float, dr.width(index)) for _ in range(channels)]
+    k = mi.UInt32(0)
+    while dr.hint(k < count, label="collisions in a voxel"):
+        within, weight = [], mi.Float(1)
+        for i in unravelled(k, sides):
+            part = i // 3
+            middle = i - part * 3 == 1
+            aside = dr.select(i - part * 3 == 0, RADAU[0][0], RADAU[2][0])
+            within.append(mi.Float(part) + dr.select(middle, RADAU[1][0], aside))
+            weight *= dr.select(middle, RADAU[1][1], RADAU[0][1])
+        p = grid.world.point(corner + mi.Point3f(within) / parts)
+        sigma_t = mi.Spectrum(medium.sigma_t.at_world(p)) * weight
+        albedo = mi.Spectrum(medium.albedo.at_world(p))
+        if dr.hint(cut, mode="scalar"):
+            sigma_t = dr.select(medium.contains(p), sigma_t, 0)
+        for c in range(channels):
+            collided[c] = collided[c] + sigma_t[c]
+            scattered[c] = scattered[c] + sigma_t[c] * albedo[c]
+        k += 1
+    return [dr.select(collided[c] > 0, scattered[c] / collided[c], 0) for c in range(channels)]

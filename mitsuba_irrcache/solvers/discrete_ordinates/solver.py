@@ -1,0 +1,444 @@
+"""The solver ``sweep``: discrete ordinates along long characteristics, all voxels at once.
+
+A batch consists of passes; a pass is a transport sweep of one ordinate set along tracks through all
+voxels (`tracks`). The first pass of a batch solves for all orders of scattering but the last by
+source iteration with multigrid and Anderson acceleration (`multigrid`); every other pass then
+sweeps the resulting source along ordinates of its own, so that their mean has little angular noise.
+Emission of the medium and small or point-like emitters are sampled voxel by voxel
+(`direct_emission`, `direct_light`).
+
+Batches have independent random numbers. The scatter of their results is the standard error of their
+mean, whatever the voxels and orders of scattering of one batch share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import chain
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merged
+from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
+from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emission_irradiance
+from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
+    EmitterSampling,
+    split_by_solid_angle,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import interleaved_channels
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
+from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
+    BoundaryOrdinateSet,
+    OrdinateSet,
+    boundary_ordinate_sets,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
+    collision_albedo,
+    extinction_grid,
+    resampled,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+
+#: Ordinates of a batch, pairs of opposite ones, at least and at most. One even set of 32 has half
+#: the noise of two sets of 16, and one of 64 four fifths of that of two of 32.
+BATCH, LARGEST_BATCH = 32, 256
+#: Ordinates of a pass in multiple scattering, where a batch consists of several: the orders before
+#: the last are solved for with one such set.
+DIRECTIONS = 16
+#: Voxels of a cache beyond which channels are swept one by one: together they take several times
+#: the memory.
+TOGETHER = 1 << 24
+#: Relative change of the irradiance below which further orders of scattering are omitted, as single
+#: precision has it; tested every so many orders.
+NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
+
+#: called with (samples done, samples in all), both in voxels times ordinates
+Progress = Callable[[int, int], None]
+
+
+def swept_together(medium: MediumGrid, voxels: int) -> bool:
+    """Whether all channels of a cache of so many ``voxels`` are swept at once."""
+    isotropic = medium.phase.is_isotropic
+    return isotropic and medium.sigma_t.channels == 1 and voxels <= TOGETHER
+
+
+def batch_of(samples: int, least: int) -> int:
+    """The ordinates of a batch of a cache of so many: all of them, or equal parts if there are too
+    many, in multiples of ``least``. Each batch solves for all orders anew.
+    """
+    batches = -(-samples // LARGEST_BATCH)
+    return -(-samples // (batches * least)) * least
+
+
+class Sweep:
+    """Fills ``cache``, which lies over ``medium``, by discrete ordinates (S_N) along long
+    characteristics, with source iteration, multigrid and Anderson acceleration.
+    """
+
+    #: ordinates of a pass in multiple scattering
+    directions = DIRECTIONS
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        cache: IrradianceCache,
+        seed: int,
+        rr_depth: int = 5,
+        pause: Callable[[], None] = lambda: None,
+    ) -> None:
+        """``rr_depth`` is that of paths between surfaces; ``pause`` is called after each launch."""
+        self.cache, self.seed = cache, seed
+        self._illumination = DistantIllumination(scene, medium.emission is not None)
+        if not cache.active_count:
+            return
+        self._medium = medium
+        self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
+        self._prepare_tracks(pause)
+        #: mean of 1/r^2 over a voxel, over its value at the sample point, in multiple scattering:
+        #: what is scattered near a light is the mean over the voxel
+        self._inverse_square_mean = mi.Float(1)
+        if cache.falloff is not None and cache.max_depth != 2:
+            self._inverse_square_mean = cache.falloff.spread(cache.active)
+            dr.eval(self._inverse_square_mean)
+        #: sampled voxel by voxel in a batch, from each point-like light and from area emitters, and
+        #: from the emission: irradiance, then moments, if they do not follow from the direction
+        self._direct: list[list[mi.Spectrum]] = []
+        self._emission: list[list[mi.Spectrum]] = []
+        #: irradiance of suns that camera rays do not interpolate
+        self._sun_irradiance: list[mi.Spectrum] = []
+        #: irradiance of all channels in units of the first one's
+        self._colour = np.ones(cache.channels)
+        self._boundary: SurfaceBoundary | None = None
+        if medium.is_isolated:
+            known = cache.direct_lights
+            points = self._illumination.point_irradiance(medium, self._sample_points, known)
+            self._direct = [[irradiance] for irradiance in points]
+            self._sun_irradiance = [d.irradiance for d in known if d.distant]
+            return
+        box = occupied_box(cache.grid, cache.active)
+        small, large = split_by_solid_angle(scene, cache.grid, *box)
+        self._boundary = SurfaceBoundary(scene, medium, large, rr_depth, cache.directional)
+        emitters = small, self._illumination.point_lights
+        self._emitter_sampling = EmitterSampling(
+            scene, medium, *emitters, self._sample_points, cache.directional
+        )
+
+    def _prepare_tracks(self, pause: Callable[[], None]) -> None:
+        """The tracks of each channel of the extinction, and what multiple scattering needs."""
+        medium, cache, grid = self._medium, self.cache, self.cache.grid
+        detail = extinction_grid(medium, grid)
+        extinction = resampled(medium, medium.sigma_t, detail)
+        box = occupied_box(grid, cache.active)
+        # Matter in blocks of the medium's voxels, or in voxels of another orientation, may reach
+        # beyond the active voxels.
+        data = medium.sigma_t.grid
+        sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
+        rest = *box, detail, cache.active, sparse, pause
+        self._tracks = [Tracks(grid, sigma_t, *rest) for sigma_t in extinction]
+        self._levels: dict[tuple[int, ...], MultigridLevel] = {}
+        # The albedo does not matter to single scattering here.
+        self._sigma_t = self._albedo = [mi.Float(0)]
+        if cache.max_depth != 2:
+            if detail is not grid:
+                extinction = resampled(medium, medium.sigma_t, grid)
+            self._sigma_t = self._at_active(extinction)
+            self._albedo = collision_albedo(medium, grid, cache.active)
+
+    def refine(self, samples: int, progress: Progress | None = None) -> None:
+        """Adds ``samples`` ordinates per voxel, a multiple of the cache's batch.
+
+        If ``progress`` raises, batches that are complete stay in the cache.
+        """
+        cache = self.cache
+        if not cache.active_count:
+            cache.note_samples(self.seed, samples)
+            return
+        first, count = cache.streams.get(self.seed, 0) // cache.batch, samples // cache.batch
+        for number in range(first, first + count):
+            cache.add(self.seed, cache.batch, [self._batch(number)])
+            if progress is not None:
+                dr.sync_thread()
+                done = (number - first + 1) * cache.batch
+                progress(done * cache.active_count, samples * cache.active_count)
+
+    # A batch
+
+    def _batch(self, number: int) -> tuple:
+        """Irradiance of both layers in all channels at the active voxels, and the moments if there
+        are any, as `IrradianceCache.add` takes it.
+        """
+        cache, seed = self.cache, (self.seed, number)
+        if self._medium.emission is not None:
+            arguments = self._medium, self._sample_points, cache.batch
+            self._emission = [emission_irradiance(*arguments, seed, cache.directional)]
+        sets, grey, colour = self._ordinate_sets(seed)
+        found = []
+        for channels in self._channel_groups(grey):
+            found += self._solve(sets(channels), channels)
+        layers: list[list] = [[] for _ in range(len(LAYERS) + cache.moments)]
+        # Channels with one factor in common are one array.
+        factors = {factor: dr.opaque(mi.Float, factor) for factor in map(float, colour)}
+        for c in range(cache.channels):
+            factor = factors[float(colour[c])]
+            for layer, phi in zip(layers, found[min(c, len(found) - 1)], strict=True):
+                layer.append(phi if phi is None else phi * factor)
+        dr.eval(layers)
+        irradiance, moments = layers[: len(LAYERS)], layers[len(LAYERS) :]
+        parts = [tuple(chain(*irradiance)), (None,) * cache.channels]
+        return (*parts, tuple(chain(*moments))) if moments else tuple(parts)
+
+    def _ordinate_sets(self, seed: tuple[int, int]) -> tuple[Callable, bool, np.ndarray]:
+        """The ordinate sets of all passes of a batch, as a function of the channels that are swept
+        together; whether all channels have the same result; and the factors (channels) of it.
+        """
+        cache, rng = self.cache, np.random.default_rng(seed)
+        pairs, passes = cache.batch // 2, 1
+        if cache.max_depth != 2:  # one pass more, which solves for the source of the others
+            pairs, passes = self.directions // 2, cache.batch // self.directions + 1
+        grey_media = max(len(self._tracks), len(self._albedo)) == 1
+        if self._boundary is None:
+            first = self._first_pairs(pairs)
+            ordinates, colour = self._illumination.factored_ordinates(
+                passes - bool(first), pairs, cache.channels, rng, first
+            )
+            self._colour = colour
+            suns = self._illumination.sun_ordinates(pairs) if self._sun_irradiance else 0
+
+            def sets(channels: Sequence[int]) -> list[OrdinateSet]:
+                return [OrdinateSet(each, channels, suns) for each in ordinates]
+
+            return sets, grey_media and ordinates[0].incoming.shape[-1] == 1, colour
+        surroundings = self._boundary, self._illumination, self._tracks[0]
+        sets, spectra = boundary_ordinate_sets(*surroundings, passes, pairs, rng, seed)
+        self._direct = self._with_known_lights(self._emitter_sampling.irradiance(seed))
+        grey = grey_media and is_grey([*spectra, *chain(*self._direct, *self._emission)])
+        return sets, grey, np.ones(cache.channels)
+
+    def _first_pairs(self, pairs: int) -> int:
+        """Pairs of ordinates of the pass that finds the orders before the last, where other passes
+        have so many ``pairs``; 0 where there are no such orders.
+
+        Few orders are found one by one with more ordinates, in about the time of all passes: later
+        passes do not reduce their noise.
+        """
+        orders = self.cache.max_depth - 2
+        if orders <= 0:
+            return pairs if orders else 0
+        return max(pairs, self.cache.batch // 2 // orders)
+
+    def _channel_groups(self, grey: bool) -> list[tuple[int, ...]]:
+        """The channels that are swept together, of all or of the first one."""
+        channels = range(1 if grey else self.cache.channels)
+        if swept_together(self._medium, self.cache.grid.voxel_count):
+            return [tuple(channels)]
+        return [(c,) for c in channels]
+
+    def _solve(
+        self,
+        sets: list[OrdinateSet] | list[BoundaryOrdinateSet],
+        channels: tuple[int, ...],
+    ) -> list[tuple]:
+        """For each channel the irradiance at the active voxels: uncollided, and scattered, if
+        wanted; then moments, if there are any.
+        """
+        if self.cache.max_depth == 2:
+            tracks = self._tracks_of(channels)
+            return [(phi, None) for phi in self._uncollided(tracks, sets, channels)[1]]
+        level = self._level(channels)
+        swept, uncollided = self._uncollided(level.tracks, sets[1:], channels)
+        total = self._swept(level, sets, channels)
+        # Both layers with the same ordinates: under a constant environment their sum has no noise.
+        scattered = [
+            dr.maximum(dr.gather(mi.Float, total, place) - phi, 0)
+            for place, phi in zip(self._interleaved_places(channels), swept, strict=True)
+        ]
+        dr.eval(scattered)
+        return list(zip(uncollided, scattered, strict=True))
+
+    # Tracks and levels
+
+    def _level(self, channels: tuple[int, ...]) -> MultigridLevel:
+        """The finest level, made when it is first asked for."""
+        if channels not in self._levels:
+            sigma_t, albedo = self._sigma_t, self._albedo
+            self._levels[channels] = self._new_level(
+                sigma_t[min(channels[0], len(sigma_t) - 1)],
+                interleaved_channels([albedo[min(c, len(albedo) - 1)] for c in channels]),
+                self._tracks_of(channels),
+            )
+        return self._levels[channels]
+
+    def _tracks_of(self, channels: tuple[int, ...]) -> Tracks:
+        """The tracks with the extinction of these channels."""
+        return self._tracks[min(channels[0], len(self._tracks) - 1)]
+
+    def _new_level(self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks) -> MultigridLevel:
+        # Among surfaces, levels have to be coarsened along all axes (`boundary_condition`).
+        return MultigridLevel(sigma_t, albedo, tracks, all_axes=not self._medium.is_isolated)
+
+    # Uncollided irradiance
+
+    def _uncollided(
+        self,
+        tracks: Tracks,
+        sets: list[OrdinateSet] | list[BoundaryOrdinateSet],
+        channels: tuple[int, ...],
+    ) -> tuple[list[mi.Float], list[mi.Float]]:
+        """Uncollided irradiance in each channel: along tracks, the mean of all passes; and in all,
+        with that of emitters which are sampled voxel by voxel.
+        """
+        (arguments, *suns), share = sets[0].uncollided(sets), dr.opaque(mi.Float, 1 / len(sets))
+        interpolated = swept = self._mean_irradiance(tracks, arguments, share, len(channels))
+        if self._sun_irradiance and self.cache.max_depth != 2:  # it is scattered, too
+            from_suns = self._mean_irradiance(tracks, suns[0], share, len(channels))
+            swept = [a + b for a, b in zip(swept, from_suns, strict=True)]
+        emitters = *self._direct, *self._emission
+        return swept, [
+            phi + sum(irradiance[c] for irradiance, *_ in emitters) + self._from_suns(c)
+            for c, phi in zip(channels, interpolated, strict=True)
+        ]
+
+    def _mean_irradiance(
+        self, tracks: Tracks, arguments: tuple, share: mi.Float, channels: int
+    ) -> list[mi.Float]:
+        """``share`` of `Tracks.uncollided` in each channel; channels may be the same array."""
+        count = self.cache.active_count
+        if not len(arguments[0]):
+            return [dr.zeros(mi.Float, count)] * channels
+        values = tracks.uncollided(*arguments) * share
+        if dr.width(values) == count:
+            return [values] * channels
+        place = dr.arange(mi.UInt32, count)
+        starts = (dr.opaque(mi.UInt32, c * count) for c in range(channels))
+        return [dr.gather(mi.Float, values, place + start) for start in starts]
+
+    def _from_suns(self, channel: int) -> mi.Float | int:
+        """Irradiance of suns that is not interpolated, in units of the batch's colour."""
+        if not self._colour[channel] > 0:
+            channel = int(self._colour.argmax())
+        colour = dr.opaque(mi.Float, 1 / float(self._colour[channel]))
+        return sum(irradiance[channel] * colour for irradiance in self._sun_irradiance)
+
+    # Multiple scattering
+
+    def _swept(
+        self,
+        level: MultigridLevel,
+        sets: list[OrdinateSet] | list[BoundaryOrdinateSet],
+        channels: tuple[int, ...],
+    ) -> mi.Float:
+        """Irradiance of all orders along tracks at the active voxels, the mean of all passes but
+        the first; channels are interleaved.
+        """
+        first, *sets = sets
+        phi, total = self._collided(level, first, channels, len(sets)), mi.Float(0)
+        used, share = mi.Float(0), dr.opaque(mi.Float, 1 / len(sets))
+        for known, each in enumerate(sets, 1):
+            irradiance, again = each.sweep(level, phi)
+            total, used = total + irradiance, used + phi
+            dr.eval(total, used)
+            if self.cache.max_depth < 0:
+                # The sweep is another estimate of all orders: the mean of both has less noise.
+                again = each.corrected(level, phi, self._add_sampled(again, channels))
+                phi = dr.lerp(phi, again, dr.opaque(mi.Float, 1 / (known + 1)))
+                dr.eval(phi)
+        if self.cache.max_depth >= 0:
+            return total * share
+        # The first passes used a noisier phi than the final one. Without this correction their
+        # noise would count three times as much as that of others.
+        ordinates = merged([each.scattering for each in sets])
+        change = level.propagated_change(phi - used * share, ordinates, len(sets))
+        return dr.fma(total, share, change)
+
+    def _collided(
+        self,
+        level: MultigridLevel,
+        first: OrdinateSet | BoundaryOrdinateSet,
+        channels: tuple[int, ...],
+        passes: int,
+    ) -> mi.Float:
+        """Mean irradiance of collisions, of all orders but the last, for so many further
+        ``passes``.
+        """
+        _, phi = first.sweep(level, None)
+        phi = self._add_sampled(phi, channels)
+        if self.cache.max_depth < 0:
+            return first.solve(level, phi, passes)
+        for order in range(self.cache.max_depth - 3):
+            before, phi = phi, self._add_sampled(first.sweep(level, phi)[1], channels)
+            # However many orders are asked for: once they are negligible, they need no sweeps.
+            if order % CHECKED_ORDERS == CHECKED_ORDERS - 1 and _change(before, phi) < NEGLIGIBLE:
+                break
+        return phi
+
+    def _add_sampled(self, phi: mi.Float, channels: tuple[int, ...]) -> mi.Float:
+        """``phi`` and the irradiance of emitters which are sampled voxel by voxel."""
+        sampled = [sum(self._sampled(c)) for c in channels]
+        if self._direct or self._emission:
+            phi = phi + interleaved_channels(sampled)
+            dr.eval(phi)
+        return phi
+
+    def _sampled(self, channel: int) -> list[mi.Float]:
+        """Irradiance at the active voxels from emitters which are sampled voxel by voxel, the mean
+        over each voxel.
+        """
+        known = {id(d.irradiance): d for d in self.cache.direct_lights}
+        direct = [
+            known[id(irradiance)].means[channel]
+            if id(irradiance) in known
+            else irradiance[channel] * self._inverse_square_mean
+            for irradiance, *_ in self._direct
+        ]
+        return direct + [irradiance[channel] for irradiance, *_ in self._emission]
+
+    def _with_known_lights(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
+        """``direct``, irradiance of each point-like light and then of others, with the values that
+        `DirectLight` has for the former.
+        """
+        known = {id(d.emitter): [d.irradiance] for d in self.cache.direct_lights}
+        lights = self._illumination.point_lights
+        replaced = [known.get(id(e), d) for e, d in zip(lights, direct, strict=False)]
+        return replaced + direct[len(lights) :]
+
+    # Arrays
+
+    def _at_active(self, fields: list[mi.Float]) -> list[mi.Float]:
+        """The values at the active voxels."""
+        found = [dr.gather(mi.Float, field, self.cache.active) for field in fields]
+        dr.eval(found)
+        return found
+
+    def _interleaved_places(self, channels: Sequence[int]) -> list[mi.UInt32]:
+        """Indices of each channel's values in an array with interleaved channels."""
+        place = dr.arange(mi.UInt32, self.cache.active_count) * len(channels)
+        return [place + c for c in range(len(channels))]
+
+
+def _change(before: mi.Float, after: mi.Float) -> float:
+    """The mean absolute change, relative to the mean."""
+    change, scale = dr.sum(dr.abs(after - before)), dr.sum(dr.abs(after))
+    dr.eval(change, scale)
+    return float(change[0]) / max(float(scale[0]), 1e-30)
+
+
+def is_grey(spectra: Sequence[mi.Spectrum]) -> bool:
+    """Whether all channels of each spectrum are the same."""
+    same = [dr.all(c == spectrum[0]) for spectrum in spectra for c in list(spectrum)[1:]]
+    dr.eval(same)
+    return all(s[0] for s in same)
+
+
+def occupied_box(grid: Grid, active: mi.UInt32) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest box of voxels (x, y, z; lower end, upper end) around all ``active`` ones."""
+    ends = [(dr.min(p), dr.max(p)) for p in grid.places(active)]
+    dr.eval(ends)
+    return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])

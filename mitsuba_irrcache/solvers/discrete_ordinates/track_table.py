@@ -1,0 +1,145 @@
+"""Tables of ordinates as kernels read them, and the boundary source of the tracks.
+
+The boundary condition of the transport equation prescribes the radiance that enters the box of
+tracks. It is either the same for all tracks of an ordinate (suns, environments), part of the
+`TrackTable`, or given track by track by a `BoundarySource` (surfaces around the medium).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
+    FIXED_POINT_ONE,
+    PackedRecords,
+    TrackRecord,
+)
+
+#: The two transverse axes of each dominant axis.
+TRANSVERSE = np.array([[1, 2], [0, 2], [0, 1]])
+
+
+class TrackGeometry:
+    """Where the tracks of n pairs of opposite ordinates lie.
+
+    ``axis`` (n) is the dominant axis of each, ``forward`` (n) tells whether the first ordinate of
+    the pair runs along it, ``transverse`` (n, 2) are the other axes, and ``sizes`` (n, 3) the
+    voxels of the box along these two and along the dominant axis. ``slopes`` (n, 2) is what tracks
+    move by along the transverse axes from slice to slice, and ``starts`` (n, 2) their position
+    within a voxel in the first slice [voxels].
+    """
+
+    def __init__(self, axis: np.ndarray, forward: np.ndarray, record: TrackRecord) -> None:
+        self.axis, self.forward, self.transverse = axis, forward, TRANSVERSE[axis]
+        b, c = record.transverse
+        self.sizes = np.stack([b.size, c.size, record.slices], axis=1)
+        self.slopes = np.stack([b.slope, c.slope], axis=1) / FIXED_POINT_ONE
+        self.starts = np.stack([b.start, c.start], axis=1) / FIXED_POINT_ONE
+
+
+class TrackTable:
+    """Pairs of opposite ordinates as kernels read them: other ordinates compile nothing.
+
+    ``incoming`` (n, 2, channels) is the irradiance that enters along the dominant axis and against
+    it; a single channel stands for all.
+    """
+
+    def __init__(
+        self, record: TrackRecord, incoming: np.ndarray, axis: np.ndarray, forward: np.ndarray
+    ) -> None:
+        self.geometry = TrackGeometry(axis, forward, record)
+        #: replaces ``incoming`` where that is not the same for all tracks of an ordinate
+        self.boundary_source: BoundarySource | None = None
+        self.records = PackedRecords(record, len(axis))
+        self._incoming = mi.Float(incoming.astype(np.float32).ravel())
+        self.channels = incoming.shape[2]
+        found = [(k, np.flatnonzero(axis == k).tolist()) for k in range(3)]
+        #: the pairs of each dominant axis, which read the same layout of the extinction
+        self.by_axis = [(k, pairs) for k, pairs in found if pairs]
+        self.pair_index = [dr.opaque(mi.UInt32, i) for i in range(len(axis))]
+        self.order = [i for _, pairs in self.by_axis for i in pairs]
+        # One more, since kernels that read an array of a single value are different ones.
+        self.ordered = mi.UInt32([*self.order, 0, 1])
+
+    def incoming(self, pair: mi.UInt32, way: int, channels: int) -> list[mi.Float]:
+        """Irradiance in each of ``channels`` that enters along the axis (0) or against it (1)."""
+        first = (pair * 2 + way) * self.channels
+        values = [dr.gather(mi.Float, self._incoming, first + c) for c in range(self.channels)]
+        return values if self.channels == channels else values * channels
+
+
+class PairGroup:
+    """Some of the pairs of a ``table``, consecutive in its order."""
+
+    def __init__(self, table: TrackTable, pairs: list[int]) -> None:
+        self.table, self._pairs = table, pairs
+        self._first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
+        self.count = dr.opaque(mi.UInt32, len(pairs))
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def pair(self, number: mi.UInt32) -> mi.UInt32:
+        """The index in the table of a number in the group."""
+        return dr.gather(mi.UInt32, self.table.ordered, self._first + number)
+
+    def weight(self, number: mi.UInt32) -> mi.Float:
+        """The ordinate weight of a number in the group."""
+        return self.table.records.weight(self.pair(number))
+
+    def direction(self, number: mi.UInt32) -> mi.Vector3f:
+        """The ordinate that runs along the dominant axis, world space."""
+        return self.table.records.direction(self.pair(number))
+
+
+class BoundarySource:
+    """Irradiance (radiance times solid angle) that enters the box, track by track.
+
+    A track is identified by the two coordinates at which it passes the first slice, or would if it
+    did not enter the box behind it. These coordinates, scaled and shifted, fall into cells, each
+    with two of the ``values``: along the dominant axis and against it. The values of all
+    ``channels`` follow each other.
+    """
+
+    def __init__(
+        self,
+        transforms: np.ndarray,
+        cells: np.ndarray,
+        values: mi.Float | None = None,
+        channels: int = 1,
+    ) -> None:
+        """``transforms`` (n, 5): scale, shifts (2) and slopes (2) of the tracks of each pair;
+        ``cells`` (n, 3): index of the first value, and the number of cells along both axes.
+        """
+        self._transforms = mi.Float(transforms.ravel().tolist())
+        self._cells = mi.UInt32(cells.ravel().tolist())
+        self.values, self.channels = values, channels
+
+    def read_pair(self, pair: mi.UInt32) -> list:
+        """What `irradiance` needs for each pair."""
+        transform = [dr.gather(mi.Float, self._transforms, pair * 5 + i) for i in range(5)]
+        return transform + [dr.gather(mi.UInt32, self._cells, pair * 3 + i) for i in range(3)]
+
+    def channel_offsets(self) -> list[mi.UInt32]:
+        """Where the values of each channel but the first begin."""
+        count = dr.width(self.values) // self.channels
+        return [dr.opaque(mi.UInt32, c * count) for c in range(1, self.channels)]
+
+    def irradiance(
+        self, pair: list, offsets: list, way: int, slice_: mi.Int32, at: tuple, active: mi.Bool
+    ) -> list[mi.Float]:
+        """Irradiance that enters along tracks which are in a slice ``at`` these voxels and
+        positions within them (b, c, position_b, position_c).
+        """
+        scale, shift_b, shift_c, slope_b, slope_c, first, nb, nc = pair
+        ib, ic, fb, fc = at
+        k = mi.Float(slice_)
+        b = dr.fma(-slope_b, k, dr.fma(mi.Float(fb), 1 / FIXED_POINT_ONE, mi.Float(ib)))
+        c = dr.fma(-slope_c, k, dr.fma(mi.Float(fc), 1 / FIXED_POINT_ONE, mi.Float(ic)))
+        b, c = (mi.Int32(dr.floor(dr.fma(x, scale, m))) for x, m in ((b, shift_b), (c, shift_c)))
+        active = active & (b >= 0) & (c >= 0) & (b < mi.Int32(nb)) & (c < mi.Int32(nc))
+        index = first + (mi.UInt32(c) * nb + mi.UInt32(b)) * 2 + way
+        indices = [index, *(index + offset for offset in offsets)]
+        return [dr.gather(mi.Float, self.values, i, active) for i in indices]

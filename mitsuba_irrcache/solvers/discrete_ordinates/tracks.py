@@ -1,0 +1,411 @@
+"""Transport sweeps along long characteristics: parallel tracks that all voxels of a grid share.
+
+For one ordinate, tracks lie on the lattice of the voxels of a slice across the ordinate's dominant
+axis, shifted by a random fraction of a voxel, and advance slice by slice. From one slice to the
+next all tracks move by the same number of whole voxels, so in every slice each voxel has exactly
+one track. A voxel and ordinate cost one step, whatever the size of the grid, and no two tracks ever
+write to the same voxel. A track that leaves through a side continues as a new one that enters
+through the opposite side, and begins at the exact point of entry, between two slices.
+
+Along a track the extinction is interpolated bilinearly in every slice and linearly from slice to
+slice; the source is that of the track's voxel. On a grid that is coarser or finer than the
+medium's, the values across the tracks are still those of the medium, and each half of a slice has
+its own mean. If they were resampled to the grid first and interpolated again, matter would become
+wider and shadows darker: on a CT head at twice its resolution, by 1 % of the irradiance in the air
+and 5 % in the skin.
+
+Each launch sweeps an ordinate and its opposite along the same tracks: two independent chains of
+arithmetic, and odd parts of what is integrated over directions cancel.
+
+Long characteristics: Askew, *A characteristics formulation of the neutron transport equation in
+complicated geometries*, AEEW-M 1108, 1972. The kernel is in `kernel`, the extinction as it reads it
+in `extinction`, and the table of ordinates in `track_table`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import EmptySpace
+from mitsuba_irrcache.solvers.discrete_ordinates.extinction import Extinction
+from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
+    SweptMedium,
+    SweptVolume,
+    add_copies,
+    sweep_tracks,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
+    STANDARD,
+    concatenated,
+    flat_index,
+    layer_and_index,
+    slicewise,
+    strides_of,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
+    FIXED_POINT_BITS,
+    FIXED_POINT_ONE,
+    TrackRecord,
+    TransverseFields,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import (
+    TRANSVERSE,
+    PairGroup,
+    TrackTable,
+)
+
+#: Share of second differences that turns means over cross sections of voxels into values at their
+#: centres: a mean over a unit square smooths with variance 1/12 along both axes, and the Taylor
+#: expansion takes back half of it.
+SECOND_DIFFERENCE = 1 / 24
+#: Up to so many voxels one launch sweeps all ordinates, each into a copy of the volume, and the
+#: copies are added in a fixed order: atomic sums would differ in their last bits each time.
+SMALL_GRID = 40**3
+#: Voxels of all copies together, at most: 64 MB where there is a source.
+MAX_COPIED_VOXELS = 1 << 22
+
+
+class Tracks:
+    """Tracks through the voxels of ``grid`` between ``lower`` and ``upper`` (x, y, z).
+
+    ``sigma_t`` holds the extinction [1/scene unit] at all voxels of ``extinction_grid``, a grid
+    over the same box (None: the same grid). Results are found at the voxels ``active`` (flat
+    indices; None: all). Where these contain all matter, ``sparse`` lets sweeps skip the empty space
+    between them, if that saves time. ``pause`` is called after every launch (see
+    `CacheBuilder.pause`).
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        sigma_t: mi.Float,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        extinction_grid: Grid | None = None,
+        active: mi.UInt32 | None = None,
+        sparse: bool = False,
+        pause: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.grid, self.extinction_grid = grid, extinction_grid or grid
+        self.pause = pause
+        self.lower, self.size = np.array(lower), np.array(upper) - np.array(lower)
+        self._to_voxels = grid.coordinates.matrix[:3, :3]
+        self._count = max(int(np.prod(np.delete(self.size, axis))) for axis in range(3))
+        self._indices = dr.arange(mi.UInt32, self._count)
+        dr.eval(self._indices)
+        #: whether one launch sweeps many ordinates
+        self.one_launch = grid.voxel_count <= SMALL_GRID
+        self._extinction = Extinction(grid, self.extinction_grid, sigma_t)
+        self.active = dr.arange(mi.UInt32, grid.voxel_count) if active is None else active
+        self.active_count = dr.width(self.active)
+        self.all_active = self.active_count == grid.voxel_count
+        self._active_index: mi.UInt32 | None = None
+        self.sparse, self._empty = sparse, None
+        if sparse and not self.one_launch:
+            self._empty = EmptySpace.find(grid, self.active, lower, upper)
+        #: where the extinction of each axis begins in an array for all of them
+        self._first_extinction = [0, 0, 0]
+        if self.one_launch:
+            sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
+            self._first_extinction = np.cumsum([0, *sizes[:2]]).tolist()
+            self._all_corners: dict[int, mi.UInt32] = {}  # of all axes
+
+    def active_index(self, voxels: mi.UInt32) -> mi.UInt32:
+        """Where these voxels are among the active ones; for others, the number of active voxels."""
+        if self.all_active:
+            return voxels
+        if self._active_index is None:
+            self._active_index = dr.opaque(mi.UInt32, self.active_count, self.grid.voxel_count)
+            dr.scatter(self._active_index, dr.arange(mi.UInt32, self.active_count), self.active)
+            dr.eval(self._active_index)
+        return dr.gather(mi.UInt32, self._active_index, voxels)
+
+    def table(
+        self,
+        directions: np.ndarray,
+        incoming: np.ndarray,
+        weights: np.ndarray,
+        offsets: np.ndarray,
+        by_slice: bool = False,
+    ) -> TrackTable:
+        """The table of pairs of opposite ordinates that kernels read.
+
+        Args:
+            directions: (n, 3), in which radiance travels, world space, unit length.
+            incoming: (n, 2) or (n, 2, channels), irradiance that enters the box along an ordinate
+                and along its opposite: radiance times solid angle.
+            weights: (n), ordinate weights for radiance that voxels emit or scatter [sr].
+            offsets: (n, 2), in [0, 1), random shifts of the tracks.
+            by_slice: whether the swept volume is laid out by the slices of each dominant axis.
+        """
+        # docs/primer, eq. (4.3)
+        incoming = incoming if incoming.ndim == 3 else incoming[..., None]
+        velocities = directions @ self._to_voxels.T
+        axis = np.abs(velocities).argmax(axis=1)
+        pairs = np.arange(len(directions))
+        along = velocities[pairs, axis]
+        strides, extinction_strides = self._strides(axis, by_slice)
+        empty_strides = np.array(self._empty.strides if self._empty else (0, 0, 0))
+        per_voxel = self._per_voxel(has_source=not by_slice)
+        if per_voxel:
+            first_extinction = extinction_strides @ self.lower
+        else:
+            first_extinction = self.lower[axis] * extinction_strides[pairs, axis]
+        last = self.extinction_grid.resolution - 1 - (self.lower if per_voxel else 0)
+
+        def transverse(number: int) -> TransverseFields:
+            k = TRANSVERSE[axis, number]
+            slope = velocities[pairs, k] / along
+            step = strides[pairs, k], extinction_strides[pairs, k], empty_strides[k]
+            return self._transverse_fields(axis, k, slope, offsets[:, number], step, last[k])
+
+        along_axis = directions * np.sign(along)[:, None]
+        record = TrackRecord(
+            transverse=(transverse(0), transverse(1)),
+            slices=self.size[axis],
+            stride=strides[pairs, axis],
+            extinction_stride=extinction_strides[pairs, axis],
+            empty_stride=empty_strides[axis],
+            first_voxel=strides @ self.lower,
+            first_extinction=first_extinction + np.array(self._first_extinction)[axis],
+            length=1 / np.abs(along),
+            weight=weights,
+            quantum=self._extinction.quantum,
+            direction_x=along_axis[:, 0],
+            direction_y=along_axis[:, 1],
+            direction_z=along_axis[:, 2],
+        )
+        forward = along > 0
+        incoming = np.where(forward[:, None, None], incoming, incoming[:, ::-1])
+        return TrackTable(record, incoming, axis, forward)
+
+    def uncollided(
+        self,
+        directions: np.ndarray,
+        incoming: np.ndarray,
+        offsets: np.ndarray,
+        boundary_source: Callable | None = None,
+    ) -> mi.Float:
+        """Uncollided irradiance at the centres of the active voxels, from radiance that enters
+        along pairs of ordinates: ``incoming``, as in `table`, or, track by track, what
+        ``boundary_source`` makes of the table (`BoundarySource`). Channels follow each other.
+        """
+        table = self.table(directions, incoming, np.zeros(len(incoming)), offsets, by_slice=True)
+        table.boundary_source = boundary_source(table) if boundary_source is not None else None
+        box = self.lower, self.lower + self.size
+        channels = (table if table.boundary_source is None else table.boundary_source).channels
+        active = self.active_count
+        total = dr.opaque(mi.Float, 0, active * channels)
+        for axis, pairs in table.by_axis:
+            volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)
+            self._sweep_axis(volume, False, table, axis, pairs)
+            for c in range(channels):
+                values = values_at_centres(volume, self.grid, *box, axis, self.active, c, channels)
+                index = dr.arange(mi.UInt32, active)
+                index = index + dr.opaque(mi.UInt32, active * c) if c else index
+                # In place: a sum would be a second array.
+                dr.scatter_add(total, values, index)
+            dr.eval(total)
+            del volume, values  # before the next axis has its own
+        return total
+
+    def sweep(self, volume: mi.Float, table: TrackTable) -> None:
+        """Sweep radiance that voxels emit or scatter, and that enters from outside.
+
+        ``volume`` holds four values for each voxel: its source S (radiance per optical depth), and
+        three that are added to: its irradiance; the radiance lost in it, the integral of L - S over
+        optical depth and directions; and the integral of 1, W. S plus the mean loss, loss / W, is
+        the mean radiance *of collisions*: scattering it conserves energy exactly, cell by cell.
+        Of several channels, a voxel has those four values of each in turn.
+        """
+        if self.one_launch:
+            self._sweep_copies(volume, True, table, table.order)
+            return
+        for axis, pairs in table.by_axis:
+            self._sweep_axis(volume, True, table, axis, pairs)
+
+    def sweep_separately(
+        self, table: TrackTable, source: Callable[[PairGroup], mi.Float] | None = None
+    ) -> Iterator[tuple[int, PairGroup, mi.Float]]:
+        """Sweep groups of pairs, and yield for each its dominant axis and what its ordinates leave
+        in the voxels: volumes one after the other, two for each pair, along the axis and against
+        it.
+
+        With ``source``, which makes such volumes of what voxels emit, these have the four values of
+        `sweep` for each voxel; else one, irradiance, laid out by slices.
+        """
+        voxels = self.grid.voxel_count
+        most = max(1, MAX_COPIED_VOXELS // (2 * voxels))
+        for axis, pairs in table.by_axis:
+            medium = self._medium(axis, source is not None)
+            for start in range(0, len(pairs), most):
+                group = PairGroup(table, pairs[start : start + most])
+                number, track = layer_and_index(self._count, len(group))
+                copies = dr.opaque(mi.Float, 0, 2 * len(group) * voxels * (4 if source else 1))
+                begin = number * dr.opaque(mi.UInt32, 2 * voxels)
+                volume = SweptVolume(
+                    copies,
+                    source(group) if source else None,
+                    begin,
+                    begin_backward=begin + dr.opaque(mi.UInt32, voxels),
+                )
+                sweep_tracks(medium, volume, table, group.pair(number), track)
+                dr.eval(copies)
+                self.pause()
+                yield axis, group, copies
+
+    def _transverse_fields(
+        self,
+        axis: np.ndarray,
+        k: np.ndarray,
+        slope: np.ndarray,
+        offset: np.ndarray,
+        steps: tuple[np.ndarray, np.ndarray, np.ndarray],
+        last: np.ndarray,
+    ) -> TransverseFields:
+        """Fields of n pairs with these dominant axes for the transverse axes ``k``: voxels by which
+        tracks move per slice, random shifts, steps of the three flat indices, and the coordinates
+        of the last extinction value.
+        """
+        size = self.size
+        slope = np.rint(slope * FIXED_POINT_ONE).astype(np.int64)
+        slope[slope == 0] = 1  # tracks never stay in a face
+        start = np.minimum((offset * FIXED_POINT_ONE).astype(np.int64), FIXED_POINT_ONE - 1)
+        end = start + (size[axis] - 1) * slope
+        ratio = (self.extinction_grid.resolution / self.grid.resolution)[k]
+        return TransverseFields(
+            size=size[k],
+            stride=steps[0],
+            extinction_stride=steps[1],
+            empty_stride=steps[2],
+            slope=slope,
+            start=start,
+            last_shift=(end >> FIXED_POINT_BITS) % size[k],
+            last_position=end & (FIXED_POINT_ONE - 1),
+            extinction_ratio=ratio,
+            extinction_origin=self.lower[k] * ratio - 0.5,
+            extinction_last=last,
+        )
+
+    def _per_voxel(self, has_source: bool) -> bool:
+        """Whether sweeps read one value of the extinction for each voxel."""
+        return self._extinction.per_voxel and not (has_source and self._extinction.dense)
+
+    def _strides(self, axis: np.ndarray, by_slice: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Strides (n, 3) of the swept volume and of the extinction for each dominant axis."""
+        layouts = [slicewise(k) for k in range(3)]
+        volume = [
+            strides_of(self.grid.resolution, layout if by_slice else STANDARD) for layout in layouts
+        ]
+        extinction = [
+            strides_of(self._extinction.sides(k), layout) for k, layout in enumerate(layouts)
+        ]
+        return np.array(volume)[axis], np.array(extinction)[axis]
+
+    def _medium(self, axis: int, has_source: bool) -> SweptMedium:
+        """The extinction for tracks along ``axis``, and empty space.
+
+        Without a source, a track finds the row above it in a processor's cache, and rows of corners
+        suffice; sweeps with a source would have replaced it there by their wider volumes.
+        """
+        by_rows = not has_source and not self.one_launch
+        words = self._extinction.words(self._per_voxel(has_source), by_rows)
+        if self.one_launch:
+            if words not in self._all_corners:
+                parts = [self._extinction.corners(k, words) for k in range(3)]
+                self._all_corners[words] = concatenated(parts)
+            return SweptMedium(self._all_corners[words], words)
+        corners = self._extinction.corners(axis, words)
+        dr.eval(corners)
+        return SweptMedium(corners, words, self._empty.slices if self._empty else None)
+
+    def _sweep_axis(
+        self, values: mi.Float, has_source: bool, table: TrackTable, axis: int, pairs: list[int]
+    ) -> None:
+        """Sweep the ``pairs`` of ``table``, all of which have the dominant ``axis``."""
+        if self.one_launch:
+            self._sweep_copies(values, has_source, table, pairs)
+            return
+        medium = self._medium(axis, has_source)  # one axis at a time is in memory
+        source = values if has_source else None
+        channels = self._channels(values, has_source)
+        for i in pairs:
+            volume = SweptVolume(values, source, dr.opaque(mi.UInt32, 0), channels)
+            sweep_tracks(medium, volume, table, table.pair_index[i], self._indices)
+            dr.eval(values)
+            self.pause()
+
+    def _sweep_copies(
+        self, values: mi.Float, has_source: bool, table: TrackTable, pairs: list[int]
+    ) -> None:
+        """The same in one launch, or few, each pair into a copy; the ``pairs``, of any axes, follow
+        each other in the table's order.
+        """
+        kind, width = (mi.Vector4f, 4) if has_source else (mi.Float, 1)
+        voxels = dr.width(values) // width  # of all channels
+        most, medium = max(1, MAX_COPIED_VOXELS // voxels), self._medium(0, has_source)
+        for start in range(0, len(pairs), most):
+            group = PairGroup(table, pairs[start : start + most])
+            number, track = layer_and_index(self._count, len(group))
+            copies = dr.opaque(mi.Float, 0, dr.width(values) * len(group))
+            volume = SweptVolume(
+                copies,
+                values if has_source else None,
+                number * dr.opaque(mi.UInt32, voxels),
+                self._channels(values, has_source),
+            )
+            sweep_tracks(medium, volume, table, group.pair(number), track)
+            dr.eval(copies)
+            add_copies(values, copies, voxels, len(group), kind)
+            dr.eval(values)
+            self.pause()
+
+    def _channels(self, values: mi.Float, has_source: bool) -> int:
+        """How many channels a swept volume has."""
+        return dr.width(values) // (self.grid.voxel_count * (4 if has_source else 1))
+
+
+def values_at_centres(
+    means: mi.Float,
+    grid: Grid,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    axis: int,
+    index: mi.UInt32,
+    channel: int = 0,
+    channels: int = 1,
+    begin: mi.UInt32 | int = 0,
+) -> mi.Float:
+    """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z), from
+    ``means`` over the cross sections of all voxels across ``axis``.
+
+    Tracks with a random shift sample a voxel's cross section uniformly; second differences along
+    both transverse axes take back the smoothing. Results are never negative. ``means``, laid out by
+    slices from ``begin`` on, have several ``channels``, of which one is taken.
+    """
+    # docs/primer, eq. (4.5)
+    places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
+    place = flat_index(places, strides) + begin
+
+    def read(i: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:
+        i = i if channels == 1 else i * channels + channel
+        return dr.gather(mi.Float, means, i, active)
+
+    value, change = read(place), mi.Float(0)
+    for k, (at, stride) in enumerate(zip(places, strides, strict=True)):
+        if k == axis or upper[k] - lower[k] < 3:
+            continue
+        stride, first, last = (dr.opaque(mi.UInt32, n) for n in (stride, lower[k], upper[k] - 1))
+        # A voxel beside the box may lie on the border of the grid, with no neighbour beyond it.
+        inside = (at >= first) & (at <= last)
+        # At a border, the second difference of the voxel next to it.
+        centre = place + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
+        here, below, above = (read(i, inside) for i in (centre, centre - stride, centre + stride))
+        # Voxels that no radiance has reached have no second difference.
+        change += dr.select((below > 0) & (above > 0), 2 * here - below - above, 0)
+    return dr.maximum(dr.fma(change, dr.opaque(mi.Float, SECOND_DIFFERENCE), value), 0)

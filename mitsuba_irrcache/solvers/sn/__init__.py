@@ -1,1 +1,0 @@
-"""Discrete ordinates (S_N) along long characteristics, with source iteration."""
