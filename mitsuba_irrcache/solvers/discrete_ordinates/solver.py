@@ -100,8 +100,10 @@ class Sweep:
         if not cache.active_count:
             return
         self._medium = medium
-        self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
+        # The tracks come first: `occupied_box` evaluates the coordinates of all voxels, which the
+        # sample points would otherwise share and store.
         self._prepare_tracks(pause)
+        self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
         #: mean of 1/r^2 over a voxel, over its value at the sample point, in multiple scattering:
         #: what is scattered near a light is the mean over the voxel
         self._inverse_square_mean = mi.Float(1)
