@@ -401,7 +401,7 @@ def test_switching_the_variant_and_back():
     before = np.array(mi.render(built, spp=1))
     try:
         mi.set_variant("llvm_ad_mono")
-        with pytest.raises(IrrcacheError, match=r"llvm_ad_rgb.*load it again"):
+        with pytest.raises(IrrcacheError, match=r"llvm_ad_rgb.*load the scene again"):
             built.integrator().prepare(built)
     finally:
         mi.set_variant("llvm_ad_rgb")
