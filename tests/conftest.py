@@ -100,3 +100,26 @@ def kernels():
                 gc.enable()
 
     return record
+
+
+@pytest.fixture
+def out_of_bounds(capfd):
+    """Return a function that lists Dr.Jit's messages about out-of-bounds accesses of ``action``.
+
+    Debug mode adds the checks.
+    """
+
+    def during(action) -> list[str]:
+        level = dr.log_level()
+        capfd.readouterr()
+        dr.set_log_level(dr.LogLevel.Warn)
+        try:
+            with dr.scoped_set_flag(dr.JitFlag.Debug):
+                action()
+                dr.sync_thread()
+        finally:
+            dr.set_log_level(level)
+        lines = "".join(capfd.readouterr()).splitlines()
+        return [line for line in lines if "out-of-bounds" in line]
+
+    return during

@@ -25,7 +25,15 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
-from mitsuba_irrcache.lights.emitters import is_sun, point_lights, position_of, spot_lights
+from mitsuba_irrcache.lights.emitters import (
+    POINT_LIKE,
+    SPOT_LIKE,
+    EmitterKind,
+    EmittersByKind,
+    kind_of,
+    position_of,
+    spot_lights,
+)
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
@@ -51,7 +59,9 @@ class DirectLight:
         survey: VoxelClasses | None = None,
     ) -> None:
         """``survey`` knows which voxels are inside of surfaces, where there are any among them."""
-        self.emitter, self._medium, self.distant = emitter, medium, is_sun(emitter)
+        self._kind = kind_of(emitter)
+        self.emitter, self._medium = emitter, medium
+        self.distant = self._kind is EmitterKind.SUN
         p = VoxelSamplePoints(scene, grid).of(voxels)
         ray, near, far = self._way(p)
         length, sigma_t = dr.maximum(far - near, 0), medium.sigma_t.at_world(p)
@@ -71,13 +81,15 @@ class DirectLight:
         self._means: mi.Spectrum | None = None
         #: E at the voxel centres; of a beam that may be narrower, its means over the voxels
         self._unobstructed = self.unobstructed(p)
-        if emitter in spot_lights(scene):
+        if self._kind in SPOT_LIKE:
             self._unobstructed = self._mean(grid, voxels, POINTS)
         #: the same of the irradiance
         self.irradiance = passed * self._unobstructed * mi.Spectrum(dr.exp(-self.depth(p)))
         dr.eval(self.irradiance)
         #: the largest E, where it is the same everywhere
-        self.maximum = float(dr.max(dr.max(self.unobstructed(p)))[0]) if self.distant else 0.0
+        self.maximum = 0.0
+        if self.distant:
+            self.maximum = float(dr.max(dr.max(self._unobstructed))[0])
 
     @property
     def means(self) -> mi.Spectrum:
@@ -123,7 +135,7 @@ class DirectLight:
 
     def _mean_unobstructed(self) -> mi.Spectrum:
         """Means of E over the voxels."""
-        if self.emitter.class_name() == "PointLight":
+        if self._kind is EmitterKind.POINT:
             return self._mean(self._grid, self._voxels, POINTS)
         return self._unobstructed
 
@@ -175,7 +187,7 @@ def direct_lights_of(
         return []
     emitters = spot_lights(scene)
     if dense and medium.is_isolated:
-        emitters = [e for e in scene.emitters() if is_sun(e) or e in point_lights(scene)]
+        emitters = EmittersByKind(scene.emitters()).of(EmitterKind.SUN, *POINT_LIKE)
     return [DirectLight(scene, emitter, medium, grid, voxels, survey) for emitter in emitters]
 
 

@@ -244,8 +244,9 @@ class Projection:
                 falloff = self.falloff.means(lamps, t, end)
                 near_radiance, far_radiance = near_radiance * falloff[0], far_radiance * falloff[1]
             radiance += transmittance * (near_radiance + far_radiance)
-            for i, light in enumerate(self._direct_lights):
+            if dr.hint(bool(self._direct_lights), mode="scalar"):
                 albedos = self._albedo_at(ray(t)), self._albedo_at(ray(end))
+            for i, light in enumerate(self._direct_lights):
                 mean = dr.select(skip, light.mean_extinction(ray(t), skip), means[i])
                 means[i] = light.mean_extinction(ray(end), active)
                 radiance += transmittance * light.scattered(

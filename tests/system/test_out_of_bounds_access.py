@@ -19,35 +19,17 @@ from mitsuba_irrcache.scene.cut_cells import CutCells
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
-@pytest.fixture
-def reported(capfd):
-    """Run an action in debug mode and return Dr.Jit's messages."""
-
-    def run(action) -> str:
-        level = dr.log_level()
-        capfd.readouterr()
-        dr.set_log_level(dr.LogLevel.Warn)
-        try:
-            with dr.scoped_set_flag(dr.JitFlag.Debug):
-                action()
-                dr.sync_thread()
-        finally:
-            dr.set_log_level(level)
-        lines = "".join(capfd.readouterr()).splitlines()
-        return "\n".join(line for line in lines if "out-of-bounds" in line)
-
-    return run
-
-
-def test_debug_mode_detects_an_access(reported):
+def test_debug_mode_detects_an_access(out_of_bounds):
     """Debug mode detects a gather and a scatter beyond the end of an array."""
     values = mi.Float([1, 2, 3, 4])
-    assert reported(lambda: dr.eval(dr.gather(mi.Float, values, mi.UInt32([1, 4]))))
-    assert reported(lambda: dr.scatter(values, mi.Float(1), mi.UInt32([1, 9])) or dr.eval(values))
+    assert out_of_bounds(lambda: dr.eval(dr.gather(mi.Float, values, mi.UInt32([1, 4]))))
+    assert out_of_bounds(
+        lambda: dr.scatter(values, mi.Float(1), mi.UInt32([1, 9])) or dr.eval(values)
+    )
 
 
 @pytest.mark.parametrize("shape", [(4, 5, 6), (1, 7, 1), (1, 1, 1)], ids=str)
-def test_lookups(reported, shape):
+def test_lookups(out_of_bounds, shape):
     """Lookups of one and two fields stay in bounds inside, on the border and outside of the
     grid.
     """
@@ -63,10 +45,10 @@ def test_lookups(reported, shape):
             dr.eval(Lookups(fields).at_world(p, mi.Bool(True)))
             dr.eval([field.at_world(p) for field in fields])
 
-    assert not reported(action)
+    assert not out_of_bounds(action)
 
 
-def test_lookups_in_cut_cells(reported):
+def test_lookups_in_cut_cells(out_of_bounds):
     """Lookups in cut cells stay in bounds, up to the last corner of the grid and beyond."""
     grid, rng = Grid((3, 4, 5), np.eye(4)), np.random.default_rng(2)
     ball = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.6}
@@ -74,7 +56,7 @@ def test_lookups_in_cut_cells(reported):
     field = RootField(grid, mi.Float(np.float32(rng.random(60) + 0.5)), 1)
     p = mi.Point3f(np.float32(rng.choice([-0.5, 0.0, 0.4, 1.0, 1.2, 1.5], (3, 500))))
     active = dr.full(mi.Bool, True, 500)
-    assert not reported(lambda: dr.eval(edges.corrected(field, p, field.at_world(p), active)))
+    assert not out_of_bounds(lambda: dr.eval(edges.corrected(field, p, field.at_world(p), active)))
 
 
 HG = {"type": "hg", "g": 0.5}
@@ -91,7 +73,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize(("settings", "medium", "objects"), SCENES.values(), ids=SCENES)
-def test_images(scenes, reported, settings, medium, objects):
+def test_images(scenes, out_of_bounds, settings, medium, objects):
     """Rendering stays in bounds for odd grid sizes, with a rotated sparse cloud of oblong
     voxels.
     """
@@ -104,4 +86,4 @@ def test_images(scenes, reported, settings, medium, objects):
     if settings.get("solver") == "path":
         integrator["cache_spp"] = 16
     scene = scenes.load(integrator | settings, shape, 6, **objects, default_solver="path")
-    assert not reported(lambda: scenes.image(scene, spp=2))
+    assert not out_of_bounds(lambda: scenes.image(scene, spp=2))
