@@ -214,7 +214,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
         self._stopping = StopCondition()
-        self._sight: ClosedFormCameraRays | TracedCameraRays | None = None
+        self._camera_rays: ClosedFormCameraRays | TracedCameraRays | None = None
         self._revision = 0  # revision of the builder for which the camera rays were created
         #: Mitsuba's integrators for scenes without a visible medium, by name, and the current
         #: choice
@@ -284,13 +284,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             except Stopped:
                 self._log_what_is_missing()
             if self._revision != self._builder.revision:
-                self._sight = self._make_sight()
+                self._camera_rays = self._make_camera_rays()
                 # Only the thread that recorded a scatter operation can evaluate it.
                 dr.eval()
                 self._revision = self._builder.revision
-                if self._sight is None:
+                if self._camera_rays is None:
                     self._choose_stock(scene)
-            return self._sight
+            return self._camera_rays
 
     def _choose_stock(self, scene: mi.Scene) -> None:
         """Choose and log the integrator for a scene without a visible medium."""
@@ -320,7 +320,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """Whether rendering was cancelled or has reached its ``timeout``."""
         return self._stopping.is_due
 
-    def _make_sight(self) -> ClosedFormCameraRays | TracedCameraRays | None:
+    def _make_camera_rays(self) -> ClosedFormCameraRays | TracedCameraRays | None:
         """Create the camera rays for the current caches; None if no medium is visible."""
         return camera_rays_of(
             self._builder.parts,
@@ -358,12 +358,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         The mask is a random rounding of alpha.
         """
-        sight = self._prepared(scene)
-        if sight is None:
+        camera_rays = self._prepared(scene)
+        if camera_rays is None:
             radiance, valid, _ = self._fallback().sample(scene, sampler, ray, medium, active)
             return radiance, valid, self._aov_values(Layers.background_only(radiance))
         radiance, alpha, layers = self._radiance(
-            sight, scene, sampler, ray, medium, mi.Spectrum(1), mi.Bool(active)
+            camera_rays, scene, sampler, ray, medium, mi.Spectrum(1), mi.Bool(active)
         )
         return radiance, sampler.next_1d(active) < alpha, self._aov_values(layers)
 
@@ -382,11 +382,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         # Threads exclude each other if they share the integrator, whose cache one of them may
         # refine, or the film, which stores one image only.
         with dr.suspend_grad(), self._builder.lock, exclusive(sensor.film()):
-            sight = self._prepared(scene)
-            if sight is None:
+            camera_rays = self._prepared(scene)
+            if camera_rays is None:
                 film = self._render_empty(scene, sensor, seed, spp)
             else:
-                film = self._render(sight, scene, sensor, seed, spp)
+                film = self._render(camera_rays, scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -426,7 +426,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _render(
         self,
-        sight: ClosedFormCameraRays | TracedCameraRays,
+        camera_rays: ClosedFormCameraRays | TracedCameraRays,
         scene: mi.Scene,
         sensor: mi.Sensor,
         seed: int,
@@ -436,10 +436,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         check_sensor(scene, sensor)  # the sensor may have moved, or may not belong to the scene
 
         def radiance(sampler, ray, weight, active) -> tuple:
-            found = self._radiance(sight, scene, sampler, ray, medium, weight, active)
+            found = self._radiance(camera_rays, scene, sampler, ray, medium, weight, active)
             return *found[:2], found[2].channels() if found[2] else []
 
-        count = sight.projection.channel_count
+        count = camera_rays.projection.channel_count
         names = [f"layer.{i}" for i in range(count)]
         film = render_film(sensor, radiance, seed, spp, self.should_stop, names)
         if not count:
@@ -478,7 +478,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def _radiance(
         self,
-        sight: ClosedFormCameraRays | TracedCameraRays,
+        camera_rays: ClosedFormCameraRays | TracedCameraRays,
         scene: mi.Scene,
         sampler: mi.Sampler,
         ray: mi.Ray3f,
@@ -487,10 +487,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, mi.Float, Layers | None]:
         """Return radiance times ``weight``, alpha, and the layers of the radiance if required."""
-        view = sight.sample(scene, sampler, mi.Ray3f(ray), medium, active)
+        view = camera_rays.sample(scene, sampler, mi.Ray3f(ray), medium, active)
         layers = None
         if self._layered:
-            layers = sight.projection.layers(
+            layers = camera_rays.projection.layers(
                 view.scattered, view.transmittance, view.gathered, view.background, weight
             )
         return (view.scattered + view.background) * weight, view.alpha, layers

@@ -29,7 +29,7 @@ def origin(error: BaseException) -> BaseException:
     return error
 
 
-def essence(error: BaseException) -> str:
+def original_message(error: BaseException) -> str:
     """Return the message of the original exception, without the text that Mitsuba adds."""
     error = origin(error)
     raised = re.findall(r"^(?:\w+\.)*\w*Error: (.+)$", str(error), re.MULTILINE)

@@ -66,7 +66,7 @@ def share_of_noise(grid: Grid, variance: mi.Float, known: mi.Bool) -> mi.Float:
 def _sums_around(grid: Grid, values: mi.Float) -> mi.Float:
     """Sum values over 3^3 voxels around each."""
     index, stride = dr.arange(mi.UInt32, grid.voxel_count), mi.UInt32(1)
-    for place, side in zip(grid.places(index), grid.sides, strict=True):
+    for place, side in zip(grid.voxel_indices(index), grid.sides, strict=True):
         dr.eval(values)
         below, above = place > 0, place + 1 < mi.UInt32(side)
         total = values
@@ -97,7 +97,7 @@ def _second_differences(grid: Grid, known: mi.Bool, channels: int) -> Iterator[C
     index = dr.arange(mi.UInt32, grid.voxel_count * channels)
     voxel = index // channels if channels > 1 else index
     own_known, stride = dr.gather(mi.Bool, known, voxel), mi.UInt32(1)
-    for place, side in zip(grid.places(voxel), grid.sides, strict=True):
+    for place, side in zip(grid.voxel_indices(voxel), grid.sides, strict=True):
         inside = own_known & (place > 0) & (place + 1 < mi.UInt32(side))
         for there in (voxel - stride, voxel + stride):
             inside &= dr.gather(mi.Bool, known, there, inside)

@@ -1,15 +1,15 @@
 """Direct irradiance of emitters without extent (spot lights, points, suns).
 
-The irradiance of such an emitter at a position p is E(p) exp(-tau(p)): E is what it would be
-without any medium, known in closed form from the emitter; tau is the optical depth of the straight
-way from the emitter, the mean extinction along it times its length in the medium. The length is
-known in closed form from the boundary; only the mean extinction is interpolated between the voxels
-of the cache. It is smooth where a beam is narrower than a voxel, and where matter is so dense that
-light is absorbed within a fraction of a voxel.
+The irradiance of such an emitter at a position p is E(p) exp(-tau(p)). E is the unobstructed
+irradiance, known in closed form from the emitter; tau is the optical depth of the straight line to
+the emitter, the mean extinction along it times its length in the medium. The length is known in
+closed form from the boundary; only the mean extinction is interpolated between the voxels of the
+cache. It remains smooth if a beam is narrower than a voxel, and if the medium is so dense that the
+irradiance decays within a fraction of a voxel.
 
-A cache holds its values at the voxel centres (of spot lights, means of E over the voxels times
-exp(-tau) there), and further orders of scattering start from means over the voxels; camera rays see
-those replaced by E(p) exp(-tau(p)).
+The cache stores the irradiance at the voxel centres (for spot lights, the mean of E over the voxel
+times exp(-tau) at its centre), and higher orders of scattering start from means over the voxels.
+Camera rays exclude these values and evaluate E(p) exp(-tau(p)) instead.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.conservative import unbiased
-from mitsuba_irrcache.core.fast_math import absorptance, clipped, greatest, least
+from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
@@ -40,9 +40,9 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import optical_depth
 
-#: Points along each axis of a voxel over which E, and over which exp(-tau), is averaged.
+#: Number of points along each axis of a voxel over which E and exp(-tau) are averaged.
 POINTS, DEPTH_POINTS = 8, 3
-#: Part of a segment over which the slope of a length at its ends is found.
+#: Part of a segment over which the derivative of a length at its ends is measured.
 TANGENT = 1 / 64
 
 
@@ -58,7 +58,7 @@ class DirectLight:
         voxels: mi.UInt32,
         survey: VoxelClasses | None = None,
     ) -> None:
-        """``survey`` knows which voxels are inside of surfaces, where there are any among them."""
+        """Compute mean extinctions and irradiance; ``survey`` is None without surfaces."""
         self._kind = kind_of(emitter)
         self.emitter, self._medium = emitter, medium
         self.distant = self._kind is EmitterKind.SUN
@@ -67,9 +67,9 @@ class DirectLight:
         length, sigma_t = dr.maximum(far - near, 0), medium.sigma_t.at_world(p)
         depth = optical_depth(medium, ray, near, far, length > 0, dr.inf)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
-        #: on the way from the emitter, for lookups
+        #: mean extinction on the line to the emitter, for lookups
         self.extinction = _on_grid(grid, voxels, mean, survey)
-        #: what surfaces and other media let through at the voxels; None where there are none
+        # transmittance of surfaces and other media at the voxels; None without any
         self._others: RootField | None = None
         passed = mi.Spectrum(1)
         if medium.is_traced:
@@ -79,21 +79,21 @@ class DirectLight:
             self._others = _root_field(grid, voxels, passed, survey)
         self._passed, self._grid, self._voxels, self._centres = passed, grid, voxels, p
         self._means: mi.Spectrum | None = None
-        #: E at the voxel centres; of a beam that may be narrower, its means over the voxels
+        # E at the voxel centres; for a spot light, which may be narrower, its means over the voxels
         self._unobstructed = self.unobstructed(p)
         if self._kind in SPOT_LIKE:
             self._unobstructed = self._mean(grid, voxels, POINTS)
-        #: the same of the irradiance
+        #: irradiance, from E as above
         self.irradiance = passed * self._unobstructed * mi.Spectrum(dr.exp(-self.depth(p)))
         dr.eval(self.irradiance)
-        #: the largest E, where it is the same everywhere
+        #: maximum of E for a sun, where it is uniform; 0 for other emitters
         self.maximum = 0.0
         if self.distant:
             self.maximum = float(dr.max(dr.max(self._unobstructed))[0])
 
     @property
     def means(self) -> mi.Spectrum:
-        """Means of the irradiance over the voxels, from which light is scattered further."""
+        """Means of the irradiance over the voxels, the source of higher orders of scattering."""
         if self._means is None:
             mean = self._mean_transmittance(self._grid, self._voxels)
             self._means = self._passed * self._mean_unobstructed() * mean
@@ -101,29 +101,29 @@ class DirectLight:
         return self._means
 
     def unobstructed(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
-        """E at world positions."""
+        """Evaluate the unobstructed irradiance E at world positions."""
         at = dr.zeros(mi.Interaction3f, dr.width(p))
         at.p = p
         _, light = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
         return dr.select(active, light, 0)
 
     def depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """The optical depth of the medium between world positions and the emitter."""
+        """Return the optical depth of the medium between world positions and the emitter."""
         # docs/primer, eq. (2.5)
         return self.extinction.at_world(p, active) * self.length(p)
 
     def length(self, p: mi.Point3f) -> mi.Float:
-        """The length of the way in the medium between world positions and the emitter."""
+        """Return the length in the medium of the line from world positions to the emitter."""
         _, near, far = self._way(p)
         return dr.maximum(far - near, 0)
 
     def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """Transmittance of all else on that way."""
+        """Return the transmittance of surfaces and other media on that line."""
         return mi.Float(1) if self._others is None else self._others.at_world(p, active)
 
     def _way(self, p: mi.Point3f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
-        """Rays from world positions to the emitter, and the distances between which they are in the
-        medium: none where the first one is not the less.
+        """Return rays from world positions to the emitter, and the distances at which they enter
+        and leave the medium; they do not intersect it unless the first one is smaller.
         """
         at = dr.zeros(mi.Interaction3f, dr.width(p))
         at.p = p
@@ -134,21 +134,21 @@ class DirectLight:
         return ray, near, dr.select(hit, far, near)
 
     def _mean_unobstructed(self) -> mi.Spectrum:
-        """Means of E over the voxels."""
+        """Compute means of E over the voxels."""
         if self._kind is EmitterKind.POINT:
             return self._mean(self._grid, self._voxels, POINTS)
         return self._unobstructed
 
     def _mean_transmittance(self, grid: Grid, voxel: mi.UInt32) -> mi.Spectrum:
-        """Means of exp(-tau) over the part of voxels that is in the medium."""
+        """Compute means of exp(-tau) over the part of voxels that is in the medium."""
         passed, count = self._sum_transmittance(grid, voxel, DEPTH_POINTS)
         centre = mi.Spectrum(dr.exp(-self.depth(self._centres)))
         return dr.select(count > 0, passed / dr.maximum(count, 1), centre)
 
     @symbolic
     def _mean(self, grid: Grid, voxel: mi.UInt32, points: int):
-        """Means of E over voxels."""
-        corner, total, k = mi.Point3f(*grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
+        """Compute means of E over ``points``^3 points in each voxel."""
+        corner, total, k = mi.Point3f(*grid.voxel_indices(voxel)), mi.Spectrum(0), mi.UInt32(0)
         n = dr.opaque(mi.UInt32, points)
         while dr.hint(k < n * n * n, label="points in a voxel"):
             place = mi.Point3f(k % n, (k // n) % n, k // (n * n)) + 0.5
@@ -158,8 +158,8 @@ class DirectLight:
 
     @symbolic
     def _sum_transmittance(self, grid: Grid, voxel: mi.UInt32, points: int):
-        """Sums of exp(-tau) over those points in voxels that are in the medium; their number."""
-        corner, total, k = mi.Point3f(*grid.places(voxel)), mi.Spectrum(0), mi.UInt32(0)
+        """Sum exp(-tau) over the points in voxels that are in the medium, and count them."""
+        corner, total, k = mi.Point3f(*grid.voxel_indices(voxel)), mi.Spectrum(0), mi.UInt32(0)
         n, count = dr.opaque(mi.UInt32, points), mi.Float(0)
         while dr.hint(k < n * n * n, label="points in a voxel"):
             place = mi.Point3f(k % n, (k // n) % n, k // (n * n)) + 0.5
@@ -179,9 +179,11 @@ def direct_lights_of(
     dense: bool,
     survey: VoxelClasses | None = None,
 ) -> list[DirectLight]:
-    """The direct light of all spot lights of a scene; where voxels are ``dense`` and there are no
-    surfaces, of points and suns, too. None in media that do not scatter isotropically,
-    whose caches hold the irradiance of such lights apart from that of others.
+    """Return the direct light of all spot lights of a scene.
+
+    Includes points and suns if the voxels are ``dense`` and there are no surfaces. The list is
+    empty for anisotropic scattering, where the cache stores the irradiance of such emitters as
+    narrow sources.
     """
     if not medium.phase.is_isotropic or not dr.width(voxels):
         return []
@@ -194,7 +196,7 @@ def direct_lights_of(
 def _on_grid(
     grid: Grid, voxels: mi.UInt32, values: mi.Float | mi.Color3f, survey: VoxelClasses | None
 ) -> GridField:
-    """Values at the ``voxels``, for lookups."""
+    """Create a field from values at the ``voxels``."""
     channels = [values] if isinstance(values, mi.Float) else list(values)
     known = dr.zeros(mi.Bool, grid.voxel_count)
     dr.scatter(known, mi.Bool(True), voxels)
@@ -205,7 +207,7 @@ def _on_grid(
 def _root_field(
     grid: Grid, voxels: mi.UInt32, values: mi.Spectrum, survey: VoxelClasses | None
 ) -> RootField:
-    """The same with their roots interpolated, of one channel where all agree."""
+    """Create a field with interpolated square roots; it has one channel if all are equal."""
     channels = [dr.sqrt(c) for c in values]
     if all(dr.all(c == channels[0])[0] for c in channels[1:]):
         channels = channels[:1]
@@ -215,7 +217,7 @@ def _root_field(
 def _spread(
     grid: Grid, voxels: mi.UInt32, channels: list[mi.Float], survey: VoxelClasses | None
 ) -> mi.Float:
-    """Values of all channels of all voxels; 0 elsewhere, but for voxels inside of surfaces."""
+    """Expand values to all voxels of the grid, 0 except at ``voxels`` and inside of surfaces."""
     values, count = dr.zeros(mi.Float, grid.voxel_count * len(channels)), len(channels)
     for c, value in enumerate(channels):
         dr.scatter(values, value, voxels * count + c)
@@ -226,7 +228,7 @@ def _spread(
 def _past_others(
     scene: mi.Scene, medium: MediumGrid, p: mi.Point3f, target: mi.Point3f
 ) -> mi.Spectrum:
-    """What surfaces and other media let through between ``p`` and ``target``."""
+    """Estimate the transmittance of surfaces and other media between ``p`` and ``target``."""
     others = Media.around(medium).without(medium)
     vertex = dr.zeros(mi.Interaction3f, dr.width(p))
     vertex.p = p
@@ -236,19 +238,19 @@ def _past_others(
 
 
 class DirectLightAlongRays:
-    """The direct light of an emitter for camera rays."""
+    """Direct light of an emitter, evaluated along camera rays."""
 
     def __init__(self, light: DirectLight) -> None:
         self._light = light
 
     def at(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
-        """Irradiance at world positions."""
+        """Evaluate the irradiance at world positions."""
         light = self._light
         passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
         return mi.Spectrum(passed) * light.unobstructed(p, active)
 
     def mean_extinction(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
-        """The mean extinction between world positions and the emitter."""
+        """Return the mean extinction between world positions and the emitter."""
         return self._light.extinction.at_world(p, active)
 
     def scattered(
@@ -260,14 +262,15 @@ class DirectLightAlongRays:
         weights: tuple,
         albedo: tuple,
     ) -> mi.Spectrum:
-        """Radiance scattered towards the camera along a segment, from what is known at both of its
-        ``ends`` (distances along the ray): the extinction ``sigma``, the mean extinction on the way
-        from the emitter, the ``albedo``. ``weights`` are those of sources that fall and rise
-        linearly, of `quadrature.segment`.
+        """Integrate the radiance scattered towards the camera along a segment.
 
-        With extinction c and depth s linear in a part of the segment, of optical depth C and from
-        depth s0 to s0 + S, int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), however
-        opaque that part is.
+        Given at both ``ends`` (distances along the ray) are the extinction ``sigma``, the mean
+        extinction on the line to the emitter (``means``) and the ``albedo``; ``weights`` are the
+        result of `quadrature.segment`.
+
+        The segment is divided into parts. In a part with constant extinction c and optical depth C,
+        along which the optical depth to the emitter changes linearly from s0 to s0 + S,
+        int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), which holds for any opacity.
         """
         # docs/primer, eq. (2.6)
         light, (a, b) = self._light, ends
@@ -283,15 +286,15 @@ class DirectLightAlongRays:
         for i, u in enumerate(middles):
             within = passed[i + 1] - passed[i]
             both = within + depths[i + 1] - depths[i]
-            # A parabola is higher than its chord by 4 u (1 - u) sag: its mean with weights e^-x u.
+            # A parabola exceeds its chord by 4 u (1 - u) sag; weight this with e^-x u.
             sag = inner[i] - 0.5 * (depths[i] + depths[i + 1])
             sag = sag * 4 / (6 + dr.abs(both))
-            exponent = greatest(-both, 0.0) - passed[i] - depths[i] - sag
+            exponent = maximum(-both, 0.0) - passed[i] - depths[i] - sag
             part = within * dr.exp(exponent) * _mean_decay(dr.abs(both))
             p = ray(dr.lerp(a, b, u))
             part = mi.Spectrum(part * light.past_others(p) * dr.lerp(*albedo, u))
             total += part * light.unobstructed(p)
-        # As the quadrature rule has it.
+        # Scale to the absorptance that the quadrature rule computes.
         absorbed = absorptance(0.5 * (near + far))
         rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
         return total * mi.Spectrum(rule) * dr.inv_four_pi
@@ -299,8 +302,9 @@ class DirectLightAlongRays:
     def _parts(
         self, ray: mi.Ray3f, a: mi.Float, b: mi.Float, depth: mi.Float | mi.Color3f
     ) -> list[mi.Float]:
-        """Ends of four parts of a segment of this optical ``depth``, as fractions: thirds of what
-        it absorbs, one of which is cut at the kink.
+        """Divide a segment of optical ``depth`` into four parts; return their ends as fractions.
+
+        Three parts absorb equal shares; one of them is divided at the kink.
         """
         depth = depth if isinstance(depth, mi.Float) else dr.mean(depth)
         absorbed, thin = absorptance(depth), depth < 1e-3
@@ -310,15 +314,15 @@ class DirectLightAlongRays:
         ]
         first, second = thirds
         kink = self._kink(ray, a, b)
-        inner = [least(kink, first), clipped(kink, first, second), greatest(kink, second)]
+        inner = [minimum(kink, first), clipped(kink, first, second), maximum(kink, second)]
         return [mi.Float(0), *inner, mi.Float(1)]
 
     def _kink(self, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> mi.Float:
-        """Where between ``a`` and ``b``, as a fraction, the tangents at both ends of the length of
-        the way in the medium meet; in the middle where they do not.
+        """Locate the kink of the length in the medium between ``a`` and ``b``, as a fraction.
 
-        In a box the length is linear between kinks, at which the way leaves the medium by another
-        face: of light that grazes a face one lies next to it.
+        In a box the length is piecewise linear; at a kink the line to the emitter changes to
+        another face of the box. The kink is where the tangents at both ends intersect; 0.5 if they
+        do not.
         """
         at = [a, dr.lerp(a, b, TANGENT), dr.lerp(b, a, TANGENT), b]
         first, second, third, last = (self._light.length(ray(t)) for t in at)
@@ -329,6 +333,6 @@ class DirectLightAlongRays:
 
 
 def _mean_decay(depth: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
-    """The mean of e^-x for x in [0, depth]."""
-    depth = greatest(depth, 1e-20)
+    """Return the mean of e^-x for x in [0, depth]."""
+    depth = maximum(depth, 1e-20)
     return absorptance(depth) / depth

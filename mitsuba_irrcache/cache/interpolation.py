@@ -1,4 +1,4 @@
-"""What lookups in a cache need to know beside its values."""
+"""Parameters of lookups in a cache, in addition to its values."""
 
 from __future__ import annotations
 

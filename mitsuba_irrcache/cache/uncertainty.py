@@ -113,7 +113,7 @@ def _everywhere(cache: IrradianceCache, values: mi.Float) -> mi.Float:
 def _at_half_resolution(cache: IrradianceCache, root: mi.Float) -> mi.Float:
     """Interpolate averages over 2^3 voxels of the root of the irradiance at the active voxels."""
     halves = Grid(tuple(-(-n // 2) for n in cache.grid.shape), np.eye(4))
-    corner = halves.places(dr.arange(mi.UInt32, halves.voxel_count))
+    corner = halves.voxel_indices(dr.arange(mi.UInt32, halves.voxel_count))
     nx, ny, nz = (mi.UInt32(n) for n in cache.grid.sides)
     values, ones = _everywhere(cache, root), _everywhere(cache, mi.Float(1))
     total, members = mi.Float(0), mi.Float(0)
@@ -126,5 +126,5 @@ def _at_half_resolution(cache: IrradianceCache, root: mi.Float) -> mi.Float:
     known = dr.select(members > 0, mi.Float(1), 0)
     # Cells without an active voxel have weight 0.
     roots, weights = (GridField(halves, v, 1) for v in (total / dr.maximum(members, 1), known))
-    u = mi.Point3f(*cache.grid.places(cache.active)) * 0.5 + 0.25
+    u = mi.Point3f(*cache.grid.voxel_indices(cache.active)) * 0.5 + 0.25
     return roots.at(u) / weights.at(u)

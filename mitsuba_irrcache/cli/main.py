@@ -10,7 +10,7 @@ from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
-from mitsuba_irrcache.errors import IrrcacheError, essence, origin
+from mitsuba_irrcache.errors import IrrcacheError, origin, original_message
 from mitsuba_irrcache.machine.extras import missing_package
 
 
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             what_is_left = f"; {origin(error)}" if str(origin(error)) else ""
             print(f"irrcache: interrupted{what_is_left}", file=sys.stderr)
             return 130
-        message = essence(error)
+        message = original_message(error)
     print(f"irrcache: error: {message.removeprefix('irrcache: ')}", file=sys.stderr)
     return 1
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.errors import IrrcacheError, essence
+from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.machine.llvm import require_llvm
 
@@ -202,7 +202,7 @@ def main() -> int:
         job["imported"] = time.time()
         KINDS[job["kind"]](job)
     except Exception as error:
-        write_json(Path(job["error"]), {"error": essence(error) or type(error).__name__})
+        write_json(Path(job["error"]), {"error": original_message(error) or type(error).__name__})
         raise
     return 0
 

@@ -43,13 +43,13 @@ def finite_number(text: str) -> float:
 finite = argument("a finite number")(finite_number)
 
 
-def whole(least: int, most: int = 2**31 - 1) -> Callable[[str], int]:
-    """Return an argparse type for integers from ``least`` to ``most``."""
+def whole(minimum: int, maximum: int = 2**31 - 1) -> Callable[[str], int]:
+    """Return an argparse type for integers from ``minimum`` to ``maximum``."""
 
-    @argument(f"a whole number from {least} to {most}")
+    @argument(f"a whole number from {minimum} to {maximum}")
     def number(text: str) -> int:
         value = int(text)
-        if not least <= value <= most:
+        if not minimum <= value <= maximum:
             raise ValueError
         return value
 

@@ -21,7 +21,7 @@ POWER_OF_TWO = (
 UNDERFLOW, SERIES_BELOW = 87.0, 0.05
 
 
-def least(a: mi.Float, b: mi.Float) -> mi.Float:
+def minimum(a: mi.Float, b: mi.Float) -> mi.Float:
     """Return the minimum of two numbers in one instruction.
 
     ``dr.minimum`` needs six instructions to propagate NaN and to order signed zeros.
@@ -29,14 +29,14 @@ def least(a: mi.Float, b: mi.Float) -> mi.Float:
     return dr.select(a < b, a, b)
 
 
-def greatest(a: mi.Float, b: mi.Float) -> mi.Float:
-    """Return the maximum of two numbers in one instruction (see `least`)."""
+def maximum(a: mi.Float, b: mi.Float) -> mi.Float:
+    """Return the maximum of two numbers in one instruction (see `minimum`)."""
     return dr.select(a > b, a, b)
 
 
 def clipped(value: mi.Float, lower: mi.Float, upper: mi.Float) -> mi.Float:
     """Clamp ``value`` to [``lower``, ``upper``]."""
-    return least(greatest(value, lower), upper)
+    return minimum(maximum(value, lower), upper)
 
 
 def decay(x):
@@ -67,7 +67,7 @@ def absorptance(tau):
     Evaluate the Taylor series a = 1 - e^-x at x = tau / 16, then apply 1 - e^-2x = a (2 - a) four
     times. This costs half of an exponential.
     """
-    x = least(tau, 16.0) * (1 / 16)
+    x = minimum(tau, 16.0) * (1 / 16)
     series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 120, -1 / 24), 1 / 6), -1 / 2), 1)
     a = x * series
     for _ in range(4):

@@ -46,26 +46,26 @@ def _shown(value: object) -> str:
     return f'"{value}"' if value == "" else str(value)
 
 
-def integer(props: mi.Properties, name: str, default: int, least: int, wanted: str) -> int:
-    """Read an integer from ``least`` to 2^31 - 1."""
-    return checked_integer(name, props.get(name, default), least, wanted)
+def integer(props: mi.Properties, name: str, default: int, minimum: int, wanted: str) -> int:
+    """Read an integer from ``minimum`` to 2^31 - 1."""
+    return checked_integer(name, props.get(name, default), minimum, wanted)
 
 
-def checked_integer(name: str, value: object, least: int, wanted: str) -> int:
-    """Return ``value`` if it is an integer from ``least`` to 2^31 - 1."""
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value < 2**31:
+def checked_integer(name: str, value: object, minimum: int, wanted: str) -> int:
+    """Return ``value`` if it is an integer from ``minimum`` to 2^31 - 1."""
+    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value < 2**31:
         raise _refusal(name, value, wanted)
     return value
 
 
 def number(
-    props: mi.Properties, name: str, default: float, least: float, most: float, wanted: str
+    props: mi.Properties, name: str, default: float, minimum: float, maximum: float, wanted: str
 ) -> float:
-    """Read a finite number from ``least`` to ``most``."""
+    """Read a finite number from ``minimum`` to ``maximum``."""
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise _refusal(name, value, wanted)
-    if not (math.isfinite(value) and least <= value <= most):
+    if not (math.isfinite(value) and minimum <= value <= maximum):
         raise _refusal(name, value, wanted)
     return float(value)
 

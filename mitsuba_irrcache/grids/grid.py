@@ -75,14 +75,14 @@ class Grid:
 
     def centers(self, index: mi.UInt32) -> mi.Point3f:
         """World positions of the voxel centres with the flat indices ``index`` (x fastest)."""
-        return self.world.point(mi.Point3f(*self.places(index)) + 0.5)
+        return self.world.point(mi.Point3f(*self.voxel_indices(index)) + 0.5)
 
-    def places(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    def voxel_indices(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """Convert flat indices (x fastest) to voxel indices along x, y, z."""
         return unravelled(index, self._divisors)
 
     def index(self, x: mi.UInt32, y: mi.UInt32, z: mi.UInt32) -> mi.UInt32:
-        """Convert voxel indices along x, y, z to flat indices: the inverse of `places`."""
+        """Convert voxel indices along x, y, z to flat indices: the inverse of `voxel_indices`."""
         nx, ny, _ = (mi.UInt32(n) for n in self.sides)
         return (mi.UInt32(z) * ny + mi.UInt32(y)) * nx + mi.UInt32(x)
 

@@ -52,7 +52,7 @@ class Packets:
         self._scales = [dr.opaque(mi.Float, value) for value in largest]
         scales = [dr.opaque(mi.Float, 1 / value) for value in largest]
         index = dr.arange(mi.UInt32, grid.voxel_count)
-        x, y, z = grid.places(index)
+        x, y, z = grid.voxel_indices(index)
         noise = x * DITHER_STEPS[0] + y * DITHER_STEPS[1] + z * DITHER_STEPS[2]
 
         def numbers(index: mi.UInt32, noise: mi.UInt32) -> list[mi.UInt32]:

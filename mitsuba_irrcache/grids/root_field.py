@@ -71,7 +71,7 @@ class Extension:
     def _nearest(self, voxel: mi.UInt32) -> list[tuple[mi.UInt32, mi.Int32]]:
         """For each axis, the index of the nearest original voxel, and the inward step."""
         found = []
-        for place, side in zip(self.grid.places(voxel), self.inner.sides, strict=True):
+        for place, side in zip(self.grid.voxel_indices(voxel), self.inner.sides, strict=True):
             at = mi.Int32(place) - 1
             nearest = dr.clip(at, 0, side - 1)
             step = dr.select(side > 1, nearest - at, 0)

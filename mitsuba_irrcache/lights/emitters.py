@@ -1,4 +1,4 @@
-"""What kinds of emitters there are, and placements that Mitsuba itself does not get right."""
+"""Classification of emitters, and rejection of placements that Mitsuba handles inconsistently."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ ORTHONORMAL_TOLERANCE = 2e-3
 
 
 class EmitterKind(Enum):
-    """What an emitter is to irrcache. A new kind is added here and in `kind_of`; solvers say which
-    kinds they support.
+    """Kind of an emitter, by its extent and its directional distribution.
+
+    A new kind is added here and in `kind_of`; each solver states which kinds it supports.
     """
 
-    #: infinitely far away, from all directions with the same radiance
+    #: infinitely far away, with the same radiance from all directions
     CONSTANT_ENVIRONMENT = "constant environment"
     #: infinitely far away, with a radiance that depends on the direction
     ENVIRONMENT_MAP = "environment map"
@@ -40,7 +41,7 @@ class EmitterKind(Enum):
 
     @property
     def is_environment(self) -> bool:
-        """Whether rays that leave the scene meet it."""
+        """Whether rays that leave the scene hit it."""
         return self in (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP)
 
     @property
@@ -54,13 +55,13 @@ class EmitterKind(Enum):
         return self in POINT_LIKE
 
 
-#: Kinds that have a position and no extent; and those of them whose intensity depends on direction.
+#: Kinds without extent at a finite position, and the subset whose intensity depends on direction.
 POINT_LIKE = (EmitterKind.POINT, EmitterKind.SPOT, EmitterKind.PROJECTOR)
 SPOT_LIKE = (EmitterKind.SPOT, EmitterKind.PROJECTOR)
 
 
 def kind_of(emitter: mi.Emitter) -> EmitterKind:
-    """The kind of an emitter, by Mitsuba's flags and, where these are the same, its plugin."""
+    """Classify an emitter by Mitsuba's flags and, if these are ambiguous, by its plugin."""
     flags, name = emitter.flags(), emitter.class_name()
     if mi.has_flag(flags, mi.EmitterFlags.Surface):
         if mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
@@ -92,7 +93,7 @@ class EmittersByKind(Immutable):
         return iter(self._emitters)
 
     def of(self, *kinds: EmitterKind) -> list[mi.Emitter]:
-        """The emitters of these kinds."""
+        """Return the emitters of these kinds, in the order of the scene."""
         return [emitter for emitter, kind in self._emitters if kind in kinds]
 
 
@@ -151,22 +152,17 @@ def _check_shape(emitter: mi.Emitter) -> None:
 
 
 def point_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """The emitters of a scene that have a position and no extent."""
+    """Return the emitters of a scene without extent at a finite position."""
     return EmittersByKind(scene.emitters()).of(*POINT_LIKE)
 
 
 def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """Those of them whose intensity depends on the direction."""
+    """Return the point-like emitters of a scene whose intensity depends on the direction."""
     return EmittersByKind(scene.emitters()).of(*SPOT_LIKE)
 
 
-def is_sun(emitter: mi.Emitter) -> bool:
-    """Whether an emitter is infinitely far away, in a single direction."""
-    return kind_of(emitter) is EmitterKind.SUN
-
-
 def position_of(emitter: mi.Emitter) -> np.ndarray:
-    """World position (3) of a point-like emitter."""
+    """Return the world position (3) of a point-like emitter."""
     params = mi.traverse(emitter)
     position = params["position"] if "position" in params else params["to_world"].translation()
     return np.array(position, dtype=np.float64).ravel()

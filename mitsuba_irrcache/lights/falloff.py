@@ -1,4 +1,6 @@
-"""Lamps nearby: where they are, places that keep away from them, and how their light falls off."""
+"""Small emitters near the voxels of a cache: sample points at a minimum distance from them, and the
+inverse-square factor that is divided out before interpolation.
+"""
 
 from __future__ import annotations
 
@@ -13,70 +15,75 @@ from mitsuba_irrcache.core.sequences import kronecker_points
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import point_lights, position_of
 
-#: A lamp is not nearer to what the cache knows than this part of a voxel's shortest edge: less than
-#: the half edge that lies between voxel centres and a lamp beside a box.
-LEAST = 0.25
-#: Lamps farther from the voxels than so many of their edges, or larger than that in radius, light
-#: these as smoothly as the voxels can tell: to 0.3 % between them.
+#: Minimum distance of sample points from an emitter, relative to a voxel's shortest edge. It is
+#: less than half an edge, the distance of voxel centres from an emitter on the face of a box.
+MINIMUM_DISTANCE = 0.25
+#: Maximum distance of an emitter from the voxels, and maximum radius, in voxel edges. The
+#: irradiance of others is smooth enough for interpolation: accurate to 0.3 % between the voxels.
 REACH, LARGEST = 16.0, 8.0
-#: Points that stand for a lamp, and for all lamps, at most.
+#: Maximum number of points that represent an area emitter, and of points of all emitters.
 MOST_POINTS = 8
-#: Positions from which the strength of a point-like light is told.
+#: Number of positions at which the strength of a point-like emitter is evaluated.
 POSITIONS = 1024
-#: Nearest that anything comes to a lamp, in edges of a voxel.
+#: Lower bound of the distance to an emitter, in voxel edges, to avoid division by 0.
 NEAREST = 1e-3
-#: Steps between both ends of a segment, over the distance to a lamp, below which its light is
-#: linear along the segment.
+#: Length of a segment, relative to its distance from an emitter, below which W is evaluated at two
+#: points instead of integrated.
 SHORT = 0.05
-#: Points along each axis of a voxel over which its light is averaged, if a lamp is at most so many
-#: edges from its middle; elsewhere two.
+#: Number of points along each axis over which W is averaged in voxels whose centre is within CLOSE
+#: edges of an emitter; in other voxels 2.
 FINEST, CLOSE = 24, 1.5
 
 
 class VoxelSamplePoints:
-    """Where the light in the voxels of ``grid`` is computed: at their centres, but for those that a
-    lamp is in.
+    """Positions at which the irradiance of the voxels of ``grid`` is computed.
 
-    A lamp beside a medium may be in the corner of a voxel's box that the medium does not fill. At
-    its centre there is no end to the light, and lookups in the medium would read some of it.
+    These are the voxel centres, except that points closer to a point-like emitter than
+    `MINIMUM_DISTANCE` are moved away from it: the irradiance diverges at the emitter, and lookups
+    in neighbouring voxels would interpolate that value, even if the emitter lies outside of the
+    medium.
     """
 
     def __init__(self, scene: mi.Scene, grid: Grid) -> None:
         self.grid = grid
         lamps = [position_of(e) for e in point_lights(scene)]
         self._lamps = [mi.Point3f([dr.opaque(mi.Float, float(v)) for v in p]) for p in lamps]
-        self._least = dr.opaque(mi.Float, LEAST * float(grid.voxel_size.min()))
+        self._minimum_distance = dr.opaque(
+            mi.Float, MINIMUM_DISTANCE * float(grid.voxel_size.min())
+        )
 
     def of(self, voxel: mi.UInt32) -> mi.Point3f:
-        """World positions for the voxels of these flat indices."""
+        """Return the world positions for the voxels of these flat indices."""
         p = self.grid.centers(voxel)
         for lamp in self._lamps:
             way = p - lamp
             distance = dr.norm(way)
             away = dr.select(distance > 0, way / distance, mi.Vector3f(0, 0, 1))
-            p = dr.select(distance < self._least, lamp + self._least * away, p)
+            p = dr.select(
+                distance < self._minimum_distance, lamp + self._minimum_distance * away, p
+            )
         return p
 
 
 class InverseSquareFactor:
-    """How light falls off with the distance from lamps nearby, relative to what it is far away.
+    """Inverse-square factor W of nearby small emitters, which tends to 1 far away from them.
 
         W = 1 + sum_k w_k REACH^2 h^2 / r_k^2,    sum_k w_k = 1,
 
-    h being the longest edge of a voxel. A cache is read as W times what is interpolated of Phi / W,
-    which is smooth where Phi falls off like 1/r^2: next to a lamp it is the transmittance of the
-    way from there.
+    where h is the longest edge of a voxel. Lookups interpolate Phi / W and multiply by W. Phi / W
+    is smooth where Phi falls off like 1/r^2: next to an emitter it is proportional to the
+    transmittance.
     """
 
     # docs/primer, eq. (2.4)
 
     def __init__(
-        self, places: VoxelSamplePoints, points: list[tuple[np.ndarray, float, float]]
+        self, sample_points: VoxelSamplePoints, points: list[tuple[np.ndarray, float, float]]
     ) -> None:
-        """``points`` are positions, strengths (irradiance times squared distance, in any unit) and
-        squared radii.
+        """Store ``points``: positions, strengths (irradiance times squared distance, in any unit)
+        and squared radii.
         """
-        self.places, edge = places, float(places.grid.voxel_size.max())
+        self.sample_points, edge = sample_points, float(sample_points.grid.voxel_size.max())
         total = sum(strength for _, strength, _ in points)
         self._points = [
             (
@@ -91,7 +98,7 @@ class InverseSquareFactor:
     def of(
         cls, scene: mi.Scene, grid: Grid, others: Sequence[mi.Emitter] = ()
     ) -> InverseSquareFactor | None:
-        """The falloff of lamps near the voxels of ``grid``, except ``others``; None without any."""
+        """Create the factor for emitters near the voxels, except ``others``; None without any."""
         lights = [e for e in point_lights(scene) if e not in others]
         points = [p for e in lights for p in _of_point(e, grid)]
         points += [p for s in scene.shapes() if s.is_emitter() for p in _of_area(s, grid)]
@@ -100,22 +107,22 @@ class InverseSquareFactor:
         return cls(VoxelSamplePoints(scene, grid), points) if points else None
 
     def at(self, p: mi.Point3f) -> mi.Float:
-        """W at a world position."""
+        """Evaluate W at a world position."""
         result = mi.Float(1)
         for position, strength, squared in self._points:
             result += strength / (dr.squared_norm(p - position) + squared)
         return result
 
     def of_voxels(self, voxel: mi.UInt32) -> mi.Float:
-        """W where the light in voxels is computed."""
-        return self.at(self.places.of(voxel))
+        """Evaluate W at the sample points of voxels."""
+        return self.at(self.sample_points.of(voxel))
 
     def maximum(self, voxel: mi.UInt32) -> float:
-        """The largest W of these voxels."""
+        """Return the maximum of W over these voxels."""
         return float(dr.max(self.of_voxels(voxel))[0])
 
     def along(self, ray: mi.Ray3f) -> list[tuple]:
-        """What `means` has to know of a ray."""
+        """Precompute the arguments of `means` for a ray."""
         found = []
         for position, strength, squared in self._points:
             way = position - ray.o
@@ -125,8 +132,8 @@ class InverseSquareFactor:
         return found
 
     def means(self, along: list[tuple], a: mi.Float, b: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Means of W between the distances ``a`` and ``b`` along a ray, with weights that fall, and
-        that rise linearly: 2 int_0^1 (1 - u | u) W du.
+        """Compute means of W between the distances ``a`` and ``b`` along a ray, with linearly
+        falling and rising weights: 2 int_0^1 (1 - u | u) W du.
         """
         near, far = mi.Float(1), mi.Float(1)
         length = b - a
@@ -136,7 +143,7 @@ class InverseSquareFactor:
             angle = dr.atan2(q * length, dr.fma(x, y, q * q)) / q  # int dx / (x^2 + q^2)
             ratio = 0.5 * dr.log(high / low)  # int x dx / (x^2 + q^2)
             scale = 2 / dr.square(length)
-            # Both are differences: of a short segment, taken at its thirds instead.
+            # These differences cancel for short segments: evaluate W at the thirds instead.
             short = dr.square(length) < SHORT**2 * dr.minimum(low, high)
             third, more = x + length / 3, x + length * (2 / 3)
             first = dr.select(
@@ -148,17 +155,17 @@ class InverseSquareFactor:
 
     @symbolic
     def spread(self, voxel: mi.UInt32):
-        """The mean of W over voxels, over W where their light is computed."""
-        grid, total, k = self.places.grid, mi.Float(0), mi.UInt32(0)
-        corner = mi.Point3f(*grid.places(voxel))
+        """Compute the mean of W over voxels, relative to W at their sample points."""
+        grid, total, k = self.sample_points.grid, mi.Float(0), mi.UInt32(0)
+        corner = mi.Point3f(*grid.voxel_indices(voxel))
         near = mi.Bool(False)
         for position, _, _ in self._points:
             way = grid.coordinates.point(position) - corner - 0.5
             near |= dr.max(dr.abs(mi.Vector3f(way))) < CLOSE
         points = dr.select(near, mi.UInt32(FINEST), 2)
         count = points * points * points
-        # Over a cube of edge d that is not near, 1/r^2 is 1/r^2 (1 + d^2 / 12 r^2) on average; over
-        # one that a lamp is in the middle of, 7.6 / d^2.
+        # The mean of 1/r^2 over a cube of edge d at a distance r >> d from an emitter is
+        # 1/r^2 (1 + d^2 / 12 r^2), and over a cube centred at the emitter 7.6 / d^2.
         edge = float(grid.voxel_size.prod() ** (1 / 3))
         squares = dr.square(dr.opaque(mi.Float, edge) / mi.Float(points))
         while dr.hint(k < count, label="points in a voxel"):
@@ -175,7 +182,7 @@ class InverseSquareFactor:
 
 
 def _of_point(emitter: mi.Emitter, grid: Grid) -> list[tuple[np.ndarray, float, float]]:
-    """A point-like light, if it is near."""
+    """Return position, strength and squared radius of a point-like emitter, if it is near."""
     position = position_of(emitter)
     if _edges_away(position[:, None], grid) > REACH:
         return []
@@ -189,7 +196,7 @@ def _of_point(emitter: mi.Emitter, grid: Grid) -> list[tuple[np.ndarray, float, 
 
 
 def _of_area(shape: mi.Shape, grid: Grid) -> list[tuple[np.ndarray, float, float]]:
-    """Points that stand for the parts of an area light, if it is small and near."""
+    """Return points that represent the parts of an area emitter, if it is small and near."""
     sample = mi.Point2f(np.float32(kronecker_points(np.arange(MOST_POINTS) + 0.5, 2)))
     found = shape.sample_position(0.0, sample)
     area, edge = float(dr.max(shape.surface_area())[0]), float(grid.voxel_size.max())
@@ -212,8 +219,9 @@ def _of_area(shape: mi.Shape, grid: Grid) -> list[tuple[np.ndarray, float, float
 
 
 def _edges_away(positions: np.ndarray, grid: Grid) -> float:
-    """How far the nearest of ``positions`` (3, n) is from the box of ``grid``, in its longest
-    edges.
+    """Return the minimum distance of ``positions`` (3, n) from the box of ``grid``.
+
+    The unit is the longest edge of a voxel.
     """
     u = np.array(grid.coordinates.point(mi.Point3f(np.float32(positions))), dtype=np.float64)
     nearest = np.clip(u, 0, grid.resolution[:, None]) - u

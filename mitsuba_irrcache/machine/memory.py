@@ -58,7 +58,7 @@ def free_at_once() -> None:
         )  # also disables the dynamic threshold
 
 
-def give_back(voxels: int) -> None:
+def release_unused_memory(voxels: int) -> None:
     """Return Dr.Jit's free arrays to the system after a pass over ``voxels`` voxels.
 
     Dr.Jit retains freed arrays for reuse at the same size, which the next pass may not need. For

@@ -71,7 +71,7 @@ def _channels(field: Field, grid: Grid | None, index: mi.UInt32, count: int) -> 
     """Evaluate ``count`` channels of a field at the voxel centres of ``grid``."""
     place = mi.Point3f(0)
     if grid is not None:
-        place = grid.world.point(mi.Point3f(*grid.places(index)) + 0.5)
+        place = grid.world.point(mi.Point3f(*grid.voxel_indices(index)) + 0.5)
     value = field.at_world(place)
     channels = [value] if field.channels == 1 else list(value)
     return [mi.Float(channels[min(c, field.channels - 1)]) for c in range(count)]

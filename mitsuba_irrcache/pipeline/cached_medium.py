@@ -20,7 +20,7 @@ from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, marked
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
-from mitsuba_irrcache.machine.memory import give_back, require_memory
+from mitsuba_irrcache.machine.memory import release_unused_memory, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
 from mitsuba_irrcache.scene.description import SceneDescription
@@ -312,7 +312,7 @@ class CachedMedium:
         if solver.is_kept:
             self._kept_solver = solver
         solver.refine(missing, progress)
-        give_back(self.cache.grid.voxel_count)
+        release_unused_memory(self.cache.grid.voxel_count)
 
     def _new_solver(self, scene: mi.Scene) -> Solver:
         settings = self.settings

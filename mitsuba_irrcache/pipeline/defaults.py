@@ -1,4 +1,4 @@
-"""Defaults for what the user left unset: the solver, and what renders a scene without a cache."""
+"""Defaults for properties left unset: the solver, and the integrator of scenes without a cache."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from mitsuba_irrcache.solvers.grid_size import (
     choose_grid,
 )
 
-#: Largest over smallest channel of the extinction from which on ``volpathmis`` needs less time than
-#: ``volpath`` for the same error. Measured on a glass ball full of fog: 1.4 times as much time at
-#: 1 : 1.5, 0.8 times at 1 : 2, 0.6 times at 1 : 3, a fortieth at 1 : 10.
+#: Ratio of the largest to the smallest channel of the extinction above which ``volpathmis`` needs
+#: less time than ``volpath`` for the same error. Measured on a glass ball filled with fog: 1.4
+#: times as much time at 1 : 1.5, 0.8 times at 1 : 2, 0.6 times at 1 : 3, a fortieth at 1 : 10.
 CHROMATIC = 1.8
 
 
 def choose_stock(scene: mi.Scene) -> tuple[str, str]:
-    """The integrator of Mitsuba that renders a scene without a cache, and why."""
+    """Choose Mitsuba's integrator for a scene without a cache; also return the reason."""
     media = {*media_of(scene)}
     if not media:
         return "volpath", "there is no medium"
@@ -37,7 +37,7 @@ def choose_stock(scene: mi.Scene) -> tuple[str, str]:
 
 
 def _chromaticity(scene: mi.Scene, medium: mi.Medium) -> float:
-    """The largest channel of a medium's extinction over the smallest one, on average over it."""
+    """Return the ratio of the largest to the smallest channel of a medium's mean extinction."""
     rng = mi.PCG32(4096)
     lower, upper = mi.Point3f(scene.bbox().min), mi.Point3f(scene.bbox().max)
     at = dr.zeros(mi.MediumInteraction3f, 4096)
@@ -51,10 +51,10 @@ def _chromaticity(scene: mi.Scene, medium: mi.Medium) -> float:
 def choose_solver(
     scene: mi.Scene, medium: MediumGrid, solver: str, max_depth: int = -1, resolution: int = 0
 ) -> tuple[type[Solver], str]:
-    """The solver for a ``medium`` of a scene, and why: the one of that name, or for ``auto`` the
-    first registered one that supports the scene.
+    """Choose the solver for a ``medium`` of a scene; also return the reason.
 
-    Raises IrrcacheError where the solver of that name does not, or none does.
+    ``solver`` is a name, or ``auto`` for the first registered solver that supports the scene.
+    Raises IrrcacheError if the named solver, or none at all, supports it.
     """
     candidates = registered() if solver == "auto" else (solver_named(solver),)
     reasons = []
@@ -80,9 +80,10 @@ def choose_solver(
 def _check_forward_peak(
     medium: MediumGrid, solver: type[Solver], reason: str, max_depth: int
 ) -> None:
-    """Raises UnsupportedSceneError for a medium with delta-M scaling where the ``solver``, chosen
-    for a ``reason``, does not support it, or where orders of scattering are limited: scattering
-    into the forward peak does not count as one.
+    """Raise UnsupportedSceneError for a medium whose delta-M scaling cannot be used.
+
+    That is the case if the ``solver``, chosen for a ``reason``, does not support it, or if the
+    orders of scattering are limited: scattering into the forward peak does not count as an order.
     """
     cosine = medium.phase.forward + (1 - medium.phase.forward) * float(medium.phase.moments[1])
     sharp = f'irrcache: medium "{medium.name}" scatters sharply, with a mean cosine of {cosine:.2f}'
@@ -103,8 +104,9 @@ def _check_forward_peak(
 def needs_no_cache(
     scene: mi.Scene, medium: MediumGrid, max_depth: int, resolution: int
 ) -> str | None:
-    """Why `HalfSpace` is more accurate than a cache for ``medium``; None where it is not, or where
-    ``resolution`` asks for a cache.
+    """Return why `HalfSpace` is more accurate than a cache for ``medium``.
+
+    None if it is not, or if ``resolution`` is set, which requests a cache.
     """
     if resolution or max_depth > half_space.MOST_ORDERS:
         return None

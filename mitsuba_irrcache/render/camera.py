@@ -19,13 +19,20 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import random_stream
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.machine.memory import give_back
+from mitsuba_irrcache.machine.memory import release_unused_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, is_null, medium_after, trace
+from mitsuba_irrcache.transport.path import (
+    MOST_CROSSINGS,
+    PathEnd,
+    PathStart,
+    is_null,
+    medium_after,
+    trace,
+)
 
 #: Transmittance below which surfaces are path traced with Russian roulette.
 ROULETTE_BELOW = 0.1
@@ -51,7 +58,7 @@ def camera_rays_of(
         if cache is None or not (cache.active_count and cache.samples):
             return Projection(medium, None, quadrature, step, layered)
         field = cache.field()
-        give_back(cache.grid.voxel_count)
+        release_unused_memory(cache.grid.voxel_count)
         projection = Projection(
             medium,
             field,
@@ -65,7 +72,7 @@ def camera_rays_of(
             direct_lights=[DirectLightAlongRays(light) for light in cache.direct_lights],
         )
         del field  # already copied by the projection
-        give_back(cache.grid.voxel_count)
+        release_unused_memory(cache.grid.voxel_count)
         return projection
 
     projections = [project(part.medium, part.shown) for part in parts]
@@ -207,7 +214,7 @@ class TracedCameraRays:
         chance = dr.minimum(dr.max(transmittance) * (1 / ROULETTE_BELOW), 1)
         traced = stopped & (rng.next_float32(stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
-        start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
+        start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True)
         direct, reflected, interacted, path_end, _ = trace(
             scene,
             self.media,
@@ -310,7 +317,7 @@ class TracedCameraRays:
             known |= pointer == projection.medium.pointer
         return known
 
-    def _irradiance(self, end: End) -> mi.Spectrum:
+    def _irradiance(self, end: PathEnd) -> mi.Spectrum:
         """Look up the cached irradiance at the ends of paths."""
         result = mi.Spectrum(0)
         for projection in self.projections:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import clipped, greatest, least
+from mitsuba_irrcache.core.fast_math import clipped, maximum, minimum
 from mitsuba_irrcache.grids.boundary import safe_rcp
 from mitsuba_irrcache.grids.distance_transform import chebyshev
 from mitsuba_irrcache.grids.majorants import Macrocells
@@ -69,5 +69,5 @@ class ClearanceAlongRay:
         for c, n, origin, rcp in zip(cell, self.sides, self.origin, self.rcp, strict=True):
             wall = c + clearance
             # Border cells extend to infinity.
-            nearest = least(dr.select(wall < n, (wall - origin) * rcp, dr.inf), nearest)
-        return clearance > 0, greatest(nearest, t)
+            nearest = minimum(dr.select(wall < n, (wall - origin) * rcp, dr.inf), nearest)
+        return clearance > 0, maximum(nearest, t)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import absorbed, absorptance, decay, greatest
+from mitsuba_irrcache.core.fast_math import absorbed, absorptance, decay, maximum
 
 QUADRATURES = ("riemann", "trapezoid", "exponential")
 
@@ -29,7 +29,7 @@ def curved(previous, a, b, ratio: mi.Float) -> tuple:
     # Sagitta of the parabola over the mean, which is scaled to 1.
     bend = ratio * dr.fma(ratio, previous - a, b - a)
     sag = bend / (3 * (1 + ratio) * (a + b))
-    scale = dr.select(a + b > 0, greatest(1 - sag, 0), 1)
+    scale = dr.select(a + b > 0, maximum(1 - sag, 0), 1)
     return a * scale, b * scale
 
 
@@ -72,7 +72,7 @@ def exponential_weights(tau_a, tau_b, transmittance) -> tuple:
     for u, weight in GAUSS_LEGENDRE:
         depth = dr.fma(tau_a, u * (1 - 0.5 * u), tau_b * (0.5 * u * u))
         near = dr.fma(absorptance(depth), weight, near)
-    return near, greatest(absorbed(0.5 * (tau_a + tau_b), transmittance) - near, 0.0)
+    return near, maximum(absorbed(0.5 * (tau_a + tau_b), transmittance) - near, 0.0)
 
 
 def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:

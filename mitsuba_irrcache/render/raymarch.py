@@ -23,7 +23,7 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularField
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.cache.uncertainty import UncertaintyField
-from mitsuba_irrcache.core.fast_math import least
+from mitsuba_irrcache.core.fast_math import minimum
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
@@ -206,16 +206,16 @@ class Projection:
         while dr.hint(active, label="ray march"):
             # Skip empty space: continue from the last lattice point inside it.
             empty, wall = clearance.exit(t, active)
-            last = dr.floor(dr.fma(least(wall, far) - near, per_step, -offset)) + 1
+            last = dr.floor(dr.fma(minimum(wall, far) - near, per_step, -offset)) + 1
             skip = empty & (last >= k) & (last >= 1)
-            last = least(last, limit)
+            last = minimum(last, limit)
             k = dr.select(skip, last + 1, k + stride - 1)
-            t = dr.select(skip, least(dr.fma(last - 1 + offset, step, near), far), t)
+            t = dr.select(skip, minimum(dr.fma(last - 1 + offset, step, near), far), t)
             extinction = dr.select(skip, 0, extinction)
             previous = dr.select(skip, 0, previous)
             previous_length = dr.select(skip, step, previous_length)
             emission_at_start = dr.select(skip, 0, emission_at_start)
-            end = least(dr.fma(k - 1 + offset, step, near), far)
+            end = minimum(dr.fma(k - 1 + offset, step, near), far)
             end = dr.select(k == 0, near, end)
             end = dr.select(k >= limit, far, end)
             next_extinction, next_source, next_extras = self.fetch(fields, end, view)

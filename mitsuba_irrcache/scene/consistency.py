@@ -1,14 +1,14 @@
-"""Whether the shapes of a scene agree about which medium is where.
+"""Check that the shapes of a scene define a unique medium at every position.
 
-Mitsuba keeps no map of media. A ray carries a medium, and a shape that has an ``interior`` or an
-``exterior`` replaces it, whatever it was. So ``volpath`` renders every scene, but where boundaries
-overlap, leave a gap or have their normals reversed, the medium at a point depends on the way that
-led there. A cache knows points only, so such scenes are refused.
+Mitsuba does not store which medium is where. Each ray has a current medium, which is replaced at
+every shape with an ``interior`` or ``exterior`` medium. ``volpath`` therefore renders every scene,
+but if boundaries overlap, leave a gap or have reversed normals, the medium at a position depends on
+the path that led there. A cache depends on the position only, so such scenes are refused.
 
-Random walks from outside and from the sensors find places where a shape contradicts the medium that
-is carried. Rays are moved off a surface by a small distance, and so miss another one close by. So
-each suspected place is asked again: straight rays from there meet shapes that must all claim the
-same medium.
+Random walks from outside and from the sensors find positions where a shape contradicts the current
+medium of the ray. Because rays are offset from surfaces and may miss another surface nearby, each
+suspected position is tested again: all shapes that straight rays from there hit first must define
+the same medium.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import orientation
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
-#: Walks that start outside, at least, per shape, and altogether; walks from each sensor.
+#: Number of walks from outside: minimum, per shape, and maximum; number from each sensor.
 WALKS, WALKS_PER_SHAPE, MOST_WALKS, SENSOR_WALKS = 2048, 256, 1 << 16, 1024
-#: Events of a walk, at most, and the share of straight flights that end half-way, as in a medium.
+#: Maximum number of events of a walk, and probability that a flight ends before the next surface.
 EVENTS, TURNS = 24, 0.25
-#: Suspected places that are examined, and the rays from each.
+#: Maximum number of suspected positions that are tested, and number of rays from each.
 PLACES, RAYS = 64, 64
-#: Places are chosen up to exp(-NEAREST) of a flight close to its ends.
+#: Positions are sampled on a flight as close to its ends as exp(-NEAREST) of its length.
 NEAREST = 6.0
-#: A place is disputed if so many of its rays contradict the others; a scene is refused if so many
-#: places are disputed. Single rays err at edges.
+#: A position is disputed if this many of its rays contradict the others, and a scene is refused if
+#: this many positions are disputed. Single rays may be wrong at edges.
 DISSENT, DISPUTED = 3, 2
-#: Share of walks that may go wrong with no place disputed: edges cost some. More of them do where
-#: surfaces are closer together than rays are moved.
+#: Tolerated share of contradictory walks if no position is disputed; some occur at edges. The share
+#: is larger if surfaces are closer together than the offset of rays.
 ASTRAY = 0.05
-#: Share of rays that do not leave a shape as they enter it, or meet its back first, from which on
-#: that shape alone is at fault.
+#: A shape is considered not closed if more than this share of rays do not leave it as often as they
+#: enter it, or hit its back first.
 OPEN = 0.5
-#: The same of rays that meet the back of a shape first, from which on it is inside out; it is 0.5
-#: for a flat one.
+#: The normals of a shape are considered reversed if more than this share of rays hit its back
+#: first; the share is 0.5 for a flat shape.
 INWARDS = 0.6
-#: Mitsuba's rays leave a surface at (1 + largest coordinate) times this.
+#: Offset of Mitsuba's secondary rays from a surface, relative to 1 + the largest coordinate.
 RAY_OFFSET = 9e-5
 
 #: Results of a straight ray that looks for the medium at its origin.
@@ -52,13 +52,13 @@ _NOTHING, _CLAIM, _ESCAPE = 0, 1, 2
 
 
 def check_media_agree(scene: mi.Scene) -> None:
-    """Raises UnsupportedSceneError, naming shapes and media, unless the shapes of a scene agree
-    about which medium is where.
+    """Raise UnsupportedSceneError, naming shapes and media, unless the shapes of a scene define a
+    unique medium everywhere.
     """
     shapes = [s for s in scene.shapes() if _bounds(s)]
     if not shapes:
         return
-    # An exterior medium that is bounded by no shape may well be what is outside of everything.
+    # An exterior medium that no shape bounds may fill the outside of all shapes.
     outside = _nothing_is_outside(shapes)
     origin, direction, pointer, known = _starts(scene, shapes, bool(outside[0]))
     wrong, met, lost, place, *near = _walk(
@@ -87,9 +87,9 @@ def check_media_agree(scene: mi.Scene) -> None:
 
 
 def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
-    """Raises UnsupportedSceneError for a sensor that says it is in a medium, and is not.
+    """Raise UnsupportedSceneError for a sensor whose medium is not the one at its position.
 
-    ``volpath`` then carries this medium up to the first shape, without bounds, and shows no
+    ``volpath`` would then extend this medium up to the first shape, without bounds, and show no
     environment behind it.
     """
     medium = sensor.get_medium()
@@ -116,15 +116,16 @@ def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
 
 def _nothing_is_outside(shapes: list[mi.Shape]) -> mi.Bool:
-    """Whether it is known that there is no medium outside of all shapes: an exterior medium that
-    fills no shape may well be there.
+    """Whether there is certainly no medium outside of all shapes.
+
+    An exterior medium that is not the interior of any shape may be there.
     """
     filled = [s.interior_medium() for s in shapes]
     return dr.opaque(mi.Bool, all(s.exterior_medium() in (None, *filled) for s in shapes))
 
 
 def _camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """Rays all over the film of a sensor."""
+    """Sample camera rays uniformly over the film of a sensor."""
     rng = mi.PCG32(count)
     film, aperture = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
     # Some sensors have no `sample_ray`.
@@ -132,7 +133,7 @@ def _camera_rays(sensor: mi.Sensor, count: int) -> tuple[mi.Ray3f, mi.Spectrum]:
 
 
 def described(shape: mi.Shape) -> str:
-    """A shape as messages call it."""
+    """Describe a shape for a message."""
     return f'shape "{shape.id()}" ({shape.class_name()})'
 
 
@@ -143,10 +144,12 @@ def _bounds(shape: mi.Shape) -> bool:
 def _starts(
     scene: mi.Scene, shapes: list[mi.Shape], outside: bool
 ) -> tuple[mi.Point3f, mi.Vector3f, mi.MediumPtr, mi.Bool]:
-    """Rays from outside through the bounds of each shape, and from the sensors; the medium that
-    they carry, and whether it is known: ``outside``, that there is none. A sensor without one may
-    be in a medium without saying so: ``volpath`` renders that as if it was in none, and so does
-    irrcache.
+    """Sample rays from outside through the bounds of each shape, and from the sensors.
+
+    Returns origins, directions, the current medium, and whether that medium is known. Outside of
+    all shapes it is known to be none if ``outside``. The medium of a sensor is known only if the
+    sensor has one: without, ``volpath`` and irrcache treat it as outside of all media wherever it
+    is.
     """
     boxes = np.array([[s.bbox().min, s.bbox().max] for s in shapes], dtype=np.float64).reshape(
         -1, 6
@@ -205,10 +208,12 @@ def _walk(
     outside: mi.Bool,
     events: mi.UInt32,
 ):
-    """Random walks that carry a medium as ``volpath`` does. Whether a shape contradicts it, whether
-    any shape with media was met, a place on the flight that led to the contradiction, the shape
-    that contradicts, and the one before. If something may be ``outside`` of all shapes: the medium
-    that is carried to infinity.
+    """Trace random walks with a current medium that changes as in ``volpath``.
+
+    Returns whether a shape contradicts the current medium; whether any shape with media was hit;
+    the medium of a ray that leaves the scene, if there may be a medium outside of all shapes (if
+    not ``outside``); a position on the flight that led to the contradiction; the shape that
+    contradicts, and the shape before it.
     """
     ray, pointer, known = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(known)
     rng = mi.PCG32(dr.width(ray))
@@ -222,19 +227,19 @@ def _walk(
         transition = hit & si.is_medium_transition()
         claim = si.target_medium(-ray.d)
         now = transition & known & (claim != pointer)
-        # Outside of everything there is no medium.
+        # There is no medium outside of all shapes.
         escapes = active & ~hit & known & (pointer != None)  # noqa: E711
         now |= escapes & outside
         lost = dr.select(escapes & ~outside, pointer, lost)
         wrong |= now
         met |= transition
-        # Close to one end of the flight or the other: what is small there fills much of the view.
+        # Prefer positions close to either end of the flight, from where small shapes appear large.
         end = dr.exp(-NEAREST * rng.next_float32(active)) / 2
         end = dr.select(rng.next_float32(active) < 0.5, end, 1 - end)
         length = dr.select(hit, si.t, dr.norm(ray.o - last))
         place = dr.select(now, ray(end * length), place)
         contradicts = dr.select(now & hit, si.shape, contradicts)
-        # Half-way in another direction, on through the surface, or back from it.
+        # Scatter before the surface, continue through it, or reflect.
         turns = rng.next_float32(active) < TURNS
         at = ray(rng.next_float32(active) * si.t)
         sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
@@ -261,15 +266,17 @@ def _walk(
 
 
 def _lets_through(flags: mi.UInt32) -> mi.Bool:
-    """Whether a BSDF of these flags transmits."""
+    """Whether a BSDF with these flags transmits."""
     return (flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)) != 0
 
 
 def _examine(
     scene: mi.Scene, place: mi.Point3f, outside: mi.Bool
 ) -> list[dict[tuple[int, int], int]]:
-    """For each place, how many straight rays from there meet a shape that claims a medium: by the
-    registry's numbers of the medium and of the shape, which is 0 where the ray escapes.
+    """Count, for each position, the straight rays that determine the medium there.
+
+    The keys are the registry's numbers of the medium and of the shape that defines it; the latter
+    is 0 for rays that leave the scene.
     """
     count = dr.width(place)
     index = dr.arange(mi.UInt32, count * RAYS)
@@ -289,8 +296,10 @@ def _examine(
 
 @symbolic
 def _claims(scene: mi.Scene, ray: mi.Ray3f):
-    """The medium at the origin of rays according to the first shape along them that has media,
-    behind any that transmit; the code says whether there is one; and that shape.
+    """Find the medium at the origin of rays according to the first shape with media along them.
+
+    Rays continue through other shapes that transmit. Returns a code (`_NOTHING`, `_CLAIM` or
+    `_ESCAPE`), the medium, and the shape.
     """
     ray, code = mi.Ray3f(ray), mi.UInt32(_NOTHING)
     medium, shape = dr.zeros(mi.MediumPtr), dr.zeros(mi.ShapePtr)
@@ -311,7 +320,7 @@ def _claims(scene: mi.Scene, ray: mi.Ray3f):
 
 
 def _dissent(votes: Counter) -> int:
-    """How many votes are for other media than the one that most are for."""
+    """Count the rays that disagree with the medium that most rays indicate."""
     media = _by_medium(votes)
     return sum(media.values()) - max(media.values(), default=0)
 
@@ -324,7 +333,7 @@ def _by_medium(votes: Counter) -> Counter:
 
 
 class _Names:
-    """Shapes and media by the numbers that Dr.Jit's registry has for them."""
+    """Shapes and media by their numbers in Dr.Jit's registry."""
 
     def __init__(self, shapes: list[mi.Shape], every: list[mi.Shape]) -> None:
         self.shapes = {_number(mi.ShapePtr(s)): s for s in every}
@@ -338,11 +347,11 @@ class _Names:
         return all(interior not in (s.interior_medium(), s.exterior_medium()) for s in others)
 
     def medium(self, number: int) -> str:
-        """A medium as messages call it."""
+        """Describe a medium for a message."""
         return f'medium "{self._media[number].id()}"' if number in self._media else "no medium"
 
     def shape(self, number: int) -> str:
-        """A shape as messages call it, with the media on both sides."""
+        """Describe a shape and the media on both sides for a message."""
         shape = self.shapes.get(number)
         if shape is None:
             return "the outside of all shapes"
@@ -356,13 +365,13 @@ def _number(pointer: mi.ShapePtr | mi.MediumPtr) -> int:
 
 
 def _refuse_dispute(scene: mi.Scene, names: _Names, votes: Counter) -> None:
-    """The error for a place where shapes claim different media."""
+    """Raise the error for a position at which shapes define different media."""
     (one, _), (other, _) = _by_medium(votes).most_common(2)
     sides = []
     for medium in (one, other):
         claims = Counter({shape: n for (m, shape), n in votes.items() if m == medium})
         sides.append(claims.most_common(1)[0][0])
-    # The outside of all shapes claims nothing that can be changed.
+    # The outside of all shapes is not an object that the user can change.
     known = [side for side in dict.fromkeys(sides) if side in names.shapes]
     if len(known) == 1:
         _refuse_single(scene, names, known[0], {one, other} - {0})
@@ -384,7 +393,7 @@ def _refuse_dispute(scene: mi.Scene, names: _Names, votes: Counter) -> None:
 
 
 def _refuse_single(scene: mi.Scene, names: _Names, number: int, media: set[int]) -> None:
-    """The error for a shape that contradicts itself, or the outside, about these ``media``."""
+    """Raise the error for a shape that contradicts itself, or the outside, about ``media``."""
     exterior = names.shapes[number].exterior_medium()
     if exterior is not None and media == {_number(mi.MediumPtr(exterior))}:
         raise UnsupportedSceneError(
@@ -409,7 +418,7 @@ def _refuse_single(scene: mi.Scene, names: _Names, number: int, media: set[int])
 
 
 def _refuse_infinite(names: _Names, medium: int) -> None:
-    """The error for a medium that rays take to infinity."""
+    """Raise the error for a medium in which rays leave the scene."""
     raise UnsupportedSceneError(
         f"irrcache: {names.medium(medium)} is the exterior of shapes and fills none, and rays take "
         "it out of the scene: volpath then shows no light from there. Put a closed shape with a "
@@ -419,7 +428,7 @@ def _refuse_infinite(names: _Names, medium: int) -> None:
 
 
 def _refuse_close(scene: mi.Scene, names: _Names, first: int, second: int) -> None:
-    """The error for shapes that are closer to each other than the offset of Mitsuba's rays."""
+    """Raise the error for shapes that are closer to each other than Mitsuba's ray offset."""
     corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
     offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
     raise UnsupportedSceneError(

@@ -1,4 +1,4 @@
-"""What irrcache knows of a scene: the result of `compile_scene`, on which all later stages work."""
+"""Description of a scene: the result of `compile_scene`, from which all later stages work."""
 
 from __future__ import annotations
 

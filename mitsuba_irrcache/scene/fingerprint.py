@@ -1,4 +1,4 @@
-"""What a cache depends on: identities of objects within a process, digests for files."""
+"""Inputs of a cache, compared by object identity within a process and by digests in files."""
 
 from __future__ import annotations
 

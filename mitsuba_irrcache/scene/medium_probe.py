@@ -1,4 +1,4 @@
-"""Which medium a position is in, by rays that look for the shapes around it."""
+"""Determine the medium at a position by rays that intersect the shapes around it."""
 
 from __future__ import annotations
 

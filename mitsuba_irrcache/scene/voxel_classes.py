@@ -1,4 +1,4 @@
-"""Where the voxels of a cache lie among surfaces and media."""
+"""Classification of the voxels of a cache by media and surfaces."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
 
-#: Rays from each voxel that look for its medium.
+#: Number of rays from each voxel that determine its medium.
 RAYS = 16
 
 
@@ -74,7 +74,7 @@ def _probed(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
     in each medium; those whose origin, a random position in the voxel, is in ``medium``; those that
     hit the back of a surface first.
     """
-    corner = mi.Point3f(*grid.places(index))
+    corner = mi.Point3f(*grid.voxel_indices(index))
     votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
     within, backs = mi.UInt32(0), mi.UInt32(0)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, RAYS)
@@ -94,7 +94,7 @@ def _probed(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
 
 @symbolic
 def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
-    """Whether rays hit the back of the first surface that is not null."""
+    """Whether rays hit the first surface that is not null from behind."""
     ray, back = mi.Ray3f(p, direction), mi.Bool(False)
     crossings, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="backs"):
@@ -117,7 +117,7 @@ def neighbourhood(
     index = dr.arange(mi.UInt32, grid.voxel_count * channels)
     voxel = index // channels
     channel = index - voxel * channels
-    places = [mi.Int32(p) for p in grid.places(voxel)]
+    places = [mi.Int32(p) for p in grid.voxel_indices(voxel)]
     nx, ny, _ = grid.sides
     total, weights = mi.Float(0), mi.Float(0)
     for step in np.ndindex(3, 3, 3):

@@ -1,8 +1,8 @@
-"""What a solver is to the rest of the program, and the list of all solvers.
+"""Interface of solvers, and their registry.
 
 A solver fills the cache of one medium. To add one, derive a class from `Solver`, decorate it with
 `register`, and import its module in ``solvers/__init__.py``: the property ``solver``, the choice of
-``auto``, memory checks, progressive rendering and cache files know it then.
+``auto``, memory checks, progressive rendering and cache files then support it.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ Progress = Callable[[int, int], None]
 
 
 def _no_pause() -> None:
-    """Does nothing."""
+    """Do nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class SolverTask:
-    """What a solver works on.
+    """Input of a solver.
 
     Attributes:
         scene: Mitsuba's scene.
@@ -62,15 +62,15 @@ class Preview(ABC):
 
     @abstractmethod
     def grow(self, size: int, progress: Progress | None = None) -> None:
-        """Adds samples until there are ``size`` in each batch."""
+        """Add samples until there are ``size`` in each batch."""
 
     @abstractmethod
     def fill(self, cache: IrradianceCache) -> None:
-        """Puts both batches into an empty ``cache`` for batches of this size."""
+        """Store both batches in an empty ``cache`` for batches of this size."""
 
 
 class Solver(ABC):
-    """Fills a cache. What has to be known before there is a cache are class methods."""
+    """Fills a cache. Methods that are needed before the cache exists are class methods."""
 
     #: value of the integrator's property ``solver``
     name: ClassVar[str]
@@ -91,44 +91,44 @@ class Solver(ABC):
     def why_not(
         cls, scene: mi.Scene, medium: MediumGrid, max_depth: int, resolution: int
     ) -> str | None:
-        """Why it does not support ``medium`` in its scene; None where it does."""
+        """Return why it does not support ``medium`` in its scene; None if it does."""
 
     @classmethod
     @abstractmethod
     def why(cls, medium: MediumGrid) -> str:
-        """Why ``auto`` chooses it for ``medium``, where no solver with precedence was refused."""
+        """Return why ``auto`` chooses it for ``medium`` if it is the first candidate."""
 
     @classmethod
     @abstractmethod
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
-        """Samples per voxel in a cache with so many active voxels, unless the user set them."""
+        """Return the default number of samples per voxel for this number of active voxels."""
 
     @classmethod
     @abstractmethod
     def batch_size(
         cls, medium: MediumGrid, max_depth: int, samples: int, basis: AngularBasis | None
     ) -> int:
-        """Samples of a batch of a cache with so many ``samples`` (0: the default)."""
+        """Return the samples per batch of a cache with ``samples`` per voxel (0: the default)."""
 
     @classmethod
     @abstractmethod
     def numbers_per_voxel(
         cls, medium: MediumGrid, max_depth: int, moments: int, voxels: int, channels: int
     ) -> int:
-        """Single precision numbers per voxel that it takes to fill a cache."""
+        """Return how many float32 values per voxel are needed to fill a cache."""
 
     @classmethod
     def voxel_classes(
         cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid
     ) -> VoxelClasses | None:
-        """Where the voxels of ``grid`` are; None where no surface can be among them."""
+        """Classify the voxels of ``grid``; None if there cannot be surfaces among them."""
         return None
 
     @classmethod
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        """Whether it leaves the irradiance of `DirectLight` to these."""
+        """Whether it takes the irradiance of emitters without extent from `DirectLight`."""
         return True
 
     @abstractmethod
@@ -136,14 +136,14 @@ class Solver(ABC):
 
     @abstractmethod
     def refine(self, samples: int, progress: Progress | None = None) -> None:
-        """Adds ``samples`` per voxel, a multiple of the cache's batch.
+        """Add ``samples`` per voxel, a multiple of the cache's batch.
 
         The random stream goes on where it stopped. If ``progress`` raises, batches that are
         complete stay in the cache.
         """
 
     def preview(self) -> Preview:
-        """The first two batches, empty, where it `has_preview`."""
+        """Return the first two batches without samples, if it `has_preview`."""
         raise NotImplementedError
 
 
@@ -151,7 +151,7 @@ _REGISTRY: dict[str, type[Solver]] = {}
 
 
 def register(solver: type[Solver]) -> type[Solver]:
-    """Adds a solver to those of the property ``solver``; ``auto`` prefers earlier ones."""
+    """Register a solver by its name; ``auto`` prefers solvers registered earlier."""
     if solver.name in _REGISTRY or solver.name == "auto":
         raise ValueError(f'there is a solver "{solver.name}" already')
     _REGISTRY[solver.name] = solver
@@ -159,12 +159,12 @@ def register(solver: type[Solver]) -> type[Solver]:
 
 
 def registered() -> tuple[type[Solver], ...]:
-    """All solvers in the order in which ``auto`` tries them."""
+    """Return all solvers in the order in which ``auto`` tries them."""
     return tuple(_REGISTRY.values())
 
 
 def solver_named(name: str) -> type[Solver]:
-    """The solver of this name; raises IrrcacheError where there is none."""
+    """Return the solver of this name; raise IrrcacheError if there is none."""
     if name not in _REGISTRY:
         names = ", ".join(f'"{known}"' for known in ("auto", *_REGISTRY))
         raise IrrcacheError(f'irrcache: there is no solver "{name}"; set solver to one of {names}.')

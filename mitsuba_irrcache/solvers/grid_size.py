@@ -1,4 +1,4 @@
-"""The voxels of a cache, from estimates of the error that they cause."""
+"""Choice of the resolution of a cache from estimates of the discretisation error."""
 
 from __future__ import annotations
 
@@ -12,38 +12,39 @@ from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 
-#: Why something is as a property of the integrator says.
+#: Reason given for a choice that a property of the integrator determines.
 REQUESTED = "as requested"
 
 #: Estimated error of the pixels at the boundary of a medium [%] above which a warning is logged.
 LARGE_BORDER_ERROR = 3.0
 
-#: The same above which the irradiance of suns and points is not interpolated.
+#: Estimated error [%] above which the irradiance of suns and points is not interpolated.
 SMALL_BORDER_ERROR = 0.2
 
-#: Voxels of a cache that ``resolution`` 0 leads to, at most; the second where scattering is not
-#: isotropic.
+#: Maximum number of voxels that ``resolution`` 0 chooses, for isotropic and anisotropic scattering.
 MOST_VOXELS, MOST_DIRECTIONAL = 1 << 25, 1 << 21
-#: RMSE of the image, in % of its mean, that ``resolution`` 0 aims at by the estimates below, which
-#: are fits to images of a CT head and of random and smooth media of 0.3 to 100 optical depths per
-#: data voxel. The error falls with the square of the voxels along an axis.
+#: RMSE of the image, in % of its mean, that ``resolution`` 0 aims at. The error estimates below are
+#: fits to images of a CT head and of random and smooth media of 0.3 to 100 optical depths per data
+#: voxel. The error is inversely proportional to the square of the number of voxels along an axis.
 TARGET_ERROR = 0.5
-#: Optical depth of a data voxel up to which the data's own voxels have that error; one above which
-#: the voxels that it takes grow less than in proportion to the depth, with this power; and the
-#: most voxels along an axis for each of the data.
+#: RESOLVED is the optical depth of a data voxel up to which voxels of that size have the target
+#: error. Above, the number of voxels is proportional to the optical depth, and above OPAQUE to its
+#: power OPAQUE_POWER; at most MOST_PER_DATA_VOXEL voxels along each axis of a data voxel.
 RESOLVED, OPAQUE, OPAQUE_POWER, MOST_PER_DATA_VOXEL = 0.7, 1.2, 0.45, 6.0
-#: A medium that is dense at its boundary, with an optical depth d of a cache voxel there, has an
-#: error of about this many % times d^1.2.
+#: The error [%] of a medium that is dense at its boundary is about BORDER_ERROR d^BORDER_ORDER,
+#: where d is the optical depth of a cache voxel at the boundary.
 BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
-#: Voxels of a cache that is finer than its data, at most: all orders of scattering in so many take
-#: half a minute on two cores.
+#: Maximum number of voxels of a cache that is finer than its data: all orders of scattering then
+#: take half a minute on two cores.
 MOST_REFINED = 8_000_000
 
 
 @dataclass(frozen=True)
 class SizeAmongSurfaces:
-    """Limits of the voxels along the longest side of a cache among surfaces, whose shadows have
-    more detail than coarse data, and the error [%] that decides between the limits.
+    """Limits of the number of voxels along the longest side of a cache among surfaces.
+
+    Shadows of surfaces have more detail than coarse data. Between the limits the number follows
+    from the estimated error and ``target_error`` [%].
     """
 
     fewest: int
@@ -53,18 +54,18 @@ class SizeAmongSurfaces:
 
 @dataclass(frozen=True)
 class SizeRule:
-    """How a solver wants ``resolution`` 0 to be understood.
+    """Rule by which ``resolution`` 0 chooses the grid of a solver.
 
     Attributes:
         target_error: RMSE of the image that the grid aims at [%].
-        fewest: voxels along the longest side that every medium gets.
-        most_by_contrast: voxels along the longest side that high contrast inside of the medium can
-            ask for; ``most_by_border`` the same where the medium is dense at its boundary or
-            homogeneous.
+        fewest: minimum number of voxels along the longest side.
+        most_by_contrast: maximum number along the longest side that contrast inside of the medium
+            can require; ``most_by_border`` is the same for media that are dense at their boundary
+            or homogeneous.
         refines_dense_data: whether voxels may be smaller than those of dense data.
-        most: voxels along the longest side, at most.
-        among_surfaces: another rule where rays are traced through the scene's shapes; None: the
-            same rule.
+        most: maximum number of voxels along the longest side.
+        among_surfaces: limits for media in which rays are traced through the scene's shapes; None:
+            the same rule as for other media.
     """
 
     target_error: float
@@ -77,10 +78,10 @@ class SizeRule:
 
 
 def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Grid, str]:
-    """The voxels of the cache, and why.
+    """Choose the grid of the cache; also return the reason.
 
-    With ``resolution`` 0 those of the medium, since larger ones lose detail, or smaller ones where
-    the medium is dense, within the limits of the ``rule``.
+    With ``resolution`` 0 the voxels are those of the medium, since larger ones lose detail, or
+    smaller if the medium is dense, within the limits of the ``rule``.
     """
     data, frame = medium.sigma_t.grid, medium.frame
     voxels = MOST_VOXELS if medium.phase.is_isotropic else MOST_DIRECTIONAL
@@ -100,19 +101,19 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
 
 
 def _edge_of_error(error: float) -> float:
-    """The optical depth of the edge of a voxel whose estimated error [%] is this."""
+    """Return the optical depth of a voxel's edge at which the estimated error [%] is ``error``."""
     return (error / BORDER_ERROR) ** (1 / BORDER_ORDER)
 
 
 def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Grid, str]:
-    """The grid whose estimated error is that of the ``rule``, with no more than so many ``voxels``,
-    and the reason for its size.
+    """Choose the grid with the estimated error of the ``rule`` and at most this number of
+    ``voxels``; also return the reason for its size.
     """
     # docs/primer, eq. (7.2)
     data, frame = medium.sigma_t.grid, medium.frame
     lengths = np.linalg.norm(frame[:3, :3], axis=0)
     mean, border = _colliding_extinction(medium), _border_extinction(medium)
-    # Voxels along x, y, z that each criterion asks for.
+    # Number of voxels along x, y, z that each criterion requires.
     wanted = {f"at least {rule.fewest}": rule.fewest * lengths / lengths.max()}
     if data is not None:
         ratio = np.ones(3)
@@ -142,13 +143,13 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
     ):
         if bound < 1:
             sides, reason = sides * bound, message
-    # Rounded down: limits hold. Counts that are whole numbers but for rounding stay what they are.
+    # Round down to respect the limits, except for rounding errors of whole numbers.
     sides = np.maximum(np.floor(sides + 1e-4), 1).astype(int)
     return Grid(tuple(int(n) for n in sides[::-1]), frame), reason
 
 
 def _colliding_extinction(medium: MediumGrid) -> float:
-    """The mean extinction over collisions in uniform radiance, int sigma_t^2 / int sigma_t
+    """Return the mean extinction over collisions in uniform radiance, int sigma_t^2 / int sigma_t
     [1/scene unit].
     """
     sigma_t = medium.sigma_t
@@ -162,16 +163,17 @@ def _colliding_extinction(medium: MediumGrid) -> float:
 
 
 def border_error(medium: MediumGrid, grid: Grid) -> float:
-    """The estimated error [%] of pixels at the boundary of a medium that is dense there, where
-    irradiance is interpolated between the voxels of ``grid``.
+    """Estimate the error [%] of pixels at the boundary of a medium that is dense there, due to
+    interpolation between the voxels of ``grid``.
     """
     # docs/primer, eq. (7.1)
     return BORDER_ERROR * (_border_extinction(medium) * grid.voxel_size.max()) ** BORDER_ORDER
 
 
 def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
-    """Logs a warning where the cache is too coarse for a medium that is dense at its boundary:
-    irradiance falls off within a fraction of a mean free path there, and no voxel lies beyond.
+    """Log a warning if the cache is too coarse for a medium that is dense at its boundary.
+
+    Irradiance decays within a fraction of a mean free path there, and no voxel lies beyond.
     """
     depth = _border_extinction(medium) * grid.voxel_size.max()
     error = border_error(medium, grid)
@@ -185,7 +187,7 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
 
 
 def _border_extinction(medium: MediumGrid) -> float:
-    """The 95th percentile of sigma_t on the faces of the medium [1/scene unit]."""
+    """Return the 95th percentile of sigma_t on the faces of the medium [1/scene unit]."""
     rng = mi.PCG32(4096)
     face = dr.arange(mi.UInt32, 4096) % 6
     place = [rng.next_float32() for _ in range(3)]

@@ -1,13 +1,14 @@
 """Radiance of opaque homogeneous media in closed form, without a cache.
 
-Where a boundary cuts through dense matter, irradiance changes within a fraction of a mean free path
-of it. Once the medium is hundreds of mean free paths across, no affordable grid resolves that
-layer. But then the layer is simple:
+Near the boundary of a dense medium the irradiance changes within a fraction of a mean free path. If
+the medium is hundreds of mean free paths across, no affordable grid resolves that layer, but its
+radiance is known in closed form:
 
-- Single scattering needs no grid at all: collisions of the camera ray and transmittance to the
-  boundary are known in closed form, for any size of the medium.
-- Higher orders leave the medium next to where they entered it, as from a plane-parallel half-space.
-  Its reflection, per irradiance on a plane normal to the incident direction, is
+- Single scattering requires no grid: collisions along the camera ray and the transmittance to the
+  boundary are analytic, for any size of the medium.
+- Higher orders leave the medium close to where they entered it, as in a plane-parallel half-space.
+  The radiance that a half-space reflects, per irradiance on a plane normal to the incident
+  direction, is
 
       omega / (4 pi) mu0 / (mu + mu0) H(mu) H(mu0)
 
@@ -16,9 +17,9 @@ layer. But then the layer is simple:
 
       H(mu) = 1 + omega / 2 mu H(mu) int_0^1 H(x) / (mu + x) dx.
 
-  H(mu) H(mu0) as a power series in omega holds one order of scattering per power, the first being
-  single scattering. It neglects that the boundary is curved, or ends at an edge: an error of the
-  order of a mean free path over the size of the medium.
+  Each power of omega in the series of H(mu) H(mu0) is one order of scattering, starting with single
+  scattering. The curvature and the edges of the boundary are neglected: the relative error is of
+  the order of the mean free path over the size of the medium.
 """
 
 from __future__ import annotations
@@ -32,26 +33,27 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.lights.emitters import point_lights, position_of
 from mitsuba_irrcache.media.medium import MediumGrid
 
-#: Error of the image [%] times the radius of a sphere, or the shortest edge of a box, in mean free
-#: paths, where higher orders are taken from the half-space.
+#: Error of the image [%] due to the half-space approximation, times the radius of a sphere, or the
+#: shortest edge of a box, in mean free paths.
 SPHERE_ERROR, BOX_ERROR = 25.0, 300.0
-#: Samples of the direction to an environment, and of the collision for each other emitter, that a
-#: camera sample takes.
+#: Number of direction samples of an environment, and of collision samples for each other emitter,
+#: per camera sample.
 ENVIRONMENT_SAMPLES, EMITTER_SAMPLES = 64, 8
-#: Entries of the table of H(mu) H(mu0) along each axis, equidistant in the roots of the cosines:
+#: Number of entries of the table of H(mu) H(mu0) along each axis, equidistant in sqrt(mu):
 #: H has a logarithmic singularity at mu = 0.
 TABLE = 64
-#: Points of Gauss-Legendre quadrature for the integral over x.
+#: Number of Gauss-Legendre nodes for the integral over x.
 POINTS = 128
-#: Orders of scattering up to which a series is summed.
+#: Maximum number of orders of scattering for which the series is summed.
 MOST_ORDERS = 200
 #: Additive constants of a three-dimensional Kronecker sequence (Roberts 2018).
 SEQUENCE = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
 
 
 def series_error(medium: MediumGrid) -> float:
-    """Estimated error [%] of higher orders of scattering from the half-space; infinite where the
-    medium is not of the kind that this module is for.
+    """Estimate the error [%] of the half-space approximation of higher orders of scattering.
+
+    It is infinite for media that this module does not support.
     """
     if not medium.homogeneous or medium.bbox is not None:
         return np.inf
@@ -67,16 +69,16 @@ def series_error(medium: MediumGrid) -> float:
 
 
 def is_seen_from_outside(scene: mi.Scene, medium: MediumGrid) -> bool:
-    """Whether neither a sensor nor a point-like emitter of the scene is inside of ``medium``."""
+    """Whether all sensors and point-like emitters of the scene are outside of ``medium``."""
     inside = [medium.boundary.contains(position_of(e)) for e in point_lights(scene)]
     return not any(inside) and all(s.get_medium() is None for s in scene.sensors())
 
 
 class HalfSpace:
-    """Scattered radiance of ``medium``, opaque and homogeneous, seen from outside, in a scene with
-    nothing else but emitters that are far away or points.
+    """Scattered radiance of an opaque homogeneous ``medium`` seen from outside.
 
-    ``max_depth`` is the integrator's: 2 for single scattering, -1 for all orders.
+    The scene contains nothing else but distant and point-like emitters. ``max_depth`` is that of
+    the integrator: 2 for single scattering, -1 for all orders.
     """
 
     # docs/primer, eq. (2.7)
@@ -96,8 +98,8 @@ class HalfSpace:
     def radiance(
         self, ray: mi.Ray3f, near: mi.Float, far: mi.Float, sampler: mi.Sampler, active: mi.Bool
     ) -> mi.Spectrum:
-        """Radiance scattered towards the origin of ``ray``, which crosses the medium from ``near``
-        to ``far``.
+        """Estimate the radiance scattered towards the origin of ``ray``, which intersects the
+        medium from ``near`` to ``far``.
         """
         shift = mi.Vector3f([sampler.next_1d(active) for _ in range(3)])
         total = mi.Spectrum(0)
@@ -118,7 +120,7 @@ class HalfSpace:
         count: mi.UInt32,
         active: mi.Bool,
     ):
-        """Radiance due to one emitter, the mean of ``count`` samples of a rank-1 sequence."""
+        """Estimate the radiance due to one emitter: the mean of ``count`` samples."""
         active = mi.Bool(active) & (near < far)
         entry = ray(near)
         normal = self.medium.boundary.outward_normal(entry)
@@ -150,8 +152,8 @@ class HalfSpace:
         u: mi.Vector3f,
         active: mi.Bool,
     ) -> mi.Spectrum:
-        """A sample of single scattering: a collision in proportion to T sigma_t for each channel of
-        the extinction, and the exact transmittance of the way from the emitter.
+        """Sample single scattering: a collision with density proportional to T sigma_t for each
+        channel of the extinction, and the exact transmittance to the emitter.
         """
         sigma_t, found = self.medium.sigma_t.value, []
         vertex = dr.zeros(mi.Interaction3f)
@@ -167,7 +169,7 @@ class HalfSpace:
         return mi.Spectrum([part[c] for c, part in enumerate(found)])
 
     def _looked_up(self, mu: mi.Float, mu0: mi.Float, active: mi.Bool) -> mi.Spectrum:
-        """H(mu) H(mu0) - 1, bilinear in the roots of the cosines."""
+        """Look up H(mu) H(mu0) - 1, interpolated bilinearly in the roots of the cosines."""
         x, y = (dr.sqrt(c) * (TABLE - 1) for c in (mu, mu0))
         i, j = (dr.minimum(mi.UInt32(v), TABLE - 2) for v in (x, y))
         wx, wy = x - mi.Float(i), y - mi.Float(j)
@@ -185,7 +187,7 @@ def _channels(value: mi.Float | mi.Color3f) -> np.ndarray:
 
 
 def _higher_orders(albedo: float, orders: int) -> np.ndarray:
-    """H(mu) H(mu0) - 1 at the table's cosines; up to so many ``orders`` of scattering, 0: all."""
+    """Tabulate H(mu) H(mu0) - 1 up to this number of ``orders`` of scattering (0: all)."""
     mu = (np.arange(TABLE) / (TABLE - 1)) ** 2
     if not orders:
         h = chandrasekhar_h(albedo, mu)
@@ -198,7 +200,7 @@ def _higher_orders(albedo: float, orders: int) -> np.ndarray:
 
 
 def chandrasekhar_h(albedo: float, mu: np.ndarray) -> np.ndarray:
-    """H(mu) of a half-space that scatters isotropically, to 1e-9.
+    """Compute H(mu) of an isotropically scattering half-space to 1e-9.
 
     Iterates 1 / H(mu) = sqrt(1 - omega) + omega / 2 int_0^1 x H(x) / (mu + x) dx, which converges
     also for the albedo 1 (Chandrasekhar 1950, section 38).
@@ -209,7 +211,7 @@ def chandrasekhar_h(albedo: float, mu: np.ndarray) -> np.ndarray:
     h, floor = np.ones(POINTS), np.sqrt(max(1 - albedo, 0))
     for _ in range(10000):
         before, h = h, 1 / (floor + kernel @ h)
-        # Two iterates lie on both sides of the solution.
+        # Successive iterates lie on both sides of the solution.
         h = np.sqrt(before * h)
         if np.abs(h / before - 1).max() < 1e-10:
             break
@@ -217,7 +219,7 @@ def chandrasekhar_h(albedo: float, mu: np.ndarray) -> np.ndarray:
 
 
 def _series(mu: np.ndarray, orders: int) -> list[np.ndarray]:
-    """Coefficients of H(mu) as a power series in the albedo, as many as ``orders``."""
+    """Compute the first ``orders`` coefficients of H(mu) as a power series in the albedo."""
     x, weights = _quadrature()
     places = np.concatenate([x, mu])
     kernel = 0.5 * weights * places[:, None] / np.maximum(places[:, None] + x, 1e-300)
@@ -229,7 +231,7 @@ def _series(mu: np.ndarray, orders: int) -> list[np.ndarray]:
 
 
 def _quadrature() -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre points and weights over [0, 1], denser towards 0 by x = s^2."""
+    """Return Gauss-Legendre nodes and weights on [0, 1], denser towards 0 by x = s^2."""
     s, weights = np.polynomial.legendre.leggauss(POINTS)
     s = 0.5 * (s + 1)
     return s**2, weights * s

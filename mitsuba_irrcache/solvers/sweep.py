@@ -13,7 +13,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
-from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, least_batch
+from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, minimum_batch
 from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.grid_size import TARGET_ERROR, SizeRule, choose_grid
 
@@ -92,8 +92,8 @@ class SweepSolver(Solver):
     def batch_size(
         cls, medium: MediumGrid, max_depth: int, samples: int, basis: AngularBasis | None
     ) -> int:
-        least = sn_solver.BATCH if basis is None else least_batch(basis.order)
-        return sn_solver.batch_of(samples, least)
+        multiple = sn_solver.BATCH if basis is None else minimum_batch(basis.order)
+        return sn_solver.batch_of(samples, multiple)
 
     @classmethod
     def numbers_per_voxel(

@@ -30,7 +30,7 @@ MAX_SURVIVAL = 0.95
 
 
 class Media(Immutable):
-    """The media of a scene. Rays know the medium they are in by Mitsuba's pointer; null is none."""
+    """Media of a scene. Mitsuba's pointer identifies the medium of a ray; null is no medium."""
 
     def __init__(self, grids: Sequence[MediumGrid]) -> None:
         self.grids = tuple(grids)
@@ -43,14 +43,15 @@ class Media(Immutable):
 
     @classmethod
     def around(cls, medium: MediumGrid) -> Media:
-        """The media of its scene for paths that end in ``medium``, whose radiance is known, and in
-        no other one: there light scattered into forward peaks counts as scattered.
+        """Return the media of the scene for paths that end in ``medium``, whose radiance is cached.
+
+        Delta-M scaling applies to ``medium`` only; the other media are unscaled.
         """
         before, after = medium.others[: medium.number], medium.others[medium.number :]
         return cls([*before, medium, *after])
 
     def pointer_of(self, number: mi.UInt32) -> mi.MediumPtr:
-        """Mitsuba's medium with this number: 1 for the first one, 0 for none."""
+        """Return Mitsuba's medium with this number: 1 for the first one, 0 for none."""
         pointer = dr.zeros(mi.MediumPtr, dr.width(number))
         for i, grid in enumerate(self.grids):
             pointer = dr.select(number == i + 1, grid.pointer, pointer)
@@ -221,7 +222,7 @@ def sample_emitter(
     return record, dr.select(active_em, radiance * attenuation, 0), rng
 
 
-class Start:
+class PathStart:
     """Initial state of paths: a ray, its medium, and how it was sampled.
 
     ``depth`` is the number of preceding vertices. ``pdf`` is the density of the ray's direction if
@@ -241,7 +242,7 @@ class Start:
         self.depth, self.pdf, self.clear = depth, pdf, clear
 
 
-class End:
+class PathEnd:
     """Final state of paths that end in a medium whose radiance is known.
 
     Position, direction and medium of the collision, and the path throughput ``weight`` including
@@ -258,7 +259,7 @@ class End:
 def trace(
     scene: mi.Scene,
     media: Media,
-    start: Start,
+    start: PathStart,
     max_depth: mi.UInt32,
     rr_depth: mi.UInt32,
     hide_emitters: bool,
@@ -269,7 +270,7 @@ def trace(
     """Trace one path per lane.
 
     Returns the radiance received directly from emitters and emissive media, the scattered radiance,
-    whether any interaction occurred, the path's `End`, and the random number generator.
+    whether any interaction occurred, the path's `PathEnd`, and the random number generator.
 
     ``known`` is an optional predicate that selects media whose radiance is known; paths end with
     their first collision in such a medium.
@@ -386,7 +387,7 @@ def trace(
         interacted |= is_vertex
         crossings += 1
         active &= (collided | surface) & (depth < max_depth) & (crossings < MOST_CROSSINGS)
-    end = End(end_position, end_direction, end_medium, end_throughput)
+    end = PathEnd(end_position, end_direction, end_medium, end_throughput)
     return direct, scattered, interacted, end, rng
 
 

@@ -40,13 +40,13 @@ class Seen:
         self,
         scene: mi.Scene,
         parts: list[CachedMedium],
-        sight: ClosedFormCameraRays | TracedCameraRays,
+        camera_rays: ClosedFormCameraRays | TracedCameraRays,
         layered: bool,
     ) -> None:
-        self.scene, self.sight, self.layered = scene, sight, layered
+        self.scene, self.camera_rays, self.layered = scene, camera_rays, layered
         self._parts = parts
-        one = isinstance(sight, ClosedFormCameraRays)
-        self._projections = [sight.projection] if one else sight.projections
+        one = isinstance(camera_rays, ClosedFormCameraRays)
+        self._projections = [camera_rays.projection] if one else camera_rays.projections
         self._steps = [p.step for p in self._projections]
 
     def stride(self, factor: float) -> None:
@@ -181,10 +181,10 @@ class Light:
         if known is None or known[0] != self.revision:
             parts = self.parts if self._coarse is None else [self._coarse]
             s = self.seeing
-            sight = camera_rays_of(
+            camera_rays = camera_rays_of(
                 parts, self.settings, s.hide_emitters, s.quadrature, s.step, layered, with_error
             )
-            known = self.revision, Seen(self.scene, parts, sight, layered)
+            known = self.revision, Seen(self.scene, parts, camera_rays, layered)
             # Release the fields of the previous caches: they are as large as the cache itself.
             self._seen = {k: v for k, v in self._seen.items() if v[0] == self.revision}
             self._seen[key] = known

@@ -141,10 +141,10 @@ class Samples:
         scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in self.size))
         ray = self.camera.rays(at * scale, width / height)
         medium = seen.medium_at(np.array(self.camera.position))
-        view = seen.sight.sample(seen.scene, sampler, ray, medium, mi.Bool(True))
+        view = seen.camera_rays.sample(seen.scene, sampler, ray, medium, mi.Bool(True))
         if seen.layered:
             parts = view.scattered, view.transmittance, view.gathered, view.background
-            values = seen.sight.projection.layers(*parts, mi.Spectrum(1)).channels()
+            values = seen.camera_rays.projection.layers(*parts, mi.Spectrum(1)).channels()
         else:
             values = list(view.scattered + view.background)
         return [value + dr.zeros(mi.Float, len(band)) for value in values]

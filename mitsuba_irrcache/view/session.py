@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError, essence
+from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.light import Light, Seen, Status
@@ -191,7 +191,7 @@ class Session:
             self._light = None
         for window in self._windows:
             window.forget()
-        self._say(message=essence(error))
+        self._say(message=original_message(error))
 
     def _begin(self) -> None:
         scene = self.document.scene()
@@ -216,7 +216,7 @@ class Session:
             light.prepare()
         except Exception as error:
             self.document.restore(before)
-            raise IrrcacheError(essence(error)) from error
+            raise IrrcacheError(original_message(error)) from error
         self._light = light
 
     @property

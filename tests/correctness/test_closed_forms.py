@@ -20,7 +20,7 @@ from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.base import SolverTask
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
-from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, least_batch
+from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, minimum_batch
 from mitsuba_irrcache.solvers.path.solver import PathSolver
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -209,7 +209,7 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     solver, least = sn_solver.Sweep, sn_solver.BATCH
     if not medium.phase.is_isotropic:
         moments = AngularBasis(medium.phase, sources_of(scene))
-        solver, least = AnisotropicSweep, least_batch(moments.order)
+        solver, least = AnisotropicSweep, minimum_batch(moments.order)
     batch = sn_solver.batch_of(samples, least)
     count = moments.count if moments else 0
     cache = IrradianceCache(

@@ -481,7 +481,7 @@ def test_no_work_for_unused_filter_and_aovs(scenes, monkeypatch):
         monkeypatch.setattr(irrcache, name, forbidden)
     scene = noisy(scenes, {"cache_spp": 8}, size=6)
     assert scenes.image(scene, spp=1).shape == (6, 6, 3)
-    assert scene.integrator()._sight.projection.channel_count == 0
+    assert scene.integrator()._camera_rays.projection.channel_count == 0
 
 
 def test_aovs_without_errors_compute_none(scenes, monkeypatch):
@@ -492,7 +492,8 @@ def test_aovs_without_errors_compute_none(scenes, monkeypatch):
     scene = noisy(scenes, {"cache_spp": 8, "aovs": "colour,depth", "filter": "fixed"}, size=6)
     scenes.image(scene, spp=1)
     assert scene.integrator().cache.samples == 8
-    assert scene.integrator()._sight.projection.channel_count == 4 * dr.size_v(mi.Spectrum) + 2
+    projection = scene.integrator()._camera_rays.projection
+    assert projection.channel_count == 4 * dr.size_v(mi.Spectrum) + 2
 
 
 def test_mono(mono, scenes):

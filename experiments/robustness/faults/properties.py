@@ -13,7 +13,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from experiments.robustness.faults.fuzz import files_here, own_folder
-from mitsuba_irrcache.errors import IrrcacheError, essence
+from mitsuba_irrcache.errors import IrrcacheError, original_message
 
 #: Limits that make rendering fast whatever else is changed.
 VALID = {"solver": "sweep", "resolution": 4, "cache_spp": 32, "timeout": 0.5}
@@ -97,8 +97,8 @@ def _render(case: dict) -> None:
             built = scene(properties, Matter())
         image = np.array(mi.render(built, spp=1))
     except (RuntimeError, TypeError, ValueError) as error:
-        if isinstance(error, IrrcacheError) or _names(essence(error), properties):
-            raise IrrcacheError(essence(error)) from error
+        if isinstance(error, IrrcacheError) or _names(original_message(error), properties):
+            raise IrrcacheError(original_message(error)) from error
         raise
     if not np.isfinite(image).all():
         raise AssertionError(f"the picture is not finite: {properties}")

@@ -42,8 +42,8 @@ MUTANTS = (
     Mutant(
         "cache voxels shifted by half a voxel",
         "grids/grid.py",
-        "*self.places(index)) + 0.5)",
-        "*self.places(index)))",
+        "*self.voxel_indices(index)) + 0.5)",
+        "*self.voxel_indices(index)))",
         (CLOSED_FORMS,),
     ),
     Mutant(
@@ -140,8 +140,8 @@ MUTANTS = (
     Mutant(
         "the curvature of a segment with the wrong sign",
         "render/quadrature.py",
-        "greatest(1 - sag, 0)",
-        "greatest(1 + sag, 0)",
+        "maximum(1 - sag, 0)",
+        "maximum(1 + sag, 0)",
         (PROJECTION,),
     ),
     Mutant(

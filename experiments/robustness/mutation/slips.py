@@ -50,7 +50,7 @@ SLIPS = (
     Mutant(
         "lines that begin next to a side pass half a slice at least (lines)",
         "solvers/discrete_ordinates/kernel.py",
-        "dr.select(voxel == self.entry, least(nearest, 0.5), 0.5)",
+        "dr.select(voxel == self.entry, minimum(nearest, 0.5), 0.5)",
         "dr.select(voxel == self.entry, dr.maximum(nearest, 0.5), 0.5)",
         (LATTICE,),
     ),
@@ -125,10 +125,10 @@ SLIPS = (
         ("tests/unit/solvers/discrete_ordinates/test_direct_light.py",),
     ),
     Mutant(
-        "places pushed away from lamps from where they are (lamps)",
+        "sample points moved away from emitters relative to themselves (falloff)",
         "lights/falloff.py",
-        "lamp + self._least * away, p)",
-        "p + self._least * away, p)",
+        "lamp + self._minimum_distance * away, p",
+        "p + self._minimum_distance * away, p",
         ("tests/unit/lights/test_voxel_sample_points.py",),
     ),
     Mutant(
@@ -188,14 +188,14 @@ SLIPS = (
         ("tests/unit/render/test_quadrature_of_emission.py",),
     ),
     Mutant(
-        "behind a null surface a medium is seen from the camera on (sight)",
+        "behind a null surface a medium is seen from the camera on (camera rays)",
         "render/camera.py",
         "            near = dr.select(crosses, far, near)\n",
         "",
         ("tests/unit/render/test_camera_null_surfaces.py",),
     ),
     Mutant(
-        "depth of media behind others as if these were clear (sight)",
+        "depth of media behind others as if these were clear (camera rays)",
         "render/camera.py",
         "old + scale * new for",
         "old + new for",

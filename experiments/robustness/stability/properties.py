@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.errors import essence
+from mitsuba_irrcache.errors import original_message
 
 
 @dataclass(frozen=True)
@@ -170,5 +170,5 @@ def refusal(action: Callable[[], object]) -> str:
     try:
         action()
     except (RuntimeError, ValueError) as error:
-        return essence(error) or type(error).__name__
+        return original_message(error) or type(error).__name__
     return ""

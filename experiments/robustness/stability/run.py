@@ -22,7 +22,7 @@ from experiments.robustness.stability.case import Case, clear
 from experiments.robustness.stability.hazards import cases
 from mitsuba_irrcache.compare.results import write_json
 from mitsuba_irrcache.compare.tables import Table
-from mitsuba_irrcache.errors import essence
+from mitsuba_irrcache.errors import original_message
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.render.quadrature import QUADRATURES
 
@@ -65,7 +65,7 @@ def run_case(case: Case, variant: str, quadratures: Sequence[str] = QUADRATURES)
             try:
                 verdicts = case.judge({"solver": solver, "quadrature": quadrature})
             except Exception as error:  # any exception is a failure of this case
-                verdicts = [(f"raised {type(error).__name__}: {essence(error)}", 1.0, 0.0)]
+                verdicts = [(f"raised {type(error).__name__}: {original_message(error)}", 1.0, 0.0)]
             about = {"hazard": case.hazard, "case": case.name, "variant": variant}
             about |= {"solver": solver, "quadrature": quadrature}
             for name, error, admitted in verdicts:

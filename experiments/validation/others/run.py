@@ -29,7 +29,7 @@ from experiments.support.options import Options, parse
 from experiments.support.scenes import DATA
 from experiments.support.store import Store
 from mitsuba_irrcache.compare import metrics
-from mitsuba_irrcache.errors import IrrcacheError, essence, origin
+from mitsuba_irrcache.errors import IrrcacheError, origin, original_message
 from mitsuba_irrcache.io.scene_files import load_scene
 
 SUITE = DATA / "scenes" / "mitsuba-data" / "tests" / "scenes" / "participating_media"
@@ -118,7 +118,7 @@ def compute(name: str, scene: Scene, options: Options) -> dict:
         except (IrrcacheError, RuntimeError) as error:
             if not isinstance(origin(error), IrrcacheError):
                 raise
-            return {"refused": essence(error)}
+            return {"refused": original_message(error)}
     return row
 
 

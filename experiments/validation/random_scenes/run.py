@@ -44,7 +44,7 @@ from experiments.support.store import Store
 from experiments.validation.random_scenes.generate import RandomScene
 from mitsuba_irrcache.compare.metrics import block_means, colours, net_rmse
 from mitsuba_irrcache.compare.tables import Table
-from mitsuba_irrcache.errors import IrrcacheError, essence, origin
+from mitsuba_irrcache.errors import IrrcacheError, origin, original_message
 
 #: Samples per pixel of an image by irrcache, of the pilot's images, and their number.
 SPP, PILOT_SPP, PILOTS = 128, 16, 4
@@ -97,7 +97,11 @@ def ours_of(case: RandomScene, folder: Path) -> dict:
             found.setdefault("seconds", time.perf_counter() - started)
     except Exception as error:  # any exception that a user would see
         refused = isinstance(origin(error), IrrcacheError)
-        return {"failed": essence(error), "refused": refused, "kind": type(origin(error)).__name__}
+        return {
+            "failed": original_message(error),
+            "refused": refused,
+            "kind": type(origin(error)).__name__,
+        }
     builder = scene.integrator()._builder
     solved = any(part.cache is not None for part in builder.parts)
     return found | {"solver": builder.solver if solved else "none"}

@@ -54,7 +54,7 @@ class AndersonAcceleration:
 
 
 def accelerated(history: list, channel: int) -> np.ndarray:
-    """The combination of images with the least residual, in one channel of a short history of
+    """The combination of images with the smallest residual, in one channel of a short history of
     points and their images: acceleration of any depth, for small arrays.
     """
     points, images = (np.array([x[channel] for x in xs]) for xs in zip(*history, strict=True))

@@ -26,8 +26,8 @@ def directions_of(order: int) -> int:
     return DIRECTIONS if order <= 4 else MORE_DIRECTIONS
 
 
-def least_batch(order: int) -> int:
-    """The least ordinates of a batch for moments up to ``order``: those of two passes."""
+def minimum_batch(order: int) -> int:
+    """Minimum number of ordinates in a batch for moments up to ``order``: those of two passes."""
     return 2 * directions_of(order)
 
 

@@ -31,7 +31,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
-from mitsuba_irrcache.transport.path import Media, Start, trace, trace_to_infinity
+from mitsuba_irrcache.transport.path import Media, PathStart, trace, trace_to_infinity
 
 #: Cells of an ordinate, at most about: a path is traced for one track in each; rays that only test
 #: the visibility of emitters are cheaper. Radiance from surfaces varies more from one direction to
@@ -42,7 +42,7 @@ INSET = 1e-3
 #: Parameters of an ordinate that the kernel reads, see `IncomingRadiance._parameters`.
 _INTEGERS = ("first", "width", "axis", "axis_b")
 _REALS = (
-    "x", "y", "z", "slope_b", "slope_c", "least_b", "least_c", "size_b", "size_c", "slices",
+    "x", "y", "z", "slope_b", "slope_c", "lowest_b", "lowest_c", "size_b", "size_c", "slices",
     "edge", "weight",
 )  # fmt: skip
 
@@ -201,9 +201,9 @@ class IncomingRadiance:
         length = geometry.sizes[:, 2:]
         # The first slice passes the middle of the first voxels.
         moved = np.stack([-0.5 * geometry.slopes, (length - 0.5) * geometry.slopes])
-        self._least = np.floor(-geometry.starts - moved.max(axis=0))
+        self._lowest = np.floor(-geometry.starts - moved.max(axis=0))
         last = np.ceil(geometry.sizes[:, :2] - geometry.starts - moved.min(axis=0))
-        count = last - self._least + 1
+        count = last - self._lowest + 1
         self._edge = np.maximum(1, np.ceil(np.sqrt(count.prod(axis=1) / most)))
         self._sides = np.ceil(count / self._edge[:, None]).astype(np.int64)
         self._ends = np.cumsum(2 * self._sides.prod(axis=1))
@@ -221,7 +221,7 @@ class IncomingRadiance:
         axes = [geometry.axis, geometry.transverse[:, 0]]
         integers = np.column_stack([self._first, self._sides[:, 0], *axes])
         sign = np.where(geometry.forward, 1.0, -1.0)
-        columns = [sign[:, None] * directions, geometry.slopes, geometry.starts + self._least]
+        columns = [sign[:, None] * directions, geometry.slopes, geometry.starts + self._lowest]
         reals = np.column_stack([*columns, geometry.sizes, self._edge, weights])
         forward = geometry.forward[:, None, None]
         ways = [np.where(forward, part, part[:, ::-1]).ravel().tolist() for part in parts]
@@ -253,7 +253,7 @@ class IncomingRadiance:
         # Coordinate 0 in the first slice of the finest grid, seen from the coarser one.
         ahead = (lower[geometry.axis] + 0.5) / ratio - tracks.lower[geometry.axis] - 0.5
         shifts = ratio * (tracks.lower[across] + geometry.slopes * ahead[n, None]) - lower[across]
-        shifts = shifts - self._geometry.starts[numbers] - self._least[numbers] + 0.5
+        shifts = shifts - self._geometry.starts[numbers] - self._lowest[numbers] + 0.5
         edge = self._edge[numbers, None]
         transforms = np.hstack([ratio / edge, shifts / edge, geometry.slopes])
         return transforms, np.column_stack([self._first[numbers], self._sides[numbers]])
@@ -299,8 +299,8 @@ def _sample_track(read, cell_b, cell_c, rng):
     k, found = mi.Float(0), mi.Float(0)
     while dr.hint(k < read.edge * read.edge, label="tracks of a cell"):
         row = dr.floor(k / read.edge)
-        at_b = read.least_b + cell_b * read.edge + (k - row * read.edge)
-        at_c = read.least_c + cell_c * read.edge + row
+        at_b = read.lowest_b + cell_b * read.edge + (k - row * read.edge)
+        at_c = read.lowest_c + cell_c * read.edge + row
         begin, end = mi.Float(0), mi.Float(read.slices)
         begin, end = _clipped(begin, end, at_b, read.slope_b, read.size_b)
         begin, end = _clipped(begin, end, at_c, read.slope_c, read.size_c)
@@ -323,7 +323,7 @@ def _clipped(begin, end, at, slope, size) -> tuple[mi.Float, mi.Float]:
 def _coarse_voxels(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
     """The voxels of a coarser grid of the hierarchy that contain those of the fine one."""
     ratio = Divisor(round((coarse.voxel_size / fine.voxel_size)[0]))
-    result = coarse.index(*(ratio.split(place)[0] for place in fine.places(voxel)))
+    result = coarse.index(*(ratio.split(place)[0] for place in fine.voxel_indices(voxel)))
     dr.eval(result)
     return result
 
@@ -353,7 +353,7 @@ def _trace_cells(
     emitted, reflected, voxel = sum(unscattered), mi.Spectrum(0), mi.UInt32(0)
     direction = mi.Vector3f(0, 0, 1)
     if paths:
-        begin = Start(ray, pointer, depth=1, pdf=0.0, clear=pointer == boundary.pointer)
+        begin = PathStart(ray, pointer, depth=1, pdf=0.0, clear=pointer == boundary.pointer)
         _, scattered, _, end, _ = trace(
             boundary.scene, boundary.media, begin, boundary.max_depth, boundary.rr_depth, False,
             rng, hit & (weight > 0), lambda medium: medium == boundary.pointer,

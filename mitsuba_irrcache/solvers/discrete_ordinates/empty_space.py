@@ -59,7 +59,7 @@ def _occupied_cells(
     _, ny, nx = (dr.opaque(mi.UInt32, n) for n in shape)
     occupied = dr.opaque(mi.UInt32, 0, int(np.prod(shape)))
     first = [dr.opaque(mi.UInt32, int(n)) for n in lower]
-    x, y, z = ((a - n) // CELL for a, n in zip(grid.places(needed), first, strict=True))
+    x, y, z = ((a - n) // CELL for a, n in zip(grid.voxel_indices(needed), first, strict=True))
     dr.scatter(occupied, mi.UInt32(1), (z * ny + y) * nx + x)
     return occupied
 

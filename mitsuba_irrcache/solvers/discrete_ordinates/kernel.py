@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import absorbed, clipped, decay, least
+from mitsuba_irrcache.core.fast_math import absorbed, clipped, decay, minimum
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import CELL
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
@@ -145,7 +145,7 @@ class _TransverseMotion:
     def start(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
         """Slices since entry in the first slice: half of one, or less through a side."""
         nearest = self.since_entry(position)
-        return dr.select(voxel == self.entry, least(nearest, 0.5), 0.5)
+        return dr.select(voxel == self.entry, minimum(nearest, 0.5), 0.5)
 
     def advance(self, voxel: mi.Int32, position: mi.Int32, slices: mi.Int32 | int) -> tuple:
         """Voxel and position after some ``slices``, and the slices since entry: 1 unless new."""
@@ -210,7 +210,7 @@ class _Way:
             position_c=position_c,
             offset=offset,
             extinction_offset=extinction_offset,
-            since_entry=least(self.b.start(b, position_b), self.c.start(c, position_c)),
+            since_entry=minimum(self.b.start(b, position_b), self.c.start(c, position_c)),
             radiance=[mi.Float(0) for _ in range(channels)],
             previous=mi.Float(0),
             crossed=mi.Int32(0),
@@ -236,7 +236,7 @@ class _Way:
             extinction_offset=state.extinction_offset - extinction_step
             if self.number
             else state.extinction_offset + extinction_step,
-            since_entry=least(since_c, since_b),
+            since_entry=minimum(since_c, since_b),
             radiance=radiance,
             previous=previous,
             crossed=crossed,

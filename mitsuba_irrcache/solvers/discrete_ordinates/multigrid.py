@@ -119,7 +119,7 @@ class MultigridLevel:
         """Along x, y, z the two voxels of a ``coarse`` grid around each ``voxel``, and the weight
         of the upper.
         """
-        axes, places = [], self.grid.places(voxel)
+        axes, places = [], self.grid.voxel_indices(voxel)
         for at, n, sides in zip(places, self._ratio, coarse.sides, strict=True):
             lower, weight, more = stencil((mi.Float(at) + 0.5) * dr.opaque(mi.Float, 1 / n), sides)
             axes.append(((lower, lower + dr.select(more, 1, 0)), weight))
@@ -357,7 +357,7 @@ def _children_of(fine: Grid, coarse: Grid, ratio: np.ndarray) -> list[tuple[mi.U
     """For each position of a fine voxel within a coarse one: the fine voxels there, and whether
     they exist.
     """
-    at = coarse.places(dr.arange(mi.UInt32, coarse.voxel_count))
+    at = coarse.voxel_indices(dr.arange(mi.UInt32, coarse.voxel_count))
     nx, ny, nz = (int(n) for n in fine.resolution)
     result = []
     for steps in np.ndindex(*(int(n) for n in ratio[::-1])):

@@ -75,7 +75,7 @@ def collision_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[
 def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
     """Means over blocks of so many voxels (x, y, z), which are the voxels of ``grid``."""
     sums: list = [0.0] * field.channels
-    at = grid.places(dr.arange(mi.UInt32, grid.voxel_count))
+    at = grid.voxel_indices(dr.arange(mi.UInt32, grid.voxel_count))
     for dz, dy, dx in np.ndindex(*block[::-1]):
         voxel = (a * int(n) + d for a, n, d in zip(at, block, (dx, dy, dz), strict=True))
         place = field.grid.index(*voxel) * field.channels
@@ -89,7 +89,7 @@ def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
 @symbolic
 def _mean(medium, field, grid, index, points: int, cut: bool):
     """Means over points^3 positions in the voxels ``index``."""
-    corner, sides = mi.Point3f(*grid.places(index)), [Divisor(points)] * 2
+    corner, sides = mi.Point3f(*grid.voxel_indices(index)), [Divisor(points)] * 2
     points, count = dr.opaque(mi.Float, points), dr.opaque(mi.UInt32, points**3)
     sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
     k = mi.UInt32(0)
@@ -112,7 +112,7 @@ def _extinction_weighted_albedo(medium, grid, index, parts: int, cut: bool):
     ``parts`` along each axis.
     """
     channels = max(medium.albedo.channels, medium.sigma_t.channels)
-    corner, sides = mi.Point3f(*grid.places(index)), [Divisor(3 * parts)] * 2
+    corner, sides = mi.Point3f(*grid.voxel_indices(index)), [Divisor(3 * parts)] * 2
     parts, count = dr.opaque(mi.Float, parts), dr.opaque(mi.UInt32, (3 * parts) ** 3)
     scattered = [dr.zeros(mi.Float, dr.width(index)) for _ in range(channels)]
     collided = [dr.zeros(mi.Float, dr.width(index)) for _ in range(channels)]

@@ -69,12 +69,12 @@ def swept_together(medium: MediumGrid, voxels: int) -> bool:
     return isotropic and medium.sigma_t.channels == 1 and voxels <= TOGETHER
 
 
-def batch_of(samples: int, least: int) -> int:
+def batch_of(samples: int, multiple: int) -> int:
     """The ordinates of a batch of a cache of so many: all of them, or equal parts if there are too
-    many, in multiples of ``least``. Each batch solves for all orders anew.
+    many, a multiple of ``multiple``. Each batch solves for all orders anew.
     """
     batches = -(-samples // LARGEST_BATCH)
-    return -(-samples // (batches * least)) * least
+    return -(-samples // (batches * multiple)) * multiple
 
 
 class Sweep:
@@ -441,6 +441,6 @@ def is_grey(spectra: Sequence[mi.Spectrum]) -> bool:
 
 def occupied_box(grid: Grid, active: mi.UInt32) -> tuple[np.ndarray, np.ndarray]:
     """The smallest box of voxels (x, y, z; lower end, upper end) around all ``active`` ones."""
-    ends = [(dr.min(p), dr.max(p)) for p in grid.places(active)]
+    ends = [(dr.min(p), dr.max(p)) for p in grid.voxel_indices(active)]
     dr.eval(ends)
     return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])

@@ -389,7 +389,7 @@ def values_at_centres(
     slices from ``begin`` on, have several ``channels``, of which one is taken.
     """
     # docs/primer, eq. (4.5)
-    places, strides = grid.places(index), strides_of(grid.resolution, slicewise(axis))
+    places, strides = grid.voxel_indices(index), strides_of(grid.resolution, slicewise(axis))
     place = flat_index(places, strides) + begin
 
     def read(i: mi.UInt32, active: mi.Bool | bool = True) -> mi.Float:

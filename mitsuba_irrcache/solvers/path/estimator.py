@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.transport.path import Media, Start, power_heuristic, sample_emitter, trace
+from mitsuba_irrcache.transport.path import Media, PathStart, power_heuristic, sample_emitter, trace
 
 
 def contributions(
@@ -43,7 +43,7 @@ def contributions(
     for emitter in excluded:
         light = dr.select(record.emitter == emitter, 0, light)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
-    start = Start(mi.Ray3f(position, direction), pointer, depth=1, pdf=dr.inv_four_pi)
+    start = PathStart(mi.Ray3f(position, direction), pointer, depth=1, pdf=dr.inv_four_pi)
     uncollided, scattered, *_ = trace(scene, media, start, max_depth, rr_depth, False, rng, always)
     sphere = 4 * dr.pi
     return [

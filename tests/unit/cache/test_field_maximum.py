@@ -23,7 +23,7 @@ def test_maximum_bounds_all_lookups(lamp, correlated):
     falloff = InverseSquareFactor.of(mi.load_dict({"type": "scene", "lamp": light}), grid)
     interpolation = Interpolation(falloff=falloff)
     cache = IrradianceCache(grid, voxels, 1, -1, correlated=correlated, interpolation=interpolation)
-    places = cache.falloff.places.of(voxels)
+    places = cache.falloff.sample_points.of(voxels)
     way = np.array(places, np.float64) - np.array(lamp)[:, None]
     phi = 3 / np.sum(way**2, axis=0)
     cache.add(0, 2 * BATCH, [((cache.real(2 * phi), None), (cache.real(0 * phi),))])

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mitsuba_irrcache.core.fast_math import clipped, decay, greatest, least
+from mitsuba_irrcache.core.fast_math import clipped, decay, maximum, minimum
 from mitsuba_irrcache.core.jit import Divisor, unravelled
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -66,6 +66,6 @@ def test_decay():
 
 def test_extremes():
     a, b = mi.Float([1.0, 2.0, -0.0, np.inf]), mi.Float([2.0, 1.0, 0.0, 3.0])
-    np.testing.assert_array_equal(least(a, b), [1, 1, 0, 3])
-    np.testing.assert_array_equal(greatest(a, b), [2, 2, 0, np.inf])
+    np.testing.assert_array_equal(minimum(a, b), [1, 1, 0, 3])
+    np.testing.assert_array_equal(maximum(a, b), [2, 2, 0, np.inf])
     np.testing.assert_array_equal(clipped(a, -1.0, 1.5), [1, 1.5, 0, 1.5])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import LEAST, VoxelSamplePoints
+from mitsuba_irrcache.lights.falloff import MINIMUM_DISTANCE, VoxelSamplePoints
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -26,7 +26,7 @@ def test_sample_points_are_moved_away_from_lights(scenes, aside):
     found = np.array(
         VoxelSamplePoints(mi.load_dict({"type": "scene", "l": light}), grid).of(index)
     ).T
-    least = LEAST * grid.voxel_size.min()
+    least = MINIMUM_DISTANCE * grid.voxel_size.min()
     before, after = (np.linalg.norm(p - lamp, axis=1) for p in (centres, found))
     near = before < least
     assert near.sum() == (aside < least)
