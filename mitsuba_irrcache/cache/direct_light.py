@@ -63,28 +63,23 @@ class DirectLight:
         self.emitter, self._medium = emitter, medium
         self.distant = self._kind is EmitterKind.SUN
         p = VoxelSamplePoints(scene, grid).of(voxels)
-        ray, near, far = self._way(p)
+        self._grid, self._voxels, self._centres = grid, voxels, p
+        line = _, near, far = self._line(p)
         length, sigma_t = dr.maximum(far - near, 0), medium.sigma_t.at_world(p)
-        depth = optical_depth(medium, ray, near, far, length > 0, dr.inf)
+        depth, self._passed = self._attenuation(scene, p, line)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
         #: mean extinction on the line to the emitter, for lookups
-        self.extinction = _on_grid(grid, voxels, mean, survey)
+        self.extinction = self._field_of_extinction(mean, survey)
         # transmittance of surfaces and other media at the voxels; None without any
-        self._others: RootField | None = None
-        passed = mi.Spectrum(1)
-        if medium.is_traced:
-            position = [dr.opaque(mi.Float, float(v)) for v in position_of(emitter)]
-            passed = _past_others(scene, medium, p, mi.Point3f(position))
-            dr.eval(passed)
-            self._others = _root_field(grid, voxels, passed, survey)
-        self._passed, self._grid, self._voxels, self._centres = passed, grid, voxels, p
+        self._others = self._field_of_others(self._passed, survey) if medium.is_traced else None
         self._means: mi.Spectrum | None = None
         # E at the voxel centres; for a spot light, which may be narrower, its means over the voxels
         self._unobstructed = self.unobstructed(p)
         if self._kind in SPOT_LIKE:
             self._unobstructed = self._mean(grid, voxels, POINTS)
         #: irradiance, from E as above
-        self.irradiance = passed * self._unobstructed * mi.Spectrum(dr.exp(-self.depth(p)))
+        self.irradiance = self._passed * self._unobstructed
+        self.irradiance *= mi.Spectrum(dr.exp(-self.depth(p)))
         dr.eval(self.irradiance)
         #: maximum of E for a sun, where it is uniform; 0 for other emitters
         self.maximum = 0.0
@@ -114,24 +109,54 @@ class DirectLight:
 
     def length(self, p: mi.Point3f) -> mi.Float:
         """Return the length in the medium of the line from world positions to the emitter."""
-        _, near, far = self._way(p)
+        _, near, far = self._line(p)
         return dr.maximum(far - near, 0)
 
     def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Return the transmittance of surfaces and other media on that line."""
         return mi.Float(1) if self._others is None else self._others.at_world(p, active)
 
-    def _way(self, p: mi.Point3f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
+    def _attenuation(
+        self, scene: mi.Scene, p: mi.Point3f, line: tuple
+    ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
+        """Return the optical depth of the medium along ``line``, and the transmittance of all else
+        between ``p`` and the emitter.
+        """
+        ray, near, far = line
+        depth = optical_depth(self._medium, ray, near, far, near < far, dr.inf)
+        passed = mi.Spectrum(1)
+        if self._medium.is_traced:
+            position = [dr.opaque(mi.Float, float(v)) for v in position_of(self.emitter)]
+            passed = _past_others(scene, self._medium, p, mi.Point3f(position))
+            dr.eval(passed)
+        return depth, passed
+
+    def _field_of_extinction(
+        self, mean: mi.Float | mi.Color3f, survey: VoxelClasses | None
+    ) -> GridField:
+        """Create the field of the mean extinction."""
+        return _on_grid(self._grid, self._voxels, mean, survey)
+
+    def _field_of_others(self, passed: mi.Spectrum, survey: VoxelClasses | None) -> GridField:
+        """Create the field of the transmittance of all else."""
+        return _root_field(self._grid, self._voxels, passed, survey)
+
+    def _line(self, p: mi.Point3f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
         """Return rays from world positions to the emitter, and the distances at which they enter
         and leave the medium; they do not intersect it unless the first one is smaller.
         """
+        direction, distance = self._direction(p)
+        ray = mi.Ray3f(p, direction)
+        hit, near, far = self._medium.intersect(ray)
+        near, far = dr.maximum(near, 0), dr.minimum(far, distance)
+        return ray, near, dr.select(hit, far, near)
+
+    def _direction(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
+        """Return the direction to the emitter and its distance."""
         at = dr.zeros(mi.Interaction3f, dr.width(p))
         at.p = p
         record, _ = self.emitter.sample_direction(at, mi.Point2f(0.5))
-        ray = mi.Ray3f(p, record.d)
-        hit, near, far = self._medium.intersect(ray)
-        near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
-        return ray, near, dr.select(hit, far, near)
+        return record.d, record.dist
 
     def _mean_unobstructed(self) -> mi.Spectrum:
         """Compute means of E over the voxels."""
@@ -200,7 +225,7 @@ def _on_grid(
     channels = [values] if isinstance(values, mi.Float) else list(values)
     known = dr.zeros(mi.Bool, grid.voxel_count)
     dr.scatter(known, mi.Bool(True), voxels)
-    values, count = _spread(grid, voxels, channels, survey), len(channels)
+    values, count = spread(grid, voxels, channels, survey), len(channels)
     return GridField(grid, unbiased(grid, values, known, count), count)
 
 
@@ -211,10 +236,10 @@ def _root_field(
     channels = [dr.sqrt(c) for c in values]
     if all(dr.all(c == channels[0])[0] for c in channels[1:]):
         channels = channels[:1]
-    return RootField(grid, _spread(grid, voxels, channels, survey), len(channels))
+    return RootField(grid, spread(grid, voxels, channels, survey), len(channels))
 
 
-def _spread(
+def spread(
     grid: Grid, voxels: mi.UInt32, channels: list[mi.Float], survey: VoxelClasses | None
 ) -> mi.Float:
     """Expand values to all voxels of the grid, 0 except at ``voxels`` and inside of surfaces."""

@@ -110,12 +110,12 @@ def boundary_of(scene: mi.Scene, shape: mi.Shape) -> Boundary:
     """
     boundary = None
     if shape.class_name() == "Sphere":
-        boundary = Boundary("sphere", _sphere_frame(shape))
+        boundary = Boundary("sphere", sphere_frame(shape))
     elif shape.is_mesh() and "vertex_positions" in mi.traverse(
         shape
     ):  # rectangles lack this parameter
         vertices = np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64)
-        frame = _box_frame(vertices.reshape(-1, 3))
+        frame = box_frame(vertices.reshape(-1, 3))
         area = float(np.ravel(shape.surface_area())[0])
         # Reject meshes with missing or duplicate faces.
         if frame is not None and abs(_box_area(frame) - area) < 1e-3 * area:
@@ -131,7 +131,7 @@ def boundary_of(scene: mi.Scene, shape: mi.Shape) -> Boundary:
     return boundary
 
 
-def _sphere_frame(shape: mi.Shape) -> np.ndarray:
+def sphere_frame(shape: mi.Shape) -> np.ndarray:
     """Return ``to_world`` of the unit sphere.
 
     Mitsuba's spheres are round whatever ``to_world`` is; the length of its first column is the
@@ -207,7 +207,7 @@ def _check_normals(scene: mi.Scene, shape: mi.Shape, name: str) -> None:
         )
 
 
-def _box_frame(vertices: np.ndarray) -> np.ndarray | None:
+def box_frame(vertices: np.ndarray) -> np.ndarray | None:
     """Return the affine map of [-1, 1]^3 onto the box with these vertices; None if it is no box."""
     size = np.ptp(vertices, axis=0).max()
     tolerance = 1e-5 * size + 4 * np.finfo(np.float32).eps * np.abs(vertices).max()

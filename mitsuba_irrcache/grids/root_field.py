@@ -42,6 +42,48 @@ class RootField(GridField):
     def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         return self.at(self.inner.coordinates.point(p), active)
 
+    @staticmethod
+    def decoded(value: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
+        """Convert an interpolated root to the value of the field."""
+        return dr.square(value)
+
+
+class ExtendedField(GridField):
+    """Values interpolated trilinearly on a grid with an `Extension`.
+
+    Unlike `RootField` it interpolates the values themselves. Beyond the outermost voxel centres
+    they are extrapolated linearly from ``known`` voxels, and clamped to 0; constant without.
+    """
+
+    def __init__(
+        self, grid: Grid, values: mi.Float, channels: int, known: mi.Bool | None = None
+    ) -> None:
+        self.inner, extension = grid, Extension(grid)
+        voxel = dr.arange(mi.UInt32, extension.grid.voxel_count)
+        inside, inwards = extension.inside(voxel), extension.inwards(voxel)
+        extended = dr.zeros(mi.Float, extension.grid.voxel_count * channels)
+        for c in range(channels):
+            value = nearest = dr.gather(mi.Float, values, inside * channels + c)
+            for inner in inwards if known is not None else ():
+                valid = dr.gather(mi.Bool, known, inner)
+                change = nearest - dr.gather(mi.Float, values, inner * channels + c)
+                value += dr.select(valid, change, 0)
+            dr.scatter(extended, dr.maximum(value, 0), voxel * channels + c)
+        dr.eval(extended)
+        super().__init__(extension.grid, extended, channels)
+
+    def at(self, u: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """Interpolate at the voxel coordinates ``u`` of the grid without its extension."""
+        return super().at(u + 1, active)
+
+    def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        return self.at(self.inner.coordinates.point(p), active)
+
+    @staticmethod
+    def decoded(value: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
+        """Convert an interpolated value to that of the field."""
+        return value
+
 
 class Extension:
     """``grid`` with one additional layer of voxels on each side."""

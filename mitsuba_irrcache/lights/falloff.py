@@ -101,7 +101,8 @@ class InverseSquareFactor:
         """Create the factor for emitters near the voxels, except ``others``; None without any."""
         lights = [e for e in point_lights(scene) if e not in others]
         points = [p for e in lights for p in _of_point(e, grid)]
-        points += [p for s in scene.shapes() if s.is_emitter() for p in _of_area(s, grid)]
+        shapes = [s for s in scene.shapes() if s.is_emitter() and s.emitter() not in others]
+        points += [p for s in shapes for p in _of_area(s, grid)]
         points.sort(key=lambda point: -point[1])
         points = points[:MOST_POINTS]
         return cls(VoxelSamplePoints(scene, grid), points) if points else None
@@ -184,7 +185,7 @@ class InverseSquareFactor:
 def _of_point(emitter: mi.Emitter, grid: Grid) -> list[tuple[np.ndarray, float, float]]:
     """Return position, strength and squared radius of a point-like emitter, if it is near."""
     position = position_of(emitter)
-    if _edges_away(position[:, None], grid) > REACH:
+    if edges_away(position[:, None], grid) > REACH:
         return []
     rng = np.random.default_rng(1)
     p = grid.world.point(mi.Point3f(rng.random((3, POSITIONS)) * grid.resolution[:, None]))
@@ -201,7 +202,7 @@ def _of_area(shape: mi.Shape, grid: Grid) -> list[tuple[np.ndarray, float, float
     found = shape.sample_position(0.0, sample)
     area, edge = float(dr.max(shape.surface_area())[0]), float(grid.voxel_size.max())
     positions = np.array(found.p, dtype=np.float64)
-    if np.sqrt(area / np.pi) > LARGEST * edge or _edges_away(positions, grid) > REACH:
+    if np.sqrt(area / np.pi) > LARGEST * edge or edges_away(positions, grid) > REACH:
         return []
     si = dr.zeros(mi.SurfaceInteraction3f, MOST_POINTS)
     si.p, si.n, si.uv, si.wi = found.p, found.n, found.uv, mi.Vector3f(0, 0, 1)
@@ -218,7 +219,7 @@ def _of_area(shape: mi.Shape, grid: Grid) -> list[tuple[np.ndarray, float, float
     ]
 
 
-def _edges_away(positions: np.ndarray, grid: Grid) -> float:
+def edges_away(positions: np.ndarray, grid: Grid) -> float:
     """Return the minimum distance of ``positions`` (3, n) from the box of ``grid``.
 
     The unit is the longest edge of a voxel.

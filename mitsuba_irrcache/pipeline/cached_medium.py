@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.cache.area_light import area_lights_of
 from mitsuba_irrcache.cache.direct_light import direct_lights_of
 from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.volume import IrradianceCache
@@ -192,6 +193,7 @@ class CachedMedium:
         if solver.knows_direct_lights(scene, medium, grid, active):
             dense = border_error(medium, grid) > SMALL_BORDER_ERROR
             direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes)
+            direct_lights += area_lights_of(scene, medium, grid, active, classes)
         falloff = InverseSquareFactor.of(scene, grid, [light.emitter for light in direct_lights])
         interpolation = Interpolation(basis, falloff, direct_lights, classes)
 

@@ -165,12 +165,16 @@ def _check_distance(name: str, distance: float, finest: float) -> None:
 
 
 def media_of(scene: mi.Scene) -> dict[mi.Medium, list[mi.Shape]]:
-    """All media of a scene, each with the shapes whose interior it is."""
+    """Return all media of a scene, each with the shapes that it fills.
+
+    A shape with the same medium on both sides, such as a lamp in fog, does not bound it.
+    """
     found: dict[mi.Medium, list[mi.Shape]] = {}
     for shape in scene.shapes():
         interior, exterior = shape.interior_medium(), shape.exterior_medium()
         if interior is not None:
-            found.setdefault(interior, []).append(shape)
+            filled = found.setdefault(interior, [])
+            filled += [shape] if interior != exterior else []
         if exterior is not None:
             found.setdefault(exterior, [])
     for sensor in scene.sensors():

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.grids.root_field import Extension, RootField
+from mitsuba_irrcache.grids.root_field import ExtendedField, Extension, RootField
 from mitsuba_irrcache.transport.path import is_null
 
 CORNERS = list(itertools.product((0, 1), repeat=3))
@@ -85,7 +85,9 @@ class CutCells:
         return nearest < dr.inf, steps.x, steps.y, steps.z, offset
 
     @symbolic
-    def corrected(self, field: RootField, p: mi.Point3f, phi: mi.Float | mi.Color3f, active):
+    def corrected(
+        self, field: RootField | ExtendedField, p: mi.Point3f, phi: mi.Float | mi.Color3f, active
+    ):
         """``phi``, the value of ``field`` at the world position ``p``; in a cut cell that of the
         voxels on the side of ``p`` alone.
         """
@@ -111,7 +113,7 @@ class CutCells:
 
     def _one_sided(
         self,
-        field: RootField,
+        field: RootField | ExtendedField,
         plane: mi.Vector4f,
         s: mi.Point3f,
         lower: mi.Vector3i,
@@ -133,7 +135,7 @@ class CutCells:
             total += weight * _roots(field, mi.UInt32((place[2] * ny + place[1]) * nx + place[0]))
             weights += weight
         known = weights > 1e-6
-        return dr.select(known, dr.square(total / dr.select(known, weights, 1)), phi)
+        return dr.select(known, field.decoded(total / dr.select(known, weights, 1)), phi)
 
 
 def _corner(index: mi.UInt32) -> mi.Vector3f:
@@ -146,7 +148,7 @@ def _table(end: int) -> mi.UInt32:
     return mi.UInt32([segment[end] for segment in SEGMENTS])
 
 
-def _roots(field: RootField, voxel: mi.UInt32) -> mi.Float | mi.Color3f:
+def _roots(field: RootField | ExtendedField, voxel: mi.UInt32) -> mi.Float | mi.Color3f:
     n = field.channels
     values = [dr.gather(mi.Float, field.data, voxel * n + c) for c in range(n)]
     return values[0] if n == 1 else mi.Color3f(values)

@@ -227,7 +227,8 @@ class PathStart:
 
     ``depth`` is the number of preceding vertices. ``pdf`` is the density of the ray's direction if
     emitters were also sampled at the previous vertex; 0 if not, so that emitters hit by the ray
-    count fully. ``clear`` states that there is no medium before the first surface.
+    count fully. ``clear`` states that there is no medium before the first surface. The radiance of
+    the emitters ``excluded`` is not added if the ray hits them before any other vertex.
     """
 
     def __init__(
@@ -237,9 +238,11 @@ class PathStart:
         depth: int,
         pdf: float,
         clear: bool = False,
+        excluded: Sequence[mi.EmitterPtr] = (),
     ) -> None:
         self.ray, self.pointer = ray, pointer
         self.depth, self.pdf, self.clear = depth, pdf, clear
+        self.excluded = tuple(excluded)
 
 
 class PathEnd:
@@ -327,6 +330,8 @@ def trace(
         density = scene.pdf_emitter_direction(last, record, sampled)
         mis_weight = dr.select(sampled, power_heuristic(pdf, density), 1)
         emitted = dr.select(hit_emitter, throughput * emitter.eval(si, hit_emitter) * mis_weight, 0)
+        for excluded in start.excluded:
+            emitted = dr.select(first & (emitter == excluded), 0, emitted)
         direct += dr.select(first, emitted, 0)
         scattered += dr.select(first, 0, emitted)
         surface &= si.is_valid()

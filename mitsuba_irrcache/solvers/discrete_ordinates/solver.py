@@ -126,7 +126,11 @@ class Sweep:
             self._sun_irradiance = [d.irradiance for d in known if d.distant]
             return
         box = occupied_box(cache.grid, cache.active)
-        small, large = split_by_solid_angle(scene, cache.grid, *box)
+        known = [light.emitter for light in cache.direct_lights]
+        small, large = (
+            [emitter for emitter in emitters if emitter not in known]
+            for emitters in split_by_solid_angle(scene, cache.grid, *box)
+        )
         self._boundary = SurfaceBoundary(scene, medium, large, rr_depth, cache.directional)
         emitters = small, self._illumination.point_lights
         self._emitter_sampling = EmitterSampling(
@@ -403,13 +407,14 @@ class Sweep:
         return direct + [irradiance[channel] for irradiance, *_ in self._emission]
 
     def _with_known_lights(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
-        """``direct``, irradiance of each point-like light and then of others, with the values that
-        `DirectLight` has for the former.
+        """Replace and complete ``direct`` by the irradiance that the cache's direct lights know.
+
+        ``direct`` is the irradiance of each point-like emitter, followed by that of others.
         """
         known = {id(d.emitter): [d.irradiance] for d in self.cache.direct_lights}
         lights = self._illumination.point_lights
-        replaced = [known.get(id(e), d) for e, d in zip(lights, direct, strict=False)]
-        return replaced + direct[len(lights) :]
+        replaced = [known.pop(id(e), d) for e, d in zip(lights, direct, strict=False)]
+        return replaced + direct[len(lights) :] + list(known.values())
 
     # Arrays
 

@@ -32,7 +32,7 @@ def contributions(
     is an unbiased estimate of the irradiance; moments of the radiance follow from the directions.
 
     ``spread`` are four uniform numbers for the directions. Radiance directly from the emitters
-    ``excluded``, which have no extent, is left out.
+    ``excluded`` is left out.
     """
     vertex, always = dr.zeros(mi.Interaction3f), mi.Bool(True)
     vertex.p = position
@@ -43,7 +43,7 @@ def contributions(
     for emitter in excluded:
         light = dr.select(record.emitter == emitter, 0, light)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
-    start = PathStart(mi.Ray3f(position, direction), pointer, depth=1, pdf=dr.inv_four_pi)
+    start = PathStart(mi.Ray3f(position, direction), pointer, 1, dr.inv_four_pi, excluded=excluded)
     uncollided, scattered, *_ = trace(scene, media, start, max_depth, rr_depth, False, rng, always)
     sphere = 4 * dr.pi
     return [

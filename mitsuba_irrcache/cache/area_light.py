@@ -1,0 +1,217 @@
+"""Direct irradiance of area emitters of simple shapes near a medium.
+
+Without a medium and other surfaces the irradiance is E(p) = L Omega(p), in closed form
+(`lights/solid_angle`). It varies by an order of magnitude within a voxel next to the emitter, and
+is zero behind it, so it is not interpolated. Only two smooth factors are:
+
+- the mean transmittance of the medium between p and the points of the emitter, as the mean
+  extinction of the line to the closest one of them (see `direct_light`);
+- the mean visibility of these points past surfaces, weighted by that transmittance.
+
+Both are ratios of sums over the same points, weighted by the solid angle for which each stands, so
+they have no variance where all points are alike. They are also defined behind a flat emitter, and
+continuous across its plane.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, spread
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import marked
+from mitsuba_irrcache.grids.root_field import ExtendedField
+from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
+from mitsuba_irrcache.lights.falloff import REACH, edges_away
+from mitsuba_irrcache.lights.solid_angle import SolidAngle
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
+from mitsuba_irrcache.transport.path import Media, visibility
+from mitsuba_irrcache.transport.tracking import medium_transmittance
+
+#: Number of points on an emitter: for all voxels together, and minimum and maximum for each voxel.
+SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 1 << 24, 16, 512
+#: Weight [sr] added to each point, so that their sum is positive in the plane of a flat emitter.
+SMALL_ANGLE = 1e-6
+#: Number of positions on an emitter from which its distance to the voxels is measured.
+POSITIONS = 64
+#: Maximum number of emitters treated in this way, and of their values at all voxels: about 14
+#: numbers each. The irradiance of further emitters is interpolated.
+MOST_LIGHTS, MOST_VALUES = 8, 1 << 24
+
+
+class AreaLight(DirectLight):
+    """The irradiance of an area emitter at the voxels of a grid, and its factors for lookups."""
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        emitter: mi.Emitter,
+        medium: MediumGrid,
+        grid: Grid,
+        voxels: mi.UInt32,
+        classes: VoxelClasses | None = None,
+    ) -> None:
+        """Compute the factors; ``classes`` is None if no surface is among the voxels."""
+        self._solid_angle, self._radiance = SolidAngle.of(emitter), _radiance(emitter)
+        # An emitter does not keep its shape alive, which Mitsuba accesses as long as it exists.
+        self._shape = emitter.get_shape()
+        self._area = dr.opaque(mi.Float, float(np.ravel(self._shape.surface_area())[0]))
+        self._edges = classes.cut_cells if classes is not None else None
+        super().__init__(scene, emitter, medium, grid, voxels, classes)
+        self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
+
+    # docs/primer, eq. (2.9)
+
+    def unobstructed(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
+        return self._radiance * dr.select(active, self._solid_angle.at(p), 0)
+
+    def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        passed = self._others.at_world(p, active)
+        if self._edges is None:
+            return passed
+        return self._edges.corrected(self._others, p, passed, mi.Bool(active))
+
+    def _direction(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
+        """Return the direction to the closest point of the emitter and its distance."""
+        way = self._solid_angle.closest(p) - p
+        distance = dr.norm(way)
+        upwards = mi.Vector3f(0, 0, 1)
+        return dr.select(distance > 0, way / distance, upwards), distance
+
+    def _attenuation(
+        self, scene: mi.Scene, p: mi.Point3f, line: tuple
+    ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
+        voxels = self._voxels
+        count = int(np.clip(SAMPLES // dr.width(voxels), FEWEST_SAMPLES, MOST_SAMPLES))
+        rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
+        others = Media.around(self._medium).without(self._medium)
+        count = dr.opaque(mi.UInt32, count)
+        transmitted, visible, weight = self._sums(scene, others, p, count, rng)
+        mean = dr.select(weight > 0, transmitted / weight, 1)
+        passed = dr.select(transmitted > 0, visible / transmitted, 0)
+        grey = self._medium.sigma_t.channels == 1
+        depth = -dr.log(dr.maximum(mean[0] if grey else mi.Color3f(mean), 1e-30))
+        dr.eval(depth, passed)
+        return depth, passed
+
+    @symbolic
+    def _sums(self, scene: mi.Scene, others: Media, p: mi.Point3f, count: mi.UInt32, rng: mi.PCG32):
+        """Sum over ``count`` points of the emitter: the solid angle for which each stands, times
+        the transmittance of the medium, also times the visibility past others, and alone.
+        """
+        vertex = dr.zeros(mi.Interaction3f, dr.width(p))
+        vertex.p = p
+        shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
+        transmitted, visible, total = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
+        k = mi.UInt32(0)
+        while dr.hint(k < count, label="points on an emitter"):
+            target, direction, distance, weight = self._sample(vertex, k, shift)
+            seen = weight > 0
+            ray = mi.Ray3f(p, direction)
+            passed = medium_transmittance(self._medium, ray, distance, seen)
+            passed = dr.select(seen, weight * mi.Spectrum(passed), 0)
+            past, rng = visibility(scene, others, vertex, target, self._medium.pointer, rng, seen)
+            transmitted += passed
+            visible += dr.select(seen, passed * past, 0)
+            total += weight
+            k += 1
+        return transmitted, visible, total
+
+    def _sample(
+        self, vertex: mi.Interaction3f, k: mi.UInt32, shift: mi.Vector2f
+    ) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float]:
+        """Sample a point by its area or, every other time, by its direction (balance heuristic).
+
+        Returns the point, its direction and distance, and the solid angle for which it stands, up
+        to a factor. Few points by area are close to a position next to the emitter.
+        """
+        flat, alternates = self._solid_angle.is_flat, self._solid_angle.density > 0
+        number = k >> 1 if alternates else k
+        sample = mi.Point2f(kronecker(number, 2, (shift.x, shift.y)))
+        record = self._shape.sample_direction(vertex, sample)
+        # Both sides of flat emitters count, so that the factors continue behind them.
+        seen = (record.pdf > 0) & (flat | (dr.dot(record.n, record.d) < 0))
+        target, direction, distance = record.p, record.d, record.dist
+        density = mi.Float(record.pdf)
+        if alternates:
+            by_area = (k & 1) == 0
+            towards, hit, length, cosine = self._solid_angle.sample_direction(vertex.p, sample)
+            target = dr.select(by_area, target, vertex.p + length * towards)
+            direction = dr.select(by_area, direction, towards)
+            distance = dr.select(by_area, distance, length)
+            density = dr.select(by_area, density, dr.square(length) / (self._area * cosine))
+            density += self._solid_angle.density
+            seen = dr.select(by_area, seen, hit)
+        return target, direction, distance, dr.select(seen, dr.rcp(density) + SMALL_ANGLE, 0)
+
+    def _field_of_extinction(
+        self, mean: mi.Float | mi.Color3f, classes: VoxelClasses | None
+    ) -> ExtendedField:
+        """Create the field of the mean extinction, extrapolated beyond the outermost voxels.
+
+        Next to a face through which the emitter shines sideways it changes within a voxel.
+        """
+        field = super()._field_of_extinction(mean, classes)
+        known = marked(self._grid, self._voxels)
+        return ExtendedField(self._grid, field.data, field.channels, known)
+
+    def _field_of_others(self, passed: mi.Spectrum, classes: VoxelClasses | None) -> ExtendedField:
+        """Create the field of visibility; interpolated linearly, shadow edges have no bias."""
+        channels = list(passed)
+        if all(dr.all(c == channels[0])[0] for c in channels[1:]):
+            channels = channels[:1]
+        values = spread(self._grid, self._voxels, channels, classes)
+        return ExtendedField(self._grid, values, len(channels))
+
+    def _mean_unobstructed(self) -> mi.Spectrum:
+        return self._mean(self._grid, self._voxels, POINTS)
+
+
+def area_lights_of(
+    scene: mi.Scene,
+    medium: MediumGrid,
+    grid: Grid,
+    voxels: mi.UInt32,
+    classes: VoxelClasses | None = None,
+) -> list[AreaLight]:
+    """Return the direct light of the area emitters of simple shapes near the voxels.
+
+    The list is empty for anisotropic scattering: the moments of the cache include such emitters.
+    """
+    if not medium.phase.is_isotropic or medium.is_isolated or not dr.width(voxels):
+        return []
+    lights = [
+        emitter
+        for emitter in EmittersByKind(scene.emitters()).of(EmitterKind.AREA)
+        if SolidAngle.of(emitter) is not None and _is_near(emitter, grid)
+    ]
+    lights.sort(key=_power, reverse=True)
+    count = min(MOST_LIGHTS, MOST_VALUES // dr.width(voxels))
+    return [AreaLight(scene, e, medium, grid, voxels, classes) for e in lights[:count]]
+
+
+def _is_near(emitter: mi.Emitter, grid: Grid) -> bool:
+    """Whether the irradiance of an emitter is not smooth enough for interpolation."""
+    rng = np.random.default_rng(POSITIONS)
+    sample = mi.Point2f(np.float32(rng.random((2, POSITIONS))))
+    positions = emitter.get_shape().sample_position(0.0, sample).p
+    return edges_away(np.array(positions, dtype=np.float64), grid) <= REACH
+
+
+def _radiance(emitter: mi.Emitter) -> mi.Spectrum:
+    """Return the radiance of an emitter that is the same everywhere."""
+    record = emitter.get_shape().sample_position(0.0, mi.Point2f(0.5))
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p, si.n, si.uv, si.wi = record.p, record.n, record.uv, mi.Vector3f(0, 0, 1)
+    return mi.Spectrum([dr.opaque(mi.Float, float(c[0])) for c in emitter.eval(si)])
+
+
+def _power(emitter: mi.Emitter) -> float:
+    """Return the radiant power of an emitter over pi, summed over the channels."""
+    area = float(np.ravel(emitter.get_shape().surface_area())[0])
+    return area * sum(float(c[0]) for c in _radiance(emitter))

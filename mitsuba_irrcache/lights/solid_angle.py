@@ -1,0 +1,207 @@
+"""Solid angles of area emitters of simple shapes, in closed form.
+
+A rectangle, disk, sphere or box with the same radiance L everywhere causes the irradiance
+(fluence rate) L Omega at a position from which it is seen under the solid angle Omega, if nothing
+lies in between. It varies by an order of magnitude within a voxel next to the emitter.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grids.boundary import Boundary, box_frame, sphere_frame
+from mitsuba_irrcache.grids.grid import Affine
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+
+#: Number of sides of the regular polygon of the same area that represents a disk.
+DISK_SIDES = 16
+#: Tolerated deviation of four corners from a parallelogram, relative to its size.
+FLAT_TOLERANCE = 1e-4
+#: Corners of the faces of the cube [-1, 1]^3, in order around each face.
+FACES = [
+    [np.insert([a, b], axis, side) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    for axis in range(3)
+    for side in (-1.0, 1.0)
+]
+
+
+class SolidAngle:
+    """Solid angle of a convex shape that emits from its front, and the closest point of it.
+
+    ``kind`` is "sphere", "box", "rectangle" (any parallelogram) or "disk"; ``frame`` maps the unit
+    sphere, the cube [-1, 1]^3, or the square or unit disk in the plane z = 0 to the world.
+    ``normal`` is the front of a flat shape.
+    """
+
+    def __init__(self, kind: str, frame: np.ndarray, normal: np.ndarray | None = None) -> None:
+        self.kind, self.frame = kind, frame
+        self.is_flat = kind in ("rectangle", "disk")
+        self._world, self._local = Affine(frame), Affine(np.linalg.inv(frame))
+        self._centre = _point(frame[:3, 3])
+        self._radius = dr.opaque(mi.Float, float(np.linalg.norm(frame[:3, 0])))
+        self._normal = None if normal is None else mi.Vector3f(_point(normal))
+        self._box = Boundary("box", frame) if kind == "box" else None
+        #: density [1/sr] of directions that `sample_direction` samples; 0 for spheres
+        self.density = {"sphere": 0.0, "box": 1 / (4 * np.pi)}.get(kind, 1 / (2 * np.pi))
+        self._polygons = [
+            ([_point(v) for v in corners], _point(front))
+            for corners, front in _polygons(kind, frame, normal)
+        ]
+
+    @classmethod
+    def of(cls, emitter: mi.Emitter) -> SolidAngle | None:
+        """Return the solid angle of an emitter; None if its shape or radiance is not supported."""
+        shape = emitter.get_shape()
+        varies = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+        if kind_of(emitter) is not EmitterKind.AREA or shape is None or varies:
+            return None
+        found = _shape_frame(shape)
+        if found is None:
+            return None
+        kind, frame = found
+        record = shape.sample_position(0.0, mi.Point2f(0.4, 0.3))
+        position, normal = (np.array(v, dtype=np.float64).ravel() for v in (record.p, record.n))
+        if kind in ("rectangle", "disk"):
+            return cls(kind, frame, normal)
+        # Shapes that emit inwards are seen from inside, where they have no closest point.
+        return cls(kind, frame) if normal @ (position - frame[:3, 3]) > 0 else None
+
+    def at(self, p: mi.Point3f) -> mi.Float:
+        """Evaluate the solid angle at world positions; 0 behind a flat shape."""
+        if self.kind == "sphere":
+            ratio = dr.minimum(dr.square(self._radius) / dr.squared_norm(p - self._centre), 1)
+            return 2 * dr.pi * ratio / (1 + dr.sqrt(1 - ratio))
+        total = mi.Float(0)
+        for corners, front in self._polygons:
+            seen = dr.dot(front, p - corners[0]) > 0
+            total += dr.select(seen, _polygon_solid_angle(corners, p), 0)
+        return total
+
+    def closest(self, p: mi.Point3f) -> mi.Point3f:
+        """Return the closest point of the shape; of sheared or uneven ones, a point close by."""
+        local = self._local.point(p)
+        if self.kind in ("sphere", "disk"):
+            if self.kind == "disk":
+                local.z = 0
+            return self._world.point(local * dr.rcp(dr.maximum(dr.norm(local), 1)))
+        local = dr.clip(local, -1, 1)
+        if self.is_flat:
+            local.z = 0
+        return self._world.point(local)
+
+    def sample_direction(
+        self, p: mi.Point3f, sample: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.Bool, mi.Float, mi.Float]:
+        """Sample a direction uniformly, for flat shapes within the hemisphere that faces them.
+
+        Returns the direction, whether it hits the shape, the distance, and the cosine there.
+        """
+        if self._box is not None:
+            direction = mi.warp.square_to_uniform_sphere(sample)
+            hit, distance, _ = self._box.intersect(mi.Ray3f(p, direction))
+            normal = self._box.outward_normal(p + distance * direction)
+            return direction, hit & (distance > 0), distance, dr.abs(dr.dot(normal, direction))
+        height = dr.dot(self._normal, self._centre - p)
+        frame = mi.Frame3f(self._normal * dr.sign(height))
+        local = mi.warp.square_to_uniform_hemisphere(sample)
+        direction, distance = frame.to_world(local), dr.abs(height) / local.z
+        q = self._local.point(p + distance * direction)
+        extent = dr.norm(mi.Vector2f(q.x, q.y)) if self.kind == "disk" else dr.abs(q.x)
+        if self.kind == "rectangle":
+            extent = dr.maximum(extent, dr.abs(q.y))
+        return direction, (extent <= 1) & (local.z > 0), distance, local.z
+
+
+def _shape_frame(shape: mi.Shape) -> tuple[str, np.ndarray] | None:
+    """Return the kind and frame of a shape for `SolidAngle`; None for other shapes."""
+    name, params = shape.class_name(), mi.traverse(shape)
+    if name == "Sphere":
+        return "sphere", sphere_frame(shape)
+    if name in ("Rectangle", "Disk"):
+        matrix = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        normal = np.cross(matrix[:3, 0], matrix[:3, 1])
+        matrix[:3, 2] = normal / np.linalg.norm(normal)  # the scale along it may be 0
+        return name.lower(), matrix
+    if not shape.is_mesh() or "vertex_positions" not in params:
+        return None
+    vertices = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    area = float(np.ravel(shape.surface_area())[0])
+    kind, frame = "box", box_frame(vertices)
+    if frame is None:
+        kind, frame = "rectangle", _parallelogram_frame(vertices)
+    if frame is None:
+        return None
+    edges = 2 * frame[:3, :3].T
+    pairs = [(0, 1)] if kind == "rectangle" else [(0, 1), (1, 2), (2, 0)]
+    sides = sum(np.linalg.norm(np.cross(edges[i], edges[j])) for i, j in pairs)
+    expected = float(sides) * (1 if kind == "rectangle" else 2)
+    # Reject meshes with missing or duplicate faces.
+    return (kind, frame) if abs(expected - area) < 1e-3 * area else None
+
+
+def _parallelogram_frame(vertices: np.ndarray) -> np.ndarray | None:
+    """Return the affine map of the square [-1, 1]^2 onto four corners; None for other meshes."""
+    corners = np.unique(vertices, axis=0)
+    if len(corners) != 4:
+        return None
+    first, *others = corners
+    for k in range(3):  # the corner opposite to the first one
+        a, b = (corner - first for i, corner in enumerate(others) if i != k)
+        size = max(np.linalg.norm(a), np.linalg.norm(b))
+        if np.abs(first + a + b - others[k]).max() <= FLAT_TOLERANCE * size:
+            frame = np.eye(4)
+            normal = np.cross(a, b)
+            frame[:3, :3] = np.stack([a / 2, b / 2, normal / np.linalg.norm(normal)], axis=1)
+            frame[:3, 3] = first + (a + b) / 2
+            return frame
+    return None
+
+
+def _polygons(
+    kind: str, frame: np.ndarray, normal: np.ndarray | None
+) -> list[tuple[list[np.ndarray], np.ndarray]]:
+    """Return the corners and the front normal of each face of a shape."""
+    if kind == "sphere":
+        return []
+    if kind == "box":
+        faces = FACES
+    elif kind == "rectangle":
+        faces = [[(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]]
+    else:
+        angles = (np.arange(DISK_SIDES) + 0.5) * (2 * np.pi / DISK_SIDES)
+        radius = np.sqrt(2 * np.pi / (DISK_SIDES * np.sin(2 * np.pi / DISK_SIDES)))
+        circle = [np.cos(angles), np.sin(angles), np.zeros(DISK_SIDES)]
+        faces = [radius * np.stack(circle, axis=1)]
+    found = []
+    for face in faces:
+        corners = [frame[:3, :3] @ np.array(v, dtype=float) + frame[:3, 3] for v in face]
+        front = np.cross(corners[1] - corners[0], corners[2] - corners[1])
+        outwards = np.mean(corners, axis=0) - frame[:3, 3] if normal is None else normal
+        found.append((corners, front * np.sign(front @ outwards)))
+    return found
+
+
+def _polygon_solid_angle(corners: list[mi.Point3f], p: mi.Point3f) -> mi.Float:
+    """Compute the solid angle of a convex polygon.
+
+    It is the sum over a fan of triangles, each twice the argument of a complex number (Van Oosterom
+    and Strackee 1983). The sum of the arguments, which is less than pi, is the argument of the
+    product.
+    """
+    # docs/primer, eq. (2.10)
+    towards = [dr.normalize(mi.Vector3f(corner - p)) for corner in corners]
+    first, real, imaginary = towards[0], mi.Float(1), mi.Float(0)
+    for a, b in pairwise(towards[1:]):
+        x = 1 + dr.dot(first, a) + dr.dot(first, b) + dr.dot(a, b)
+        y = dr.dot(first, dr.cross(a, b))
+        real, imaginary = real * x - imaginary * y, real * y + imaginary * x
+    return 2 * dr.abs(dr.atan2(imaginary, real))
+
+
+def _point(values: np.ndarray) -> mi.Point3f:
+    """Return an opaque point: other values do not compile other kernels."""
+    return mi.Point3f([dr.opaque(mi.Float, float(v)) for v in values])
