@@ -58,7 +58,7 @@ def random_stream(
 
 
 def kronecker_steps(dimension: int) -> tuple[float, ...]:
-    """What each coordinate of the sequence advances by from point to point, modulo 1."""
+    """Return the increment of each coordinate of the sequence, modulo 1."""
     ratio = GENERALISED_GOLDEN_RATIOS[dimension]
     return tuple(ratio ** -(k + 1) % 1.0 for k in range(dimension))
 

@@ -1,4 +1,4 @@
-"""From the integrator's property ``emission`` to the emission coefficient of media."""
+"""Convert the integrator's property ``emission`` to the emission coefficient of media."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.bake import baked_field, volume_error
 from mitsuba_irrcache.media.emission import Emission
 
-#: How far baked values may be from Mitsuba's own, relative to their maximum.
+#: Tolerated deviation of baked values from Mitsuba's own, relative to their maximum.
 TOLERANCE = 0.02
 
 
@@ -58,7 +58,7 @@ def _numbers(value: object, scale: float) -> np.ndarray:
 
 
 def _verify(volume: mi.Volume, field: Field, scale: float) -> None:
-    """Compares baked values with Mitsuba's own inside of the volume."""
+    """Compare baked values with Mitsuba's own inside of the volume."""
     if field.grid is None or not field.maximum > 0:
         return
     rng = mi.PCG32(512)

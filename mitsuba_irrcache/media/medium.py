@@ -23,9 +23,9 @@ class MediumGrid(Immutable):
         emission: emission coefficient of the medium; None where it emits nothing.
         phase: phase function, the same everywhere.
         name: unique among the media of a scene.
-        pointer: Mitsuba's medium, by which rays know the medium they are in. None where rays are
-            not traced through the scene's shapes, since an isotropic medium in its boundary is all
-            there is.
+        pointer: Mitsuba's medium, which identifies the medium of a ray. None if rays are not traced
+            through the scene's shapes, because the scene has only an isotropic medium in its
+            boundary.
         number: place in the scene's list of media.
         others: the other media of the scene in the order of that list, before delta-M scaling.
         is_isolated: whether this medium in its boundary is all there is beside emitters.
@@ -102,7 +102,7 @@ class MediumGrid(Immutable):
         return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
 
     def contains(self, p: mi.Point3f) -> mi.Bool:
-        """Whether points lie in the medium."""
+        """Whether world positions lie in the medium."""
         inside = self.boundary.surrounds(p)
         return inside if self.bbox is None else inside & self._clip.contains(p)
 

@@ -1,4 +1,4 @@
-"""From a scene to filled caches, and which of them remain valid when the scene changes."""
+"""Builds the caches of a scene, and detects which remain valid when the scene changes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mitsuba_irrcache.solvers.base import Progress as SolverProgress
 
 __all__ = ["CacheBuilder", "CacheSettings", "Progress"]
 
-#: Between two checkpoints: at least so many seconds, and the time of writing over this share.
+#: Minimum seconds between two checkpoints, and maximum share of the time spent on writing.
 CHECKPOINT_SECONDS = 30.0
 CHECKPOINT_SHARE = 0.1
 
@@ -34,8 +34,8 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(eq=False)
 class Stage:
-    """What a progressive run asks of the caches: ``samples`` per voxel (0: it has not begun), and
-    whether the first two batches may be shown while incomplete.
+    """Request of a progressive run: ``samples`` per voxel (0: not begun), and whether the first two
+    batches may be shown while they are incomplete.
     """
 
     samples: int = 0
@@ -43,7 +43,7 @@ class Stage:
 
 
 class CacheBuilder:
-    """Keeps the media and caches of one scene up to date without repeating work.
+    """Keep the media and caches of one scene up to date without repeating work.
 
     Threads may share it: media and caches change under its ``lock`` only. To read several
     attributes that have to be consistent, hold the lock.
@@ -92,14 +92,14 @@ class CacheBuilder:
         return bool(self.parts) and self.parts[0].solver.has_preview
 
     def update(self, scene: mi.Scene, progress: Progress | None = None) -> None:
-        """Brings media and caches up to date with ``scene``."""
+        """Update media and caches to ``scene``."""
         with self.lock:
             self.fit(scene)
             for number, part in enumerate(self.parts):
                 self._refine(scene, part, _progress_of_one(progress, number, len(self.parts)))
 
     def fit(self, scene: mi.Scene) -> None:
-        """Brings the media up to date with ``scene``; caches that are not valid become empty."""
+        """Update the media to ``scene``; invalid caches become empty."""
         with self.lock:
             self._fit(scene)
 
@@ -151,7 +151,7 @@ class CacheBuilder:
                 part.save()
 
     def save(self) -> None:
-        """Writes the caches to their files unless these hold at least as many samples."""
+        """Write the caches to their files unless these have at least as many samples."""
         with self.lock:
             for part in self.parts:
                 part.save()
@@ -180,18 +180,18 @@ class CacheBuilder:
 
     @property
     def _wanted(self) -> int:
-        """Samples per voxel to build up to now; 0: the default."""
+        """Current target of samples per voxel; 0: the default."""
         return max((stage.samples for stage in self._stages), default=0) or self.samples
 
     @property
     def done(self) -> int:
-        """Samples per voxel that all caches have, including those in incomplete batches."""
+        """Minimum samples per voxel over the caches, including those in incomplete batches."""
         shown = [p.shown.samples for p in self._nonzero or self.parts if p.shown is not None]
         return min(shown, default=0)
 
     @property
     def saved_samples(self) -> int:
-        """Samples per voxel that all caches have in their files."""
+        """Minimum samples per voxel over the cache files."""
         return min((p.saved_samples for p in self._nonzero), default=0)
 
     @property
@@ -201,12 +201,12 @@ class CacheBuilder:
 
     @property
     def target(self) -> int:
-        """Samples per voxel that `update` builds up to, the maximum over the caches."""
+        """Target samples per voxel of `update`, the maximum over the caches."""
         return max((p.target(self._wanted) for p in self.parts if p.cache is not None), default=0)
 
     @property
     def is_dark(self) -> bool:
-        """Whether all caches are zero, or there are none: samples change nothing."""
+        """Whether there are no caches or all are zero, so that samples have no effect."""
         return not self._nonzero
 
     @property

@@ -41,7 +41,7 @@ _SAVING = Lock()
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """Properties of the integrator that caches depend on; see the plugin's documentation."""
+    """Properties of the integrator on which caches depend; see the plugin's documentation."""
 
     max_depth: int = -1
     rr_depth: int = 5
@@ -84,7 +84,7 @@ class CachedMedium:
         self._preview: IrradianceCache | None = None
         self._kept_solver: Solver | None = None
         self.cache: IrradianceCache | None = None
-        #: closed form that replaces the cache; None where there is a cache, or nothing is scattered
+        #: closed form that replaces the cache; None if there is a cache, or no scattering
         self.half_space: HalfSpace | None = None
         if settings.max_depth in (0, 1):
             return
@@ -101,12 +101,12 @@ class CachedMedium:
 
     @property
     def label(self) -> str:
-        """Prefix of messages about it."""
+        """Prefix of messages about this medium."""
         return f'medium "{self.name}": ' if self.name else ""
 
     @property
     def file(self) -> str:
-        """File of the cache; of several media, each has its own with the medium's name in it."""
+        """File of the cache; with several visible media the name contains that of the medium."""
         if not self.settings.file or not self.name:
             return self.settings.file
         file = Path(self.settings.file)
@@ -115,7 +115,7 @@ class CachedMedium:
 
     @property
     def shown(self) -> IrradianceCache | None:
-        """The cache to be rendered, or a preview of it while its first batches are incomplete."""
+        """Cache to render, or a preview of it while its first batches are incomplete."""
         return self._preview or self.cache
 
     def target(self, samples: int) -> int:
@@ -130,7 +130,7 @@ class CachedMedium:
 
     @property
     def is_dark(self) -> bool:
-        """Whether the cache is known to be zero, or there is none: samples change nothing."""
+        """Whether there is no cache or it is zero, so that samples have no effect."""
         return self.cache is None or not self.cache.active_count
 
     def refine(self, scene: mi.Scene, samples: int, early: bool, progress: Progress | None) -> bool:
@@ -153,13 +153,13 @@ class CachedMedium:
         return True
 
     def close(self) -> bool:
-        """Drops incomplete batches; returns whether there were any."""
+        """Discard incomplete batches; return whether there were any."""
         dropped = self._preview is not None
         self._opening = self._preview = None
         return dropped
 
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
-        """The cache in the file if there is one, else an empty one."""
+        """Load the cache from its file if that exists, else create an empty one."""
         settings, medium, solver, media = (
             self.settings,
             self.medium,
@@ -217,12 +217,13 @@ class CachedMedium:
 
     @property
     def _is_lit(self) -> bool:
-        """Whether any radiance may reach the medium."""
+        """Whether the scene has any emitter or emissive medium."""
         return bool(self.description.emitters) or self.medium.emission is not None
 
     def _check_memory(self, grid: Grid, moments: int) -> None:
-        """Refuses a cache that cannot be held, by what it takes to fill it and to look it up; as
-        much again for the field of its errors (experiments/paper/memory).
+        """Refuse a cache that exceeds the available memory while it is filled or looked up.
+
+        The field of its errors needs as much again (experiments/paper/memory).
         """
         channels, max_depth = 1 if mi.is_monochromatic else 3, self.settings.max_depth
         numbers = self.solver.numbers_per_voxel(
@@ -242,9 +243,11 @@ class CachedMedium:
         }
 
     def _resume(self, cache: IrradianceCache, edited: bool) -> IrradianceCache | None:
-        """The cache on disk where it is one of the same scene, else the empty ``cache``; None where
-        the file is of the scene before it was ``edited``, and is not to be overwritten. Raises
-        CacheFileError for the file of another scene.
+        """Load the cache from its file if it belongs to the same scene; without a file return the
+        empty ``cache``.
+
+        Returns None if the file belongs to the scene before it was ``edited``, so that the file is
+        not overwritten. Raises CacheFileError for the file of another scene.
         """
         file = Path(self.file)
         if not os.path.exists(file):  # returns False where Path.exists may raise
@@ -285,7 +288,7 @@ class CachedMedium:
         )
 
     def _open(self, scene: mi.Scene, samples: int, progress: Progress | None) -> bool:
-        """Adds to the first two batches up to ``samples`` in all; returns whether it added any."""
+        """Grow the first two batches up to ``samples`` in total; return whether any were added."""
         cache = self.cache
         if self._opening is None:
             self._opening = self._new_solver(scene).preview()
@@ -331,7 +334,7 @@ class CachedMedium:
         )
 
     def save_as(self, scene: mi.Scene, file: str | Path) -> None:
-        """Writes a copy of the cache that fits ``scene`` to a file of any name."""
+        """Write a copy of the cache, with the fingerprint of ``scene``, to a file of any name."""
         cache = self.cache
         cache.save(file, self._fingerprint(scene, cache.grid, cache.moments))
 
@@ -369,7 +372,7 @@ class CachedMedium:
 
 
 def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> None:
-    """Raises CacheFileError if the contents of a file contradict its fingerprint."""
+    """Raise CacheFileError if the contents of a file contradict its fingerprint."""
     alike = ("active_count", "channels", "correlated", "max_depth", "moments")
     unlike = [name for name in alike if getattr(cache, name) != getattr(stored, name)]
     if stored.grid.shared(cache.grid) is not cache.grid:

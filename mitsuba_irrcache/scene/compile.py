@@ -1,4 +1,4 @@
-"""From Mitsuba's scene to its description, and which scenes are refused.
+"""Convert Mitsuba's scene to its description, and refuse unsupported scenes.
 
 A medium is *isolated* if the scene has no other medium and no surface, it fills a box or sphere,
 and all emitters are distant or points: then no ray has to be intersected with shapes. In all other
@@ -39,9 +39,9 @@ STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
 
 
 def compile_scene(scene: mi.Scene, emission: Emission | None = None) -> SceneDescription:
-    """The description of ``scene``, whose media emit ``emission``.
+    """Create the description of ``scene``, whose media emit ``emission``.
 
-    Raises UnsupportedSceneError, naming the object, for what would be rendered wrongly.
+    Raises UnsupportedSceneError, naming the object, for scenes that would be rendered incorrectly.
     """
     emitters = EmittersByKind(scene.emitters())
     media = media_of(scene)
@@ -85,7 +85,7 @@ def compile_scene(scene: mi.Scene, emission: Emission | None = None) -> SceneDes
 
 
 def _check_general(scene: mi.Scene, media: dict[mi.Medium, list[mi.Shape]]) -> None:
-    """Raises UnsupportedSceneError for shapes and media that cannot be traced."""
+    """Raise UnsupportedSceneError for shapes and media that cannot be traced."""
     shapes = scene.shapes()
     for shape in shapes:
         _check_shape(scene, shape)
@@ -101,7 +101,7 @@ def _baked(
     emission: Emission | None,
     is_isolated: bool,
 ) -> tuple[list[MediumGrid], set[str]]:
-    """All media on their grids, before delta-M scaling; and the names of the visible ones."""
+    """Convert all media to grids, without delta-M scaling; also return the visible ones' names."""
     grids: list[MediumGrid] = []
     visible = set()
     for medium, filled in media.items():
@@ -125,7 +125,7 @@ def _baked(
 
 
 def _is_visible(scene: mi.Scene, medium: mi.Medium) -> bool:
-    """Whether a camera may see a medium other than through a surface."""
+    """Whether a camera ray can reach a medium without crossing a surface other than a null one."""
     around = [s for s in scene.shapes() if medium in (s.interior_medium(), s.exterior_medium())]
     return any(is_null(_flags(s)) for s in around) or any(
         sensor.get_medium() == medium for sensor in scene.sensors()
@@ -154,7 +154,7 @@ def _warn_that_none_is_visible(emission: Emission | None) -> None:
 
 
 def _check_distance(name: str, distance: float, finest: float) -> None:
-    """Refuses a medium too far from the origin for the resolution of single precision."""
+    """Refuse a medium too far from the origin for the resolution of single precision."""
     step = float(np.spacing(np.float32(distance)))
     if step > finest:
         _refuse(
@@ -191,7 +191,7 @@ def _flags(shape: mi.Shape) -> int:
 def _boundary_without_surfaces(
     scene: mi.Scene, media: dict[mi.Medium, list[mi.Shape]]
 ) -> Boundary | None:
-    """The boundary of the one medium in a scene that has no surfaces; None for other scenes."""
+    """Return the boundary of the single medium of a scene without surfaces; None otherwise."""
     bounded = [s for s in scene.shapes() if s.interior_medium() is not None]
     if len(media) != 1 or len(bounded) != 1:
         return None
@@ -210,7 +210,7 @@ def _is_isotropic(medium: mi.Medium) -> bool:
 
 
 def _exact_boundary(scene: mi.Scene, filled: list[mi.Shape]) -> Boundary | None:
-    """The one box or sphere that a medium fills; None where it fills other shapes."""
+    """Return the box or sphere that a medium fills; None if it fills other shapes or several."""
     try:
         return boundary_of(scene, filled[0]) if len(filled) == 1 else None
     except UnsupportedSceneError:
@@ -218,7 +218,7 @@ def _exact_boundary(scene: mi.Scene, filled: list[mi.Shape]) -> Boundary | None:
 
 
 def _unique_name(medium: mi.Medium, taken: list[str]) -> str:
-    """The medium's id; with a number where another one has it too."""
+    """Return the medium's id, with a number if another medium has the same one."""
     name, number = medium.id(), 2
     while name in taken:
         name, number = f"{medium.id()}_{number}", number + 1
@@ -253,7 +253,7 @@ def _extent(medium: mi.Medium, filled: list[mi.Shape]) -> np.ndarray:
 
 
 def _refuse_unbounded(medium: mi.Medium, shapes: list[mi.Shape]) -> None:
-    """The error for a medium that nothing bounds."""
+    """Raise the error for a medium without bounds."""
     around = [s for s in shapes if s.exterior_medium() == medium]
     role = ""
     if around:
@@ -298,7 +298,7 @@ def _meets_media(scene: mi.Scene, instance: mi.ShapePtr, ray: mi.Ray3f):
 
 
 def _warn_of_scale(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
-    """Warns where the offset of Mitsuba's rays from surfaces is large compared to a medium."""
+    """Log a warning if Mitsuba's ray offset is large compared to a medium."""
     corners = np.abs([np.array(scene.bbox().min), np.array(scene.bbox().max)])
     offset = (1 + corners[np.isfinite(corners)].max(initial=0.0)) * RAY_OFFSET
     for grid in grids:
@@ -313,7 +313,7 @@ def _warn_of_scale(scene: mi.Scene, grids: Sequence[MediumGrid]) -> None:
 
 
 def _brightest(scene: mi.Scene) -> float:
-    """The largest radiance found on emitters that can be seen."""
+    """Estimate the maximum radiance of visible emitters."""
     rng = mi.PCG32(1024)
     si = dr.zeros(mi.SurfaceInteraction3f, 1024)
     si.uv = mi.Point2f(rng.next_float32(), rng.next_float32())

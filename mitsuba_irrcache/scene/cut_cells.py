@@ -28,7 +28,7 @@ SEGMENTS = [
 
 
 class CutCells:
-    """The cells of a cache over ``grid`` that surfaces cut, and the planes of these."""
+    """The cells of a cache over ``grid`` that surfaces intersect, and a plane for each of them."""
 
     def __init__(self, scene: mi.Scene, grid: Grid) -> None:
         self.grid = Extension(grid).grid  #: the grid that lookups interpolate on
@@ -88,8 +88,9 @@ class CutCells:
     def corrected(
         self, field: RootField | ExtendedField, p: mi.Point3f, phi: mi.Float | mi.Color3f, active
     ):
-        """``phi``, the value of ``field`` at the world position ``p``; in a cut cell that of the
-        voxels on the side of ``p`` alone.
+        """Correct ``phi``, the value of ``field`` at the world position ``p``, in cut cells.
+
+        There it becomes the mean of the voxels on the same side of the plane as ``p``.
         """
         s = self._clamped(p)
         cell = self._cell(s)
@@ -102,13 +103,13 @@ class CutCells:
         return phi
 
     def _clamped(self, p: mi.Point3f) -> mi.Point3f:
-        """Coordinates of a world position in voxels, 0 at the centre of the first, clamped."""
+        """Convert a world position to voxels, 0 at the centre of the first one, clamped."""
         u = self.grid.coordinates.point(p) - 0.5
         last = mi.Point3f([mi.Float(n) for n in self.cells])
         return dr.minimum(dr.maximum(u, 0), last)
 
     def _cell(self, s: mi.Point3f) -> mi.Vector3f:
-        """The cell that ``s`` is in; at the far border the last one."""
+        """Return the cell that contains ``s``; the last one at the upper border."""
         return dr.minimum(dr.floor(s), mi.Vector3f([mi.Float(n - 1) for n in self.cells]))
 
     def _one_sided(
@@ -119,8 +120,9 @@ class CutCells:
         lower: mi.Vector3i,
         phi: mi.Float | mi.Color3f,
     ) -> mi.Float | mi.Color3f:
-        """The mean of the voxels on the side of ``s`` with trilinear weights; ``phi`` where there
-        are none.
+        """Return the mean of the voxels on the side of ``s`` with trilinear weights.
+
+        ``phi`` if there are none.
         """
         gradient = mi.Vector3f(plane.x, plane.y, plane.z)
         ahead = dr.dot(gradient, s) + plane.w > 0
@@ -139,12 +141,12 @@ class CutCells:
 
 
 def _corner(index: mi.UInt32) -> mi.Vector3f:
-    """The corner of a cell with this place in `CORNERS`."""
+    """Return the corner of a cell with this index in `CORNERS`."""
     return mi.Vector3f((index >> 2) & 1, (index >> 1) & 1, index & 1)
 
 
 def _table(end: int) -> mi.UInt32:
-    """One end of all `SEGMENTS`."""
+    """Return one end of all `SEGMENTS`."""
     return mi.UInt32([segment[end] for segment in SEGMENTS])
 
 

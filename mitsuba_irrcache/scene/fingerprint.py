@@ -14,15 +14,15 @@ from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import Media
 
-#: Arrays of up to so many bytes are compared by their contents, all of them up to the second number
-#: of bytes in a scene; of larger arrays, so many values are.
+#: Maximum number of bytes of an array, and of all arrays of a scene, whose contents are compared;
+#: number of values compared in larger arrays.
 SMALL, SMALL_IN_ALL, SAMPLED = 1 << 17, 1 << 19, 1 << 12
 
 
-#: An ingredient of `digests` that is compared with a tolerance; rays for each shape, and how far
-#: their means may be apart.
+#: The ingredient of `digests` that is compared with a tolerance, the number of rays for each shape,
+#: and the tolerance of their means.
 RESPONSES, PROBES, TOLERANCE = "responses of surfaces", 512, 1e-4
-#: In a description, what is no property of the object: a mesh's name, the scene's bounds, address.
+#: Parts of a description that are not properties of the object: mesh name, scene bounds, address.
 _ELSEWHERE = re.compile(
     r"\A\w+\[\s*name = [^\n]*|\bbsphere = \w+\[.*?\n *\],?|0x[0-9a-f]+", re.DOTALL
 )
@@ -73,29 +73,29 @@ class Snapshot:
         self._values = {k: _kept(v, shared.get(k), budget) for k, v in values.items()}
 
     def changes(self, other: Snapshot) -> list[str]:
-        """Names of the parameters that differ, and the classes of objects that only one has."""
+        """Return names of differing parameters, and classes of objects that only one has."""
         mine, theirs = self._values, other._values
         names = [k for k in mine.keys() | theirs.keys() if mine.get(k) != theirs.get(k)]
         return sorted({*names, *(node.class_name() for node in self._objects ^ other._objects)})
 
     def shares_objects_with(self, other: Snapshot) -> bool:
-        """Whether both are of the same scene, or of scenes that have objects in common."""
+        """Whether both belong to the same scene, or to scenes that share objects."""
         return not self._objects.isdisjoint(other._objects)
 
 
 def _value(entry: tuple) -> Any:
-    """The value of a parameter, from what a traversal has found; None where the plugin has none."""
+    """Return the value of a traversed parameter; None if the plugin has none."""
     value, kind, node, _ = entry
     return value if kind is None else mi.get_property(value, kind, node)
 
 
 def _is_transform(value: Any) -> bool:
-    """Points have an attribute ``matrix`` as well: whatever is asked of them is a swizzle."""
+    """Whether a value is a transform. Points accept any attribute name as a swizzle."""
     return not dr.is_array_v(value) and hasattr(value, "matrix")
 
 
 class _Budget:
-    """Bytes that may still be compared by their contents."""
+    """Number of bytes whose contents may still be compared."""
 
     __slots__ = ("left",)
 
@@ -104,7 +104,7 @@ class _Budget:
 
 
 class _Kept:
-    """A one-dimensional Dr.Jit array, held and compared."""
+    """A one-dimensional Dr.Jit array that is held for comparison."""
 
     __slots__ = ("_array", "_bytes", "_kind", "_view", "_whole", "_width", "index")
 
@@ -123,7 +123,7 @@ class _Kept:
 
     @property
     def is_intact(self) -> bool:
-        """Whether the memory of the array holds what it held, as far as that is compared."""
+        """Whether the memory of the array is unchanged, as far as it is compared."""
         return self._view is None or self._view.tobytes() == self._bytes
 
     def __eq__(self, other: object) -> bool:
@@ -137,7 +137,7 @@ class _Kept:
 
 
 def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
-    """A form of ``value`` that stays as it is and can be compared; ``previous`` if it still is."""
+    """Return an immutable, comparable form of ``value``; ``previous`` if it is unchanged."""
     if dr.is_jit_v(value):
         if dr.is_tensor_v(value):
             parts, shape = (value.array,), value.shape
@@ -180,17 +180,17 @@ def digests(scene: mi.Scene, media: Media, medium: MediumGrid) -> dict[str, str]
 
 
 def digest_of_emitters(scene: mi.Scene) -> str:
-    """SHA-256 of all emitters, in any order."""
+    """Compute the SHA-256 of all emitters, whatever their order."""
     return _digest(*sorted(_object_digest(emitter) for emitter in scene.emitters()))
 
 
 def digest_of_surfaces(scene: mi.Scene) -> str:
-    """SHA-256 of all shapes, in any order."""
+    """Compute the SHA-256 of all shapes, whatever their order."""
     return _digest(*sorted(_shape_digest(shape) for shape in scene.shapes()))
 
 
 def differing(mine: dict[str, str], theirs: dict[str, str]) -> list[str]:
-    """Names of the ingredients that differ between two results of `digests`."""
+    """Return the names of the ingredients that differ between two results of `digests`."""
     names = sorted(mine.keys() | theirs.keys())
     return [n for n in names if not _agree(n, mine.get(n), theirs.get(n))]
 
@@ -253,7 +253,7 @@ def responses(scene: mi.Scene) -> str:
 
 
 def _squashed(value: mi.Spectrum) -> mi.Float:
-    """A number in [0, 1] for a radiance or a BSDF that can have any value; colours differ."""
+    """Map a radiance or BSDF of any magnitude to [0, 1], with different weights of channels."""
     parts = [channel / (1 + dr.abs(channel)) for channel in mi.Spectrum(value)]
     scale = 1 / len(parts)
     total = sum((i + 1) * scale * dr.clip(part, 0, 1) for i, part in enumerate(parts))

@@ -15,7 +15,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.consistency import described
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
-#: Offsets of rays along each axis that look for surfaces: through the corners and the middle of
+#: Offsets of the rays along each axis that detect surfaces: through the corners and the centre of
 #: each voxel's face.
 OFFSETS = ((0.0, 0.0), (0.5, 0.5))
 #: Margin in voxels: surfaces may lie on the faces of the box.
@@ -25,8 +25,9 @@ _PICK = np.array(list(np.ndindex(2, 2, 2)), dtype=bool)  # corners of a box
 
 
 def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> str | None:
-    """A shape other than null boundaries that lies in the box of voxels between ``lower`` and
-    ``upper`` (x, y, z), by its name; None where there is none.
+    """Return the name of a shape, other than null boundaries, in a box of voxels; None without any.
+
+    The box lies between ``lower`` and ``upper`` (x, y, z).
 
     Exact for shapes whose bounds do not meet the box, for vertices, and for shapes within the box;
     of other shapes, rays find parts about as large as a voxel.
@@ -51,7 +52,7 @@ def _is_solid(shape: mi.Shape) -> bool:
 
 
 def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
-    """Whether the bounds of a shape meet the box."""
+    """Whether the bounds of a shape overlap the box."""
     box = shape.bbox()
     ends = np.array([box.min, box.max], dtype=np.float64)
     if not np.isfinite(ends).all():
@@ -76,17 +77,17 @@ def boxes_meet(grid: Grid, lower: np.ndarray, upper: np.ndarray, corners: np.nda
 
 
 def corners_of(frame: np.ndarray) -> np.ndarray:
-    """Corners (8, 3) of the image of the unit cube."""
+    """Return the corners (8, 3) of the image of the unit cube."""
     return _mapped(frame, _PICK)
 
 
 def _mapped(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Images of points (n, 3) under an affine map."""
+    """Apply an affine map to points (n, 3)."""
     return (matrix[:3, :3] * points[:, None, :]).sum(axis=-1) + matrix[:3, 3]
 
 
 def _is_partly_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
-    """Whether a vertex of a mesh, or all of another shape, is in the box."""
+    """Whether a vertex of a mesh, or another shape as a whole, is in the box."""
     vertices = mi.traverse(shape).get("vertex_positions")
     if vertices is not None:
         u = grid.coordinates.point(dr.unravel(mi.Point3f, mi.Float(vertices)))
@@ -99,7 +100,7 @@ def _is_partly_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.
 
 
 def _first_hit(scene, near, grid, lower, upper, axis, offset) -> mi.Shape | None:
-    """One of the shapes ``near`` that rays along an axis of the grid hit in the box."""
+    """Return one of the shapes ``near`` that rays along an axis of the grid hit in the box."""
     across = [k for k in range(3) if k != axis]
     corner, sides = lower + SLACK, upper - lower - 2 * SLACK
     steps = grid.world.matrix[:3, :3]  # a voxel along each axis
@@ -125,7 +126,7 @@ def _opaque(values: Sequence[float]) -> mi.Vector3f:
 
 @symbolic
 def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
-    """The first shapes between two points that are not null boundaries."""
+    """Return the first shape between two points that is not a null boundary."""
     length = dr.norm(stop - start)
     direction = (stop - start) / length
     ray, found = mi.Ray3f(start, direction), dr.zeros(mi.ShapePtr, dr.width(start))
@@ -145,8 +146,9 @@ def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
 
 
 def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
-    """A shape behind whose null surface ``medium`` ends, in the ``box`` of voxels of ``grid``; None
-    where there is none.
+    """Return the name of a null shape inside of ``medium`` that encloses something else.
+
+    Only shapes in the ``box`` of voxels of ``grid`` count; None without any.
     """
     for shape in scene.shapes():
         outer = shape.exterior_medium()

@@ -50,9 +50,10 @@ class VoxelClasses(Immutable):
         dr.eval(self.readable)
 
     def filled(self, values: mi.Float, channels: int) -> mi.Float:
-        """``values`` of all voxels, where those of enclosed voxels that are 0 become the means of
-        their neighbours: near a curved surface, lookups that `cut_cells` restrict to one side still
-        read a little of them.
+        """Replace zeros of enclosed voxels in ``values`` by the means of their neighbours.
+
+        Near a curved surface, lookups that `cut_cells` restrict to one side still read some of
+        these voxels.
         """
         voxel = dr.arange(mi.UInt32, self.grid.voxel_count)
         positive = mi.Bool(False)

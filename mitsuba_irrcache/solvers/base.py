@@ -128,7 +128,7 @@ class Solver(ABC):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        """Whether it takes the irradiance of emitters without extent from `DirectLight`."""
+        """Whether it takes the irradiance of some emitters from `DirectLight` and `AreaLight`."""
         return True
 
     @abstractmethod

@@ -2,7 +2,7 @@
 
     python -m experiments.validation.random_scenes.run [--count 60] [--seed 1] [--only K ...]
         [--seconds 12]
-        [--budget 480] [--force]
+        [--budget 480] [--force] [--document FILE]
 
 Each scene (see generate.py) is loaded by `mi.load_dict`, with the integrator ``irrcache`` at
 default settings except ``max_depth`` and ``hide_emitters``, and rendered with two values of
@@ -21,7 +21,8 @@ unscattered radiance (volpath at depth 1). A scene *disagrees* if one of these, 
 renderings, is beyond three standard errors (4.5 for the worst of 64 blocks) and beyond LIMITS.
 
 Rows are stored in output/random_scenes/<seed>.json, images and references as .npz files;
-``--force`` discards the rows and renders with irrcache again, against the stored references. No
+``--force`` discards the rows and renders with irrcache again, against the stored references.
+``--document`` writes the counts, and the scenes that do not agree, to a Markdown file. No
 scene is started after ``--budget`` seconds: run it again for the others, and with more
 ``--seconds`` for those that are undecided.
 """
@@ -39,7 +40,8 @@ import mitsuba as mi
 import numpy as np
 
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
-from experiments.support.options import begin, parser_of
+from experiments.support.documents import replace_tables
+from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
 from experiments.validation.random_scenes.generate import RandomScene
 from mitsuba_irrcache.compare.metrics import block_means, colours, net_rmse
@@ -294,6 +296,7 @@ def main() -> None:
     parser.add_argument("--only", type=int, nargs="+", help="numbers of scenes")
     parser.add_argument("--seconds", type=float, default=12, help="of a reference")
     parser.add_argument("--budget", type=float, default=480, help="no scene is begun later")
+    add_document(parser)
     args = parser.parse_args()
     begin()
     folder = args.output / "random_scenes"
@@ -315,11 +318,28 @@ def main() -> None:
     }
     print(f"\n{table(rows, 'Random scenes').as_text()}")
     print(f"\n{table(wrong, 'Scenes that do not agree').as_text()}")
-    counts: dict[str, int] = {}
-    for row in rows.values():
-        word = verdict(row).partition(":")[0].partition(",")[0]
-        counts[word] = counts.get(word, 0) + 1
-    print("\n" + ", ".join(f"{word}: {count}" for word, count in sorted(counts.items())))
+    counts = counts_of(rows)
+    print("\n" + ", ".join(f"{word}: {count}" for word, count in counts.items()))
+    if args.document:
+        replace_tables(args.document, {"random-scenes": short_table(rows, wrong)})
+
+
+def counts_of(rows: dict[str, dict]) -> dict[str, int]:
+    """Return the number of scenes with each verdict."""
+    words = [verdict(row).partition(":")[0].partition(",")[0] for row in rows.values()]
+    return {word: words.count(word) for word in sorted(set(words))}
+
+
+def short_table(rows: dict[str, dict], wrong: dict[str, dict]) -> Table:
+    """Tabulate the counts, and the errors [%] of the scenes that do not agree."""
+    body = [["all", f"{count} {word}", "", "", ""] for word, count in counts_of(rows).items()]
+    for key, row in wrong.items():
+        cells = line(key, row)
+        means, block = (cells[column].split(" (")[0] for column in (3, 6))
+        noises = [cells[column].partition("+- ")[2] for column in (3, 6)]
+        errors = [f"{v} ({n})" for v, n in zip((means, block), noises, strict=True)]
+        body.append([key, cells[1], *errors, cells[8]])
+    return Table("", ["scene", "verdict", "mean [%]", "worst block [%]", "about"], body)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Direct illumination among surfaces by small area emitters and point-like lights, sampled from
 each voxel (next event estimation).
 
-The tracks that all voxels share hit a small emitter rarely, and then in many voxels at once. So
-points on it are sampled from each voxel instead, and tracks ignore it. Emitters that fill much of
-the solid angle are left to the tracks: few points on them matter to a voxel close by.
+Tracks, which all voxels share, hit a small emitter rarely, and then contribute to many voxels at
+once. Points on small emitters are therefore sampled from each voxel, and tracks ignore them.
+Emitters of a large solid angle are left to the tracks: a voxel close by would need many points.
+Emitters near the medium whose solid angle is known (`cache/area_light`) are not part of either.
 """
 
 from __future__ import annotations
@@ -23,13 +24,12 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
-#: Solid angle of an emitter, the mean over the voxels, from which on tracks are relied upon to hit
-#: it [sr].
+#: Mean solid angle [sr] of an emitter, seen from the voxels, above which it is left to the tracks.
 LARGE = 2.0
-#: Points in the voxels' box, and as many on an emitter, from which its solid angle is estimated.
+#: Number of pairs of a point in the voxels' box and one on the emitter for this estimate.
 POINTS = 1024
-#: Points that are sampled from each voxel in a batch, on all area emitters; one on each, if there
-#: are more of these, but never more than the latter.
+#: Number of points on all area emitters sampled from each voxel in a batch, and the maximum number
+#: if there are more emitters, each of which gets one point.
 SAMPLES, MOST_SAMPLES = 4, 16
 
 
@@ -41,8 +41,9 @@ def is_area_emitter(emitter: mi.Emitter) -> bool:
 def split_by_solid_angle(
     scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray
 ) -> tuple[list[mi.Emitter], list[mi.Emitter]]:
-    """Area emitters that are small, and that are large, as seen from the box of voxels of ``grid``
-    between ``lower`` and ``upper`` (x, y, z).
+    """Split the area emitters into small and large ones, seen from a box of voxels of ``grid``.
+
+    The box lies between ``lower`` and ``upper`` (x, y, z).
     """
     small, large = [], []
     for emitter in scene.emitters():
@@ -53,7 +54,7 @@ def split_by_solid_angle(
 
 
 def _solid_angle(emitter: mi.Emitter, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> float:
-    """A rough mean over positions in the box, without regard to occlusion."""
+    """Estimate the mean solid angle over positions in the box, ignoring occlusion."""
     rng = np.random.default_rng(POINTS)
     u = np.float32(rng.random((5, POINTS)))
     found = emitter.get_shape().sample_position(0.0, mi.Point2f(u[:2]))
@@ -125,7 +126,7 @@ class EmitterSampling:
         return dr.select(visible, irradiance * passed, 0), record.d, rng
 
     def _from(self, emitter: mi.Emitter) -> list[mi.Spectrum]:
-        """Irradiance from a point-like light."""
+        """Compute the irradiance from a point-like emitter."""
         irradiance, *_ = self.sample(emitter, mi.Point2f(0.5), mi.PCG32(dr.width(self.p)))
         dr.eval(irradiance)
         return [irradiance]
@@ -133,12 +134,12 @@ class EmitterSampling:
 
 @symbolic
 def _mean_irradiance(sampling, emitters, count, samples, rng):
-    """The mean of samples of the irradiance from all ``count`` emitters, and of its moments."""
+    """Average samples of the irradiance from all ``count`` emitters, and of its moments."""
     shift = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
     total, k = nothing(sampling.angular_basis), mi.UInt32(0)
     weight = mi.Float(count) / mi.Float(samples)
     while dr.hint(k < samples, label="area emitters"):
-        # The same number on each emitter, as far as possible, and evenly spread over it.
+        # Distribute the points evenly among the emitters and over each of them.
         which = mi.UInt32((mi.Float(k) + shift.z) / mi.Float(samples) * mi.Float(count))
         emitter = dr.gather(mi.EmitterPtr, emitters, dr.minimum(which, count - 1))
         sample = mi.Point2f(kronecker(k, 2, (shift.x, shift.y)))

@@ -100,9 +100,7 @@ class PathSolver(Solver):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        """Whether all of a straight line within the boundary of ``medium`` is in the medium, unless
-        it ends at a surface.
-        """
+        """Whether straight lines within the boundary of ``medium`` stay in it up to a surface."""
         if medium.is_isolated or not dr.width(active):
             return medium.is_isolated
         if not medium.has_exact_boundary or medium.others:
@@ -147,26 +145,27 @@ class PathSolver(Solver):
 
 
 def _orders(cache: IrradianceCache) -> int:
-    """Scattering orders that the cache holds: 0 .. max_depth - 2, or all of them."""
+    """Return the number of scattering orders in the cache; the largest integer for all."""
     return cache.max_depth - 1 if cache.max_depth >= 0 else 0xFFFFFFFF
 
 
 def _blocks(count: int, width: int) -> Iterator[mi.UInt32]:
-    """The numbers 0 .. ``count`` - 1 in arrays of ``width``, the last of which may be shorter."""
+    """Yield the numbers 0 .. ``count`` - 1 in arrays of ``width``; the last one may be shorter."""
     for start in range(0, count, width):
         yield dr.arange(mi.UInt32, min(width, count - start)) + dr.opaque(mi.UInt32, start)
 
 
 def _lanes(cache: IrradianceCache) -> int:
-    """Paths in one kernel launch: fewer where moments of the radiance are stored, too."""
+    """Return the paths per kernel launch: fewer if moments of the radiance are stored as well."""
     return LANES // 8 if cache.moments else LANES
 
 
 def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
-    """Statistics of each voxel from sums over batches of ``size`` samples, ``count`` consecutive
-    batches for each voxel: sums of batch means for each layer and channel; squared deviations of
-    the sum of both layers from its mean for each channel; sums of batch means of the moments, if
-    there are any.
+    """Compute the statistics of each voxel from sums over batches of ``size`` samples.
+
+    Each voxel has ``count`` consecutive batches. Returns sums of batch means for each layer and
+    channel; squared deviations of the irradiance (both layers) from its mean for each channel; and
+    sums of batch means of the moments, if any.
     """
     means = [total / size for total in totals]
     n = dr.opaque(type(means[0]), count)
@@ -183,8 +182,9 @@ def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
 
 
 class Opening(Preview):
-    """The first two batches of a stream, a few samples of both at a time: two are enough for a
-    standard error. Complete, they are the first two batches of `PathSolver.refine`.
+    """The first two batches of a stream, which suffice for a standard error, filled in small steps.
+
+    When they are complete they equal the first two batches of `PathSolver.refine`.
     """
 
     def __init__(self, task: SolverTask) -> None:
@@ -195,7 +195,7 @@ class Opening(Preview):
         self._totals: list[list] = []
 
     def grow(self, size: int, progress: Progress | None = None) -> None:
-        """Adds samples until there are ``size`` in each batch, at most `BATCH`."""
+        """Add samples until there are ``size`` in each batch, at most `BATCH`."""
         more, active = size - self.size, self.cache.active_count
         totals, done = [], 0
         for i, voxels in enumerate(_blocks(active, min(active, _lanes(self.cache) // (2 * BATCH)))):
@@ -211,13 +211,13 @@ class Opening(Preview):
         self._totals, self.size = totals, size
 
     def fill(self, cache: IrradianceCache) -> None:
-        """Puts both batches into an empty ``cache`` for batches of this size."""
+        """Store both batches in an empty ``cache`` with batches of this size."""
         blocks = [_statistics(sums, self.size, 2, cache.channels) for sums in self._totals]
         cache.add(self.seed, 2 * self.size, blocks)
 
 
 class _Estimator:
-    """Estimates of batches, by one kernel for all passes: what differs between them is opaque."""
+    """Estimates of batches, by one kernel for all passes, whose differing parameters are opaque."""
 
     def __init__(self, task: SolverTask) -> None:
         scene, medium, cache = task.scene, task.medium, task.cache
@@ -246,11 +246,11 @@ class _Estimator:
         )
 
     def batches(self, voxels: mi.UInt32, first: int, count: int) -> tuple:
-        """Estimates ``count`` batches from the batch ``first`` on.
+        """Estimate ``count`` batches, starting with batch ``first``.
 
-        ``voxels`` are places in the list of active voxels. Returns, for every layer and channel,
-        the sum of the batch means, and for every channel their spread, per voxel (float64); then
-        the sums for every moment and channel (float32).
+        ``voxels`` are indices into the list of active voxels. Returns for each voxel the sums of
+        the batch means of every layer and channel and their spread for every channel (float64),
+        and the sums for every moment and channel (float32).
         """
         result = _statistics(
             self.sums(voxels, first, count, 0, BATCH), BATCH, count, self.cache.channels
@@ -260,11 +260,11 @@ class _Estimator:
         return result
 
     def sums(self, voxels: mi.UInt32, first: int, count: int, start: int, size: int) -> list:
-        """Sums of the samples ``start`` to ``start + size`` of the batches ``first`` to ``first +
-        count``, for every layer and channel; the batches of a voxel are consecutive.
+        """Sum samples ``start`` to ``start + size`` of batches ``first`` to ``first + count`` for
+        every layer and channel; the batches of a voxel are consecutive.
 
-        In float64, sums of float32 values are exact (unless these span a factor of 2^25), so they
-        do not depend on how samples are divided into passes.
+        Float64 sums of float32 values are exact (unless these span a factor of 2^25), so they do
+        not depend on how samples are divided into passes.
         """
         cache = self.cache
         per_batch, per_voxel = (dr.opaque(mi.UInt32, n) for n in (size, size * count))
@@ -292,7 +292,7 @@ class _Estimator:
     def _layers(
         self, position: mi.Point3f, batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32
     ) -> Sequence[mi.Spectrum]:
-        """One sample per lane of both layers, and of the moments."""
+        """Compute one sample per lane of both layers and of the moments."""
         if not self.medium.is_traced:
             return _estimate(
                 self.scene,
@@ -325,7 +325,7 @@ class _Estimator:
         )
 
     def seconds(self, samples: int) -> float:
-        """Predicts the time for ``samples`` from one batch at voxels all over the medium."""
+        """Predict the time for ``samples`` from one batch at voxels all over the medium."""
         count = self.cache.active_count
         voxels = dr.arange(mi.UInt32, min(count, _lanes(self.cache) // 256))
         voxels = voxels * dr.opaque(mi.UInt32, max(1, count // dr.width(voxels)))
@@ -350,8 +350,8 @@ def _estimate(
     multiple: bool,
     emitters: mi.EmitterPtr | None,
 ):
-    """One sample of both layers per lane; the samples ``within`` a batch are stratified over
-    directions.
+    """Compute one sample of both layers per lane; the samples ``within`` a batch are stratified
+    over directions.
     """
     # docs/primer, eq. (3.1)
     rng, spread = _random_numbers(batch, within, voxel, seed)
@@ -398,7 +398,7 @@ def _estimate(
 def _random_numbers(
     batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32, seed: mi.UInt32
 ) -> tuple[mi.PCG32, list[mi.Float]]:
-    """The random stream of a sample, and its point of a four-dimensional low-discrepancy set."""
+    """Return the random stream of a sample, and its point of a 4D low-discrepancy set."""
     first, second = mi.sample_tea_32(voxel, mi.sample_tea_32(seed, batch)[0])
     rng = random_stream((first, second), mi.UInt64(within) + 1)
     # A batch shares one random shift of a low-discrepancy set; each point alone is uniform.
@@ -415,8 +415,8 @@ def direct_light(
     active: mi.Bool,
     emitters: mi.EmitterPtr | None = None,
 ) -> tuple[mi.Spectrum, mi.PCG32]:
-    """One sample of D(x) = int_S2 L_e T dw by emitter sampling and ratio tracking, from all or some
-    ``emitters`` of the scene.
+    """Sample D(x) = int_S2 L_e T dw, by emitter sampling and ratio tracking, for all emitters of
+    the scene or the given ``emitters``.
     """
     interaction = dr.zeros(mi.Interaction3f)
     interaction.p = position
