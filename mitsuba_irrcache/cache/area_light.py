@@ -4,8 +4,8 @@ Without a medium and other surfaces the irradiance is E(p) = L Omega(p), in clos
 (`lights/solid_angle`). It varies by an order of magnitude within a voxel next to the emitter, and
 is zero behind it, so it is not interpolated. Only two smooth factors are:
 
-- the mean transmittance of the medium between p and the points of the emitter, as the mean
-  extinction of the line to the closest one of them (see `direct_light`);
+- the mean transmittance of the medium between p and the points of the emitter, as an optical
+  depth, or as that depth over the length of the line to the closest point;
 - the mean visibility of these points past surfaces, weighted by that transmittance.
 
 Both are ratios of sums over the same points, weighted by the solid angle for which each stands, so
@@ -37,6 +37,8 @@ from mitsuba_irrcache.transport.tracking import medium_transmittance
 SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 1 << 24, 16, 512
 #: Weight [sr] added to each point, so that their sum is positive in the plane of a flat emitter.
 SMALL_ANGLE = 1e-6
+#: Number of positions at which the error of interpolated optical depths is measured.
+TESTS = 2048
 #: Number of positions on an emitter from which its distance to the voxels is measured.
 POSITIONS = 64
 #: Maximum number of emitters treated in this way, and of their values at all voxels: about 14
@@ -62,7 +64,18 @@ class AreaLight(DirectLight):
         self._shape = emitter.get_shape()
         self._area = dr.opaque(mi.Float, float(np.ravel(self._shape.surface_area())[0]))
         self._edges = classes.cut_cells if classes is not None else None
-        super().__init__(scene, emitter, medium, grid, voxels, classes)
+        self._scene, self._found = scene, None
+        arguments = scene, emitter, medium, grid, voxels, classes
+        self._follows_closest_line = True
+        super().__init__(*arguments)
+        if not _is_inside(self._shape, medium):
+            by_line = self._depth_error()
+            self._follows_closest_line = False
+            super().__init__(*arguments)
+            if by_line < self._depth_error():
+                self._follows_closest_line = True
+                super().__init__(*arguments)
+        self._scene = self._found = None
         self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
 
     # docs/primer, eq. (2.9)
@@ -76,16 +89,47 @@ class AreaLight(DirectLight):
             return passed
         return self._edges.corrected(self._others, p, passed, mi.Bool(active))
 
-    def _direction(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
-        """Return the direction to the closest point of the emitter and its distance."""
+    def length(self, p: mi.Point3f) -> mi.Float:
+        """Return the length in the medium of the line to the closest point of the emitter, or 1.
+
+        The optical depth over that length is smooth next to the emitter and to the face through
+        which it shines. Where lines to different points leave the medium through different faces,
+        the optical depth itself is smoother; what is better for a scene is measured.
+        """
+        if not self._follows_closest_line:
+            return dr.full(mi.Float, 1, dr.width(p))
         way = self._solid_angle.closest(p) - p
         distance = dr.norm(way)
-        upwards = mi.Vector3f(0, 0, 1)
-        return dr.select(distance > 0, way / distance, upwards), distance
+        direction = dr.select(distance > 0, way / distance, mi.Vector3f(0, 0, 1))
+        hit, near, far = self._medium.intersect(mi.Ray3f(p, direction))
+        near, far = dr.maximum(near, 0), dr.minimum(far, distance)
+        return dr.maximum(dr.select(hit, far - near, 0), 0)
+
+    def _depth_error(self) -> float:
+        """Estimate the relative error of the irradiance due to interpolated optical depths.
+
+        It is evaluated at random positions in random voxels.
+        """
+        rng = np.random.default_rng(TESTS)
+        number = mi.UInt32(rng.integers(dr.width(self._voxels), size=TESTS).astype(np.uint32))
+        voxel = dr.gather(mi.UInt32, self._voxels, number)
+        offset = mi.Vector3f(np.float32(rng.random((3, TESTS))))
+        p = self._grid.world.point(mi.Point3f(*self._grid.voxel_indices(voxel)) + offset)
+        stream = random_stream(mi.sample_tea_32(voxel, hashed_seed((TESTS, 1))[0]))
+        others = Media.around(self._medium).without(self._medium)
+        count = dr.opaque(mi.UInt32, MOST_SAMPLES)
+        transmitted, _, weight = self._sums(self._scene, others, p, count, stream)
+        exact = dr.mean(transmitted) / dr.maximum(weight, 1e-20)
+        scale = dr.select(self._medium.contains(p), self._solid_angle.at(p), 0)
+        error = dr.abs(dr.mean(mi.Spectrum(dr.exp(-self.depth(p)))) - exact)
+        total, reference = dr.sum(scale * error), dr.sum(scale * exact)
+        return float(total[0]) / max(float(reference[0]), 1e-30)
 
     def _attenuation(
-        self, scene: mi.Scene, p: mi.Point3f, line: tuple
+        self, scene: mi.Scene, p: mi.Point3f
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
+        if self._found is not None:
+            return self._found
         voxels = self._voxels
         count = int(np.clip(SAMPLES // dr.width(voxels), FEWEST_SAMPLES, MOST_SAMPLES))
         rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
@@ -97,6 +141,7 @@ class AreaLight(DirectLight):
         grey = self._medium.sigma_t.channels == 1
         depth = -dr.log(dr.maximum(mean[0] if grey else mi.Color3f(mean), 1e-30))
         dr.eval(depth, passed)
+        self._found = depth, passed
         return depth, passed
 
     @symbolic
@@ -152,7 +197,8 @@ class AreaLight(DirectLight):
     def _field_of_extinction(
         self, mean: mi.Float | mi.Color3f, classes: VoxelClasses | None
     ) -> ExtendedField:
-        """Create the field of the mean extinction, extrapolated beyond the outermost voxels.
+        """Create the field of the optical depth over `length`, extrapolated beyond the outermost
+        voxels.
 
         Next to a face through which the emitter shines sideways it changes within a voxel.
         """
@@ -195,11 +241,21 @@ def area_lights_of(
     return [AreaLight(scene, e, medium, grid, voxels, classes) for e in lights[:count]]
 
 
-def _is_near(emitter: mi.Emitter, grid: Grid) -> bool:
-    """Whether the irradiance of an emitter is not smooth enough for interpolation."""
+def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:
+    """Whether any of `POSITIONS` points of a shape lies in the medium."""
+    return bool(dr.any(medium.contains(_positions(shape))))
+
+
+def _positions(shape: mi.Shape) -> mi.Point3f:
+    """Sample points of a shape."""
     rng = np.random.default_rng(POSITIONS)
     sample = mi.Point2f(np.float32(rng.random((2, POSITIONS))))
-    positions = emitter.get_shape().sample_position(0.0, sample).p
+    return shape.sample_position(0.0, sample).p
+
+
+def _is_near(emitter: mi.Emitter, grid: Grid) -> bool:
+    """Whether the irradiance of an emitter is not smooth enough for interpolation."""
+    positions = _positions(emitter.get_shape())
     return edges_away(np.array(positions, dtype=np.float64), grid) <= REACH
 
 

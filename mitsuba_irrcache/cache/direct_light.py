@@ -64,9 +64,8 @@ class DirectLight:
         self.distant = self._kind is EmitterKind.SUN
         p = VoxelSamplePoints(scene, grid).of(voxels)
         self._grid, self._voxels, self._centres = grid, voxels, p
-        line = _, near, far = self._line(p)
-        length, sigma_t = dr.maximum(far - near, 0), medium.sigma_t.at_world(p)
-        depth, self._passed = self._attenuation(scene, p, line)
+        length, sigma_t = self.length(p), medium.sigma_t.at_world(p)
+        depth, self._passed = self._attenuation(scene, p)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
         #: mean extinction on the line to the emitter, for lookups
         self.extinction = self._field_of_extinction(mean, survey)
@@ -117,12 +116,12 @@ class DirectLight:
         return mi.Float(1) if self._others is None else self._others.at_world(p, active)
 
     def _attenuation(
-        self, scene: mi.Scene, p: mi.Point3f, line: tuple
+        self, scene: mi.Scene, p: mi.Point3f
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
-        """Return the optical depth of the medium along ``line``, and the transmittance of all else
-        between ``p`` and the emitter.
+        """Return the optical depth of the medium, and the transmittance of all else, between ``p``
+        and the emitter.
         """
-        ray, near, far = line
+        ray, near, far = self._line(p)
         depth = optical_depth(self._medium, ray, near, far, near < far, dr.inf)
         passed = mi.Spectrum(1)
         if self._medium.is_traced:
@@ -145,18 +144,13 @@ class DirectLight:
         """Return rays from world positions to the emitter, and the distances at which they enter
         and leave the medium; they do not intersect it unless the first one is smaller.
         """
-        direction, distance = self._direction(p)
-        ray = mi.Ray3f(p, direction)
-        hit, near, far = self._medium.intersect(ray)
-        near, far = dr.maximum(near, 0), dr.minimum(far, distance)
-        return ray, near, dr.select(hit, far, near)
-
-    def _direction(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
-        """Return the direction to the emitter and its distance."""
         at = dr.zeros(mi.Interaction3f, dr.width(p))
         at.p = p
         record, _ = self.emitter.sample_direction(at, mi.Point2f(0.5))
-        return record.d, record.dist
+        ray = mi.Ray3f(p, record.d)
+        hit, near, far = self._medium.intersect(ray)
+        near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
+        return ray, near, dr.select(hit, far, near)
 
     def _mean_unobstructed(self) -> mi.Spectrum:
         """Compute means of E over the voxels."""

@@ -161,6 +161,11 @@ def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
     return EmittersByKind(scene.emitters()).of(*SPOT_LIKE)
 
 
+def varies(emitter: mi.Emitter) -> bool:
+    """Whether the radiance of an emitter depends on the position on its surface."""
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+
+
 def position_of(emitter: mi.Emitter) -> np.ndarray:
     """Return the world position (3) of a point-like emitter."""
     params = mi.traverse(emitter)

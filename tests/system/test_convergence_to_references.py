@@ -35,9 +35,11 @@ SWEEP = {
     Case("constant"): (96, 512, 0.003),
     Case("constant", "rayleigh"): (64, 512, 0.003),
     Case("rectangle far"): (64, 512, 0.003),
-    Case("rectangle near"): (64, 512, 0.003),
-    Case("sphere near"): (64, 512, 0.003),
-    Case("disk near"): (64, 512, 0.003),
+    Case("rectangle near"): (64, 32, 0.001),
+    Case("sphere near"): (64, 32, 0.001),
+    Case("disk near"): (64, 32, 0.001),
+    # Wider than the medium: it shines through the sides, where transmittance is not exponential.
+    Case("rectangle large"): (64, 32, 0.008),
     Case("point outside", grid="3x5x2"): (64, 32, 0.001),
     Case("point outside", grid="1x1x6"): (64, 32, 0.001),
 }
@@ -45,7 +47,8 @@ PATH = {
     Case("constant"): (64, 64, 0.003),
     Case("point inside"): (64, 64, 0.002),
     Case("point outside"): (64, 64, 0.003),
-    Case("rectangle near"): (64, 32, 0.003),
+    Case("rectangle near"): (64, 32, 0.001),
+    Case("disk near"): (64, 32, 0.001),
 }
 #: All orders of scattering, solver ``sweep``.
 ORDERS = {
