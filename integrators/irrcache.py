@@ -16,6 +16,9 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core import properties
 from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.gradients.backward import check, parameter_gradients
+from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients.parameters import enabled
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
 from mitsuba_irrcache.machine.versions import check_versions
@@ -31,7 +34,10 @@ from mitsuba_irrcache.scene.consistency import check_sensor
 from mitsuba_irrcache.solvers.base import registered
 
 SOLVERS = ("auto", *sorted(solver.name for solver in registered()))
-_NO_GRADIENTS = 'irrcache computes no gradients; use the integrator "prbvolpath" for them.'
+_NO_FORWARD = (
+    "irrcache computes gradients in reverse mode only (dr.backward); use the integrator "
+    '"prbvolpath" for dr.forward.'
+)
 
 
 class IrradianceCachingIntegrator(mi.SamplingIntegrator):
@@ -419,10 +425,33 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return frames(self._builder, scene, image, Targets(**targets), progress)
 
     def render_forward(self, *args: object, **kwargs: object) -> mi.TensorXf:
-        raise NotImplementedError(_NO_GRADIENTS)
+        raise NotImplementedError(_NO_FORWARD)
 
-    def render_backward(self, *args: object, **kwargs: object) -> None:
-        raise NotImplementedError(_NO_GRADIENTS)
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        grad_in: mi.TensorXf,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> None:
+        """Add the gradients of an objective to the parameters that carry some, from those by the
+        pixels of the image, ``grad_in``.
+        """
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        keys = enabled(params)
+        if not keys:
+            return
+        with dr.suspend_grad(), self._builder.lock:
+            sight = self._prepared(scene)
+            check(self._builder.parts, keys, self._layered)
+            film = FilmAdjoint(sensor, grad_in, seed, spp)
+            (part,) = self._builder.parts
+            found = parameter_gradients(scene, params, keys, part, sight, self._step, film)
+        for key, grad in found.items():
+            dr.accum_grad(params[key], grad)
 
     def _render(
         self,

@@ -121,21 +121,8 @@ class ClosedFormCameraRays:
         active: mi.Bool,
     ) -> RayResult:
         """Compute the radiance along ``ray``, which starts in ``medium``."""
-        background = mi.Spectrum(0)
-        environment = scene.environment()
-        visible = environment is not None and not self.hide_emitters and self.shows_emitters
-        if visible:
-            escaped = dr.zeros(mi.SurfaceInteraction3f)
-            escaped.wi = -ray.d
-            escaped.wavelengths = ray.wavelengths
-            background = environment.eval(escaped, active)
-        hit, near, far = self.medium.intersect(ray)
-        # As in volpath, a sensor is inside the medium only if the scene says so, and rays enter
-        # through the boundary, even if the grid covers only a part of it.
-        _, entry, leave = self.medium.boundary.intersect(ray)
-        entered = entry > -1e-5 * (leave - entry)
-        hit &= (far > 0) if medium is not None else entered
-        near = dr.maximum(near, 0)
+        visible, background = self.background(scene, ray, active)
+        hit, near, far = self.span(ray, medium)
         scattered, transmittance, gathered, emitted = self.projection.march(
             ray, near, far, background, 1 - sampler.next_1d(active), active & hit
         )
@@ -152,6 +139,30 @@ class ClosedFormCameraRays:
         if not visible:  # dr.mean would make the number of samples a constant of the kernel
             alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
         return RayResult(scattered, background, transmittance, alpha, gathered)
+
+    def background(
+        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[bool, mi.Spectrum]:
+        """Whether an environment is visible behind the medium, and its radiance along ``ray``."""
+        environment = scene.environment()
+        if environment is None or self.hide_emitters or not self.shows_emitters:
+            return False, mi.Spectrum(0)
+        escaped = dr.zeros(mi.SurfaceInteraction3f)
+        escaped.wi = -ray.d
+        escaped.wavelengths = ray.wavelengths
+        return True, environment.eval(escaped, active)
+
+    def span(self, ray: mi.Ray3f, medium: mi.Medium | None) -> tuple[mi.Bool, mi.Float, mi.Float]:
+        """Whether ``ray``, which starts in ``medium``, passes through the medium with a cache, and
+        the distances between which it does.
+        """
+        hit, near, far = self.medium.intersect(ray)
+        # As in volpath, a sensor is inside the medium only if the scene says so, and rays enter
+        # through the boundary, even if the grid covers only a part of it.
+        _, entry, leave = self.medium.boundary.intersect(ray)
+        entered = entry > -1e-5 * (leave - entry)
+        hit &= (far > 0) if medium is not None else entered
+        return hit, dr.maximum(near, 0), far
 
     def _attenuation(self, transmittance: mi.Spectrum, direction: mi.Vector3f) -> mi.Spectrum:
         """Attenuation of the environment; by the original extinction for narrow sources."""

@@ -1,0 +1,304 @@
+"""From derivatives of an objective by the pixels to those by the parameters of the medium."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.conservative import conserving
+from mitsuba_irrcache.cache.direct_light import DirectLight, DirectLightAlongRays
+from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.gradients.film import LUMINANCE, CameraPass, FilmAdjoint
+from mitsuba_irrcache.gradients.parameters import (
+    ALBEDO,
+    SIGMA_T,
+    channels_of,
+    refuse_all,
+    roles_of,
+    shaped_like,
+)
+from mitsuba_irrcache.gradients.points import add_ways
+from mitsuba_irrcache.gradients.replay import CameraSplats, LitMedium
+from mitsuba_irrcache.gradients.resampling import VoxelQuadrature
+from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat
+from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
+from mitsuba_irrcache.grids.fields import Field
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.root_field import RootField
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+from mitsuba_irrcache.render.camera import ClosedFormCameraRays
+from mitsuba_irrcache.scene.compile import media_of
+
+#: Pairs of ordinates, at least and at most.
+FEWEST_PAIRS, MOST_PAIRS = 16, 128
+#: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
+MARGIN = 256.0
+
+
+def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
+    """Raise IrrcacheError for scenes and settings in which no gradients are computed."""
+    if not parts:
+        refuse_all(keys, "no medium is visible, and Mitsuba's volpath renders the scene",
+                   'Give the shape of the medium a null BSDF')
+    if layered:
+        refuse_all(keys, "the image is filtered or has aovs", "Set filter to none and no aovs")
+    (part, *others), medium = parts, parts[0].medium
+    if others or not medium.is_isolated or medium.is_traced and medium.phase.is_isotropic:
+        refuse_all(
+            keys, "there are surfaces, area lights or several media, or the boundary is neither a "
+            "box nor a sphere", "Reduce the scene to one medium under distant and point lights"
+        )
+    name = f'medium "{medium.name}"'
+    if not medium.phase.is_isotropic:
+        refuse_all(keys, f"the phase function of {name} is not isotropic", "Make it isotropic")
+    if medium.emission is not None:
+        refuse_all(keys, f"{name} is emissive", "Remove the emission")
+    if part.half_space is not None:
+        refuse_all(keys, f"{name} is opaque and homogeneous, and has no cache", "Set resolution")
+    if part.solver.name != "sweep":
+        refuse_all(keys, f'the solver is "{part.solver.name}"', 'Set solver to "sweep"')
+    depth = part.settings.max_depth
+    if depth > 2:
+        refuse_all(keys, f"max_depth is {depth}", "Set max_depth to 1, 2 or -1")
+
+
+def parameter_gradients(
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    keys: list[str],
+    part: CachedMedium,
+    sight: ClosedFormCameraRays,
+    step: float,
+    film: FilmAdjoint,
+) -> dict[str, object]:
+    """The derivatives by the parameters ``keys`` of the objective whose derivatives by the pixels
+    ``film`` has, in the types of these parameters.
+
+    ``part`` is the scene's only medium, with its cache; ``step`` is the integrator's property.
+    """
+    (medium,) = media_of(scene)
+    roles, wanted = roles_of(params, keys, medium), {}
+    for key, role in roles.items():
+        field = part.medium.sigma_t if role == SIGMA_T else part.medium.albedo
+        own = field.channels if field.grid is not None else channels_of(params[key])
+        wanted[role] = max(wanted.get(role, 1), own)
+    adjoint = MediumAdjoint(scene, part, sight, step, wanted)
+    found = adjoint.gradients(film)
+    result = {}
+    for key, role in roles.items():
+        value = params[key]
+        grad = by_parameter(value, adjoint.field(role), found[role])
+        result[key] = shaped_like(value, grad)
+    return result
+
+
+class MediumAdjoint:
+    """Derivatives by the medium of ``part`` in ``scene``, whose camera rays are ``sight``.
+
+    ``wanted`` maps what is wanted, `SIGMA_T` or `ALBEDO`, to the number of its channels.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        part: CachedMedium,
+        sight: ClosedFormCameraRays,
+        step: float,
+        wanted: dict[str, int],
+    ) -> None:
+        self._scene, self._part, self._sight, self._wanted = scene, part, sight, wanted
+        self._medium, self._max_depth = part.medium, part.settings.max_depth
+        self._transport: AdjointTransport | None = None
+        self._collided: list[mi.Float] = []
+        field, falloff, lights = None, None, []
+        if part.cache is not None:
+            self.grid = part.cache.grid
+            pairs = int(np.clip(part.target(0) // 2, FEWEST_PAIRS, MOST_PAIRS))
+            self._transport = AdjointTransport(
+                scene, self._medium, self.grid, part.settings.seed, pairs, self._max_depth == 2
+            )
+            field, falloff, lights = self._irradiance()
+        self._lit = LitMedium(self._medium, field, falloff, lights, step)
+
+    # The irradiance
+
+    def _irradiance(self) -> tuple[RootField, InverseSquareFactor | None, list]:
+        """The irradiance at all voxels, also where there is no matter, for lookups."""
+        cache, grid = self._part.cache, self.grid
+        count, voxels = grid.voxel_count, dr.arange(mi.UInt32, grid.voxel_count)
+        channels = self._transport.channels
+        cached, place = cache.irradiance.array, voxels * channels
+        known = [dr.gather(mi.Float, cached, place + c) for c in range(channels)]
+        swept, self._collided = self._transport.irradiance(known)
+        has_value = dr.zeros(mi.Bool, count)
+        if cache.active_count and cache.samples:
+            dr.scatter(has_value, mi.Bool(True), cache.active)
+        total = [dr.select(has_value, a, b) for a, b in zip(known, swept, strict=True)]
+        lights = [
+            DirectLight(self._scene, light.emitter, self._medium, grid, voxels)
+            for light in cache.direct_lights
+        ]
+        for light in lights:
+            total = [dr.maximum(t - e, 0) for t, e in zip(total, light.irradiance, strict=False)]
+        falloff = InverseSquareFactor.of(self._scene, grid, [light.emitter for light in lights])
+        roots = [dr.sqrt(dr.maximum(t, 0)) for t in total]
+        if falloff is not None:
+            smooth = dr.rsqrt(falloff.of_voxels(voxels))
+            roots = [r * smooth for r in roots]
+        values = interleaved(roots, count)
+        values = conserving(grid, values, dr.full(mi.Bool, True, count), channels)
+        field = RootField(grid, values, channels)
+        return field, falloff, [DirectLightAlongRays(light) for light in lights]
+
+    # The camera
+
+    def gradients(self, film: FilmAdjoint) -> dict[str, mi.Float]:
+        """Derivatives by extinction and albedo at the data's voxels, of the objective whose
+        derivatives by the pixels ``film`` has.
+        """
+        sums: dict[str, list] = {role: [] for role in self._wanted}
+        fluence = self._replayed(film, sums)
+        if self._transport is not None and fluence is not None:
+            self._add_transport(fluence, sums)
+        return {role: _total(parts) for role, parts in sums.items()}
+
+    def _replayed(self, film: FilmAdjoint, sums: dict[str, list]) -> list[mi.Float] | None:
+        """Add what camera rays depend on straight to ``sums``; return the adjoint fluence that they
+        leave in the voxels.
+        """
+        splats = None
+        for each in film.passes():
+            span, behind, hit, offset = self._rays(each, film)
+            ahead, _ = self._lit.radiance(each.ray, span, each.radiance, behind, offset, hit)
+            dr.eval(ahead)
+            if splats is None:
+                splats = self._camera_splats(film, ahead)
+            self._lit.replay(each.ray, span, each.radiance, ahead, offset, hit, splats)
+            dr.eval()
+        for role, splat in ((SIGMA_T, splats.sigma_t), (ALBEDO, splats.albedo)):
+            if splat is not None:
+                sums[role].append(splat.values())
+        return self._fluence(splats.fluence) if splats.fluence is not None else None
+
+    def _rays(self, each: CameraPass, film: FilmAdjoint) -> tuple:
+        """For camera rays the distances between which they are in the medium, the weighted radiance
+        behind it, whether there is any such, and the first step.
+        """
+        ray, sight = each.ray, self._sight
+        visible, background = sight.background(self._scene, ray, mi.Bool(True))
+        behind = each.radiance * background if visible else mi.Spectrum(0)
+        if each.alpha is not None and not visible:
+            behind = behind - each.alpha / dr.size_v(mi.Spectrum)
+        hit, near, far = sight.span(ray, film.medium)
+        offset = 1 - each.sampler.next_1d()
+        span = mi.Float(near), mi.Float(far)
+        dr.eval(ray, span, behind, hit, offset, each.radiance)
+        return span, behind, hit, offset
+
+    def _camera_splats(self, film: FilmAdjoint, ahead: mi.Spectrum) -> CameraSplats:
+        """Empty sums for the derivatives that are wanted."""
+        lengths = np.linalg.norm(self._medium.frame[:3, :3], axis=0)
+        diagonal, rays = float(np.linalg.norm(lengths)), film.samples * MARGIN
+        largest = film.largest * film.pixels * MARGIN
+        brightest = max(float(dr.max(dr.max(dr.abs(ahead)))[0]) * rays, 1e-30)
+        irradiance = self._lit.irradiance
+        mean = irradiance.maximum / (4 * np.pi) if irradiance is not None else 0.0
+        needs = self._transport is not None
+        return CameraSplats(
+            self._splat(SIGMA_T, (brightest + largest * mean) * diagonal),
+            self._splat(ALBEDO, largest * mean),
+            GridSplat(self.grid, self._transport.channels, largest * diagonal) if needs else None,
+        )
+
+    def _splat(self, role: str, bound: float) -> GridSplat | ConstantSplat | None:
+        """Empty sums of the derivative by a field of the medium; None if it is not wanted."""
+        if role not in self._wanted:
+            return None
+        field = self.field(role)
+        if field.grid is None:
+            return ConstantSplat(self._wanted[role], bound)
+        return GridSplat(field.grid, field.channels, bound)
+
+    def field(self, role: str) -> Field:
+        return self._medium.sigma_t if role == SIGMA_T else self._medium.albedo
+
+    # Transport
+
+    def _fluence(self, splat: GridSplat) -> list[mi.Float]:
+        """Means over the voxels of the adjoint fluence of camera rays, by channel."""
+        channels, count = self._transport.channels, self.grid.voxel_count
+        volumes = GridSplat(self.grid, 1, 2 * abs(np.linalg.det(self._medium.frame[:3, :3])))
+        VoxelQuadrature(self._medium, self.grid).volumes(volumes)
+        volume, sums = volumes.values(), splat.values()
+        place = dr.arange(mi.UInt32, count) * channels
+        found = [
+            dr.select(volume > 0, dr.gather(mi.Float, sums, place + c) / volume, 0)
+            for c in range(channels)
+        ]
+        dr.eval(found)
+        return found
+
+    def _add_transport(self, fluence: list[mi.Float], sums: dict[str, list]) -> None:
+        """Add to ``sums`` what depends on the radiance that reaches the voxels."""
+        transport = self._transport
+        found = transport.derivatives(self._collided, fluence)
+        quadrature = VoxelQuadrature(self._medium, self.grid)
+        volume = 3 * MARGIN * abs(np.linalg.det(self._medium.frame[:3, :3]))
+        collided = _largest(found.collided)
+        splats = {
+            SIGMA_T: self._splat(SIGMA_T, volume * (_largest(found.sigma_t) + collided)),
+            ALBEDO: self._splat(ALBEDO, volume * collided * self._medium.sigma_t.maximum),
+        }
+        quadrature.add(splats[SIGMA_T], splats[ALBEDO], found, transport.albedo)
+        for role, splat in splats.items():
+            if splat is not None:
+                sums[role].append(splat.values())
+        if SIGMA_T in self._wanted:
+            for emitter, irradiance in zip(
+                transport.point_lights, transport.from_points, strict=True
+            ):
+                sums[SIGMA_T].append(self._along_ways(emitter, irradiance, found))
+
+    def _along_ways(
+        self, emitter: mi.Emitter, irradiance: mi.Spectrum, found: Derivatives
+    ) -> mi.Float:
+        """The derivative by the extinction between a point-like light and the voxels."""
+        grid = self.grid
+        share = dr.opaque(mi.Float, -abs(float(np.linalg.det(grid.to_world[:3, :3])))
+                          / grid.voxel_count)
+        removed = irradiance * mi.Spectrum(*found.direct) * share
+        dr.eval(removed)
+        diagonal = float(np.linalg.norm(grid.side_lengths))
+        bound = float(dr.max(dr.max(dr.abs(removed)))[0]) * grid.voxel_count * diagonal * 3
+        splat = self._splat(SIGMA_T, bound * MARGIN)
+        add_ways(
+            self._medium, emitter, self._transport.positions, removed, self._lit.step, splat
+        )
+        return splat.values()
+
+
+def _largest(channels: list[mi.Float]) -> float:
+    return max(float(dr.max(dr.abs(values))[0]) for values in channels)
+
+
+def _total(parts: list[mi.Float]) -> mi.Float:
+    result = parts[0]
+    for part in parts[1:]:
+        result = result + part
+    dr.eval(result)
+    return result
+
+
+def by_parameter(value: object, field: Field, grad: mi.Float) -> mi.Float:
+    """The derivative by a parameter's ``value`` from that by the ``field`` made of it: grids have a
+    scale, and in monochromatic variants the luminance of coloured data.
+    """
+    if field.grid is None:
+        return grad * dr.opaque(mi.Float, field.scale)
+    grad = grad * field.scale
+    if dr.is_tensor_v(value) and value.shape[3] != field.channels:
+        grad = interleaved([grad * share for share in LUMINANCE])
+    dr.eval(grad)
+    return grad

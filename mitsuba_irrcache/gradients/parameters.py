@@ -1,0 +1,83 @@
+"""Which parameters of a scene gradients are computed for, and the refusal of all others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.media.bake import children
+
+#: What a parameter can be of a medium.
+SIGMA_T, ALBEDO = "sigma_t", "albedo"
+
+
+def enabled(params: Mapping) -> list[str]:
+    """Keys of the parameters that carry gradients."""
+    return [key for key in params.keys() if _is_enabled(params[key])]
+
+
+def _is_enabled(value: object) -> bool:
+    return dr.is_array_v(value) and dr.grad_enabled(value)
+
+
+def roles_of(params: mi.SceneParameters, keys: list[str], medium: mi.Medium) -> dict[str, str]:
+    """What each of the parameters ``keys`` is of ``medium``: `SIGMA_T` or `ALBEDO`.
+
+    Raises IrrcacheError for a parameter of anything else.
+    """
+    volumes = children(medium)
+    nodes: dict[mi.Object, str] = {}
+    for role in (SIGMA_T, ALBEDO):
+        volume = volumes[role]
+        for node in (volume, *children(volume).values()):
+            if nodes.get(node, role) != role:
+                refuse(_first_key_of(params, node, keys), "both extinction and albedo depend on it")
+            nodes[node] = role
+    roles = {}
+    for key in keys:
+        node = params.properties[key][2]
+        if node not in nodes or not key.endswith((".data", ".value")):
+            refuse(key, f"it belongs to a {node.class_name()}")
+        roles[key] = nodes[node]
+    return roles
+
+
+def _first_key_of(params: mi.SceneParameters, node: mi.Object, keys: list[str]) -> str:
+    return next((key for key in keys if params.properties[key][2] == node), "sigma_t")
+
+
+def refuse(key: str, reason: str) -> None:
+    """Raise the error for a parameter without gradients."""
+    raise IrrcacheError(
+        f'irrcache computes no gradient of the parameter "{key}": {reason}. Gradients are known of '
+        "sigma_t and albedo of a medium; detach this parameter (dr.disable_grad, params.update), "
+        'or use the integrator "prbvolpath".'
+    )
+
+
+def refuse_all(keys: list[str], reason: str, remedy: str) -> None:
+    """Raise the error for a scene or setting in which no gradients are computed."""
+    names = ", ".join(f'"{key}"' for key in keys[:3]) + (", ..." if len(keys) > 3 else "")
+    raise IrrcacheError(
+        f"irrcache computes no gradient of {names} here: {reason}. {remedy}, or use the integrator "
+        '"prbvolpath".'
+    )
+
+
+def channels_of(value: object) -> int:
+    """How many channels a constant has."""
+    return len(value) if dr.depth_v(value) > 1 else 1
+
+
+def shaped_like(value: object, grad: mi.Float) -> object:
+    """A gradient, given as a flat array, in the type of the parameter's ``value``."""
+    kind = type(value)
+    if dr.is_tensor_v(value):
+        return kind(grad, value.shape)
+    if dr.depth_v(value) == 1:
+        return kind(dr.sum(grad) if dr.width(grad) != dr.width(value) else grad)
+    count = dr.width(grad)
+    return kind(*(dr.gather(mi.Float, grad, mi.UInt32(min(i, count - 1))) for i in range(len(value))))
