@@ -21,7 +21,7 @@ from mitsuba_irrcache.gradients.parameters import (
 from mitsuba_irrcache.gradients.points import add_ways
 from mitsuba_irrcache.gradients.replay import CameraSplats, LitMedium
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature
-from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat
+from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
@@ -35,6 +35,8 @@ from mitsuba_irrcache.scene.compile import media_of
 FEWEST_PAIRS, MOST_PAIRS = 16, 128
 #: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
 MARGIN = 256.0
+#: Optical depth of a voxel below which its collisions do not matter.
+EMPTY = 1e-6
 
 
 def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
@@ -180,7 +182,7 @@ class MediumAdjoint:
         for role, splat in ((SIGMA_T, splats.sigma_t), (ALBEDO, splats.albedo)):
             if splat is not None:
                 sums[role].append(splat.values())
-        return self._fluence(splats.fluence) if splats.fluence is not None else None
+        return self._fluence(splats.collisions) if splats.collisions is not None else None
 
     def _rays(self, each: CameraPass, film: FilmAdjoint) -> tuple:
         """For camera rays the distances between which they are in the medium, the weighted radiance
@@ -209,7 +211,7 @@ class MediumAdjoint:
         return CameraSplats(
             self._splat(SIGMA_T, (brightest + largest * mean) * diagonal),
             self._splat(ALBEDO, largest * mean),
-            GridSplat(self.grid, self._transport.channels, largest * diagonal) if needs else None,
+            VoxelSums(self.grid, self._transport.channels, largest) if needs else None,
         )
 
     def _splat(self, role: str, bound: float) -> GridSplat | ConstantSplat | None:
@@ -226,16 +228,14 @@ class MediumAdjoint:
 
     # Transport
 
-    def _fluence(self, splat: GridSplat) -> list[mi.Float]:
-        """Means over the voxels of the adjoint fluence of camera rays, by channel."""
-        channels, count = self._transport.channels, self.grid.voxel_count
-        volumes = GridSplat(self.grid, 1, 2 * abs(np.linalg.det(self._medium.frame[:3, :3])))
-        VoxelQuadrature(self._medium, self.grid).volumes(volumes)
-        volume, sums = volumes.values(), splat.values()
-        place = dr.arange(mi.UInt32, count) * channels
+    def _fluence(self, sums: VoxelSums) -> list[mi.Float]:
+        """The adjoint fluence of camera rays for collisions in the voxels, by channel."""
+        collisions = VoxelQuadrature(self._medium, self.grid).collisions()
+        edge, voxel = float(self.grid.voxel_size.min()), float(np.prod(self.grid.voxel_size))
+        least = dr.opaque(mi.Float, EMPTY * voxel / edge)
         found = [
-            dr.select(volume > 0, dr.gather(mi.Float, sums, place + c) / volume, 0)
-            for c in range(channels)
+            dr.select(depth > least, total / dr.maximum(depth, least), 0)
+            for total, depth in zip(sums.values(), collisions, strict=True)
         ]
         dr.eval(found)
         return found

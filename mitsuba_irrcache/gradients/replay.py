@@ -15,7 +15,7 @@ import mitsuba as mi
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.core.fast_math import absorptance, least
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, of_channels
+from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums, of_channels
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -28,7 +28,7 @@ OPAQUE = 1e-6
 
 class CameraSplats:
     """Where the replay adds derivatives: by the extinction and the albedo at positions, and the
-    adjoint fluence. None where a derivative is not wanted.
+    adjoint fluence of collisions in voxels. None where a derivative is not wanted.
 
     It is no dataclass, whose fields would be state of the recorded loop.
     """
@@ -37,9 +37,9 @@ class CameraSplats:
         self,
         sigma_t: GridSplat | ConstantSplat | None,
         albedo: GridSplat | ConstantSplat | None,
-        fluence: GridSplat | None,
+        collisions: VoxelSums | None,
     ) -> None:
-        self.sigma_t, self.albedo, self.fluence = sigma_t, albedo, fluence
+        self.sigma_t, self.albedo, self.collisions = sigma_t, albedo, collisions
 
 
 class LitMedium:
@@ -143,10 +143,8 @@ class LitMedium:
             if dr.hint(splats.albedo is not None, mode="scalar"):
                 change = passed * absorbed * mean
                 splats.albedo.add(p, of_channels(change, splats.albedo.channels), active)
-            if dr.hint(splats.fluence is not None, mode="scalar"):
-                thin = tau < 1e-4
-                share = dr.select(thin, 1 - 0.5 * tau, absorbed / dr.select(thin, 1, tau))
-                splats.fluence.add(p, list(passed * share * length), active)
+            if dr.hint(splats.collisions is not None, mode="scalar"):
+                splats.collisions.add(p, list(passed * absorbed), active)
             passed = following
             transmittance *= 1 - absorbed
             t = end

@@ -14,6 +14,8 @@ from mitsuba_irrcache.media.medium import MediumGrid
 
 #: Points along each axis of a voxel that the boundary may cut, at least.
 CUT_POINTS = 4
+#: Points along each axis of a voxel by which its extinction is integrated, at least.
+COLLISION_POINTS = 4
 
 
 class VoxelQuadrature:
@@ -26,7 +28,7 @@ class VoxelQuadrature:
         fields = [f.grid for f in (medium.sigma_t, medium.albedo) if f.grid is not None]
         ratio = max((float((grid.voxel_size / g.voxel_size).max()) for g in fields), default=1.0)
         self.cut = not medium.fills(grid)
-        points = int(np.ceil(ratio - 1e-3))
+        points = 2 * int(np.ceil(ratio - 1e-3))
         self.points = max(points, CUT_POINTS if self.cut else 1)
 
     @symbolic
@@ -65,18 +67,20 @@ class VoxelQuadrature:
             k += 1
 
     @symbolic
-    def volumes(self, splat: GridSplat):
-        """Add the volume of the medium around the voxel centres to ``splat``."""
+    def collisions(self):
+        """Integrals of the extinction over the voxels, for each channel of the radiance."""
         grid, medium = self.grid, self.medium
         voxel = dr.arange(mi.UInt32, grid.voxel_count)
-        corner, sides = mi.Point3f(*grid.places(voxel)), [Divisor(self.points)] * 2
-        count, points = dr.opaque(mi.UInt32, self.points**3), dr.opaque(mi.Float, self.points)
-        share, k = dr.opaque(mi.Float, _volume(grid) / self.points**3), mi.UInt32(0)
+        number = max(self.points, COLLISION_POINTS)
+        corner, sides = mi.Point3f(*grid.places(voxel)), [Divisor(number)] * 2
+        count, points = dr.opaque(mi.UInt32, number**3), dr.opaque(mi.Float, number)
+        total, k = mi.Spectrum(dr.zeros(mi.Float, grid.voxel_count)), mi.UInt32(0)
         while dr.hint(k < count, label="points in a voxel"):
             p = grid.world.point(corner + (mi.Point3f(*unravelled(k, sides)) + 0.5) / points)
             inside = medium.contains(p) if dr.hint(self.cut, mode="scalar") else mi.Bool(True)
-            splat.add(p, [share], inside)
+            total += dr.select(inside, mi.Spectrum(medium.sigma_t.at_world(p, inside)), 0)
             k += 1
+        return total * dr.opaque(mi.Float, _volume(grid) / number**3)
 
 
 def _volume(grid: Grid) -> float:

@@ -69,6 +69,32 @@ class GridSplat:
         return self._sums.values()
 
 
+class VoxelSums:
+    """Integrals over the voxels of ``grid`` of ``channels`` values."""
+
+    def __init__(self, grid: Grid, channels: int, bound: float) -> None:
+        self.grid, self.channels = grid, channels
+        self._sums = FixedPointSums(grid.voxel_count * channels, bound)
+
+    def add(self, p: mi.Point3f, values: Sequence[mi.Float], active: mi.Bool) -> None:
+        """Add one value for each channel to the voxels around world positions."""
+        place = [
+            dr.clip(mi.Int32(dr.floor(clipped(x, -1.0, mi.Float(n)))), 0, n - 1)
+            for x, n in zip(self.grid.coordinates.point(p), self.grid.sides, strict=True)
+        ]
+        index = self.grid.index(*place) * self.channels
+        for c, value in enumerate(values):
+            self._sums.add(index + c, value, active)
+
+    def values(self) -> list[mi.Float]:
+        """The integrals of each channel."""
+        sums = self._sums.values()
+        place = dr.arange(mi.UInt32, self.grid.voxel_count) * self.channels
+        found = [dr.gather(mi.Float, sums, place + c) for c in range(self.channels)]
+        dr.eval(found)
+        return found
+
+
 class ConstantSplat:
     """The transpose of the lookup of a constant of ``channels`` values."""
 
