@@ -65,7 +65,7 @@ class AdjointTransport:
         illumination = DistantIllumination(scene)
         (self.ordinates,) = illumination.ordinates(1, pairs, rng)
         (solving,) = illumination.ordinates(1, min(pairs, SOLVING_PAIRS), rng)
-        self._solving = solving.scattering()
+        self._solving = solving.scattering().without_incoming()
         voxels = dr.arange(mi.UInt32, grid.voxel_count)
         self.positions = VoxelSamplePoints(scene, grid).of(voxels)
         self.point_lights = illumination.point_lights
@@ -164,7 +164,7 @@ class AdjointTransport:
             _, first = level.sweep(source, level.tracks.table(*self._solving))
             phi = source + level.solve(first, self._solving)
             dr.eval(phi)
-            _, phi = level.sweep(phi, level.tracks.table(*self.ordinates.scattering()))
+            _, phi = level.sweep(phi, level.tracks.table(*self.ordinates.scattering().without_incoming()))
             travelled += self._apart(phi, own)
             totals += self._apart(phi + source, own)
         dr.eval(totals, travelled)

@@ -1,0 +1,111 @@
+"""Finite differences of the integrator's own image along smooth perturbations of a parameter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from experiments.gradients.cases import Case, blob
+
+#: Camera samples of each pixel, for images and for gradients.
+SPP, SPP_GRAD = 64, 64
+#: Perturbations of a grid, their width in edges of it, and their step relative to its maximum.
+BLOBS, WIDTH, STEP = 6, 0.12, 0.03
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Directional derivatives by finite differences and by the adjoint."""
+
+    differences: np.ndarray
+    adjoint: np.ndarray
+
+    @property
+    def error(self) -> float:
+        """Relative error."""
+        return float(
+            np.linalg.norm(self.adjoint - self.differences) / np.linalg.norm(self.differences)
+        )
+
+    @property
+    def cosine(self) -> float:
+        norms = np.linalg.norm(self.adjoint) * np.linalg.norm(self.differences)
+        return float(self.adjoint @ self.differences / norms)
+
+
+def key_of(params: mi.SceneParameters, name: str) -> str:
+    """The key of a medium's parameter."""
+    (key,) = [k for k in params.keys() if f".{name}." in k]
+    return key
+
+
+def pixel_weights(scene: mi.Scene) -> np.ndarray:
+    """Smooth weights of the pixels: the objective is their scalar product with the image."""
+    shape = np.array(mi.render(scene, spp=1)).shape
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    plane = 1 + 0.5 * np.cos(columns / shape[1] * 4 + 1) * np.sin(rows / shape[0] * 3)
+    channels = np.linspace(1.0, 0.6, shape[2])
+    return plane[..., None] * channels / np.prod(shape[:2])
+
+
+def gradients(
+    scene: mi.Scene, names: tuple[str, ...], weights: np.ndarray, spp: int = SPP_GRAD, seed: int = 3
+) -> dict[str, np.ndarray]:
+    """Gradients of the objective by the parameters of these names."""
+    params = mi.traverse(scene)
+    keys = {name: key_of(params, name) for name in names}
+    before = {key: type(params[key])(params[key]) for key in keys.values()}
+    for key in keys.values():
+        dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, spp=spp, seed=seed)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32))))
+    found = {n: np.array(dr.grad(params[k]), dtype=np.float64) for n, k in keys.items()}
+    for key, value in before.items():
+        params[key] = dr.detach(value)
+    params.update()
+    return found
+
+
+def directions(case: Case, name: str, value: np.ndarray) -> list[np.ndarray]:
+    """Perturbations of a parameter: smooth ones of a grid, each channel of a constant."""
+    if case.homogeneous:
+        return [0.05 * value * row.reshape(value.shape) for row in np.eye(value.size)]
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(BLOBS):
+        plane = blob(case.data, tuple(rng.uniform(0.25, 0.75, 3)), WIDTH)[..., None]
+        colour = rng.uniform(0.3, 1.0, value.shape[-1])
+        step = STEP * (value.max() if name == "sigma_t" else 1.0)
+        found.append(step * plane * colour / colour.max())
+    return found
+
+
+def compare(
+    scene: mi.Scene, case: Case, name: str, weights: np.ndarray, gradient: np.ndarray
+) -> Comparison:
+    """Compare a ``gradient`` with central differences; with one-sided ones where a parameter would
+    become negative.
+    """
+    params = mi.traverse(scene)
+    key = key_of(params, name)
+    kind, value = type(params[key]), np.array(params[key], dtype=np.float64)
+
+    def objective(changed: np.ndarray) -> float:
+        flat = changed.astype(np.float32)
+        params[key] = kind(flat if value.ndim != 1 else flat.ravel())
+        params.update()
+        image = np.array(mi.render(scene, spp=SPP, seed=7), dtype=np.float64)
+        return float((image * weights).sum())
+
+    found = []
+    for step in directions(case, name, value):
+        upper, lower = value + step, np.maximum(value - step, 0)
+        change = upper.astype(np.float32) - lower.astype(np.float32)
+        difference = objective(upper) - objective(lower)
+        found.append((difference, float((gradient.reshape(value.shape) * change).sum())))
+    objective(value)
+    return Comparison(*np.array(found).T)
