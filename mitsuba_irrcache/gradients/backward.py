@@ -26,13 +26,15 @@ from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
 
-#: Pairs of ordinates, at least and at most.
-FEWEST_PAIRS, MOST_PAIRS = 16, 128
+#: Pairs of ordinates, and those under environments that vary, whose spots they have to find.
+PAIRS, MOST_PAIRS = 32, 128
+UNEVEN = (EmitterKind.ENVIRONMENT_MAP,)
 #: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
 MARGIN = 256.0
 #: Optical depth of a voxel below which its collisions do not matter.
@@ -111,18 +113,30 @@ class MediumAdjoint:
         wanted: dict[str, int],
     ) -> None:
         self._scene, self._part, self._sight, self._wanted = scene, part, sight, wanted
-        self._medium, self._max_depth = part.medium, part.settings.max_depth
+        self._medium = part.medium
         self._transport: AdjointTransport | None = None
         self._collided: list[mi.Float] = []
         field, falloff, lights = None, None, []
         if part.cache is not None:
             self.grid = part.cache.grid
-            pairs = int(np.clip(part.target(0) // 2, FEWEST_PAIRS, MOST_PAIRS))
+            environment = scene.environment()
+            uneven = environment is not None and kind_of(environment) in UNEVEN
+            pairs = MOST_PAIRS if uneven else PAIRS
             self._transport = AdjointTransport(
-                scene, self._medium, self.grid, part.settings.seed, pairs, self._max_depth == 2
+                scene,
+                self._medium,
+                self.grid,
+                part.settings.seed,
+                pairs,
+                part.settings.max_depth == 2,
+                self._medium.channels == 1 and max(wanted.values()) == 1,
             )
             field, falloff, lights = self._irradiance()
         self._lit = LitMedium(self._medium, field, falloff, lights, step)
+        if self._transport is not None and self._transport.channels == 1:
+            self._lit.colour = mi.Spectrum(
+                [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
+            )
 
     # The irradiance
 
@@ -130,9 +144,15 @@ class MediumAdjoint:
         """The irradiance at all voxels, also where there is no matter, for lookups."""
         cache, grid = self._part.cache, self.grid
         count, voxels = grid.voxel_count, dr.arange(mi.UInt32, grid.voxel_count)
-        channels = self._transport.channels
-        cached, place = cache.irradiance.array, voxels * channels
-        known = [dr.gather(mi.Float, cached, place + c) for c in range(channels)]
+        channels, colour = self._transport.channels, self._transport.colour
+        cached, all_channels = cache.irradiance.array, cache.channels
+        # Of all that differ by a factor, the brightest.
+        own = range(channels) if channels == all_channels else [int(colour.argmax())]
+        place = voxels * all_channels
+        known = [
+            dr.gather(mi.Float, cached, place + c) * dr.opaque(mi.Float, 1 / float(colour[c]))
+            for c in own
+        ]
         swept, self._collided = self._transport.irradiance(known)
         has_value = dr.zeros(mi.Bool, count)
         if cache.active_count and cache.samples:
@@ -143,7 +163,10 @@ class MediumAdjoint:
             for light in cache.direct_lights
         ]
         for light in lights:
-            total = [dr.maximum(t - e, 0) for t, e in zip(total, light.irradiance, strict=False)]
+            total = [
+                dr.maximum(t - light.irradiance[c] * dr.opaque(mi.Float, 1 / float(colour[c])), 0)
+                for t, c in zip(total, own, strict=True)
+            ]
         falloff = InverseSquareFactor.of(self._scene, grid, [light.emitter for light in lights])
         roots = [dr.sqrt(dr.maximum(t, 0)) for t in total]
         if falloff is not None:
@@ -235,7 +258,7 @@ class MediumAdjoint:
         least = dr.opaque(mi.Float, EMPTY * voxel / edge)
         found = [
             dr.select(depth > least, total / dr.maximum(depth, least), 0)
-            for total, depth in zip(sums.values(), collisions, strict=True)
+            for total, depth in zip(sums.values(), collisions, strict=False)
         ]
         dr.eval(found)
         return found

@@ -58,6 +58,8 @@ class LitMedium:
     ) -> None:
         self.medium, self.irradiance = medium, irradiance
         self._falloff, self._direct_lights = falloff, direct_lights
+        #: factors of the irradiance of all channels; None where each has its own
+        self.colour: mi.Spectrum | None = None
         fields = medium.sigma_t, medium.albedo, irradiance
         edges = [f.grid.voxel_size.min() for f in fields if f is not None and f.grid is not None]
         length = min(edges, default=float(max(abs(medium.frame[:3, :3]).max(), 1e-30) / 64))
@@ -74,6 +76,8 @@ class LitMedium:
         if self.irradiance is None:
             return mi.Spectrum(0)
         phi = mi.Spectrum(self.irradiance.at_world(p, active))
+        if self.colour is not None:
+            phi = phi * self.colour
         if self._falloff is not None:
             phi = phi * self._falloff.at(p)
         for light in self._direct_lights:
@@ -144,7 +148,10 @@ class LitMedium:
                 change = passed * absorbed * mean
                 splats.albedo.add(p, of_channels(change, splats.albedo.channels), active)
             if dr.hint(splats.collisions is not None, mode="scalar"):
-                splats.collisions.add(p, list(passed * absorbed), active)
+                collided = passed * absorbed
+                one = dr.hint(self.colour is not None, mode="scalar")
+                values = [dr.sum(collided * self.colour)] if one else list(collided)
+                splats.collisions.add(p, values, active)
             passed = following
             transmittance *= 1 - absorbed
             t = end

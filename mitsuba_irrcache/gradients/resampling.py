@@ -47,7 +47,9 @@ class VoxelQuadrature:
         voxel = dr.arange(mi.UInt32, grid.voxel_count)
         corner, sides = mi.Point3f(*grid.places(voxel)), [Divisor(self.points)] * 2
         count, points = dr.opaque(mi.UInt32, self.points**3), dr.opaque(mi.Float, self.points)
-        share = dr.opaque(mi.Float, _volume(grid) / self.points**3)
+        # A channel that stands for all is their sum.
+        several = dr.size_v(mi.Spectrum) // len(found.sigma_t)
+        share = dr.opaque(mi.Float, _volume(grid) / self.points**3 / several)
         by_sigma_t = mi.Spectrum(*found.sigma_t) * share
         by_collided = mi.Spectrum(*found.collided) * share
         mean, k = mi.Spectrum(*mean_albedo), mi.UInt32(0)

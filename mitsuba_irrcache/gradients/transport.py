@@ -36,7 +36,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 #: products are as many as the cache was built with.
 SOLVING_PAIRS = 16
 #: Sweeps by which the irradiance of collisions follows from that of voxel centres.
-SWEEPS = 2
+SWEEPS = 1
 
 
 class Derivatives:
@@ -53,17 +53,31 @@ class Derivatives:
 class AdjointTransport:
     """The transport equation in all voxels of ``grid``, and its adjoint.
 
-    ``pairs`` of opposite ordinates are used. With ``single``, radiance is scattered once only.
+    ``pairs`` of opposite ordinates are used. With ``single``, radiance is scattered once only. If
+    the medium and what is wanted are ``grey``, and all emitters have one colour, a single channel
+    stands for all: ``colour`` holds the factors of the radiance of each.
     """
 
     def __init__(
-        self, scene: mi.Scene, medium: MediumGrid, grid: Grid, seed: int, pairs: int, single: bool
+        self,
+        scene: mi.Scene,
+        medium: MediumGrid,
+        grid: Grid,
+        seed: int,
+        pairs: int,
+        single: bool,
+        grey: bool = False,
     ) -> None:
         self.grid, self._medium, self.single = grid, medium, single
-        self.channels = 1 if mi.is_monochromatic else 3
+        colours = 1 if mi.is_monochromatic else 3
         rng = np.random.default_rng((seed, 0x67726164))
         illumination = DistantIllumination(scene)
-        (self.ordinates,) = illumination.ordinates(1, pairs, rng)
+        if grey:
+            (self.ordinates,), self.colour = illumination.factored_ordinates(1, pairs, colours, rng)
+        else:
+            (self.ordinates,) = illumination.ordinates(1, pairs, rng)
+            self.colour = np.ones(colours)
+        self.channels = self.ordinates.incoming.shape[-1] if grey else colours
         (solving,) = illumination.ordinates(1, min(pairs, SOLVING_PAIRS), rng)
         self._solving = solving.scattering().without_incoming()
         voxels = dr.arange(mi.UInt32, grid.voxel_count)
