@@ -9,6 +9,7 @@ import numpy as np
 from mitsuba_irrcache.cache.conservative import conserving
 from mitsuba_irrcache.cache.direct_light import DirectLight, DirectLightAlongRays
 from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import LUMINANCE, CameraPass, FilmAdjoint
 from mitsuba_irrcache.gradients.parameters import (
     ALBEDO,
@@ -20,7 +21,7 @@ from mitsuba_irrcache.gradients.parameters import (
 )
 from mitsuba_irrcache.gradients.points import add_ways
 from mitsuba_irrcache.gradients.replay import CameraSplats, LitMedium
-from mitsuba_irrcache.gradients.resampling import VoxelQuadrature
+from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.grids.fields import Field
@@ -83,25 +84,27 @@ def parameter_gradients(
     ``part`` is the scene's only medium, with its cache; ``step`` is the integrator's property.
     """
     (medium,) = media_of(scene)
-    roles, wanted = roles_of(params, keys, medium), {}
-    for key, role in roles.items():
+    roles, wanted = roles_of(params, keys, medium, scene), {}
+    emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
+    of_medium = {key: role for key, role in roles.items() if not isinstance(role, mi.Emitter)}
+    for key, role in of_medium.items():
         field = part.medium.sigma_t if role == SIGMA_T else part.medium.albedo
         own = field.channels if field.grid is not None else channels_of(params[key])
         wanted[role] = max(wanted.get(role, 1), own)
-    adjoint = MediumAdjoint(scene, part, sight, step, wanted)
+    adjoint = MediumAdjoint(scene, part, sight, step, wanted, EmitterAdjoint(scene, emitters))
     found = adjoint.gradients(film)
     result = {}
-    for key, role in roles.items():
-        value = params[key]
-        grad = by_parameter(value, adjoint.field(role), found[role])
-        result[key] = shaped_like(value, grad)
+    for key, role in of_medium.items():
+        grad = by_parameter(params[key], adjoint.field(role), found[role])
+        result[key] = shaped_like(params[key], grad)
     return result
 
 
 class MediumAdjoint:
     """Derivatives by the medium of ``part`` in ``scene``, whose camera rays are ``sight``.
 
-    ``wanted`` maps what is wanted, `SIGMA_T` or `ALBEDO`, to the number of its channels.
+    ``wanted`` maps what is wanted, `SIGMA_T` or `ALBEDO`, to the number of its channels; the
+    derivatives by ``emitters`` are added to their parameters.
     """
 
     def __init__(
@@ -111,9 +114,10 @@ class MediumAdjoint:
         sight: ClosedFormCameraRays,
         step: float,
         wanted: dict[str, int],
+        emitters: EmitterAdjoint,
     ) -> None:
         self._scene, self._part, self._sight, self._wanted = scene, part, sight, wanted
-        self._medium = part.medium
+        self._medium, self._emitters = part.medium, emitters
         self._transport: AdjointTransport | None = None
         self._collided: list[mi.Float] = []
         field, falloff, lights = None, None, []
@@ -129,9 +133,12 @@ class MediumAdjoint:
                 part.settings.seed,
                 pairs,
                 part.settings.max_depth == 2,
-                self._medium.channels == 1 and max(wanted.values()) == 1,
+                self._medium.channels == max(wanted.values(), default=3) == 1 and not emitters,
             )
             field, falloff, lights = self._irradiance()
+            self._quadrature = VoxelQuadrature(self._medium, self.grid)
+            self._extinction = list(self._quadrature.extinction())
+            dr.eval(self._extinction)
         self._lit = LitMedium(self._medium, field, falloff, lights, step)
         if self._transport is not None and self._transport.channels == 1:
             self._lit.colour = mi.Spectrum(
@@ -196,11 +203,14 @@ class MediumAdjoint:
         splats = None
         for each in film.passes():
             span, behind, hit, offset = self._rays(each, film)
-            ahead, _ = self._lit.radiance(each.ray, span, each.radiance, behind, offset, hit)
-            dr.eval(ahead)
+            march = each.ray, span, each.radiance
+            ahead, passed = self._lit.radiance(*march, behind, offset, hit)
+            dr.eval(ahead, passed)
+            if self._sight.background(self._scene, each.ray, mi.Bool(True))[0]:
+                self._emitters.add_background(each.ray, passed * each.radiance)
             if splats is None:
                 splats = self._camera_splats(film, ahead)
-            self._lit.replay(each.ray, span, each.radiance, ahead, offset, hit, splats)
+            self._lit.replay(*march, ahead, offset, hit, splats)
             dr.eval()
         for role, splat in ((SIGMA_T, splats.sigma_t), (ALBEDO, splats.albedo)):
             if splat is not None:
@@ -253,12 +263,11 @@ class MediumAdjoint:
 
     def _fluence(self, sums: VoxelSums) -> list[mi.Float]:
         """The adjoint fluence of camera rays for collisions in the voxels, by channel."""
-        collisions = VoxelQuadrature(self._medium, self.grid).collisions()
-        edge, voxel = float(self.grid.voxel_size.min()), float(np.prod(self.grid.voxel_size))
-        least = dr.opaque(mi.Float, EMPTY * voxel / edge)
+        least = dr.opaque(mi.Float, EMPTY / float(self.grid.voxel_size.min()))
+        per_volume = dr.opaque(mi.Float, 1 / volume_of(self.grid))
         found = [
-            dr.select(depth > least, total / dr.maximum(depth, least), 0)
-            for total, depth in zip(sums.values(), collisions, strict=False)
+            dr.select(mean > least, total * per_volume / dr.maximum(mean, least), 0)
+            for total, mean in zip(sums.values(), self._extinction, strict=False)
         ]
         dr.eval(found)
         return found
@@ -266,15 +275,15 @@ class MediumAdjoint:
     def _add_transport(self, fluence: list[mi.Float], sums: dict[str, list]) -> None:
         """Add to ``sums`` what depends on the radiance that reaches the voxels."""
         transport = self._transport
-        found = transport.derivatives(self._collided, fluence)
-        quadrature = VoxelQuadrature(self._medium, self.grid)
+        found = transport.derivatives(self._collided, fluence, self._extinction)
+        self._emitters.add_transport(transport, found)
         volume = 3 * MARGIN * abs(np.linalg.det(self._medium.frame[:3, :3]))
         collided = _largest(found.collided)
         splats = {
             SIGMA_T: self._splat(SIGMA_T, volume * (_largest(found.sigma_t) + collided)),
             ALBEDO: self._splat(ALBEDO, volume * collided * self._medium.sigma_t.maximum),
         }
-        quadrature.add(splats[SIGMA_T], splats[ALBEDO], found, transport.albedo)
+        self._quadrature.add(splats[SIGMA_T], splats[ALBEDO], found, transport.albedo)
         for role, splat in splats.items():
             if splat is not None:
                 sums[role].append(splat.values())
@@ -289,8 +298,7 @@ class MediumAdjoint:
     ) -> mi.Float:
         """The derivative by the extinction between a point-like light and the voxels."""
         grid = self.grid
-        share = dr.opaque(mi.Float, -abs(float(np.linalg.det(grid.to_world[:3, :3])))
-                          / grid.voxel_count)
+        share = dr.opaque(mi.Float, -volume_of(grid))
         removed = irradiance * mi.Spectrum(*found.direct) * share
         dr.eval(removed)
         diagonal = float(np.linalg.norm(grid.side_lengths))

@@ -12,6 +12,8 @@ from mitsuba_irrcache.media.bake import children
 
 #: What a parameter can be of a medium.
 SIGMA_T, ALBEDO = "sigma_t", "albedo"
+#: Textures of emitters on which their radiance depends linearly.
+RADIANCE = ("radiance", "irradiance", "intensity")
 
 
 def enabled(params: Mapping) -> list[str]:
@@ -23,23 +25,33 @@ def _is_enabled(value: object) -> bool:
     return dr.is_array_v(value) and dr.grad_enabled(value)
 
 
-def roles_of(params: mi.SceneParameters, keys: list[str], medium: mi.Medium) -> dict[str, str]:
-    """What each of the parameters ``keys`` is of ``medium``: `SIGMA_T` or `ALBEDO`.
+def roles_of(
+    params: mi.SceneParameters, keys: list[str], medium: mi.Medium, scene: mi.Scene
+) -> dict[str, str | mi.Emitter]:
+    """What each of the parameters ``keys`` is: `SIGMA_T` or `ALBEDO` of ``medium``, or the emitter
+    whose radiance it is.
 
-    Raises IrrcacheError for a parameter of anything else.
+    Raises IrrcacheError for any other parameter.
     """
     volumes = children(medium)
-    nodes: dict[mi.Object, str] = {}
+    nodes: dict[mi.Object, str | mi.Emitter] = {}
     for role in (SIGMA_T, ALBEDO):
         volume = volumes[role]
         for node in (volume, *children(volume).values()):
             if nodes.get(node, role) != role:
                 refuse(_first_key_of(params, node, keys), "both extinction and albedo depend on it")
             nodes[node] = role
+    for emitter in scene.emitters():
+        nodes[emitter] = emitter
+        nodes |= {node: emitter for name, node in children(emitter).items() if name in RADIANCE}
     roles = {}
     for key in keys:
         node = params.properties[key][2]
-        if node not in nodes or not key.endswith((".data", ".value")):
+        last = key.rpartition(".")[2]
+        is_texels = node.class_name() == "EnvironmentMapEmitter" and last == "data"
+        if isinstance(node, mi.Emitter) and not is_texels:
+            refuse(key, f'"{last}" is not the radiance of the {node.class_name()}')
+        if node not in nodes or last not in ("data", "value"):
             refuse(key, f"it belongs to a {node.class_name()}")
         roles[key] = nodes[node]
     return roles

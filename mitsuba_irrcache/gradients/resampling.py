@@ -49,7 +49,7 @@ class VoxelQuadrature:
         count, points = dr.opaque(mi.UInt32, self.points**3), dr.opaque(mi.Float, self.points)
         # A channel that stands for all is their sum.
         several = dr.size_v(mi.Spectrum) // len(found.sigma_t)
-        share = dr.opaque(mi.Float, _volume(grid) / self.points**3 / several)
+        share = dr.opaque(mi.Float, volume_of(grid) / self.points**3 / several)
         by_sigma_t = mi.Spectrum(*found.sigma_t) * share
         by_collided = mi.Spectrum(*found.collided) * share
         mean, k = mi.Spectrum(*mean_albedo), mi.UInt32(0)
@@ -69,8 +69,8 @@ class VoxelQuadrature:
             k += 1
 
     @symbolic
-    def collisions(self):
-        """Integrals of the extinction over the voxels, for each channel of the radiance."""
+    def extinction(self):
+        """Means of the extinction over the voxels, for each channel of the radiance."""
         grid, medium = self.grid, self.medium
         voxel = dr.arange(mi.UInt32, grid.voxel_count)
         number = max(self.points, COLLISION_POINTS)
@@ -82,9 +82,9 @@ class VoxelQuadrature:
             inside = medium.contains(p) if dr.hint(self.cut, mode="scalar") else mi.Bool(True)
             total += dr.select(inside, mi.Spectrum(medium.sigma_t.at_world(p, inside)), 0)
             k += 1
-        return total * dr.opaque(mi.Float, _volume(grid) / number**3)
+        return total * dr.opaque(mi.Float, 1 / number**3)
 
 
-def _volume(grid: Grid) -> float:
+def volume_of(grid: Grid) -> float:
     """The volume of a voxel."""
     return abs(float(np.linalg.det(grid.to_world[:3, :3]))) / grid.voxel_count

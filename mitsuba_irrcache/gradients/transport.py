@@ -77,6 +77,8 @@ class AdjointTransport:
         else:
             (self.ordinates,) = illumination.ordinates(1, pairs, rng)
             self.colour = np.ones(colours)
+        #: sets of tracks of each sun, the last ordinates
+        self.sun_tracks = illumination.sun_ordinates(pairs) // max(illumination.sun_count, 1)
         self.channels = self.ordinates.incoming.shape[-1] if grey else colours
         (solving,) = illumination.ordinates(1, min(pairs, SOLVING_PAIRS), rng)
         self._solving = solving.scattering().without_incoming()
@@ -102,7 +104,6 @@ class AdjointTransport:
             for c in range(self.channels)
         ]
         dr.eval(albedo)
-        self.sigma_t = [_of(mean, c) for c in range(self.channels)]
         self.albedo = albedo
         box = np.zeros(3, int), grid.resolution, detail
         tracks = [Tracks(grid, sigma_t, *box) for sigma_t in extinction]
@@ -117,6 +118,11 @@ class AdjointTransport:
             )
             for own, own_tracks in zip(groups, tracks, strict=True)
         ]
+
+    @property
+    def tracks(self) -> list[tuple[Tracks, tuple[int, ...]]]:
+        """Tracks, and the channels whose extinction they have."""
+        return [(level.tracks, own) for level, own in self._levels]
 
     # The irradiance
 
@@ -184,9 +190,11 @@ class AdjointTransport:
         dr.eval(totals, travelled)
         return totals, travelled
 
-    def derivatives(self, phi: list[mi.Float], camera: list[mi.Float]) -> Derivatives:
+    def derivatives(
+        self, phi: list[mi.Float], camera: list[mi.Float], extinction: list[mi.Float]
+    ) -> Derivatives:
         """Derivatives by the medium, from the irradiance ``phi`` of collisions and the adjoint
-        fluence of the ``camera`` rays.
+        fluence of the ``camera`` rays; ``extinction`` is its mean over the voxels.
         """
         # docs/primer, eqs. (8.5), (8.6)
         total, travelled = self.adjoint(camera)
@@ -197,7 +205,7 @@ class AdjointTransport:
                 source = mi.Float(0) if self.single else scale * phi[c]
                 sigma_t.append(self._products(level.tracks, c, source, scale * total[c]))
                 collided.append(phi[c] * travelled[c] * dr.inv_four_pi)
-                direct.append(self.sigma_t[c] * scale * total[c])
+                direct.append(extinction[c] * scale * total[c])
         dr.eval(sigma_t, collided, direct)
         return Derivatives(sigma_t, collided, direct)
 
@@ -213,8 +221,8 @@ class AdjointTransport:
         source = source + dr.zeros(mi.Float, voxels)
         dr.eval(source, adjoint)
         both = zip(
-            tracks.sweep_separately(forward, lambda group: _repeated(source, group, voxels)),
-            tracks.sweep_separately(backward, lambda group: _repeated(adjoint, group, voxels)),
+            tracks.sweep_separately(forward, lambda group: repeated(source, group, voxels)),
+            tracks.sweep_separately(backward, lambda group: repeated(adjoint, group, voxels)),
             strict=True,
         )
         for (_, group, radiance), (_, _, importance) in both:
@@ -228,7 +236,7 @@ def _of(channels: list, number: int) -> mi.Float:
     return channels[min(number, len(channels) - 1)]
 
 
-def _repeated(values: mi.Float, group: PairGroup, voxels: int) -> mi.Float:
+def repeated(values: mi.Float, group: PairGroup, voxels: int) -> mi.Float:
     """Values of the voxels for both ways of all pairs of a group."""
     count = dr.opaque(mi.UInt32, voxels)
     result = dr.gather(mi.Float, values, dr.arange(mi.UInt32, 2 * len(group) * voxels) % count)
