@@ -18,7 +18,7 @@ from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.backward import check, parameter_gradients
 from mitsuba_irrcache.gradients.film import FilmAdjoint
-from mitsuba_irrcache.gradients.parameters import enabled
+from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
 from mitsuba_irrcache.machine.versions import check_versions
@@ -34,10 +34,6 @@ from mitsuba_irrcache.scene.consistency import check_sensor
 from mitsuba_irrcache.solvers.base import registered
 
 SOLVERS = ("auto", *sorted(solver.name for solver in registered()))
-_NO_FORWARD = (
-    "irrcache computes gradients in reverse mode only (dr.backward); use the integrator "
-    '"prbvolpath" for dr.forward.'
-)
 
 
 class IrradianceCachingIntegrator(mi.SamplingIntegrator):
@@ -424,8 +420,16 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         progress = self._stopping.raising(self.progress)
         return frames(self._builder, scene, image, Targets(**targets), progress)
 
-    def render_forward(self, *args: object, **kwargs: object) -> mi.TensorXf:
-        raise NotImplementedError(_NO_FORWARD)
+    def render_forward(
+        self,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> mi.TensorXf:
+        """Refuse: gradients are computed in reverse mode only."""
+        refuse_all(enabled(params), "dr.forward was called", "Call dr.backward on a loss")
 
     def render_backward(
         self,

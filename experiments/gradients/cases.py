@@ -100,9 +100,9 @@ class Case:
             "component_format": "float32",
             "rfilter": {"type": self.filter},
         }
-        centre = mi.ScalarTransform4f(place @ np.array(
-            [[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]]
-        ))
+        centre = mi.ScalarTransform4f(
+            place @ np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
+        )
         return mi.load_dict(
             {
                 "type": "scene",
@@ -149,7 +149,10 @@ def placed(turn: float) -> np.ndarray:
 def _volume(values: np.ndarray, place: np.ndarray) -> dict:
     grid = mi.VolumeGrid(values)
     return {
-        "type": "gridvolume", "grid": grid, "raw": True, "to_world": mi.ScalarTransform4f(place)
+        "type": "gridvolume",
+        "grid": grid,
+        "raw": True,
+        "to_world": mi.ScalarTransform4f(place),
     }
 
 

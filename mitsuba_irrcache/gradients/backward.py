@@ -25,7 +25,6 @@ from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.grids.fields import Field
-from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
@@ -45,15 +44,20 @@ EMPTY = 1e-6
 def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
     """Raise IrrcacheError for scenes and settings in which no gradients are computed."""
     if not parts:
-        refuse_all(keys, "no medium is visible, and Mitsuba's volpath renders the scene",
-                   'Give the shape of the medium a null BSDF')
+        refuse_all(
+            keys,
+            "no medium is visible, and Mitsuba's volpath renders the scene",
+            "Give the shape of the medium a null BSDF",
+        )
     if layered:
         refuse_all(keys, "the image is filtered or has aovs", "Set filter to none and no aovs")
     (part, *others), medium = parts, parts[0].medium
-    if others or not medium.is_isolated or medium.is_traced and medium.phase.is_isotropic:
+    if others or not medium.is_isolated:
         refuse_all(
-            keys, "there are surfaces, area lights or several media, or the boundary is neither a "
-            "box nor a sphere", "Reduce the scene to one medium under distant and point lights"
+            keys,
+            "there are surfaces, area lights or several media, or the boundary is neither a "
+            "box nor a sphere",
+            "Reduce the scene to one medium under distant and point lights",
         )
     name = f'medium "{medium.name}"'
     if not medium.phase.is_isotropic:
@@ -304,9 +308,7 @@ class MediumAdjoint:
         diagonal = float(np.linalg.norm(grid.side_lengths))
         bound = float(dr.max(dr.max(dr.abs(removed)))[0]) * grid.voxel_count * diagonal * 3
         splat = self._splat(SIGMA_T, bound * MARGIN)
-        add_ways(
-            self._medium, emitter, self._transport.positions, removed, self._lit.step, splat
-        )
+        add_ways(self._medium, emitter, self._transport.positions, removed, self._lit.step, splat)
         return splat.values()
 
 

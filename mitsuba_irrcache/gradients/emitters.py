@@ -40,9 +40,7 @@ class EmitterAdjoint:
 
     def add_transport(self, transport: AdjointTransport, found: Derivatives) -> None:
         """Add what emitters send to the voxels, each of which is worth ``found.direct``."""
-        for emitter, irradiance in zip(
-            transport.point_lights, transport.from_points, strict=True
-        ):
+        for emitter, irradiance in zip(transport.point_lights, transport.from_points, strict=True):
             if emitter in self._wanted:
                 _add_point(emitter, transport, irradiance, found)
         suns = [emitter for emitter in self._scene.emitters() if is_sun(emitter)]
@@ -106,9 +104,7 @@ def _received(
     return [result * volume_of(transport.grid) for result in found]
 
 
-def _solid_angles(
-    environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray
-) -> np.ndarray:
+def _solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray) -> np.ndarray:
     """What the radiance along each ordinate and its opposite is multiplied by."""
     radiance = environment_radiance(environment, both).reshape(-1, 2, incoming.shape[-1])
     known = radiance > 0
@@ -146,4 +142,5 @@ def _add_sun(emitter: mi.Emitter, adjoint: np.ndarray) -> None:
 def _pull(value: mi.Spectrum, adjoint: mi.Spectrum) -> None:
     """Add to the parameters that ``value`` depends on their derivatives of ``value . adjoint``."""
     if dr.grad_enabled(value):
-        dr.backward_from(dr.sum(dr.dot(value, adjoint)))
+        # Edges are kept: an emitter is evaluated more than once.
+        dr.backward_from(dr.sum(dr.dot(value, adjoint)), flags=dr.ADFlag.ClearVertices)

@@ -64,9 +64,7 @@ class FilmAdjoint:
         if not self._film.rfilter().is_box_filter():
             norm = mi.Float(0)
             for position, *_ in self._drawn():
-                (weights,) = reconstructed(
-                    self._film, self._border, self._per_pass, position, []
-                )
+                (weights,) = reconstructed(self._film, self._border, self._per_pass, position, [])
                 norm = norm + weights
                 dr.eval(norm)
         for position, index, sampler, ray, weight in self._drawn():

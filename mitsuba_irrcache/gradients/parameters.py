@@ -17,12 +17,22 @@ RADIANCE = ("radiance", "irradiance", "intensity")
 
 
 def enabled(params: Mapping) -> list[str]:
-    """Keys of the parameters that carry gradients."""
+    """Keys of the parameters that carry gradients.
+
+    Raises IrrcacheError where an integrator around this one has hidden them.
+    """
+    if not hasattr(params, "keys"):
+        raise IrrcacheError(
+            "irrcache computes no gradients within another integrator, which does not hand on the "
+            'parameters; render with irrcache itself, or use the integrator "prbvolpath".'
+        )
     return [key for key in params.keys() if _is_enabled(params[key])]
 
 
 def _is_enabled(value: object) -> bool:
-    return dr.is_array_v(value) and dr.grad_enabled(value)
+    if not dr.is_array_v(value):
+        value = getattr(value, "matrix", None)  # of a transform
+    return value is not None and dr.grad_enabled(value)
 
 
 def roles_of(
@@ -65,8 +75,8 @@ def refuse(key: str, reason: str) -> None:
     """Raise the error for a parameter without gradients."""
     raise IrrcacheError(
         f'irrcache computes no gradient of the parameter "{key}": {reason}. Gradients are known of '
-        "sigma_t and albedo of a medium; detach this parameter (dr.disable_grad, params.update), "
-        'or use the integrator "prbvolpath".'
+        "sigma_t and albedo of a medium and of the radiance of emitters; detach this parameter "
+        '(dr.disable_grad, params.update), or use the integrator "prbvolpath".'
     )
 
 
@@ -92,4 +102,6 @@ def shaped_like(value: object, grad: mi.Float) -> object:
     if dr.depth_v(value) == 1:
         return kind(dr.sum(grad) if dr.width(grad) != dr.width(value) else grad)
     count = dr.width(grad)
-    return kind(*(dr.gather(mi.Float, grad, mi.UInt32(min(i, count - 1))) for i in range(len(value))))
+    return kind(
+        *(dr.gather(mi.Float, grad, mi.UInt32(min(i, count - 1))) for i in range(len(value)))
+    )

@@ -134,8 +134,10 @@ class AdjointTransport:
         for level, own in self._levels:
             table = level.tracks.table(*self._incoming(own))
             points = interleaved_channels(
-                [sum((e[c] for e in self.from_points), dr.zeros(mi.Float, self._count))
-                 for c in own]
+                [
+                    sum((e[c] for e in self.from_points), dr.zeros(mi.Float, self._count))
+                    for c in own
+                ]
             )
             phi = None if self.single else interleaved_channels([known[c] for c in own])
             for _ in range(1 if self.single else SWEEPS):
@@ -184,7 +186,9 @@ class AdjointTransport:
             _, first = level.sweep(source, level.tracks.table(*self._solving))
             phi = source + level.solve(first, self._solving)
             dr.eval(phi)
-            _, phi = level.sweep(phi, level.tracks.table(*self.ordinates.scattering().without_incoming()))
+            _, phi = level.sweep(
+                phi, level.tracks.table(*self.ordinates.scattering().without_incoming())
+            )
             travelled += self._apart(phi, own)
             totals += self._apart(phi + source, own)
         dr.eval(totals, travelled)
