@@ -63,6 +63,9 @@ class Case:
     extinction: tuple[float, ...] = (1.0,)
     albedo: tuple[float, ...] = (0.85,)
     empty_below: float = 0.0
+    #: no matter at larger x than this, in edges of the grid; and where perturbations are
+    empty_beyond: float = 1.0
+    changed: tuple[float, float] = (0.25, 0.75)
     turn: float = 0.0
     shape: str = "cube"
     homogeneous: bool = False
@@ -74,6 +77,7 @@ class Case:
         """Extinction (z, y, x, channel)."""
         values = matter(self.data)
         values = np.where(values < self.empty_below, 0, values)
+        values[:, :, round(self.empty_beyond * self.data) :] = 0
         peak = self.depth * self.data / EDGE
         return (values[..., None] * np.array(self.extinction) * peak).astype(np.float32)
 
@@ -187,6 +191,12 @@ CASES = {
     "voxel depth 2": Case(depth=2.0),
     "voxel depth 0.8, sun": Case(depth=0.8, emitters=_under(sun=SUN)),
     "edges of matter": Case(empty_below=0.05),
+    "empty voxels": Case(empty_beyond=0.5, changed=(0.75, 0.85)),
+    "empty voxels, single": Case(empty_beyond=0.5, changed=(0.75, 0.85), max_depth=2),
+    "no matter": Case(empty_beyond=0.0, parameters=("sigma_t",)),
+    "no matter, sun": Case(
+        empty_beyond=0.0, parameters=("sigma_t",), emitters=_under(sun=SUN), max_depth=2
+    ),
     "data finer than the cache": Case(data=24, cache=12, depth=0.2),
     "data coarser than the cache": Case(data=8, cache=16, depth=0.5),
     "data of no common multiple": Case(data=10, cache=16, depth=0.5),

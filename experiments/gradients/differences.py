@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from experiments.gradients.cases import Case, blob
+from experiments.gradients.cases import EDGE, Case, blob
 
 #: Camera samples of each pixel, for images and for gradients.
 SPP, SPP_GRAD = 64, 64
@@ -77,9 +77,13 @@ def directions(case: Case, name: str, value: np.ndarray) -> list[np.ndarray]:
     rng = np.random.default_rng(3)
     found = []
     for _ in range(BLOBS):
-        plane = blob(case.data, tuple(rng.uniform(0.25, 0.75, 3)), WIDTH)[..., None]
+        centre = rng.uniform(*case.changed), *rng.uniform(0.25, 0.75, 2)
+        plane = blob(case.data, centre, WIDTH)[..., None]
+        # Without the far tails: one-sided differences are for what would become negative.
+        plane = np.where(plane < 1e-2, 0, plane)
         colour = rng.uniform(0.3, 1.0, value.shape[-1])
-        step = STEP * (value.max() if name == "sigma_t" else 1.0)
+        peak = case.depth * case.data / EDGE
+        step = STEP * (peak if name == "sigma_t" else 1.0)
         found.append(step * plane * colour / colour.max())
     return found
 
@@ -87,8 +91,8 @@ def directions(case: Case, name: str, value: np.ndarray) -> list[np.ndarray]:
 def compare(
     scene: mi.Scene, case: Case, name: str, weights: np.ndarray, gradient: np.ndarray
 ) -> Comparison:
-    """Compare a ``gradient`` with central differences; with one-sided ones where a parameter would
-    become negative.
+    """Compare a ``gradient`` with central differences; with one-sided ones, of second order too,
+    where a parameter would become negative.
     """
     params = mi.traverse(scene)
     key = key_of(params, name)
@@ -103,9 +107,12 @@ def compare(
 
     found = []
     for step in directions(case, name, value):
-        upper, lower = value + step, np.maximum(value - step, 0)
-        change = upper.astype(np.float32) - lower.astype(np.float32)
-        difference = objective(upper) - objective(lower)
-        found.append((difference, float((gradient.reshape(value.shape) * change).sum())))
+        worth = float((gradient.reshape(value.shape) * step.astype(np.float32)).sum())
+        if (value - step < 0).any():
+            values = [objective(value + k * step) for k in range(3)]
+            difference = -1.5 * values[0] + 2 * values[1] - 0.5 * values[2]
+        else:
+            difference = 0.5 * (objective(value + step) - objective(value - step))
+        found.append((difference, worth))
     objective(value)
     return Comparison(*np.array(found).T)
