@@ -110,7 +110,7 @@ class Case:
         return mi.load_dict(
             {
                 "type": "scene",
-                "integrator": integrator | properties,
+                "integrator": integrator | properties if "type" not in properties else properties,
                 "sensor": {"type": "perspective", "fov": 34.0, "to_world": look, "film": film},
                 "shape": {
                     "type": self.shape,

@@ -70,13 +70,13 @@ def gradients(
     return found
 
 
-def directions(case: Case, name: str, value: np.ndarray) -> list[np.ndarray]:
-    """Perturbations of a parameter: smooth ones of a grid, each channel of a constant."""
+def directions(case: Case, name: str, value: np.ndarray, count: int) -> list[np.ndarray]:
+    """Perturbations of a parameter: ``count`` smooth ones of a grid, each channel of a constant."""
     if case.homogeneous:
         return [0.05 * value * row.reshape(value.shape) for row in np.eye(value.size)]
     rng = np.random.default_rng(3)
     found = []
-    for _ in range(BLOBS):
+    for _ in range(count):
         centre = rng.uniform(*case.changed), *rng.uniform(0.25, 0.75, 2)
         plane = blob(case.data, centre, WIDTH)[..., None]
         # Without the far tails: one-sided differences are for what would become negative.
@@ -89,7 +89,12 @@ def directions(case: Case, name: str, value: np.ndarray) -> list[np.ndarray]:
 
 
 def compare(
-    scene: mi.Scene, case: Case, name: str, weights: np.ndarray, gradient: np.ndarray
+    scene: mi.Scene,
+    case: Case,
+    name: str,
+    weights: np.ndarray,
+    gradient: np.ndarray,
+    count: int = BLOBS,
 ) -> Comparison:
     """Compare a ``gradient`` with central differences; with one-sided ones, of second order too,
     where a parameter would become negative.
@@ -106,7 +111,7 @@ def compare(
         return float((image * weights).sum())
 
     found = []
-    for step in directions(case, name, value):
+    for step in directions(case, name, value, count):
         worth = float((gradient.reshape(value.shape) * step.astype(np.float32)).sum())
         if (value - step < 0).any():
             values = [objective(value + k * step) for k in range(3)]

@@ -139,6 +139,7 @@ class MediumAdjoint:
                 part.settings.max_depth == 2,
                 self._medium.channels == max(wanted.values(), default=3) == 1 and not emitters,
             )
+            self._transport.wants_extinction = SIGMA_T in wanted
             field, falloff, lights = self._irradiance()
             self._quadrature = VoxelQuadrature(self._medium, self.grid)
             self._extinction = list(self._quadrature.extinction())
@@ -267,6 +268,7 @@ class MediumAdjoint:
 
     def _fluence(self, sums: VoxelSums) -> list[mi.Float]:
         """The adjoint fluence of camera rays for collisions in the voxels, by channel."""
+        # docs/primer, eq. (8.4)
         least = dr.opaque(mi.Float, EMPTY / float(self.grid.voxel_size.min()))
         per_volume = dr.opaque(mi.Float, 1 / volume_of(self.grid))
         found = [
@@ -281,6 +283,8 @@ class MediumAdjoint:
         transport = self._transport
         found = transport.derivatives(self._collided, fluence, self._extinction)
         self._emitters.add_transport(transport, found)
+        if not self._wanted:
+            return
         volume = 3 * MARGIN * abs(np.linalg.det(self._medium.frame[:3, :3]))
         collided = _largest(found.collided)
         splats = {
@@ -313,7 +317,8 @@ class MediumAdjoint:
 
 
 def _largest(channels: list[mi.Float]) -> float:
-    return max(float(dr.max(dr.abs(values))[0]) for values in channels)
+    """The largest magnitude; 0 without any channels."""
+    return max((float(dr.max(dr.abs(values))[0]) for values in channels), default=0.0)
 
 
 def _total(parts: list[mi.Float]) -> mi.Float:

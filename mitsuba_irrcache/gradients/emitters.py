@@ -85,6 +85,7 @@ def _received(
     """For each of ``weights`` of the voxels, integrals (n, 2) over the voxels of the transmittance
     from where each ordinate enters.
     """
+    # docs/primer, eq. (8.10)
     directions, _, unused, offsets = transport.ordinates
     count, voxels = len(directions), transport.grid.voxel_count
     table = tracks.table(directions, np.ones((count, 2)), 0 * unused, offsets)

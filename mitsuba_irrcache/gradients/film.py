@@ -60,6 +60,7 @@ class FilmAdjoint:
 
     def passes(self) -> Iterator[CameraPass]:
         """Yield all camera samples, launch by launch."""
+        # docs/primer, eq. (8.1)
         norm = None
         if not self._film.rfilter().is_box_filter():
             norm = mi.Float(0)

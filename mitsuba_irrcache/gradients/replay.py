@@ -3,8 +3,8 @@ leave in the medium.
 
 A ray's radiance is L = sum_k T_k (1 - e^-tau_k) q_k + T B, with the source q = albedo Phi / (4 pi)
 in the middle of each step, and the radiance B behind the medium. It is marched twice: once for L,
-and again with the radiance that is still ahead, which is L minus what was gathered (Nimier-David
-et al. 2020 and Vicini et al. 2021 replay paths for the same reason).
+and again with the radiance that is still ahead, which is L minus what was gathered (Vicini et al.
+2021 replay paths for the same reason).
 """
 
 from __future__ import annotations

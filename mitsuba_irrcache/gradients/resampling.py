@@ -48,9 +48,9 @@ class VoxelQuadrature:
         corner, sides = mi.Point3f(*grid.places(voxel)), [Divisor(self.points)] * 2
         count, points = dr.opaque(mi.UInt32, self.points**3), dr.opaque(mi.Float, self.points)
         # A channel that stands for all is their sum.
-        several = dr.size_v(mi.Spectrum) // len(found.sigma_t)
+        several = dr.size_v(mi.Spectrum) // len(found.collided)
         share = dr.opaque(mi.Float, volume_of(grid) / self.points**3 / several)
-        by_sigma_t = mi.Spectrum(*found.sigma_t) * share
+        by_sigma_t = mi.Spectrum(*(found.sigma_t or [0.0])) * share
         by_collided = mi.Spectrum(*found.collided) * share
         mean, k = mi.Spectrum(*mean_albedo), mi.UInt32(0)
         while dr.hint(k < count, label="points in a voxel"):

@@ -69,6 +69,8 @@ class AdjointTransport:
         grey: bool = False,
     ) -> None:
         self.grid, self._medium, self.single = grid, medium, single
+        #: whether derivatives by the extinction are wanted
+        self.wants_extinction = True
         colours = 1 if mi.is_monochromatic else 3
         rng = np.random.default_rng((seed, 0x67726164))
         illumination = DistantIllumination(scene)
@@ -175,6 +177,7 @@ class AdjointTransport:
         """The adjoint fluence of collisions: in all, with that of the ``camera`` rays, and the part
         that has travelled between voxels.
         """
+        # docs/primer, eq. (8.5)
         totals, travelled = [], []
         for level, own in self._levels:
             source = interleaved_channels([camera[c] for c in own])
@@ -198,16 +201,18 @@ class AdjointTransport:
         self, phi: list[mi.Float], camera: list[mi.Float], extinction: list[mi.Float]
     ) -> Derivatives:
         """Derivatives by the medium, from the irradiance ``phi`` of collisions and the adjoint
-        fluence of the ``camera`` rays; ``extinction`` is its mean over the voxels.
+        fluence of the ``camera`` rays; ``extinction`` is its mean over the voxels. Those by the
+        extinction are left out if they are not wanted.
         """
-        # docs/primer, eqs. (8.5), (8.6)
+        # docs/primer, eq. (8.6)
         total, travelled = self.adjoint(camera)
         sigma_t, collided, direct = [], [], []
         for level, own in self._levels:
             for c in own:
                 scale = self.albedo[c] * dr.inv_four_pi
                 source = mi.Float(0) if self.single else scale * phi[c]
-                sigma_t.append(self._products(level.tracks, c, source, scale * total[c]))
+                if self.wants_extinction:
+                    sigma_t.append(self._products(level.tracks, c, source, scale * total[c]))
                 collided.append(phi[c] * travelled[c] * dr.inv_four_pi)
                 direct.append(extinction[c] * scale * total[c])
         dr.eval(sigma_t, collided, direct)

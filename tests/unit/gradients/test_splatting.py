@@ -47,8 +47,9 @@ def test_grid_splat_is_the_transpose_of_a_lookup(channels):
 
 def test_sums_do_not_depend_on_the_order():
     rng = np.random.default_rng(2)
-    index, value = rng.integers(0, 20, POINTS), rng.normal(size=POINTS) * 10.0 ** rng.uniform(
-        -6, 3, POINTS
+    index, value = (
+        rng.integers(0, 20, POINTS),
+        rng.normal(size=POINTS) * 10.0 ** rng.uniform(-6, 3, POINTS),
     )
     results = []
     for order in (np.arange(POINTS), rng.permutation(POINTS)):
