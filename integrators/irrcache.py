@@ -164,6 +164,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     may have g up to 0.85 if ``max_depth`` is -1. Scattering into such a sharp forward peak is then
     treated as unscattered (delta-M), also in ``transmittance`` and alpha.
 
+    Gradients (``dr.backward``) are computed by ``sigma_t`` and ``albedo`` of a medium and by the
+    radiance of emitters, by solving the adjoint transport equation: for one isotropic medium in a
+    box or sphere under distant and point emitters, without surfaces and emission, with the solver
+    ``sweep``, ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. All other gradients, and forward
+    mode, are refused with an error that names the parameter. While parameters carry gradients, the
+    grid of the cache is kept.
+
     .. tabs::
         .. code-tab:: xml
 

@@ -210,5 +210,11 @@ CASES = {
     "homogeneous sphere": Case(homogeneous=True, depth=0.1, shape="sphere"),
     "homogeneous, sun": Case(homogeneous=True, depth=0.1, emitters=_under(sun=SUN)),
     "gaussian filter": Case(filter="gaussian"),
+    "radiance of sky and sun": Case(emitters=_under(sky=SKY, sun=SUN), parameters=("sky", "sun")),
+    "radiance of sky and sun, single": Case(
+        emitters=_under(sky=SKY, sun=SUN), parameters=("sky", "sun"), max_depth=2
+    ),
+    "intensity of a point": Case(emitters=_under(point=POINT), parameters=("point",)),
+    "texels of an envmap": Case(emitters=lambda: {"sky": sky_with_sun()}, parameters=("sky",)),
     "alpha": Case(pixels="rgba", emitters=_under(sun=SUN)),
 }

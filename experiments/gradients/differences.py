@@ -37,8 +37,9 @@ class Comparison:
 
 
 def key_of(params: mi.SceneParameters, name: str) -> str:
-    """The key of a medium's parameter."""
-    (key,) = [k for k in params.keys() if f".{name}." in k]
+    """The key of a medium's parameter, or of the radiance of the emitter of this name."""
+    keys = (key for key in params.keys() if key.endswith((".value", ".data")))
+    (key,) = [key for key in keys if name in key.split(".")]
     return key
 
 
@@ -57,22 +58,29 @@ def gradients(
     """Gradients of the objective by the parameters of these names."""
     params = mi.traverse(scene)
     keys = {name: key_of(params, name) for name in names}
-    before = {key: type(params[key])(params[key]) for key in keys.values()}
-    for key in keys.values():
-        dr.enable_grad(params[key])
+    # Environments keep another array than they are given.
+    leaves = {key: type(params[key])(params[key]) for key in keys.values()}
+    for key, leaf in leaves.items():
+        dr.enable_grad(leaf)
+        params[key] = leaf
     params.update()
     image = mi.render(scene, params, spp=spp, seed=seed)
     dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32))))
-    found = {n: np.array(dr.grad(params[k]), dtype=np.float64) for n, k in keys.items()}
-    for key, value in before.items():
-        params[key] = dr.detach(value)
+    found = {name: np.array(dr.grad(leaves[key]), dtype=np.float64) for name, key in keys.items()}
+    for key, leaf in leaves.items():
+        params[key] = dr.detach(leaf)
     params.update()
     return found
 
 
 def directions(case: Case, name: str, value: np.ndarray, count: int) -> list[np.ndarray]:
     """Perturbations of a parameter: ``count`` smooth ones of a grid, each channel of a constant."""
-    if case.homogeneous:
+    if name not in ("sigma_t", "albedo") and value.ndim == 3:
+        rows, columns = np.mgrid[: value.shape[0], : value.shape[1]]
+        turns = 2 * np.pi * columns / (value.shape[1] - 2)  # two columns are repeated
+        waves = [0.3 * (1 + np.cos(k * turns + rows * 0.1 * k)) for k in range(count)]
+        return [wave[..., None] * value.mean() for wave in waves]
+    if case.homogeneous or name not in ("sigma_t", "albedo"):
         return [0.05 * value * row.reshape(value.shape) for row in np.eye(value.size)]
     rng = np.random.default_rng(3)
     found = []

@@ -1,7 +1,10 @@
-"""Gradients against finite differences of the image.
+"""Gradients against finite differences of the image, and beside those of ``prbvolpath``.
 
-``python -m experiments.gradients.run`` prints for each case and parameter the relative error and
-the cosine of directional derivatives along smooth perturbations. ``--case NAME`` runs one case.
+    python -m experiments.gradients.run [--case NAME] [--document docs/validation.md]
+
+The first table has for each case and parameter the relative error and the cosine of directional
+derivatives along smooth perturbations (`differences`), the second one errors by voxel at equal
+CPU time (`beside_prb`). ``--case`` runs the cases of the first table whose names contain it.
 """
 
 from __future__ import annotations
@@ -11,35 +14,59 @@ from time import perf_counter, process_time
 
 import mitsuba as mi
 
+from experiments.gradients import beside_prb
+from experiments.gradients.cases import CASES, Case
+from experiments.gradients.differences import compare, gradients, pixel_weights
+from experiments.support.documents import replace_tables
+from experiments.support.options import add_document, begin
+from mitsuba_irrcache.compare.tables import Table
+
 
 def main() -> None:
-    """Run the cases and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--variant", default="llvm_ad_rgb")
+    """Print both tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--case", default="", help="part of the names of the cases to run")
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--voxels", type=int, default=32, help="along a side, beside prbvolpath")
+    add_document(parser)
     options = parser.parse_args()
+    begin()
     mi.set_variant(options.variant)
     mi.set_log_level(mi.LogLevel.Error)
-    from experiments.gradients.cases import CASES
-    from experiments.gradients.differences import compare, gradients, pixel_weights
+    tables = {"gradients": differences(options.case)}
+    if not options.case:
+        tables["gradients-prb"] = beside_prb.table(options.voxels)
+        print(tables["gradients-prb"].as_text())
+    if options.document:
+        replace_tables(options.document, tables)
 
-    print("| case | parameter | error | cosine | seconds (CPU seconds) of the gradient |")
-    print("|---|---|---|---|---|")
+
+def differences(chosen: str) -> Table:
+    """The table of finite differences."""
+    cells = []
     for name, case in CASES.items():
-        if options.case not in name:
-            continue
-        scene = case.load()
-        weights = pixel_weights(scene)
-        wall, cpu = perf_counter(), process_time()
-        found = gradients(scene, case.parameters, weights)
-        wall, cpu = perf_counter() - wall, process_time() - cpu
-        for parameter, gradient in found.items():
-            result = compare(scene, case, parameter, weights, gradient)
-            print(
-                f"| {name} | {parameter} | {result.error:.2%} | {result.cosine:.5f} "
-                f"| {wall:.2f} ({cpu:.2f}) |",
-                flush=True,
-            )
+        if chosen in name:
+            for row in _rows(name, case):
+                print("  ".join(row), flush=True)
+                cells.append(row)
+    head = ["case", "parameter", "error", "cosine", "CPU s"]
+    return Table("Gradients against finite differences", head, cells)
+
+
+def _rows(name: str, case: Case) -> list[list[str]]:
+    scene = case.load()
+    weights = pixel_weights(scene)
+    wall, cpu = perf_counter(), process_time()
+    found = gradients(scene, case.parameters, weights)
+    wall, cpu = perf_counter() - wall, process_time() - cpu
+    rows = []
+    for parameter, gradient in found.items():
+        result = compare(scene, case, parameter, weights, gradient)
+        cells = f"{result.error:.2%}", f"{result.cosine:.5f}", f"{cpu:.2f}"
+        rows.append([name, parameter, *cells])
+    return rows
 
 
 if __name__ == "__main__":
