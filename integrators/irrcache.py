@@ -166,10 +166,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     Gradients (``dr.backward``) are computed by ``sigma_t`` and ``albedo`` of a medium and by the
     radiance of emitters, by solving the adjoint transport equation: for one isotropic medium in a
-    box or sphere under distant and point emitters, without surfaces and emission, with the solver
-    ``sweep``, ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. All other gradients, and forward
-    mode, are refused with an error that names the parameter. While parameters carry gradients, the
-    grid of the cache is kept.
+    box or sphere under distant and point emitters, without surfaces, with the solver ``sweep``,
+    ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. Emissive media have gradients by
+    ``emission`` only. All other gradients, and forward mode, are refused with an error that names
+    the parameter. While parameters carry gradients, the grid of the cache is kept.
 
     .. tabs::
         .. code-tab:: xml
@@ -460,7 +460,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             check(self._builder.parts, keys, self._layered)
             film = FilmAdjoint(sensor, grad_in, seed, spp)
             (part,) = self._builder.parts
-            found = parameter_gradients(scene, params, keys, part, sight, self._step, film)
+            image = sight, self._step, self._emission
+            found = parameter_gradients(scene, params, keys, part, image, film)
         for key, grad in found.items():
             dr.accum_grad(params[key], grad)
 

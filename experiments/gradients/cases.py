@@ -71,6 +71,7 @@ class Case:
     homogeneous: bool = False
     filter: str = "box"
     pixels: str = "rgb"
+    emissive: bool = False
     parameters: tuple[str, ...] = ("sigma_t", "albedo")
 
     def sigma_t(self) -> np.ndarray:
@@ -86,6 +87,11 @@ class Case:
         values = 1 + 0.1 * blob(self.data, (0.6, 0.4, 0.5), 0.2)[..., None]
         return (values * np.array(self.albedo)).astype(np.float32)
 
+    def emission(self) -> np.ndarray:
+        """Emission coefficient (z, y, x, channel)."""
+        plane = 0.5 * blob(self.data, (0.5, 0.45, 0.6), 0.15)[..., None]
+        return (0.01 + plane * [1.0, 0.6, 0.3]).astype(np.float32)
+
     def load(self, **properties: object) -> mi.Scene:
         """Load the scene; ``properties`` are the integrator's."""
         place = placed(self.turn)
@@ -95,6 +101,8 @@ class Case:
             "resolution": self.cache,
             "max_depth": self.max_depth,
         }
+        if self.emissive:
+            integrator["emission"] = _volume(self.emission(), place)
         look = mi.ScalarTransform4f().look_at([1.0, 1.5, -5.0], [0, 0, 0], [0, 1, 0])
         film = {
             "type": "hdrfilm",
@@ -216,5 +224,9 @@ CASES = {
     ),
     "intensity of a point": Case(emitters=_under(point=POINT), parameters=("point",)),
     "texels of an envmap": Case(emitters=lambda: {"sky": sky_with_sun()}, parameters=("sky",)),
+    "emission": Case(emissive=True, empty_beyond=0.5, parameters=("emission",)),
+    "emission, single": Case(
+        emissive=True, empty_beyond=0.5, parameters=("emission",), max_depth=2
+    ),
     "alpha": Case(pixels="rgba", emitters=_under(sun=SUN)),
 }

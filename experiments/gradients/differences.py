@@ -75,12 +75,12 @@ def gradients(
 
 def directions(case: Case, name: str, value: np.ndarray, count: int) -> list[np.ndarray]:
     """Perturbations of a parameter: ``count`` smooth ones of a grid, each channel of a constant."""
-    if name not in ("sigma_t", "albedo") and value.ndim == 3:
+    if value.ndim == 3:  # an environment map
         rows, columns = np.mgrid[: value.shape[0], : value.shape[1]]
         turns = 2 * np.pi * columns / (value.shape[1] - 2)  # two columns are repeated
         waves = [0.3 * (1 + np.cos(k * turns + rows * 0.1 * k)) for k in range(count)]
         return [wave[..., None] * value.mean() for wave in waves]
-    if case.homogeneous or name not in ("sigma_t", "albedo"):
+    if value.ndim < 3:
         return [0.05 * value * row.reshape(value.shape) for row in np.eye(value.size)]
     rng = np.random.default_rng(3)
     found = []
@@ -91,7 +91,7 @@ def directions(case: Case, name: str, value: np.ndarray, count: int) -> list[np.
         plane = np.where(plane < 1e-2, 0, plane)
         colour = rng.uniform(0.3, 1.0, value.shape[-1])
         peak = case.depth * case.data / EDGE
-        step = STEP * (peak if name == "sigma_t" else 1.0)
+        step = STEP * {"sigma_t": peak, "albedo": 1.0}.get(name, value.max())
         found.append(step * plane * colour / colour.max())
     return found
 

@@ -13,6 +13,7 @@ from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import LUMINANCE, CameraPass, FilmAdjoint
 from mitsuba_irrcache.gradients.parameters import (
     ALBEDO,
+    EMISSION,
     SIGMA_T,
     channels_of,
     refuse_all,
@@ -28,6 +29,7 @@ from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
+from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
@@ -62,8 +64,6 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
     name = f'medium "{medium.name}"'
     if not medium.phase.is_isotropic:
         refuse_all(keys, f"the phase function of {name} is not isotropic", "Make it isotropic")
-    if medium.emission is not None:
-        refuse_all(keys, f"{name} is emissive", "Remove the emission")
     if part.half_space is not None:
         refuse_all(keys, f"{name} is opaque and homogeneous, and has no cache", "Set resolution")
     if part.solver.name != "sweep":
@@ -78,36 +78,59 @@ def parameter_gradients(
     params: mi.SceneParameters,
     keys: list[str],
     part: CachedMedium,
-    sight: ClosedFormCameraRays,
-    step: float,
+    image: tuple[ClosedFormCameraRays, float, object],
     film: FilmAdjoint,
 ) -> dict[str, object]:
     """The derivatives by the parameters ``keys`` of the objective whose derivatives by the pixels
     ``film`` has, in the types of these parameters.
 
-    ``part`` is the scene's only medium, with its cache; ``step`` is the integrator's property.
+    ``part`` is the scene's only medium, with its cache; ``image`` are its camera rays and the
+    integrator's properties ``step`` and ``emission``.
     """
+    sight, step, emission = image
     (medium,) = media_of(scene)
-    roles, wanted = roles_of(params, keys, medium, scene), {}
+    roles, wanted = roles_of(params, keys, medium, scene, emission), {}
     emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
     of_medium = {key: role for key, role in roles.items() if not isinstance(role, mi.Emitter)}
+    _check_emission(part, of_medium)
     for key, role in of_medium.items():
-        field = part.medium.sigma_t if role == SIGMA_T else part.medium.albedo
+        field = field_of(part.medium, role)
         own = field.channels if field.grid is not None else channels_of(params[key])
         wanted[role] = max(wanted.get(role, 1), own)
     adjoint = MediumAdjoint(scene, part, sight, step, wanted, EmitterAdjoint(scene, emitters))
     found = adjoint.gradients(film)
     result = {}
     for key, role in of_medium.items():
-        grad = by_parameter(params[key], adjoint.field(role), found[role])
+        grad = by_parameter(params[key], field_of(part.medium, role), found[role])
         result[key] = shaped_like(params[key], grad)
     return result
+
+
+def field_of(medium: MediumGrid, role: str) -> Field:
+    """The field of ``medium`` that a role names."""
+    if role == EMISSION:
+        return medium.emission.field
+    return medium.sigma_t if role == SIGMA_T else medium.albedo
+
+
+def _check_emission(part: CachedMedium, of_medium: dict[str, str]) -> None:
+    """Refuse derivatives by a medium that emits, and by emission that is 0 everywhere."""
+    name = f'medium "{part.medium.name}"'
+    others = [key for key, role in of_medium.items() if role != EMISSION]
+    if part.medium.emission is not None and others:
+        refuse_all(others, f"{name} is emissive", "Remove the emission")
+    if part.medium.emission is None and len(others) < len(of_medium):
+        refuse_all(
+            [key for key in of_medium if key not in others],
+            "the emission is 0 everywhere, and ignored",
+            "Start with a small positive value",
+        )
 
 
 class MediumAdjoint:
     """Derivatives by the medium of ``part`` in ``scene``, whose camera rays are ``sight``.
 
-    ``wanted`` maps what is wanted, `SIGMA_T` or `ALBEDO`, to the number of its channels; the
+    ``wanted`` maps what is wanted, `SIGMA_T`, `ALBEDO` or `EMISSION`, to its channels; the
     derivatives by ``emitters`` are added to their parameters.
     """
 
@@ -137,9 +160,12 @@ class MediumAdjoint:
                 part.settings.seed,
                 pairs,
                 part.settings.max_depth == 2,
-                self._medium.channels == max(wanted.values(), default=3) == 1 and not emitters,
+                self._medium.channels == max(wanted.values(), default=3) == 1
+                and not emitters
+                and EMISSION not in wanted,
             )
             self._transport.wants_extinction = SIGMA_T in wanted
+            self._transport.wants_emission = EMISSION in wanted
             field, falloff, lights = self._irradiance()
             self._quadrature = VoxelQuadrature(self._medium, self.grid)
             self._extinction = list(self._quadrature.extinction())
@@ -217,9 +243,8 @@ class MediumAdjoint:
                 splats = self._camera_splats(film, ahead)
             self._lit.replay(*march, ahead, offset, hit, splats)
             dr.eval()
-        for role, splat in ((SIGMA_T, splats.sigma_t), (ALBEDO, splats.albedo)):
-            if splat is not None:
-                sums[role].append(splat.values())
+        for role in self._wanted:
+            sums[role].append(getattr(splats, role).values())
         return self._fluence(splats.collisions) if splats.collisions is not None else None
 
     def _rays(self, each: CameraPass, film: FilmAdjoint) -> tuple:
@@ -250,19 +275,17 @@ class MediumAdjoint:
             self._splat(SIGMA_T, (brightest + largest * mean) * diagonal),
             self._splat(ALBEDO, largest * mean),
             VoxelSums(self.grid, self._transport.channels, largest) if needs else None,
+            self._splat(EMISSION, largest * diagonal),
         )
 
     def _splat(self, role: str, bound: float) -> GridSplat | ConstantSplat | None:
         """Empty sums of the derivative by a field of the medium; None if it is not wanted."""
         if role not in self._wanted:
             return None
-        field = self.field(role)
+        field = field_of(self._medium, role)
         if field.grid is None:
             return ConstantSplat(self._wanted[role], bound)
         return GridSplat(field.grid, field.channels, bound)
-
-    def field(self, role: str) -> Field:
-        return self._medium.sigma_t if role == SIGMA_T else self._medium.albedo
 
     # Transport
 
@@ -290,11 +313,12 @@ class MediumAdjoint:
         splats = {
             SIGMA_T: self._splat(SIGMA_T, volume * (_largest(found.sigma_t) + collided)),
             ALBEDO: self._splat(ALBEDO, volume * collided * self._medium.sigma_t.maximum),
+            EMISSION: self._splat(EMISSION, volume * _largest(found.emitted)),
         }
-        self._quadrature.add(splats[SIGMA_T], splats[ALBEDO], found, transport.albedo)
-        for role, splat in splats.items():
-            if splat is not None:
-                sums[role].append(splat.values())
+        of_medium = splats[SIGMA_T], splats[ALBEDO], found, transport.albedo
+        self._quadrature.add(*of_medium, splats[EMISSION])
+        for role in self._wanted:
+            sums[role].append(splats[role].values())
         if SIGMA_T in self._wanted:
             for emitter, irradiance in zip(
                 transport.point_lights, transport.from_points, strict=True

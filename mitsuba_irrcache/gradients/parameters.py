@@ -11,7 +11,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.media.bake import children
 
 #: What a parameter can be of a medium.
-SIGMA_T, ALBEDO = "sigma_t", "albedo"
+SIGMA_T, ALBEDO, EMISSION = "sigma_t", "albedo", "emission"
 #: Textures of emitters on which their radiance depends linearly.
 RADIANCE = ("radiance", "irradiance", "intensity")
 
@@ -36,20 +36,28 @@ def _is_enabled(value: object) -> bool:
 
 
 def roles_of(
-    params: mi.SceneParameters, keys: list[str], medium: mi.Medium, scene: mi.Scene
+    params: mi.SceneParameters,
+    keys: list[str],
+    medium: mi.Medium,
+    scene: mi.Scene,
+    emission: object = None,
 ) -> dict[str, str | mi.Emitter]:
-    """What each of the parameters ``keys`` is: `SIGMA_T` or `ALBEDO` of ``medium``, or the emitter
-    whose radiance it is.
+    """What each of the parameters ``keys`` is: `SIGMA_T` or `ALBEDO` of ``medium``, its `EMISSION`
+    if it belongs to that volume of the integrator, or the emitter whose radiance it is.
 
     Raises IrrcacheError for any other parameter.
     """
-    volumes = children(medium)
+    own = children(medium)
+    volumes = {SIGMA_T: own["sigma_t"], ALBEDO: own["albedo"]}
+    if isinstance(emission, mi.Volume):
+        volumes[EMISSION] = emission
     nodes: dict[mi.Object, str | mi.Emitter] = {}
-    for role in (SIGMA_T, ALBEDO):
-        volume = volumes[role]
+    for role, volume in volumes.items():
         for node in (volume, *children(volume).values()):
             if nodes.get(node, role) != role:
-                refuse(_first_key_of(params, node, keys), "both extinction and albedo depend on it")
+                refuse(
+                    _first_key_of(params, node, keys), f"both {nodes[node]} and {role} depend on it"
+                )
             nodes[node] = role
     for emitter in scene.emitters():
         nodes[emitter] = emitter
@@ -75,8 +83,8 @@ def refuse(key: str, reason: str) -> None:
     """Raise the error for a parameter without gradients."""
     raise IrrcacheError(
         f'irrcache computes no gradient of the parameter "{key}": {reason}. Gradients are known of '
-        "sigma_t and albedo of a medium and of the radiance of emitters; detach this parameter "
-        '(dr.disable_grad, params.update), or use the integrator "prbvolpath".'
+        "sigma_t and albedo of a medium and of the radiance of emitters and emission; detach this "
+        'parameter (dr.disable_grad, params.update), or use the integrator "prbvolpath".'
     )
 
 

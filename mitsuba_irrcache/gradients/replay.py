@@ -27,7 +27,7 @@ OPAQUE = 1e-6
 
 
 class CameraSplats:
-    """Where the replay adds derivatives: by the extinction and the albedo at positions, and the
+    """Where the replay adds derivatives: by extinction, albedo and emission at positions, and the
     adjoint fluence of collisions in voxels. None where a derivative is not wanted.
 
     It is no dataclass, whose fields would be state of the recorded loop.
@@ -38,8 +38,10 @@ class CameraSplats:
         sigma_t: GridSplat | ConstantSplat | None,
         albedo: GridSplat | ConstantSplat | None,
         collisions: VoxelSums | None,
+        emission: GridSplat | ConstantSplat | None = None,
     ) -> None:
-        self.sigma_t, self.albedo, self.collisions = sigma_t, albedo, collisions
+        self.sigma_t, self.albedo, self.emission = sigma_t, albedo, emission
+        self.collisions = collisions
 
 
 class LitMedium:
@@ -147,6 +149,11 @@ class LitMedium:
             if dr.hint(splats.albedo is not None, mode="scalar"):
                 change = passed * absorbed * mean
                 splats.albedo.add(p, of_channels(change, splats.albedo.channels), active)
+            if dr.hint(splats.emission is not None, mode="scalar"):
+                thin = tau < 1e-4
+                share = dr.select(thin, 1 - 0.5 * tau, absorbed / dr.select(thin, 1, tau))
+                change = of_channels(passed * share * length, splats.emission.channels)
+                splats.emission.add(p, change, active & self.medium.emission.covers(p))
             if dr.hint(splats.collisions is not None, mode="scalar"):
                 collided = passed * absorbed
                 one = dr.hint(self.colour is not None, mode="scalar")

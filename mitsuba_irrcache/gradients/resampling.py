@@ -26,6 +26,8 @@ class VoxelQuadrature:
     def __init__(self, medium: MediumGrid, grid: Grid) -> None:
         self.medium, self.grid = medium, grid
         fields = [f.grid for f in (medium.sigma_t, medium.albedo) if f.grid is not None]
+        if medium.emission is not None and medium.emission.grid is not None:
+            fields.append(medium.emission.grid)
         ratio = max((float((grid.voxel_size / g.voxel_size).max()) for g in fields), default=1.0)
         self.cut = not medium.fills(grid)
         points = 2 * int(np.ceil(ratio - 1e-3))
@@ -38,11 +40,12 @@ class VoxelQuadrature:
         albedo: GridSplat | ConstantSplat | None,
         found: Derivatives,
         mean_albedo: list,
+        emission: GridSplat | ConstantSplat | None = None,
     ):
         """Add the derivatives ``found`` at voxels to those by the data. ``mean_albedo`` is the
         albedo of the voxels: matter of another albedo scatters more, or less.
         """
-        # docs/primer, eq. (8.8)
+        # docs/primer, eqs. (8.8), (8.11)
         grid, medium = self.grid, self.medium
         voxel = dr.arange(mi.UInt32, grid.voxel_count)
         corner, sides = mi.Point3f(*grid.places(voxel)), [Divisor(self.points)] * 2
@@ -52,6 +55,7 @@ class VoxelQuadrature:
         share = dr.opaque(mi.Float, volume_of(grid) / self.points**3 / several)
         by_sigma_t = mi.Spectrum(*(found.sigma_t or [0.0])) * share
         by_collided = mi.Spectrum(*found.collided) * share
+        by_emission = mi.Spectrum(*(found.emitted or [0.0])) * share
         mean, k = mi.Spectrum(*mean_albedo), mi.UInt32(0)
         while dr.hint(k < count, label="points in a voxel"):
             place = mi.Point3f(*unravelled(k, sides)) + 0.5
@@ -66,6 +70,9 @@ class VoxelQuadrature:
             if dr.hint(albedo is not None, mode="scalar"):
                 change = mi.Spectrum(medium.sigma_t.at_world(p, inside)) * by_collided
                 albedo.add(p, of_channels(change, albedo.channels), inside)
+            if dr.hint(emission is not None, mode="scalar"):
+                there = inside & medium.emission.covers(p)
+                emission.add(p, of_channels(by_emission, emission.channels), there)
             k += 1
 
     @symbolic

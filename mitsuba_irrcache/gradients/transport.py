@@ -42,12 +42,13 @@ SWEEPS = 1
 class Derivatives:
     """Derivatives of the objective by the means over the voxels of a grid, per volume, for each
     channel of the radiance: by the extinction, for collisions of the voxel's albedo;
-    ``collided``, by the scattering coefficient, Phi Phi* / (4 pi); and ``direct``, by the
-    irradiance of point-like lights at the voxels.
+    ``collided``, by the scattering coefficient, Phi Phi* / (4 pi); ``direct``, by the
+    irradiance of point-like lights at the voxels; and ``emitted``, by emission that is scattered.
     """
 
-    def __init__(self, sigma_t: list, collided: list, direct: list) -> None:
-        self.sigma_t, self.collided, self.direct = sigma_t, collided, direct
+    def __init__(self, sigma_t: list, collided: list, direct: list, emitted: list) -> None:
+        self.sigma_t, self.collided = sigma_t, collided
+        self.direct, self.emitted = direct, emitted
 
 
 class AdjointTransport:
@@ -69,8 +70,8 @@ class AdjointTransport:
         grey: bool = False,
     ) -> None:
         self.grid, self._medium, self.single = grid, medium, single
-        #: whether derivatives by the extinction are wanted
-        self.wants_extinction = True
+        #: whether derivatives by the extinction, and by emission, are wanted
+        self.wants_extinction, self.wants_emission = True, False
         colours = 1 if mi.is_monochromatic else 3
         rng = np.random.default_rng((seed, 0x67726164))
         illumination = DistantIllumination(scene)
@@ -173,29 +174,30 @@ class AdjointTransport:
 
     # The adjoint
 
-    def adjoint(self, camera: list[mi.Float]) -> tuple[list[mi.Float], list[mi.Float]]:
+    def adjoint(self, camera: list[mi.Float]) -> tuple[list, list, list]:
         """The adjoint fluence of collisions: in all, with that of the ``camera`` rays, and the part
-        that has travelled between voxels.
+        that has travelled between voxels; and the latter at the voxel centres, also without matter.
         """
         # docs/primer, eq. (8.5)
-        totals, travelled = [], []
+        totals, travelled, centres = [], [], []
         for level, own in self._levels:
             source = interleaved_channels([camera[c] for c in own])
+            table = level.tracks.table(*self.ordinates.scattering().without_incoming())
             if self.single:
-                parts = [dr.zeros(mi.Float, dr.width(source))] * 2
                 totals += self._apart(source, own)
-                travelled += self._apart(parts[0], own)
+                travelled += [dr.zeros(mi.Float, self._count) for _ in own]
+                if self.wants_emission:
+                    centres += self._apart(level.sweep(source, table)[0], own)
                 continue
             _, first = level.sweep(source, level.tracks.table(*self._solving))
             phi = source + level.solve(first, self._solving)
             dr.eval(phi)
-            _, phi = level.sweep(
-                phi, level.tracks.table(*self.ordinates.scattering().without_incoming())
-            )
+            irradiance, phi = level.sweep(phi, table)
+            centres += self._apart(irradiance, own)
             travelled += self._apart(phi, own)
             totals += self._apart(phi + source, own)
-        dr.eval(totals, travelled)
-        return totals, travelled
+        dr.eval(totals, travelled, centres)
+        return totals, travelled, centres
 
     def derivatives(
         self, phi: list[mi.Float], camera: list[mi.Float], extinction: list[mi.Float]
@@ -205,7 +207,7 @@ class AdjointTransport:
         extinction are left out if they are not wanted.
         """
         # docs/primer, eq. (8.6)
-        total, travelled = self.adjoint(camera)
+        total, travelled, emitted = self.adjoint(camera)
         sigma_t, collided, direct = [], [], []
         for level, own in self._levels:
             for c in own:
@@ -216,7 +218,7 @@ class AdjointTransport:
                 collided.append(phi[c] * travelled[c] * dr.inv_four_pi)
                 direct.append(extinction[c] * scale * total[c])
         dr.eval(sigma_t, collided, direct)
-        return Derivatives(sigma_t, collided, direct)
+        return Derivatives(sigma_t, collided, direct, emitted)
 
     def _products(
         self, tracks: Tracks, channel: int, source: mi.Float, adjoint: mi.Float

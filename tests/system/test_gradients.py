@@ -25,6 +25,7 @@ COLOURED = (
     "homogeneous, coloured",
     "data of no common multiple",
     "sphere",
+    "emission",
 )
 
 
@@ -51,6 +52,10 @@ def test_gradients_in_colour_are_those_of_the_image(rgb, name):
 @pytest.mark.parametrize("name", ["empty voxels", "no matter", "no matter, sun"])
 def test_empty_voxels_have_gradients(mono, name):
     check(CASES[name], EMPTY_ERROR)
+
+
+def test_emission_has_gradients_with_single_scattering(rgb):
+    check(CASES["emission, single"])
 
 
 EMITTERS = {
@@ -282,6 +287,15 @@ def test_scenes_without_gradients_are_refused(rgb, scenes):
     shape = scenes.boundary(scenes.medium(500.0, 0.8, place), place)
     opaque = scenes.load(ours | {"resolution": 0}, shape, 8)
     assert "has no cache" in refused(opaque, "sigma_t.value.value")
+
+
+def test_emission_of_zero_is_refused(rgb):
+    scene = Case(data=8, cache=8, emissive=True).load()
+    params = mi.traverse(scene)
+    key = key_of(params, "emission")
+    params[key] = dr.zeros(mi.TensorXf, params[key].shape)
+    params.update()
+    assert "the emission is 0 everywhere" in refused(scene, "emission.data")
 
 
 def test_forward_mode_is_refused(rgb):

@@ -57,7 +57,7 @@ def test_resampling_has_an_exact_transpose(case):
     worth = [mi.Float(1 + 0.5 * np.sin(np.arange(count) * (c + 1.0))) for c in range(3)]
     none = [dr.zeros(mi.Float, count)] * 3
     splat = GridSplat(medium.sigma_t.grid, 1, 100.0)
-    found = Derivatives(worth, none, none)
+    found = Derivatives(worth, none, none, [])
     quadrature.add(splat, None, found, [mi.Float(0)] * 3)
     data = np.array(medium.sigma_t.data, dtype=np.float64) * medium.sigma_t.scale[0]
     means = np.array(quadrature.extinction(), dtype=np.float64)
