@@ -23,7 +23,6 @@ from experiments.support.options import begin
 
 VIEWS, UNSEEN = 8, 2
 SIZE = 64
-ALBEDO = (0.9,)
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,7 @@ class Method:
 METHODS = (
     Method("irrcache", 4, 0.02),
     Method("irrcache", 4, 0.05),
+    Method("irrcache", 4, 0.1),
     Method("prbvolpath", 4, 0.005),
     Method("prbvolpath", 4, 0.02),
     Method("prbvolpath", 16, 0.02),
@@ -74,40 +74,54 @@ def main() -> None:
         print(f"{method.integrator:10} spp {method.spp:2} rate {method.rate:5}: {text}", flush=True)
 
 
+def sensor(number: int) -> dict:
+    """A sensor around the medium, without a film."""
+    turn, height = 2 * np.pi * (number * 0.618), 0.8 * np.cos(2.4 * number)
+    origin = 5 * np.array([np.cos(turn), height, np.sin(turn)]) / np.hypot(1, height)
+    look = mi.ScalarTransform4f().look_at(list(origin), [0, 0, 0], [0, 1, 0])
+    return {"type": "perspective", "fov": 32.0, "to_world": look}
+
+
+def film(count: int) -> dict:
+    """A film for so many views beside each other."""
+    size = {"width": SIZE * count, "height": SIZE}
+    form = {"component_format": "float32", "rfilter": {"type": "box"}}
+    return {"film": {"type": "hdrfilm"} | size | form}
+
+
 def views() -> list[mi.Sensor]:
-    """Sensors around the medium; the last ones are those that are not fitted."""
-    found = []
-    for number in range(VIEWS + UNSEEN):
-        turn, height = 2 * np.pi * (number * 0.618), 0.8 * np.cos(2.4 * number)
-        origin = 5 * np.array([np.cos(turn), height, np.sin(turn)]) / np.hypot(1, height)
-        look = mi.ScalarTransform4f().look_at(list(origin), [0, 0, 0], [0, 1, 0])
-        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
-        film["component_format"] = "float32"
-        found.append(
-            mi.load_dict({"type": "perspective", "fov": 32.0, "to_world": look, "film": film})
-        )
-    return found
+    """All sensors; the last ones are those that are not fitted."""
+    return [mi.load_dict(sensor(number) | film(1)) for number in range(VIEWS + UNSEEN)]
+
+
+def together() -> mi.Sensor:
+    """The views that are fitted in one image: they share one cache and one adjoint solve."""
+    return mi.load_dict(
+        {"type": "batch"} | film(VIEWS) | {f"view{i}": sensor(i) for i in range(VIEWS)}
+    )
 
 
 def fit(case: Case, method: Method, truth: list, seconds: float) -> list[tuple[float, float]]:
     """Times and errors of unseen views."""
     own = {"type": method.integrator, "max_depth": -1}
-    own |= {"solver": "sweep", "resolution": case.cache} if method.integrator == "irrcache" else {}
-    scene, sensors = case.load(**own), views()
+    if method.integrator == "irrcache":  # all views at once; else one of them for each step
+        own |= {"solver": "sweep", "resolution": case.cache}
+        sensors = [together()]
+        targets = [mi.TensorXf(np.concatenate(truth[:VIEWS], axis=1))]
+    else:
+        sensors, targets = views()[:VIEWS], [mi.TensorXf(image) for image in truth[:VIEWS]]
+    scene = case.load(**own)
     params, peak = mi.traverse(scene), float(case.sigma_t().max())
     key = key_of(params, "sigma_t")
     optimizer = mi.ad.Adam(lr=method.rate * peak)
     optimizer[key] = dr.full(mi.TensorXf, 0.1 * peak, params[key].shape)
     params.update(optimizer)
-    targets = [mi.TensorXf(image) for image in truth]
     marks, spent, step, following = [], 0.0, 0, seconds / 4
     while spent < seconds:
-        begun = process_time()
-        for view in range(VIEWS) if method.integrator == "irrcache" else [step % VIEWS]:
-            image = mi.render(
-                scene, params, sensor=sensors[view], spp=method.spp, seed=step * 8 + view
-            )
-            dr.backward(dr.mean(dr.square(image - targets[view])))
+        begun, number = process_time(), step % len(sensors)
+        view = sensors[number]
+        image = mi.render(scene, params, sensor=view, spp=method.spp, seed=step)
+        dr.backward(dr.mean(dr.square(image - targets[number])))
         optimizer.step()
         optimizer[key] = dr.clip(optimizer[key], 0, 3 * peak)
         params.update(optimizer)

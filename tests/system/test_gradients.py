@@ -158,6 +158,22 @@ def test_views_add_up(rgb):
     np.testing.assert_allclose(both, one + two, rtol=1e-4, atol=1e-6 * np.abs(both).max())
 
 
+def test_a_batch_sensor_is_all_of_its_views(rgb):
+    """They share one adjoint solve; its ordinates and samples are others."""
+    scene, params, key = small()
+    film = {"type": "hdrfilm", "height": 16, "rfilter": {"type": "box"}}
+    views = []
+    for origin in ([5.0, 1.0, 0.0], [0.0, 1.0, 5.0]):
+        look = mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
+        views.append({"type": "perspective", "fov": 32.0, "to_world": look})
+    both = {"type": "batch", "a": views[0], "b": views[1], "film": film | {"width": 32}}
+    sensors = [mi.load_dict(view | {"film": film | {"width": 16}}) for view in views]
+    one, two = (gradient_of(scene, params, key, spp=64, sensor=s) for s in sensors)
+    found = gradient_of(scene, params, key, spp=64, sensor=mi.load_dict(both))
+    expected = 0.5 * (one + two)  # the loss is a mean over pixels
+    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
+
+
 @pytest.mark.parametrize("max_depth", [2, -1])
 def test_adam_finds_a_density(mono, max_depth):
     """An optimisation that starts without matter."""
