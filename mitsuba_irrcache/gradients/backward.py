@@ -97,8 +97,11 @@ def parameter_gradients(
         field = field_of(part.medium, role)
         own = field.channels if field.grid is not None else channels_of(params[key])
         wanted[role] = max(wanted.get(role, 1), own)
-    adjoint = MediumAdjoint(scene, part, sight, step, wanted, EmitterAdjoint(scene, emitters))
-    found = adjoint.gradients(film)
+    if film.largest == 0:
+        return {key: dr.zeros(type(params[key]), dr.shape(params[key])) for key in keys}
+    emitted = EmitterAdjoint(scene, emitters)
+    adjoint = MediumAdjoint(scene, part, (sight, step), wanted, emitted, film)
+    found = adjoint.gradients()
     result = {}
     for key, role in of_medium.items():
         grad = by_parameter(params[key], field_of(part.medium, role), found[role])
@@ -128,7 +131,8 @@ def _check_emission(part: CachedMedium, of_medium: dict[str, str]) -> None:
 
 
 class MediumAdjoint:
-    """Derivatives by the medium of ``part`` in ``scene``, whose camera rays are ``sight``.
+    """Derivatives by the medium of ``part`` in ``scene`` of the objective whose derivatives by the
+    pixels ``film`` has; ``image`` are the camera rays and the integrator's property ``step``.
 
     ``wanted`` maps what is wanted, `SIGMA_T`, `ALBEDO` or `EMISSION`, to its channels; the
     derivatives by ``emitters`` are added to their parameters.
@@ -138,12 +142,13 @@ class MediumAdjoint:
         self,
         scene: mi.Scene,
         part: CachedMedium,
-        sight: ClosedFormCameraRays,
-        step: float,
+        image: tuple[ClosedFormCameraRays, float],
         wanted: dict[str, int],
         emitters: EmitterAdjoint,
+        film: FilmAdjoint,
     ) -> None:
-        self._scene, self._part, self._sight, self._wanted = scene, part, sight, wanted
+        self._scene, self._part, self._wanted, self._film = scene, part, wanted, film
+        self._sight, step = image
         self._medium, self._emitters = part.medium, emitters
         self._transport: AdjointTransport | None = None
         self._collided: list[mi.Float] = []
@@ -157,7 +162,7 @@ class MediumAdjoint:
                 scene,
                 self._medium,
                 self.grid,
-                part.settings.seed,
+                (part.settings.seed, film.seed),
                 pairs,
                 part.settings.max_depth == 2,
                 self._medium.channels == max(wanted.values(), default=3) == 1
@@ -217,37 +222,35 @@ class MediumAdjoint:
 
     # The camera
 
-    def gradients(self, film: FilmAdjoint) -> dict[str, mi.Float]:
-        """Derivatives by extinction and albedo at the data's voxels, of the objective whose
-        derivatives by the pixels ``film`` has.
-        """
+    def gradients(self) -> dict[str, mi.Float]:
+        """Derivatives by what is wanted, at the data's voxels."""
         sums: dict[str, list] = {role: [] for role in self._wanted}
-        fluence = self._replayed(film, sums)
+        fluence = self._replayed(sums)
         if self._transport is not None and fluence is not None:
             self._add_transport(fluence, sums)
         return {role: _total(parts) for role, parts in sums.items()}
 
-    def _replayed(self, film: FilmAdjoint, sums: dict[str, list]) -> list[mi.Float] | None:
+    def _replayed(self, sums: dict[str, list]) -> list[mi.Float] | None:
         """Add what camera rays depend on straight to ``sums``; return the adjoint fluence that they
         leave in the voxels.
         """
         splats = None
-        for each in film.passes():
-            span, behind, hit, offset = self._rays(each, film)
+        for each in self._film.passes():
+            span, behind, hit, offset = self._rays(each)
             march = each.ray, span, each.radiance
             ahead, passed = self._lit.radiance(*march, behind, offset, hit)
             dr.eval(ahead, passed)
             if self._sight.background(self._scene, each.ray, mi.Bool(True))[0]:
                 self._emitters.add_background(each.ray, passed * each.radiance)
             if splats is None:
-                splats = self._camera_splats(film, ahead)
+                splats = self._camera_splats(ahead)
             self._lit.replay(*march, ahead, offset, hit, splats)
             dr.eval()
         for role in self._wanted:
             sums[role].append(getattr(splats, role).values())
         return self._fluence(splats.collisions) if splats.collisions is not None else None
 
-    def _rays(self, each: CameraPass, film: FilmAdjoint) -> tuple:
+    def _rays(self, each: CameraPass) -> tuple:
         """For camera rays the distances between which they are in the medium, the weighted radiance
         behind it, whether there is any such, and the first step.
         """
@@ -256,15 +259,15 @@ class MediumAdjoint:
         behind = each.radiance * background if visible else mi.Spectrum(0)
         if each.alpha is not None and not visible:
             behind = behind - each.alpha / dr.size_v(mi.Spectrum)
-        hit, near, far = sight.span(ray, film.medium)
+        hit, near, far = sight.span(ray, self._film.medium)
         offset = 1 - each.sampler.next_1d()
         span = mi.Float(near), mi.Float(far)
         dr.eval(ray, span, behind, hit, offset, each.radiance)
         return span, behind, hit, offset
 
-    def _camera_splats(self, film: FilmAdjoint, ahead: mi.Spectrum) -> CameraSplats:
+    def _camera_splats(self, ahead: mi.Spectrum) -> CameraSplats:
         """Empty sums for the derivatives that are wanted."""
-        lengths = np.linalg.norm(self._medium.frame[:3, :3], axis=0)
+        film, lengths = self._film, np.linalg.norm(self._medium.frame[:3, :3], axis=0)
         diagonal, rays = float(np.linalg.norm(lengths)), film.samples * MARGIN
         largest = film.largest * film.pixels * MARGIN
         brightest = max(float(dr.max(dr.max(dr.abs(ahead)))[0]) * rays, 1e-30)

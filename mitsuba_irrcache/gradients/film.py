@@ -47,6 +47,8 @@ class FilmAdjoint:
         pixels = int(self._size.x) * int(self._size.y)
         self._per_pass = _divisor(self._spp, max(1, LANES // pixels))
         self.colour, self.alpha = _planes(film, grad)
+        #: the seed as a number: wrapping functions pass it as an array
+        self.seed = int(np.array(seed).ravel()[0])
         #: medium around the sensor
         self.medium = sensor.get_medium()
         #: numbers of pixels, with those beside the image, and of camera samples

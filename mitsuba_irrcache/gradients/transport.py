@@ -64,7 +64,7 @@ class AdjointTransport:
         scene: mi.Scene,
         medium: MediumGrid,
         grid: Grid,
-        seed: int,
+        seed: tuple[int, int],
         pairs: int,
         single: bool,
         grey: bool = False,
@@ -73,7 +73,7 @@ class AdjointTransport:
         #: whether derivatives by the extinction, and by emission, are wanted
         self.wants_extinction, self.wants_emission = True, False
         colours = 1 if mi.is_monochromatic else 3
-        rng = np.random.default_rng((seed, 0x67726164))
+        rng = np.random.default_rng((*seed, 0x67726164))
         illumination = DistantIllumination(scene)
         if grey:
             (self.ordinates,), self.colour = illumination.factored_ordinates(1, pairs, colours, rng)

@@ -222,6 +222,15 @@ def test_parameters_without_gradients_cost_nothing(rgb, kernels):
     )
 
 
+def test_an_objective_that_does_not_depend_on_the_image(rgb):
+    scene, params, key = small()
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, spp=1)
+    dr.backward(dr.sum(image * mi.TensorXf(np.zeros(image.shape, np.float32))))
+    assert not np.array(dr.grad(params[key])).any()
+
+
 def test_only_what_is_wanted_is_computed(rgb, monkeypatch):
     """The radiance of a sun needs no derivatives by the extinction."""
     from mitsuba_irrcache.gradients import resampling

@@ -27,7 +27,9 @@ def test_a_sweep_is_its_own_transpose():
     """Weighted by the scattering coefficient, for smooth fields."""
     case = Case(data=20, cache=20)
     scene, medium = medium_of(case)
-    transport = AdjointTransport(scene, medium, Grid.near_cubic(medium.frame, 20), 0, 64, False)
+    transport = AdjointTransport(
+        scene, medium, Grid.near_cubic(medium.frame, 20), (0, 1), 64, False
+    )
     ((level, own),) = transport._levels
     table = level.tracks.table(*transport.ordinates.scattering().without_incoming())
     z, y, x = np.mgrid[:20, :20, :20] / 20
