@@ -29,6 +29,7 @@ from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
+from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
@@ -39,6 +40,9 @@ PAIRS, MOST_PAIRS = 32, 128
 UNEVEN = (EmitterKind.ENVIRONMENT_MAP,)
 #: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
 MARGIN = 256.0
+#: Bytes for camera samples and copies of tracks; numbers for each voxel, and for each of its
+#: channels.
+MEMORY, NUMBERS = 3 << 27, (40, 25)
 #: Optical depth of a voxel below which its collisions do not matter.
 EMPTY = 1e-6
 
@@ -155,6 +159,7 @@ class MediumAdjoint:
         field, falloff, lights = None, None, []
         if part.cache is not None:
             self.grid = part.cache.grid
+            self._check_memory()
             environment = scene.environment()
             uneven = environment is not None and kind_of(environment) in UNEVEN
             pairs = MOST_PAIRS if uneven else PAIRS
@@ -180,6 +185,15 @@ class MediumAdjoint:
             self._lit.colour = mi.Spectrum(
                 [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
             )
+
+    def _check_memory(self) -> None:
+        """Refuse an adjoint solve that cannot be held."""
+        channels = 1 if mi.is_monochromatic else 3
+        needed = MEMORY + 4 * self.grid.voxel_count * sum(
+            n * c for n, c in zip(NUMBERS, (1, channels), strict=True)
+        )
+        sides = " x ".join(map(str, self.grid.shape[::-1]))
+        require_memory(needed, f"irrcache: a gradient with {sides} voxels", "lower resolution")
 
     # The irradiance
 
