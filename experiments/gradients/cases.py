@@ -23,6 +23,7 @@ POINT = {
     "position": [0.4, 3.0, 1.0],
     "intensity": {"type": "rgb", "value": [20.0, 15.0, 12.0]},
 }
+LAMP = {"type": "point", "position": [0.13, 0.2, -0.1], "intensity": 1.0}
 
 
 def blob(count: int, centre: tuple, width: float) -> np.ndarray:
@@ -47,6 +48,12 @@ def sky_with_sun() -> dict:
     values = values[..., None] * [0.8, 0.9, 1.0]
     values[4, 7] += [60.0, 55.0, 40.0]
     return {"type": "envmap", "bitmap": mi.Bitmap(values.astype(np.float32))}
+
+
+def spot() -> dict:
+    """A narrow spot light."""
+    look = mi.ScalarTransform4f().look_at([0.5, 3.0, 0.0], [0, 0, 0], [1, 0, 0])
+    return {"type": "spot", "to_world": look, "intensity": 5.0, "cutoff_angle": 12.0}
 
 
 @dataclass(frozen=True)
@@ -187,6 +194,10 @@ CASES = {
     "sky and sun": Case(emitters=_under(sky=SKY, sun=SUN)),
     "point, single": Case(max_depth=2, emitters=_under(point=POINT)),
     "point": Case(emitters=_under(point=POINT)),
+    "point in the medium, single": Case(max_depth=2, emitters=_under(point=LAMP)),
+    "point in the medium": Case(emitters=_under(point=LAMP)),
+    "spot, single": Case(max_depth=2, emitters=lambda: {"spot": spot()}),
+    "spot": Case(emitters=lambda: {"spot": spot()}),
     "envmap with a bright spot": Case(emitters=lambda: {"sky": sky_with_sun()}),
     "envmap, single": Case(max_depth=2, emitters=lambda: {"sky": sky_with_sun()}),
     "attenuation alone": Case(max_depth=1, parameters=("sigma_t",)),

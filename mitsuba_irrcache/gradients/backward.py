@@ -215,6 +215,7 @@ class MediumAdjoint:
         if cache.active_count and cache.samples:
             dr.scatter(has_value, mi.Bool(True), cache.active)
         total = [dr.select(has_value, a, b) for a, b in zip(known, swept, strict=True)]
+        brightest = _largest(total)
         lights = [
             DirectLight(self._scene, light.emitter, self._medium, grid, voxels)
             for light in cache.direct_lights
@@ -232,6 +233,9 @@ class MediumAdjoint:
         values = interleaved(roots, count)
         values = conserving(grid, values, dr.full(mi.Bool, True, count), channels)
         field = RootField(grid, values, channels)
+        if falloff is not None:
+            field.maximum *= falloff.maximum(voxels)
+        field.maximum = max([field.maximum, brightest, *(light.maximum for light in lights)])
         return field, falloff, [DirectLightAlongRays(light) for light in lights]
 
     # The camera

@@ -18,7 +18,7 @@ import numpy as np
 
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor, VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
@@ -88,9 +88,14 @@ class AdjointTransport:
         voxels = dr.arange(mi.UInt32, grid.voxel_count)
         self.positions = VoxelSamplePoints(scene, grid).of(voxels)
         self.point_lights = illumination.point_lights
-        #: irradiance at the voxels from each point-like light
-        self.from_points = illumination.point_irradiance(medium, self.positions)
-        dr.eval(self.from_points)
+        at_centres = illumination.point_irradiance(medium, self.positions)
+        falloff = InverseSquareFactor.of(scene, grid) if at_centres else None
+        mean = falloff.spread(voxels) if falloff is not None else mi.Float(1)
+        #: irradiance from all point-like lights at the voxel centres, and means over the voxels of
+        #: that from each
+        self._at_centres = sum(at_centres, mi.Spectrum(0))
+        self.from_points = [irradiance * mean for irradiance in at_centres]
+        dr.eval(self._at_centres, self.from_points)
         self._levels = self._new_levels(medium, grid, voxels)
 
     def _new_levels(self, medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[tuple]:
@@ -136,16 +141,15 @@ class AdjointTransport:
         centres, collided = [], []
         for level, own in self._levels:
             table = level.tracks.table(*self._incoming(own))
+            none = dr.zeros(mi.Float, self._count)
+            centre = interleaved_channels([self._at_centres[c] + none for c in own])
             points = interleaved_channels(
-                [
-                    sum((e[c] for e in self.from_points), dr.zeros(mi.Float, self._count))
-                    for c in own
-                ]
+                [sum((e[c] for e in self.from_points), none) for c in own]
             )
             phi = None if self.single else interleaved_channels([known[c] for c in own])
             for _ in range(1 if self.single else SWEEPS):
                 irradiance, swept = level.sweep(phi, table)
-                irradiance, phi = irradiance + points, swept + points
+                irradiance, phi = irradiance + centre, swept + points
                 dr.eval(irradiance, phi)
             centres += self._apart(irradiance, own)
             collided += self._apart(phi, own)

@@ -16,7 +16,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 #: Largest relative error of directional derivatives along smooth perturbations, and the least
 #: cosine; the first also where voxels are empty.
 ERROR, COSINE, EMPTY_ERROR = 0.03, 0.999, 0.05
-GREY = ("sky, single", "sky", "sun, single", "sun", "point", "voxel depth 0.8", "alpha")
+GREY = ("sky, single", "sky", "sun, single", "sun", "point", "spot, single", "voxel depth 0.8")
 #: Perturbations of each parameter.
 BLOBS = 3
 COLOURED = (
