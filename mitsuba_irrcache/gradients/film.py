@@ -22,13 +22,12 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 @dataclass(eq=False)
 class CameraPass:
-    """Camera samples of one launch: their rays, the sensor's ``weight`` of each, and the derivative
-    of the objective by radiance times weight (``radiance``) and by ``alpha``.
+    """Camera samples of one launch: their rays, and the derivatives of the objective by the radiance
+    along these, the sensor's weight included, and by ``alpha``.
     """
 
     sampler: mi.Sampler
     ray: mi.Ray3f
-    weight: mi.Spectrum
     radiance: mi.Spectrum
     alpha: mi.Float | None
 
@@ -77,7 +76,7 @@ class FilmAdjoint:
                 radiance = mi.Spectrum(sum(colour)) * weight
             else:
                 radiance = mi.Spectrum(colour) * weight
-            yield CameraPass(sampler, mi.Ray3f(ray), weight, radiance, alpha)
+            yield CameraPass(sampler, mi.Ray3f(ray), radiance, alpha)
 
     def _drawn(self) -> Iterator[tuple]:
         """Positions on the film, pixels, and rays of the camera samples of each launch."""

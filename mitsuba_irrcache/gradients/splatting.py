@@ -15,7 +15,6 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.fast_math import clipped
-from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 
 #: Bits of the largest sum of magnitudes.
@@ -112,13 +111,6 @@ class ConstantSplat:
     def values(self) -> mi.Float:
         sums = np.array(self._sums.values(), dtype=np.float64).reshape(SLOTS, self.channels)
         return mi.Float(sums.sum(axis=0).tolist())
-
-
-def splat_of(field: Field, bound: float) -> GridSplat | ConstantSplat:
-    """The transpose of lookups of ``field``, without its scale."""
-    if field.grid is None:
-        return ConstantSplat(field.channels, bound)
-    return GridSplat(field.grid, field.channels, bound)
 
 
 def of_channels(values: mi.Spectrum, channels: int) -> list[mi.Float]:
