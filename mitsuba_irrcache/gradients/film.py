@@ -22,8 +22,8 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 @dataclass(eq=False)
 class CameraPass:
-    """Camera samples of one launch: their rays, and the derivatives of the objective by the radiance
-    along these, the sensor's weight included, and by ``alpha``.
+    """Camera samples of one launch: their rays, and the derivatives of the objective by the
+    radiance along these, the sensor's weight included, and by ``alpha``.
     """
 
     sampler: mi.Sampler
