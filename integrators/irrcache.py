@@ -386,6 +386,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             if sight is None:
                 film = self._render_empty(scene, sensor, seed, spp)
             else:
+                if isinstance(sight, TracedCameraRays):
+                    sight.prepare_view(scene, sensor, self._settings.seed)
                 film = self._render(sight, scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:

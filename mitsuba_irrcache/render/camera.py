@@ -22,7 +22,9 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import give_back
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
+from mitsuba_irrcache.render.film import pixel_centre_rays
 from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance, has_surfaces
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, is_null, medium_after, trace
@@ -188,6 +190,24 @@ class TracedCameraRays:
         self.known = self._is_known if max_depth < 0 else None
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+        self._description = description
+        all_known = len(projections) == len(description.media.grids)
+        #: whether irradiance is cached on surfaces, too
+        self._caches_surfaces = max_depth < 0 and all_known
+        self._surfaces: SurfaceIrradiance | None = None
+
+    def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> None:
+        """Cache the irradiance on the surfaces that ``sensor`` sees."""
+        if not self._caches_surfaces or not has_surfaces(scene):
+            return
+        if self._surfaces is None:
+            self._surfaces = SurfaceIrradiance(
+                scene, self._description, self.projections, self.rr_depth, seed
+            )
+        ray = pixel_centre_rays(sensor)
+        medium = sensor.get_medium()
+        pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
+        self._surfaces.prepare(scene, ray, pointer)
 
     def sample(
         self,
@@ -207,20 +227,25 @@ class TracedCameraRays:
         chance = dr.minimum(dr.max(transmittance) * (1 / ROULETTE_BELOW), 1)
         traced = stopped & (rng.next_float32(stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
-        start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
-        direct, reflected, interacted, path_end, _ = trace(
-            scene,
-            self.media,
-            start,
-            self.max_depth,
-            self.rr_depth,
-            self.hide_emitters,
-            rng,
-            traced,
-            self.known,
-        )
-        if self.known is not None:
-            reflected += path_end.weight * self._irradiance(path_end) * dr.inv_four_pi
+        if self._surfaces is not None:
+            direct, reflected, interacted, *_ = self._surfaces.paths.follow(
+                scene, end, pointer, rng, traced, False, self.hide_emitters
+            )
+        else:
+            start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
+            direct, reflected, interacted, path_end, _ = trace(
+                scene,
+                self.media,
+                start,
+                self.max_depth,
+                self.rr_depth,
+                self.hide_emitters,
+                rng,
+                traced,
+                self.known,
+            )
+            if self.known is not None:
+                reflected += path_end.weight * self._irradiance(path_end) * dr.inv_four_pi
         direct_weight = weight
         if self.narrow is not None:
             lamp = self.narrow.hits_source(ray.o, ray.d, far=mi.Bool(False), near=traced)

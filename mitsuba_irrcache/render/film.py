@@ -219,6 +219,17 @@ def camera_ray(
     return sensor.sample_ray_differential(time, 0, on_film, aperture)
 
 
+def pixel_centre_rays(sensor: mi.Sensor) -> mi.Ray3f:
+    """Rays through the centres of all pixels of the film, from the centre of the aperture."""
+    width, height = (int(n) for n in sensor.film().crop_size())
+    offset = mi.Vector2f(sensor.film().crop_offset())
+    position = mi.Vector2f(pixel_of(dr.arange(mi.UInt32, width * height), width)) + 0.5 + offset
+    scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in (width, height)))
+    time = mi.Float(sensor.shutter_open() + 0.5 * sensor.shutter_open_time())
+    ray, _ = sensor.sample_ray(time, 0.5, (position - offset) * scale, mi.Point2f(0.5))
+    return ray
+
+
 def _sampled(
     sensor: mi.Sensor,
     sampler: mi.Sampler,

@@ -1,0 +1,305 @@
+"""Paths between surfaces, with ray-marched media and cached irradiance at their last vertex.
+
+A path ends at the first diffuse surface whose irradiance can be interpolated. Mirrors, glass and
+glossy surfaces are sampled as in path tracing. Between surfaces the in-scattered radiance of the
+media is integrated by ray marching of their caches, which is free of the noise of sampled
+collisions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.surface import SurfaceNodes
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.lights.emitters import EmitterKind
+from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.transport.path import (
+    MAX_SURVIVAL,
+    MOST_CROSSINGS,
+    is_null,
+    medium_after,
+    power_heuristic,
+    visibility,
+)
+
+#: Vertices without a diffuse surface up to which positions for nodes are searched.
+MOST_BOUNCES = 6
+#: Distance, in voxels of its cache, over which the radiance of a medium varies: nodes within the
+#: medium need not be closer than a part of it.
+MEDIUM_CELLS = 8.0
+#: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
+LAMBERTIAN = 1e-4
+
+
+class SurfacePaths:
+    """Paths in a scene with caches of its media (``projections``) and on its surfaces.
+
+    Irradiance at the ``nodes`` excludes what comes straight from the ``sampled`` emitters, which
+    are sampled wherever a path ends.
+    """
+
+    def __init__(
+        self,
+        description: SceneDescription,
+        projections: Sequence[Projection],
+        nodes: SurfaceNodes,
+        sampled: Sequence[mi.Emitter],
+        rr_depth: mi.UInt32,
+    ) -> None:
+        self.media, self.projections, self.nodes = description.media, projections, nodes
+        self.brightest, self.rr_depth = description.brightest, rr_depth
+        gathered = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP)
+        self.gathers_environment = any(e not in sampled for e in description.emitters.of(*gathered))
+        self._sampled_count = dr.opaque(mi.UInt32, len(sampled))
+        self._sampled = dr.zeros(mi.EmitterPtr, max(len(sampled), 1))
+        for i, emitter in enumerate(sampled):
+            dr.scatter(self._sampled, mi.EmitterPtr(emitter), mi.UInt32(i))
+        dr.eval(self._sampled)
+        self.most_levels = dr.opaque(mi.UInt32, 0)
+        #: irradiance of the nodes, one array for each channel
+        self.irradiance = [mi.Float(0) for _ in range(dr.size_v(mi.Spectrum))]
+
+    @symbolic
+    def follow(
+        self,
+        scene: mi.Scene,
+        ray: mi.Ray3f,
+        pointer: mi.MediumPtr,
+        rng: mi.PCG32,
+        active: mi.Bool,
+        from_node: bool,
+        hide_emitters: bool = False,
+    ):
+        """Follow paths that begin with ``ray`` in the medium ``pointer``: at a camera ray's end
+        before a surface or, if ``from_node``, at a node.
+
+        Returns the radiance of emitters at the first surface, all other radiance, whether there was
+        any interaction, and the node whose irradiance has to be added with the returned factor
+        (only if ``from_node``; else it is included).
+        """
+        emitted, radiance = mi.Spectrum(0), mi.Spectrum(0)
+        throughput, eta = mi.Spectrum(1), mi.Float(1)
+        ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
+        pdf, last = mi.Float(0), dr.zeros(mi.Interaction3f)
+        last.p = ray.o
+        first, interacted = mi.Bool(True), mi.Bool(False)
+        clear = mi.Bool(not from_node)
+        end_number, end_factor = mi.UInt32(0), mi.Spectrum(0)
+        depth, crossings = mi.UInt32(0), mi.UInt32(0)
+        context, active = mi.BSDFContext(), mi.Bool(active)
+        while dr.hint(active, label="surface paths"):
+            survival = dr.minimum(dr.max(throughput) * dr.square(eta), MAX_SURVIVAL)
+            survival = dr.select(depth > self.rr_depth, survival, 1)
+            active &= (rng.next_float32(active) < survival) & (dr.max(throughput) > 0)
+            throughput = dr.select(active, throughput / survival, throughput)
+
+            # Ray march the media up to the next surface.
+            si = scene.ray_intersect(ray, active)
+            offset = 1 - rng.next_float32(active)
+            for projection in self.projections:
+                hit, entry, leave = projection.medium.intersect(ray)
+                entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
+                hit &= active & ~clear & (pointer == projection.medium.pointer)
+                found, transmittance, _, glow = projection.march(
+                    ray, entry, leave, mi.Spectrum(self.brightest), offset, hit
+                )
+                radiance += dr.select(hit, throughput * (found + glow), 0)
+                throughput = dr.select(hit, throughput * transmittance, throughput)
+            clear = mi.Bool(False)
+
+            # Add emission, with multiple importance sampling behind vertices that sample emitters.
+            valid = active & si.is_valid()
+            emitter = si.emitter(scene, active)
+            is_emitter = active & (emitter != None)  # noqa: E711
+            if dr.hint(from_node, mode="scalar"):
+                is_emitter &= ~first | (~si.is_valid() & self.gathers_environment)
+            if dr.hint(hide_emitters and not from_node, mode="scalar"):
+                is_emitter &= ~first
+            record = mi.DirectionSample3f(scene, si, last)
+            weighted = is_emitter & (pdf > 0)
+            density = scene.pdf_emitter_direction(last, record, weighted)
+            weight = dr.select(weighted, power_heuristic(pdf, density), 1)
+            value = dr.select(is_emitter, throughput * emitter.eval(si, is_emitter) * weight, 0)
+            emitted += dr.select(first, value, 0)
+            radiance += dr.select(first, 0, value)
+
+            # End at a diffuse surface with nodes.
+            bsdf = si.bsdf()
+            crosses = valid & is_null(bsdf.flags())
+            surface = valid & ~crosses
+            diffuse, factor = lambertian(si, surface)
+            normals = facing(si, ray.d)
+            numbers, weights, _, _ = self.nodes.find(si.p, normals, self.most_levels, diffuse)
+            ends = diffuse & (weights[0] + weights[1] + weights[2] + weights[3] > 0)
+            direct, rng = self.direct(scene, si, pointer, rng, ends, not from_node)
+            radiance += dr.select(ends, throughput * direct, 0)
+            if dr.hint(from_node, mode="scalar"):
+                end_number = dr.select(ends, chosen(numbers, weights, rng.next_float32(ends)), 0)
+                end_factor = dr.select(ends, throughput * factor, end_factor)
+            else:
+                known = self.irradiance_at(numbers, weights, ends)
+                radiance += dr.select(ends, throughput * factor * known, 0)
+            interacted |= ends
+
+            # Sample an emitter and the BSDF elsewhere.
+            scatters = surface & ~ends
+            smooth = scatters & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            vertex = dr.zeros(mi.Interaction3f)
+            vertex.p, vertex.n = si.p, si.n
+            vertex.time, vertex.wavelengths = ray.time, ray.wavelengths
+            sample = mi.Point2f(rng.next_float32(smooth), rng.next_float32(smooth))
+            record, value = scene.sample_emitter_direction(vertex, sample, False, smooth)
+            lit = smooth & (record.pdf > 0) & (dr.max(value) > 0)
+            f, density = bsdf.eval_pdf(context, si, si.to_local(record.d), lit)
+            lit &= dr.max(f) > 0
+            behind = medium_after(si, record.d, pointer)
+            passed, rng = visibility(scene, self.media, vertex, record.p, behind, rng, lit)
+            weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
+            radiance += dr.select(lit, throughput * f * value * passed * weight, 0)
+            choice = rng.next_float32(scatters)
+            sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
+            bsdf_sample, f = bsdf.sample(context, si, choice, sample, scatters)
+            throughput = dr.select(scatters, throughput * f, throughput)
+            eta = dr.select(scatters, eta * bsdf_sample.eta, eta)
+            is_vertex = scatters & ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
+            delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+            pdf = dr.select(is_vertex, dr.select(delta, 0, bsdf_sample.pdf), pdf)
+            last = dr.select(is_vertex, vertex, last)
+            first &= ~is_vertex
+            interacted |= is_vertex
+            depth = dr.select(is_vertex, depth + 1, depth)
+            direction = dr.select(scatters, si.to_world(bsdf_sample.wo), ray.d)
+            pointer = dr.select(
+                crosses | scatters, medium_after(si, direction, pointer), pointer
+            )
+            ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
+            crossings += 1
+            active &= (crosses | scatters) & (crossings < MOST_CROSSINGS)
+        return emitted, radiance, interacted, end_number, end_factor
+
+    @symbolic
+    def direct(self, scene, si, pointer, rng, active, exact: bool):
+        """Return the radiance reflected at ``si`` that comes straight from the sampled emitters."""
+        result, number, context = mi.Spectrum(0), mi.UInt32(0), mi.BSDFContext()
+        vertex = dr.zeros(mi.Interaction3f)
+        vertex.p, vertex.n = si.p, si.n
+        vertex.time, vertex.wavelengths = si.time, si.wavelengths
+        active = mi.Bool(active) & (self._sampled_count > 0)
+        while dr.hint(active, label="sampled emitters"):
+            emitter = dr.gather(mi.EmitterPtr, self._sampled, number, active)
+            sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+            record, value = emitter.sample_direction(vertex, sample, active)
+            f = si.bsdf().eval(context, si, si.to_local(record.d), active)
+            lit = active & (record.pdf > 0) & (dr.max(value * f) > 0)
+            behind = medium_after(si, record.d, pointer)
+            passed, rng = visibility(
+                scene, self.media, vertex, record.p, behind, rng, lit, exact
+            )
+            result += dr.select(lit, f * value * passed, 0)
+            number += 1
+            active &= number < self._sampled_count
+        return result, rng
+
+    def irradiance_at(
+        self, numbers: list[mi.UInt32], weights: list[mi.Float], active: mi.Bool
+    ) -> mi.Spectrum:
+        """Interpolate the irradiance between nodes."""
+        channels = []
+        for values in self.irradiance:
+            total = mi.Float(0)
+            for number, weight in zip(numbers, weights, strict=True):
+                total += weight * dr.gather(mi.Float, values, number, active & (weight > 0))
+            channels.append(total)
+        return mi.Spectrum(*channels)
+
+    @symbolic
+    def walk(self, scene, ray, pointer, rng, active):
+        """Follow rays through null, glossy and specular surfaces to the first diffuse one.
+
+        Returns its position and its geometric and shading normal; whether there is one; and the
+        distances of the first surface or medium, and of the first surface (infinite where there is
+        none).
+        """
+        ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
+        position, geometric, shading = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
+        found, nearest, travelled = mi.Bool(False), mi.Float(dr.inf), mi.Float(0)
+        nearest_surface = mi.Float(dr.inf)
+        bounces, crossings, active = mi.UInt32(0), mi.UInt32(0), mi.Bool(active)
+        context = mi.BSDFContext()
+        while dr.hint(active, label="towards a diffuse surface"):
+            for projection in self.projections:
+                inside = active & (bounces == 0) & (pointer == projection.medium.pointer)
+                scale = projection.cell * MEDIUM_CELLS
+                nearest = dr.select(
+                    inside, dr.minimum(nearest, dr.maximum(travelled, scale)), nearest
+                )
+            si = scene.ray_intersect(ray, active)
+            active &= si.is_valid()
+            travelled += dr.select(active, si.t, 0)
+            crosses = active & is_null(si.bsdf().flags())
+            surface = active & ~crosses
+            nearest_surface = dr.select(surface & (bounces == 0), travelled, nearest_surface)
+            diffuse, _ = lambertian(si, surface)
+            normals = facing(si, ray.d)
+            position = dr.select(diffuse, si.p, position)
+            geometric = dr.select(diffuse, normals[0], geometric)
+            shading = dr.select(diffuse, normals[1], shading)
+            found |= diffuse
+            scatters = surface & ~diffuse
+            choice = rng.next_float32(scatters)
+            sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
+            bsdf_sample, f = si.bsdf().sample(context, si, choice, sample, scatters)
+            scatters &= dr.max(f) > 0
+            direction = dr.select(scatters, si.to_world(bsdf_sample.wo), ray.d)
+            pointer = dr.select(crosses | scatters, medium_after(si, direction, pointer), pointer)
+            ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
+            bounces = dr.select(scatters, bounces + 1, bounces)
+            crossings += 1
+            active &= (crosses | scatters) & (bounces < MOST_BOUNCES)
+            active &= crossings < MOST_CROSSINGS
+        distances = dr.minimum(nearest, nearest_surface), nearest_surface
+        return position, (geometric, shading), found, distances
+
+
+def facing(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> tuple[mi.Normal3f, mi.Normal3f]:
+    """Geometric and shading normal on the side from which a ray arrives in ``direction``."""
+    geometric, shading = si.n, si.sh_frame.n
+    geometric = dr.select(dr.dot(geometric, direction) < 0, geometric, -geometric)
+    shading = dr.select(dr.dot(shading, direction) < 0, shading, -shading)
+    return mi.Normal3f(geometric), mi.Normal3f(shading)
+
+
+def lambertian(si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
+    """Whether the BSDF reflects alike in all directions, and its value f = reflectance / pi.
+
+    By flags and, since the normals of bump maps differ from those of the surface, by its values.
+    """
+    bsdf, context = si.bsdf(), mi.BSDFContext()
+    flags = bsdf.flags() & int(mi.BSDFFlags.All)
+    active = active & (flags == int(mi.BSDFFlags.DiffuseReflection))
+    side = dr.select(si.wi.z < 0, mi.Float(-1), 1)
+    value = bsdf.eval(context, si, mi.Vector3f(0, 0, side), active)
+    for x, y in ((0.6, 0.0), (-0.3, 0.51961524)):
+        other = bsdf.eval(context, si, mi.Vector3f(x, y, 0.8 * side), active) / 0.8
+        active = active & (dr.max(dr.abs(other - value)) <= LAMBERTIAN * dr.max(value))
+    return active, value
+
+
+def chosen(numbers: list[mi.UInt32], weights: list[mi.Float], u: mi.Float) -> mi.UInt32:
+    """Choose one of the ``numbers`` with probabilities ``weights``."""
+    result, largest = mi.UInt32(numbers[0]), mi.Float(weights[0])
+    for number, weight in zip(numbers[1:], weights[1:], strict=True):
+        result = dr.select(weight > largest, number, result)  # in case of rounding
+        largest = dr.maximum(weight, largest)
+    remaining, settled = mi.Float(u), mi.Bool(False)
+    for number, weight in zip(numbers, weights, strict=True):
+        here = ~settled & (remaining < weight)
+        result = dr.select(here, number, result)
+        settled |= here
+        remaining -= weight
+    return result
