@@ -202,7 +202,7 @@ class TracedCameraRays:
             return
         if self._surfaces is None:
             self._surfaces = SurfaceIrradiance(
-                scene, self._description, self.projections, self.rr_depth, seed
+                self._description, self.projections, self.rr_depth, seed
             )
         ray = pixel_centre_rays(sensor)
         medium = sensor.get_medium()

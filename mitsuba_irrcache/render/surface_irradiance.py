@@ -20,7 +20,6 @@ import numpy as np
 from mitsuba_irrcache.cache.surface import LEVELS, SurfaceNodes
 from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
-from mitsuba_irrcache.lights.emitters import EmitterKind
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.render.surface_paths import SurfacePaths, facing, lambertian
 from mitsuba_irrcache.scene.description import SceneDescription
@@ -39,8 +38,6 @@ INDIRECT_LEVELS, GENERATIONS = 3, 4
 LANES = 1 << 21
 #: Relative change of the irradiances at which the iteration ends, and the most iterations.
 CONVERGED, MOST_ITERATIONS = 1e-4, 500
-#: Density of an environment over its mean from which on it casts shadows: it is sampled.
-PEAKED = 30.0
 
 
 class SurfaceIrradiance:
@@ -48,7 +45,6 @@ class SurfaceIrradiance:
 
     def __init__(
         self,
-        scene: mi.Scene,
         description: SceneDescription,
         projections: Sequence[Projection],
         rr_depth: mi.UInt32,
@@ -56,8 +52,7 @@ class SurfaceIrradiance:
     ) -> None:
         corners = np.array([p.medium.frame @ c for p in projections for c in _UNIT_CUBE])[:, :3]
         self.nodes = SurfaceNodes(corners.min(axis=0), corners.max(axis=0))
-        sampled = _sampled_emitters(scene, description)
-        self.paths = SurfacePaths(description, projections, self.nodes, sampled, rr_depth)
+        self.paths = SurfacePaths(description, projections, self.nodes, rr_depth)
         self._seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self._channels = range(dr.size_v(mi.Spectrum))
         self._exchange: list[Exchange] = []
@@ -234,30 +229,6 @@ def has_surfaces(scene: mi.Scene) -> bool:
         shape.bsdf() is not None and not is_null(int(shape.bsdf().flags()))
         for shape in scene.shapes()
     )
-
-
-def _sampled_emitters(scene: mi.Scene, description: SceneDescription) -> list[mi.Emitter]:
-    """The emitters that are sampled where paths end: all but smooth environments."""
-    return [
-        emitter
-        for emitter, kind in description.emitters
-        if not kind.is_environment
-        or (kind is EmitterKind.ENVIRONMENT_MAP and _is_peaked(emitter))
-    ]
-
-
-def _is_peaked(emitter: mi.Emitter) -> bool:
-    """Whether an environment is so bright in some directions that these cast shadows."""
-    u = np.random.default_rng(1).random((2, 4096), dtype=np.float32)
-    _, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 4096), mi.Point2f(u))
-    uniform = mi.warp.square_to_uniform_sphere(mi.Point2f(u))
-    si = dr.zeros(mi.SurfaceInteraction3f, 4096)
-    record, _ = emitter.sample_direction(si, mi.Point2f(u))
-    si.wi = -record.d
-    sampled = np.array(mi.luminance(emitter.eval(si)) if mi.is_rgb else emitter.eval(si)[0])
-    si.wi = -uniform
-    mean = np.array(mi.luminance(emitter.eval(si)) if mi.is_rgb else emitter.eval(si)[0]).mean()
-    return bool(np.quantile(sampled, 0.9) > PEAKED * mean)
 
 
 @symbolic

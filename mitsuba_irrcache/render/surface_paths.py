@@ -12,9 +12,11 @@ from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.cache.surface import SurfaceNodes
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.lights.emitters import EmitterKind
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.description import SceneDescription
@@ -32,15 +34,82 @@ MOST_BOUNCES = 6
 #: Distance, in voxels of its cache, over which the radiance of a medium varies: nodes within the
 #: medium need not be closer than a part of it.
 MEDIUM_CELLS = 8.0
+#: Luminance over its mean from which on a direction of an environment counts as a peak, which
+#: casts shadows; samples of such an environment at each vertex.
+PEAK, ENVIRONMENT_SAMPLES = 8.0, 4
 #: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
 LAMBERTIAN = 1e-4
+
+
+class SampledEmitters:
+    """Emitters that are sampled at the vertices of paths: all but smooth environments.
+
+    Of an environment with a peak, such as a sun in a map of the sky, only the excess over
+    ``threshold`` (a luminance) is sampled; the remainder is gathered along all directions. Each
+    point-like or distant emitter is sampled once, an environment `ENVIRONMENT_SAMPLES` times.
+    """
+
+    def __init__(self, description: SceneDescription) -> None:
+        environments = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP)
+        slots = [
+            (emitter, 0.0, 1.0)
+            for emitter, kind in description.emitters
+            if not kind.is_environment
+        ]
+        threshold = dr.inf
+        for environment in description.emitters.of(EmitterKind.ENVIRONMENT_MAP):
+            threshold = peak_threshold(environment)
+            if threshold < dr.inf:
+                share = 1 / ENVIRONMENT_SAMPLES
+                slots += [(environment, k * share, share) for k in range(ENVIRONMENT_SAMPLES)]
+        self.has_environment = bool(description.emitters.of(*environments))
+        self.threshold = dr.opaque(mi.Float, threshold)
+        self.count = dr.opaque(mi.UInt32, len(slots))
+        self._emitters = dr.zeros(mi.EmitterPtr, max(len(slots), 1))
+        for i, (emitter, *_) in enumerate(slots):
+            dr.scatter(self._emitters, mi.EmitterPtr(emitter), mi.UInt32(i))
+        self._first = mi.Float([first for _, first, _ in slots] or [0.0])
+        self._share = mi.Float([share for *_, share in slots] or [1.0])
+        dr.eval(self._emitters, self._first, self._share)
+
+    def excess(self, emitter: mi.EmitterPtr, radiance: mi.Spectrum) -> mi.Float:
+        """The part of a ``radiance`` of an emitter that is sampled."""
+        peak = dr.maximum(1 - self.threshold / dr.maximum(luminance(radiance), 1e-30), 0)
+        return dr.select(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite), peak, 1)
+
+    def sample(
+        self, number: mi.UInt32, vertex: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """Sample a direction; return it with its radiance, without what is gathered, over its
+        density.
+        """
+        emitter = dr.gather(mi.EmitterPtr, self._emitters, number, active)
+        share = dr.gather(mi.Float, self._share, number, active)
+        first = dr.gather(mi.Float, self._first, number, active)
+        u = mi.Point2f(u.x, first + u.y * share)
+        record, value = emitter.sample_direction(vertex, u, active)
+        infinite = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) & ~record.delta
+        excess = self.excess(emitter, value * record.pdf)
+        return record, value * share * dr.select(infinite, excess, 1)
+
+
+def peak_threshold(environment: mi.Emitter) -> float:
+    """The luminance beyond which an environment counts as a peak; infinite without peaks."""
+    u = np.random.default_rng(1).random((2, 1 << 14), dtype=np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f, u.shape[1])
+    si.wi = -mi.warp.square_to_uniform_sphere(mi.Point2f(u))
+    mean = float(dr.mean(luminance(environment.eval(si)))[0])
+    record, _ = environment.sample_direction(si, mi.Point2f(u))
+    si.wi = -record.d
+    highest = float(dr.max(luminance(environment.eval(si)))[0])
+    return PEAK * mean if highest > PEAK * mean else dr.inf
 
 
 class SurfacePaths:
     """Paths in a scene with caches of its media (``projections``) and on its surfaces.
 
-    Irradiance at the ``nodes`` excludes what comes straight from the ``sampled`` emitters, which
-    are sampled wherever a path ends.
+    Irradiance at the ``nodes`` excludes what comes straight from the `SampledEmitters`, which are
+    sampled wherever a path ends.
     """
 
     def __init__(
@@ -48,18 +117,11 @@ class SurfacePaths:
         description: SceneDescription,
         projections: Sequence[Projection],
         nodes: SurfaceNodes,
-        sampled: Sequence[mi.Emitter],
         rr_depth: mi.UInt32,
     ) -> None:
         self.media, self.projections, self.nodes = description.media, projections, nodes
         self.brightest, self.rr_depth = description.brightest, rr_depth
-        gathered = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP)
-        self.gathers_environment = any(e not in sampled for e in description.emitters.of(*gathered))
-        self._sampled_count = dr.opaque(mi.UInt32, len(sampled))
-        self._sampled = dr.zeros(mi.EmitterPtr, max(len(sampled), 1))
-        for i, emitter in enumerate(sampled):
-            dr.scatter(self._sampled, mi.EmitterPtr(emitter), mi.UInt32(i))
-        dr.eval(self._sampled)
+        self.emitters = SampledEmitters(description)
         self.most_levels = dr.opaque(mi.UInt32, 0)
         #: irradiance of the nodes, one array for each channel
         self.irradiance = [mi.Float(0) for _ in range(dr.size_v(mi.Spectrum))]
@@ -112,19 +174,22 @@ class SurfacePaths:
                 throughput = dr.select(hit, throughput * transmittance, throughput)
             clear = mi.Bool(False)
 
-            # Add emission, with multiple importance sampling behind vertices that sample emitters.
+            # Add emission, with multiple importance sampling where the last vertex sampled it.
             valid = active & si.is_valid()
             emitter = si.emitter(scene, active)
             is_emitter = active & (emitter != None)  # noqa: E711
-            if dr.hint(from_node, mode="scalar"):
-                is_emitter &= ~first | (~si.is_valid() & self.gathers_environment)
             if dr.hint(hide_emitters and not from_node, mode="scalar"):
                 is_emitter &= ~first
+            value = emitter.eval(si, is_emitter)
+            excess = self.emitters.excess(emitter, value)
+            value *= throughput
             record = mi.DirectionSample3f(scene, si, last)
-            weighted = is_emitter & (pdf > 0)
-            density = scene.pdf_emitter_direction(last, record, weighted)
-            weight = dr.select(weighted, power_heuristic(pdf, density), 1)
-            value = dr.select(is_emitter, throughput * emitter.eval(si, is_emitter) * weight, 0)
+            sampled = is_emitter & (pdf > 0) & (excess > 0)
+            density = emitter.pdf_direction(last, record, sampled)
+            weight = dr.select(sampled, power_heuristic(pdf, density), 1)
+            if dr.hint(from_node, mode="scalar"):
+                weight = dr.select(first, 0, weight)
+            value = dr.select(is_emitter, value * (1 - excess + excess * weight), 0)
             emitted += dr.select(first, value, 0)
             radiance += dr.select(first, 0, value)
 
@@ -136,8 +201,6 @@ class SurfacePaths:
             normals = facing(si, ray.d)
             numbers, weights, _, _ = self.nodes.find(si.p, normals, self.most_levels, diffuse)
             ends = diffuse & (weights[0] + weights[1] + weights[2] + weights[3] > 0)
-            direct, rng = self.direct(scene, si, pointer, rng, ends, not from_node)
-            radiance += dr.select(ends, throughput * direct, 0)
             if dr.hint(from_node, mode="scalar"):
                 end_number = dr.select(ends, chosen(numbers, weights, rng.next_float32(ends)), 0)
                 end_factor = dr.select(ends, throughput * factor, end_factor)
@@ -146,21 +209,12 @@ class SurfacePaths:
                 radiance += dr.select(ends, throughput * factor * known, 0)
             interacted |= ends
 
-            # Sample an emitter and the BSDF elsewhere.
+            # Sample the emitters, and the BSDF where the path continues.
             scatters = surface & ~ends
-            smooth = scatters & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            vertex = dr.zeros(mi.Interaction3f)
-            vertex.p, vertex.n = si.p, si.n
-            vertex.time, vertex.wavelengths = ray.time, ray.wavelengths
-            sample = mi.Point2f(rng.next_float32(smooth), rng.next_float32(smooth))
-            record, value = scene.sample_emitter_direction(vertex, sample, False, smooth)
-            lit = smooth & (record.pdf > 0) & (dr.max(value) > 0)
-            f, density = bsdf.eval_pdf(context, si, si.to_local(record.d), lit)
-            lit &= dr.max(f) > 0
-            behind = medium_after(si, record.d, pointer)
-            passed, rng = visibility(scene, self.media, vertex, record.p, behind, rng, lit)
-            weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
-            radiance += dr.select(lit, throughput * f * value * passed * weight, 0)
+            smooth = surface & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            direct, rng = self.direct(scene, si, pointer, rng, smooth, ends, not from_node)
+            radiance += dr.select(smooth, throughput * direct, 0)
+            vertex = vertex_at(si)
             choice = rng.next_float32(scatters)
             sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
             bsdf_sample, f = bsdf.sample(context, si, choice, sample, scatters)
@@ -183,26 +237,28 @@ class SurfacePaths:
         return emitted, radiance, interacted, end_number, end_factor
 
     @symbolic
-    def direct(self, scene, si, pointer, rng, active, exact: bool):
-        """Return the radiance reflected at ``si`` that comes straight from the sampled emitters."""
+    def direct(self, scene, si, pointer, rng, active, ends, exact: bool):
+        """Return the radiance reflected at ``si`` that comes straight from the sampled emitters.
+
+        With multiple importance sampling unless the path ``ends`` here. The transmittance has no
+        noise if it is to be ``exact``.
+        """
         result, number, context = mi.Spectrum(0), mi.UInt32(0), mi.BSDFContext()
-        vertex = dr.zeros(mi.Interaction3f)
-        vertex.p, vertex.n = si.p, si.n
-        vertex.time, vertex.wavelengths = si.time, si.wavelengths
-        active = mi.Bool(active) & (self._sampled_count > 0)
+        vertex, active = vertex_at(si), mi.Bool(active) & (self.emitters.count > 0)
         while dr.hint(active, label="sampled emitters"):
-            emitter = dr.gather(mi.EmitterPtr, self._sampled, number, active)
-            sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
-            record, value = emitter.sample_direction(vertex, sample, active)
-            f = si.bsdf().eval(context, si, si.to_local(record.d), active)
-            lit = active & (record.pdf > 0) & (dr.max(value * f) > 0)
+            u = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+            record, value = self.emitters.sample(number, vertex, u, active)
+            f, density = si.bsdf().eval_pdf(context, si, si.to_local(record.d), active)
+            value *= f
+            reflects = active & (record.pdf > 0) & (dr.max(value) > 0)
             behind = medium_after(si, record.d, pointer)
             passed, rng = visibility(
-                scene, self.media, vertex, record.p, behind, rng, lit, exact
+                scene, self.media, vertex, record.p, behind, rng, reflects, exact
             )
-            result += dr.select(lit, f * value * passed, 0)
+            weight = power_heuristic(record.pdf, dr.select(record.delta | ends, 0, density))
+            result += dr.select(reflects, value * passed * weight, 0)
             number += 1
-            active &= number < self._sampled_count
+            active &= number < self.emitters.count
         return result, rng
 
     def irradiance_at(
@@ -264,6 +320,14 @@ class SurfacePaths:
             active &= crossings < MOST_CROSSINGS
         distances = dr.minimum(nearest, nearest_surface), nearest_surface
         return position, (geometric, shading), found, distances
+
+
+def vertex_at(si: mi.SurfaceInteraction3f) -> mi.Interaction3f:
+    """The interaction from which emitters are sampled."""
+    vertex = dr.zeros(mi.Interaction3f)
+    vertex.p, vertex.n = si.p, si.n
+    vertex.time, vertex.wavelengths = si.time, si.wavelengths
+    return vertex
 
 
 def facing(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> tuple[mi.Normal3f, mi.Normal3f]:
