@@ -29,8 +29,8 @@ from mitsuba_irrcache.core.jit import symbolic
 NONE = 0xFFFFFFFF
 #: Levels below the coarsest one at a point.
 LEVELS = 6
-#: Spacing of the lattice at level 0 over the diagonal of the media's box; the distance from the box,
-#: in units of the spacing, from which on the coarsest level is coarser.
+#: Spacing of the lattice at level 0 over the diagonal of the media's box; the distance from the
+#: box, in units of the spacing, from which on the coarsest level is coarser.
 COARSEST, COARSER_BEYOND = 0.25, 2.0
 #: Largest spacing over the harmonic mean distance of a node.
 SPACING_PER_DISTANCE = 0.25
@@ -42,8 +42,8 @@ TANGENT = 0.3
 #: Distance of another surface from a node, over the spacing, below which this surface may lie
 #: between nodes, as in corners and below objects.
 CLEARANCE = 1.5
-#: Offset of the lattices' origin, so that planes at round coordinates are not on the boundary of two
-#: intervals.
+#: Offset of the lattices' origin, so that planes at round coordinates are not on the boundary of
+#: two intervals.
 SHIFT = np.array([0.2137, 0.3719, 0.4482])
 #: Bits of a coordinate, and offsets that make coordinates and levels positive.
 BITS, OFFSET, LEVEL_OFFSET = 18, 1 << 17, 32
@@ -80,12 +80,12 @@ class SurfaceNodes:
         most_levels: mi.UInt32,
         active: mi.Bool,
     ):
-        """Find the nodes between which to interpolate at ``p`` with these ``normals`` (geometric and
-        shading).
+        """Find the nodes between which to interpolate at ``p`` with these ``normals``, geometric
+        and shading.
 
         Returns the numbers of four nodes and their weights, whose sum is 1, or 0 where there are
-        none, or where another surface may lie between them at the finest level; further, the keys
-        at the last level visited and whether any of them is missing.
+        none; whether another surface may lie between them; further, the keys at the last level
+        visited and whether any of them is missing.
         """
         geometric, shading = normals
         axis, side, place, slope = _across(geometric, mi.Vector3f(p - self._origin))
@@ -95,6 +95,7 @@ class SurfaceNodes:
         weights = [mi.Float(0) for _ in range(4)]
         keys = [mi.UInt64(0) for _ in range(4)]
         missing, found_any, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
+        uncertain = mi.Bool(False)
         while dr.hint(active, label="levels of surface nodes"):
             spacing = self._spacing_at(level)
             u, v = place.x / spacing, place.y / spacing
@@ -115,9 +116,7 @@ class SurfaceNodes:
                 cosine = dr.dot(mi.Vector3f(normal.x, normal.y, normal.z), shading)
                 applies = known & (found.w > 0) & (dr.abs(offset) < TANGENT * spacing)
                 applies &= cosine > SAME_SIDE
-                finer |= applies & (
-                    (found.w * SPACING_PER_DISTANCE < spacing) | (cosine < FLAT)
-                )
+                finer |= applies & ((found.w * SPACING_PER_DISTANCE < spacing) | (cosine < FLAT))
                 divided |= known & (found.w > 0) & (normal.w < CLEARANCE * spacing)
                 weight = (1 - dr.abs(at_u - u)) * (1 - dr.abs(at_v - v))
                 weight = dr.select(applies, dr.maximum(weight, 1e-6), 0)
@@ -126,16 +125,19 @@ class SurfaceNodes:
                 corner_numbers.append(number)
                 corner_weights.append(weight)
             # Nodes of a level that is not complete are used only where there are no coarser ones.
-            better = active & (total > 0) & ~divided & (~incomplete | ~found_any)
+            better = active & (total > 0) & (~incomplete | ~found_any)
+            uncertain = dr.select(better, divided, uncertain)
             scale = dr.rcp(total)
             for k in range(4):
-                numbers[k] = dr.select(better & (corner_weights[k] > 0), corner_numbers[k], numbers[k])
+                numbers[k] = dr.select(
+                    better & (corner_weights[k] > 0), corner_numbers[k], numbers[k]
+                )
                 weights[k] = dr.select(better, corner_weights[k] * scale, weights[k])
             found_any |= better
             missing |= incomplete
             active &= ~incomplete & (finer | divided | (total == 0)) & (level < last)
             level = dr.select(active, level + 1, level)
-        return numbers, weights, keys, missing
+        return numbers, weights, uncertain, keys, missing
 
     def _coarsest_level(self, p: mi.Point3f) -> mi.Int32:
         """Level at which the search begins at ``p``."""
@@ -228,7 +230,9 @@ class SurfaceNodes:
         )
         step = dr.select(forward, mi.Float(1), -1)
         direction = mi.Vector3f(
-            dr.select(axis == 0, step, 0), dr.select(axis == 1, step, 0), dr.select(axis == 2, step, 0)
+            dr.select(axis == 0, step, 0),
+            dr.select(axis == 1, step, 0),
+            dr.select(axis == 2, step, 0),
         )
         return mi.Ray3f(self._origin + place, direction), 2 * spacing
 
@@ -255,11 +259,13 @@ class SurfaceNodes:
         self._places, self._normals, self._geometric = joined
         dr.eval(joined)
 
-    def positions(self, numbers: mi.UInt32) -> tuple[mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Float]:
+    def positions(
+        self, numbers: mi.UInt32, active: mi.Bool = True
+    ) -> tuple[mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Float]:
         """Position, geometric and shading normal, and harmonic mean distance of nodes."""
-        found = dr.gather(mi.Vector4f, self._places, numbers)
-        geometric = dr.gather(mi.Vector4f, self._geometric, numbers)
-        shading = dr.gather(mi.Vector4f, self._normals, numbers)
+        found = dr.gather(mi.Vector4f, self._places, numbers, active)
+        geometric = dr.gather(mi.Vector4f, self._geometric, numbers, active)
+        shading = dr.gather(mi.Vector4f, self._normals, numbers, active)
         return (
             mi.Point3f(found.x, found.y, found.z),
             mi.Normal3f(geometric.x, geometric.y, geometric.z),

@@ -26,8 +26,8 @@ from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
-#: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance; by
-#: which those gather it that only other nodes see.
+#: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance;
+#: by which those gather it that only other nodes see.
 PROBES, GATHERED, GATHERED_INDIRECT = 32, 128, 32
 #: Nodes beyond which no further ones are created where rays from nodes end.
 MOST_NODES = 1 << 18
@@ -121,9 +121,7 @@ class SurfaceIrradiance:
         dr.eval(q, others, found, closeness, surface)
         mean = dr.block_sum(closeness, PROBES) / PROBES
         distance = dr.select(valid, dr.rcp(dr.maximum(mean, 1e-18)), 0)
-        self.nodes.place(
-            p, normals, distance, dr.block_reduce(dr.ReduceOp.Min, surface, PROBES)
-        )
+        self.nodes.place(p, normals, distance, dr.block_reduce(dr.ReduceOp.Min, surface, PROBES))
         return q, others, found
 
     def _ray_from(
@@ -153,7 +151,7 @@ class SurfaceIrradiance:
     # Irradiance
 
     def _gather(self, scene: mi.Scene, first: int, end: int, rays: int) -> None:
-        """Gather the radiance along so many ``rays`` from each of the nodes ``first`` to ``end``."""
+        """Gather radiance along so many ``rays`` from each of the nodes ``first`` to ``end``."""
         per_launch = LANES // rays
         for begin in range(first, end, per_launch):
             count = min(per_launch, end - begin)

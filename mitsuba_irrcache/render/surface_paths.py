@@ -34,9 +34,12 @@ MOST_BOUNCES = 6
 #: Distance, in voxels of its cache, over which the radiance of a medium varies: nodes within the
 #: medium need not be closer than a part of it.
 MEDIUM_CELLS = 8.0
+#: Height above the surface, over their distance, at which the visibility between a point and a node
+#: is tested: chords of curved surfaces lie below these.
+CHORD = 0.1
 #: Luminance over its mean from which on a direction of an environment counts as a peak, which
 #: casts shadows; samples of such an environment at each vertex.
-PEAK, ENVIRONMENT_SAMPLES = 8.0, 4
+PEAK, ENVIRONMENT_SAMPLES = 8.0, 8
 #: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
 LAMBERTIAN = 1e-4
 
@@ -52,9 +55,7 @@ class SampledEmitters:
     def __init__(self, description: SceneDescription) -> None:
         environments = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP)
         slots = [
-            (emitter, 0.0, 1.0)
-            for emitter, kind in description.emitters
-            if not kind.is_environment
+            (emitter, 0.0, 1.0) for emitter, kind in description.emitters if not kind.is_environment
         ]
         threshold = dr.inf
         for environment in description.emitters.of(EmitterKind.ENVIRONMENT_MAP):
@@ -199,7 +200,10 @@ class SurfacePaths:
             surface = valid & ~crosses
             diffuse, factor = lambertian(si, surface)
             normals = facing(si, ray.d)
-            numbers, weights, _, _ = self.nodes.find(si.p, normals, self.most_levels, diffuse)
+            numbers, weights, uncertain, _, _ = self.nodes.find(
+                si.p, normals, self.most_levels, diffuse
+            )
+            weights = self.visible(scene, si, numbers, weights, diffuse & uncertain)
             ends = diffuse & (weights[0] + weights[1] + weights[2] + weights[3] > 0)
             if dr.hint(from_node, mode="scalar"):
                 end_number = dr.select(ends, chosen(numbers, weights, rng.next_float32(ends)), 0)
@@ -228,9 +232,7 @@ class SurfacePaths:
             interacted |= is_vertex
             depth = dr.select(is_vertex, depth + 1, depth)
             direction = dr.select(scatters, si.to_world(bsdf_sample.wo), ray.d)
-            pointer = dr.select(
-                crosses | scatters, medium_after(si, direction, pointer), pointer
-            )
+            pointer = dr.select(crosses | scatters, medium_after(si, direction, pointer), pointer)
             ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
             crossings += 1
             active &= (crosses | scatters) & (crossings < MOST_CROSSINGS)
@@ -260,6 +262,25 @@ class SurfacePaths:
             number += 1
             active &= number < self.emitters.count
         return result, rng
+
+    def visible(self, scene, si, numbers, weights, active):
+        """Reduce the ``weights`` of nodes, where ``active``, to those that are visible from a
+        point, and normalise them.
+        """
+        seen = []
+        for number, weight in zip(numbers, weights, strict=True):
+            tested = active & (weight > 0)
+            p, geometric, *_ = self.nodes.positions(number, tested)
+            height = CHORD * dr.norm(p - si.p)
+            vertex = dr.zeros(mi.Interaction3f)
+            vertex.p, vertex.n = si.p + height * geometric, si.n
+            clear = unobstructed(scene, vertex.spawn_ray_to(p + height * geometric), tested)
+            seen.append(dr.select(active & ~clear, 0, weight))
+        total = seen[0] + seen[1] + seen[2] + seen[3]
+        scale = dr.select(total > 0, dr.rcp(total), 0)
+        return [
+            dr.select(active, w * scale, weight) for w, weight in zip(seen, weights, strict=True)
+        ]
 
     def irradiance_at(
         self, numbers: list[mi.UInt32], weights: list[mi.Float], active: mi.Bool
@@ -320,6 +341,24 @@ class SurfacePaths:
             active &= crossings < MOST_CROSSINGS
         distances = dr.minimum(nearest, nearest_surface), nearest_surface
         return position, (geometric, shading), found, distances
+
+
+@symbolic
+def unobstructed(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
+    """Whether no surface but null ones lies on ``ray`` up to its end."""
+    ray, clear, active = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)
+    crossings = mi.UInt32(0)
+    while dr.hint(active, label="visible nodes"):
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid()
+        null = is_null(si.bsdf().flags())
+        clear &= ~(hit & ~null)
+        remaining = ray.maxt - si.t
+        ray = si.spawn_ray(ray.d)
+        ray.maxt = remaining
+        crossings += 1
+        active &= hit & null & (crossings < MOST_CROSSINGS)
+    return clear
 
 
 def vertex_at(si: mi.SurfaceInteraction3f) -> mi.Interaction3f:
