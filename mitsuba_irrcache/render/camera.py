@@ -25,6 +25,7 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.film import pixel_centre_rays
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance, has_surfaces
+from mitsuba_irrcache.render.surface_paths import SampledEmitters, SurfacePaths
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, is_null, medium_after, trace
@@ -185,25 +186,26 @@ class TracedCameraRays:
         self.narrow = next(
             (p.directional.directional for p in projections if p.truncates_peak), None
         )
-        #: predicate of media whose radiance is known; caches contain all orders, so not with a
-        #: limited depth
-        self.known = self._is_known if max_depth < 0 else None
+        #: whether paths may end in media; caches contain all orders, so not with a limited depth
+        self._ends_in_media = max_depth < 0
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
-        self._description = description
-        all_known = len(projections) == len(description.media.grids)
-        #: whether irradiance is cached on surfaces, too
-        self._caches_surfaces = max_depth < 0 and all_known
+        #: what irradiance on surfaces is computed with. An object that outlives the scene must not
+        #: hold its emitters: Dr.Jit would call them without their shapes.
+        self._emitters: SampledEmitters | None = None
+        if max_depth < 0 and len(projections) == len(description.media.grids):
+            self._emitters = SampledEmitters(description.emitters)
         self._surfaces: SurfaceIrradiance | None = None
 
     def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> None:
         """Cache the irradiance on the surfaces that ``sensor`` sees."""
-        if not self._caches_surfaces or not has_surfaces(scene):
+        if self._emitters is None or not has_surfaces(scene):
             return
         if self._surfaces is None:
-            self._surfaces = SurfaceIrradiance(
-                self._description, self.projections, self.rr_depth, seed
+            paths = SurfacePaths(
+                self.media, self.projections, self._emitters, self.brightest, self.rr_depth
             )
+            self._surfaces = SurfaceIrradiance(paths, seed)
         ray = pixel_centre_rays(sensor)
         medium = sensor.get_medium()
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
@@ -242,9 +244,9 @@ class TracedCameraRays:
                 self.hide_emitters,
                 rng,
                 traced,
-                self.known,
+                self._is_known if self._ends_in_media else None,
             )
-            if self.known is not None:
+            if self._ends_in_media:
                 reflected += path_end.weight * self._irradiance(path_end) * dr.inv_four_pi
         direct_weight = weight
         if self.narrow is not None:

@@ -15,14 +15,11 @@ from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from mitsuba_irrcache.cache.surface import LEVELS, SurfaceNodes
+from mitsuba_irrcache.cache.surface import LEVELS
 from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
-from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.render.surface_paths import SurfacePaths, facing, lambertian
-from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
@@ -43,16 +40,8 @@ CONVERGED, MOST_ITERATIONS = 1e-4, 500
 class SurfaceIrradiance:
     """The cached irradiance on the surfaces of a scene."""
 
-    def __init__(
-        self,
-        description: SceneDescription,
-        projections: Sequence[Projection],
-        rr_depth: mi.UInt32,
-        seed: int,
-    ) -> None:
-        corners = np.array([p.medium.frame @ c for p in projections for c in _UNIT_CUBE])[:, :3]
-        self.nodes = SurfaceNodes(corners.min(axis=0), corners.max(axis=0))
-        self.paths = SurfacePaths(description, projections, self.nodes, rr_depth)
+    def __init__(self, paths: SurfacePaths, seed: int) -> None:
+        self.paths, self.nodes = paths, paths.nodes
         self._seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self._channels = range(dr.size_v(mi.Spectrum))
         self._exchange: list[Exchange] = []
@@ -215,10 +204,6 @@ def _joined(parts: Sequence) -> object:
     if isinstance(first, (mi.Point3f, mi.Normal3f)):
         return type(first)(*(dr.concat([part[k] for part in parts]) for k in range(3)))
     return dr.concat(list(parts))
-
-
-#: Corners of the unit cube in homogeneous coordinates.
-_UNIT_CUBE = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 
 
 def has_surfaces(scene: mi.Scene) -> bool:

@@ -17,12 +17,12 @@ import numpy as np
 from mitsuba_irrcache.cache.surface import SurfaceNodes
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.spectrum import luminance
-from mitsuba_irrcache.lights.emitters import EmitterKind
+from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
 from mitsuba_irrcache.render.raymarch import Projection
-from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.transport.path import (
     MAX_SURVIVAL,
     MOST_CROSSINGS,
+    Media,
     is_null,
     medium_after,
     power_heuristic,
@@ -42,6 +42,8 @@ CHORD = 0.1
 PEAK, ENVIRONMENT_SAMPLES = 8.0, 8
 #: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
 LAMBERTIAN = 1e-4
+#: Corners of the unit cube in homogeneous coordinates.
+UNIT_CUBE = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0, 1)]).T
 
 
 class SampledEmitters:
@@ -52,18 +54,14 @@ class SampledEmitters:
     point-like or distant emitter is sampled once, an environment `ENVIRONMENT_SAMPLES` times.
     """
 
-    def __init__(self, description: SceneDescription) -> None:
-        environments = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP)
-        slots = [
-            (emitter, 0.0, 1.0) for emitter, kind in description.emitters if not kind.is_environment
-        ]
+    def __init__(self, emitters: EmittersByKind) -> None:
+        slots = [(emitter, 0.0, 1.0) for emitter, kind in emitters if not kind.is_environment]
         threshold = dr.inf
-        for environment in description.emitters.of(EmitterKind.ENVIRONMENT_MAP):
+        for environment in emitters.of(EmitterKind.ENVIRONMENT_MAP):
             threshold = peak_threshold(environment)
             if threshold < dr.inf:
                 share = 1 / ENVIRONMENT_SAMPLES
                 slots += [(environment, k * share, share) for k in range(ENVIRONMENT_SAMPLES)]
-        self.has_environment = bool(description.emitters.of(*environments))
         self.threshold = dr.opaque(mi.Float, threshold)
         self.count = dr.opaque(mi.UInt32, len(slots))
         self._emitters = dr.zeros(mi.EmitterPtr, max(len(slots), 1))
@@ -115,14 +113,17 @@ class SurfacePaths:
 
     def __init__(
         self,
-        description: SceneDescription,
+        media: Media,
         projections: Sequence[Projection],
-        nodes: SurfaceNodes,
+        emitters: SampledEmitters,
+        brightest: mi.Float,
         rr_depth: mi.UInt32,
     ) -> None:
-        self.media, self.projections, self.nodes = description.media, projections, nodes
-        self.brightest, self.rr_depth = description.brightest, rr_depth
-        self.emitters = SampledEmitters(description)
+        self.media, self.projections, self.emitters = media, projections, emitters
+        self.brightest, self.rr_depth = brightest, rr_depth
+        corners = [(p.medium.frame @ UNIT_CUBE)[:3] for p in projections]
+        lower, upper = np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2))
+        self.nodes = SurfaceNodes(lower, upper)
         self.most_levels = dr.opaque(mi.UInt32, 0)
         #: irradiance of the nodes, one array for each channel
         self.irradiance = [mi.Float(0) for _ in range(dr.size_v(mi.Spectrum))]
