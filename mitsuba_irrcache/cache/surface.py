@@ -27,8 +27,8 @@ from mitsuba_irrcache.core.jit import symbolic
 
 #: Node number of keys that are not in the table.
 NONE = 0xFFFFFFFF
-#: Levels below the coarsest one at a point.
-LEVELS = 6
+#: Levels below the coarsest one at a point, and for points that only other nodes see.
+LEVELS, INDIRECT_LEVELS = 6, 3
 #: Spacing of the lattice at level 0 over the diagonal of the media's box; the distance from the
 #: box, in units of the spacing, from which on the coarsest level is coarser.
 COARSEST, COARSER_BEYOND = 0.25, 2.0
@@ -83,10 +83,11 @@ class SurfaceNodes:
         """Find the nodes between which to interpolate at ``p`` with these ``normals``, geometric
         and shading.
 
-        Returns the numbers of four nodes and their weights, whose sum is 1, or 0 where there are
-        none; whether another surface may lie between them; further, the keys at the last level
+        Returns the numbers of four nodes and their weights, whose sum is 1, or 0 where some of
+        them are missing; whether another surface may lie between them; further, the keys at the last level
         visited and whether any of them is missing.
         """
+        # docs/primer, eq. (5.7)
         geometric, shading = normals
         axis, side, place, slope = _across(geometric, mi.Vector3f(p - self._origin))
         level = self._coarsest_level(p)
@@ -94,8 +95,7 @@ class SurfaceNodes:
         numbers = [mi.UInt32(0) for _ in range(4)]
         weights = [mi.Float(0) for _ in range(4)]
         keys = [mi.UInt64(0) for _ in range(4)]
-        missing, found_any, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
-        uncertain = mi.Bool(False)
+        missing, uncertain, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
         while dr.hint(active, label="levels of surface nodes"):
             spacing = self._spacing_at(level)
             u, v = place.x / spacing, place.y / spacing
@@ -124,18 +124,18 @@ class SurfaceNodes:
                 incomplete |= active & ~known
                 corner_numbers.append(number)
                 corner_weights.append(weight)
-            # Nodes of a level that is not complete are used only where there are no coarser ones.
-            better = active & (total > 0) & (~incomplete | ~found_any)
-            uncertain = dr.select(better, divided, uncertain)
+            # Coarser nodes than a point asks for would bias it.
+            finer |= divided | (total == 0)
+            ends = active & ~incomplete & (~finer | (level >= last)) & (total > 0)
+            uncertain |= ends & divided
             scale = dr.rcp(total)
             for k in range(4):
                 numbers[k] = dr.select(
-                    better & (corner_weights[k] > 0), corner_numbers[k], numbers[k]
+                    ends & (corner_weights[k] > 0), corner_numbers[k], numbers[k]
                 )
-                weights[k] = dr.select(better, corner_weights[k] * scale, weights[k])
-            found_any |= better
+                weights[k] = dr.select(ends, corner_weights[k] * scale, weights[k])
             missing |= incomplete
-            active &= ~incomplete & (finer | divided | (total == 0)) & (level < last)
+            active &= ~incomplete & finer & (level < last)
             level = dr.select(active, level + 1, level)
         return numbers, weights, uncertain, keys, missing
 
@@ -207,7 +207,9 @@ class SurfaceNodes:
         self.keys = dr.gather(mi.UInt64, candidates, chosen)
         self.count = total
         dr.eval(self._slots, self.keys)
-        return dr.arange(mi.UInt32, total - before) + before
+        if total == before:
+            return mi.UInt32()
+        return dr.arange(mi.UInt32, total - before) + dr.opaque(mi.UInt32, before)
 
     def rays(self, numbers: mi.UInt32) -> tuple[mi.Ray3f, mi.Float]:
         """Rays on which the nodes with these ``numbers`` have to be found, and their lengths."""

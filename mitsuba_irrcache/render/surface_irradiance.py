@@ -16,7 +16,6 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.surface import LEVELS
 from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
 from mitsuba_irrcache.render.surface_paths import SurfacePaths, facing, lambertian
@@ -28,9 +27,8 @@ from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 PROBES, GATHERED, GATHERED_INDIRECT = 32, 128, 32
 #: Nodes beyond which no further ones are created where rays from nodes end.
 MOST_NODES = 1 << 18
-#: Levels below the coarsest one for nodes that only other nodes see; how often nodes are created
-#: where rays from the last ones end. Paths continue where there are none.
-INDIRECT_LEVELS, GENERATIONS = 3, 4
+#: How often nodes are created where rays from the last ones end. Paths continue where there are none.
+GENERATIONS = 4
 #: Gather rays of a launch, at most.
 LANES = 1 << 21
 #: Relative change of the irradiances at which the iteration ends, and the most iterations.
@@ -41,21 +39,29 @@ class SurfaceIrradiance:
     """The cached irradiance on the surfaces of a scene."""
 
     def __init__(self, paths: SurfacePaths, seed: int) -> None:
-        self.paths, self.nodes = paths, paths.nodes
+        self.paths, self.nodes, self.seed = paths, paths.nodes, seed
         self._seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self._channels = range(dr.size_v(mi.Spectrum))
+        #: the first of consecutive nodes, the end, and the number of rays that gather radiance
+        self._groups: list[tuple[int, int, int]] = []
         self._exchange: list[Exchange] = []
+        self._gathered = 0  # groups
+
+    def renewed(self, paths: SurfacePaths) -> SurfaceIrradiance:
+        """The same nodes, with irradiance that is gathered anew along ``paths``."""
+        new = SurfaceIrradiance(paths, self.seed)
+        new._groups = list(self._groups)
+        return new
 
     def prepare(self, scene: mi.Scene, ray: mi.Ray3f, pointer: mi.MediumPtr) -> None:
         """Create the nodes that camera rays like these need, and compute their irradiance."""
         rng = random_stream(mi.sample_tea_32(dr.arange(mi.UInt32, dr.width(ray)), self._seed))
         p, normals, found, _ = self.paths.walk(scene, ray, pointer, rng, mi.Bool(True))
-        before = self.nodes.count
-        seen = self._cover(scene, p, normals, found)
-        if self.nodes.count > before:
-            self.paths.most_levels = dr.opaque(mi.UInt32, LEVELS)
-            self._gather(scene, before, seen, GATHERED)
-            self._gather(scene, seen, self.nodes.count, GATHERED_INDIRECT)
+        self._cover(scene, p, normals, found)
+        for first, end, rays in self._groups[self._gathered :]:
+            self._gather(scene, first, end, rays)
+        if self._gathered < len(self._groups):
+            self._gathered = len(self._groups)
             self._solve()
 
     # Placement
@@ -66,11 +72,11 @@ class SurfaceIrradiance:
         p: mi.Point3f,
         normals: tuple[mi.Normal3f, mi.Normal3f],
         active: mi.Bool,
-    ) -> int:
+    ) -> None:
         """Create all nodes for interpolation at points, and then those for the points that rays
-        from these nodes meet. Return the number of nodes with the former.
+        from these nodes meet.
         """
-        seen = self.nodes.count
+        first = seen = self.nodes.count
         for generation in range(GENERATIONS):
             found = []
             while self.nodes.count < MOST_NODES:
@@ -79,8 +85,8 @@ class SurfaceIrradiance:
                     break
                 p = dr.gather(mi.Point3f, p, index)
                 normals = tuple(dr.gather(mi.Normal3f, n, index) for n in normals)
-                most = dr.opaque(mi.UInt32, INDIRECT_LEVELS if generation else LEVELS)
-                *_, keys, active = self.nodes.find(p, normals, most, mi.Bool(True))
+                levels = self.paths.indirect_levels if generation else self.paths.levels
+                *_, keys, active = self.nodes.find(p, normals, levels, mi.Bool(True))
                 dr.eval(p, normals, keys, active)
                 missing = dr.compress(active)
                 if not dr.width(missing):
@@ -93,7 +99,8 @@ class SurfaceIrradiance:
             if not found:
                 break
             p, normals, active = (_joined(parts) for parts in zip(*found, strict=True))
-        return seen
+        groups = (first, seen, GATHERED), (seen, self.nodes.count, GATHERED_INDIRECT)
+        self._groups += [group for group in groups if group[0] < group[1]]
 
     def _place(self, scene: mi.Scene, numbers: mi.UInt32) -> tuple:
         """Find new nodes on surfaces; return the points where rays from them meet others."""
@@ -152,7 +159,7 @@ class SurfaceIrradiance:
             pointer = probe(scene, ray.o, ray.d)
             active = dr.gather(mi.Float, distance, lane) > 0
             emitted, radiance, _, other, factor = self.paths.follow(
-                scene, ray, pointer, rng, active, True
+                scene, ray, pointer, rng, active
             )
             weight = dr.opaque(mi.Float, dr.pi / rays)
             radiance, factor = (emitted + radiance) * weight, factor * weight
@@ -163,6 +170,7 @@ class SurfaceIrradiance:
 
     def _solve(self) -> None:
         """Solve E = E_0 + H E by iteration."""
+        # docs/primer, eq. (5.8)
         total = [dr.concat([part.own[c] for part in self._exchange]) for c in self._channels]
         for _ in range(MOST_ITERATIONS):
             parts = [part.gathered(total) for part in self._exchange]

@@ -14,8 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.surface import SurfaceNodes
+from mitsuba_irrcache.cache.surface import INDIRECT_LEVELS, LEVELS, SurfaceNodes
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import kronecker
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
 from mitsuba_irrcache.render.raymarch import Projection
@@ -118,13 +119,19 @@ class SurfacePaths:
         emitters: SampledEmitters,
         brightest: mi.Float,
         rr_depth: mi.UInt32,
+        nodes: SurfaceNodes | None = None,
     ) -> None:
+        """Use these ``nodes``, or none yet."""
         self.media, self.projections, self.emitters = media, projections, emitters
         self.brightest, self.rr_depth = brightest, rr_depth
-        corners = [(p.medium.frame @ UNIT_CUBE)[:3] for p in projections]
-        lower, upper = np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2))
-        self.nodes = SurfaceNodes(lower, upper)
-        self.most_levels = dr.opaque(mi.UInt32, 0)
+        if nodes is None:
+            corners = [(p.medium.frame @ UNIT_CUBE)[:3] for p in projections]
+            nodes = SurfaceNodes(np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2)))
+        self.nodes = nodes
+        #: levels of nodes for points that the camera sees, and for others
+        self.levels, self.indirect_levels = (
+            dr.opaque(mi.UInt32, n) for n in (LEVELS, INDIRECT_LEVELS)
+        )
         #: irradiance of the nodes, one array for each channel
         self.irradiance = [mi.Float(0) for _ in range(dr.size_v(mi.Spectrum))]
 
@@ -136,16 +143,17 @@ class SurfacePaths:
         pointer: mi.MediumPtr,
         rng: mi.PCG32,
         active: mi.Bool,
-        from_node: bool,
+        on_emitter: mi.Point2f | None = None,
         hide_emitters: bool = False,
     ):
-        """Follow paths that begin with ``ray`` in the medium ``pointer``: at a camera ray's end
-        before a surface or, if ``from_node``, at a node.
+        """Follow paths that begin with ``ray`` in the medium ``pointer``: at a node or, if samples
+        ``on_emitter`` for the first vertex are given, at a camera ray's end before a surface.
 
         Returns the radiance of emitters at the first surface, all other radiance, whether there was
         any interaction, and the node whose irradiance has to be added with the returned factor
-        (only if ``from_node``; else it is included).
+        (only for rays from nodes; else it is included).
         """
+        from_node = on_emitter is None
         emitted, radiance = mi.Spectrum(0), mi.Spectrum(0)
         throughput, eta = mi.Spectrum(1), mi.Float(1)
         ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
@@ -195,15 +203,14 @@ class SurfacePaths:
             emitted += dr.select(first, value, 0)
             radiance += dr.select(first, 0, value)
 
-            # End at a diffuse surface with nodes.
+            # End at a diffuse surface with nodes: docs/primer, eq. (5.9).
             bsdf = si.bsdf()
             crosses = valid & is_null(bsdf.flags())
             surface = valid & ~crosses
             diffuse, factor = lambertian(si, surface)
             normals = facing(si, ray.d)
-            numbers, weights, uncertain, _, _ = self.nodes.find(
-                si.p, normals, self.most_levels, diffuse
-            )
+            levels = self.indirect_levels if from_node else self.levels
+            numbers, weights, uncertain, _, _ = self.nodes.find(si.p, normals, levels, diffuse)
             weights = self.visible(scene, si, numbers, weights, diffuse & uncertain)
             ends = diffuse & (weights[0] + weights[1] + weights[2] + weights[3] > 0)
             if dr.hint(from_node, mode="scalar"):
@@ -217,7 +224,10 @@ class SurfacePaths:
             # Sample the emitters, and the BSDF where the path continues.
             scatters = surface & ~ends
             smooth = surface & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            direct, rng = self.direct(scene, si, pointer, rng, smooth, ends, not from_node)
+            u = mi.Point2f(rng.next_float32(smooth), rng.next_float32(smooth))
+            if dr.hint(not from_node, mode="scalar"):
+                u = dr.select(first, on_emitter, u)
+            direct, rng = self.direct(scene, si, pointer, u, rng, smooth, ends, not from_node)
             radiance += dr.select(smooth, throughput * direct, 0)
             vertex = vertex_at(si)
             choice = rng.next_float32(scatters)
@@ -240,17 +250,18 @@ class SurfacePaths:
         return emitted, radiance, interacted, end_number, end_factor
 
     @symbolic
-    def direct(self, scene, si, pointer, rng, active, ends, exact: bool):
+    def direct(self, scene, si, pointer, u, rng, active, ends, exact: bool):
         """Return the radiance reflected at ``si`` that comes straight from the sampled emitters.
 
-        With multiple importance sampling unless the path ``ends`` here. The transmittance has no
-        noise if it is to be ``exact``.
+        The sample ``u`` is shifted by a golden-ratio sequence for each of them. With multiple
+        importance sampling unless the path ``ends`` here. The transmittance has no noise if it is
+        to be ``exact``.
         """
         result, number, context = mi.Spectrum(0), mi.UInt32(0), mi.BSDFContext()
         vertex, active = vertex_at(si), mi.Bool(active) & (self.emitters.count > 0)
         while dr.hint(active, label="sampled emitters"):
-            u = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
-            record, value = self.emitters.sample(number, vertex, u, active)
+            shifted = mi.Point2f(*kronecker(number, 2, (u.x, u.y)))
+            record, value = self.emitters.sample(number, vertex, shifted, active)
             f, density = si.bsdf().eval_pdf(context, si, si.to_local(record.d), active)
             value *= f
             reflects = active & (record.pdf > 0) & (dr.max(value) > 0)
