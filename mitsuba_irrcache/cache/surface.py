@@ -84,8 +84,8 @@ class SurfaceNodes:
         and shading.
 
         Returns the numbers of four nodes and their weights, whose sum is 1, or 0 where some of
-        them are missing; whether another surface may lie between them; further, the keys at the last level
-        visited and whether any of them is missing.
+        them are missing; whether another surface may lie between them; further, the keys at the
+        last level visited and whether any of them is missing.
         """
         # docs/primer, eq. (5.7)
         geometric, shading = normals

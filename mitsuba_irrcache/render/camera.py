@@ -32,8 +32,8 @@ from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, is_null, medium_after, trace
 
-#: Camera rays, at least about, by which nodes on surfaces are placed: in a small image, one for each
-#: pixel would miss the narrow cells in corners.
+#: Camera rays, at least about, by which nodes on surfaces are placed: in a small image, one for
+#: each pixel would miss the narrow cells in corners.
 PLACEMENT_RAYS = 1 << 16
 #: Transmittance below which surfaces are path traced with Russian roulette.
 ROULETTE_BELOW = 0.1

@@ -27,7 +27,8 @@ from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 PROBES, GATHERED, GATHERED_INDIRECT = 32, 128, 32
 #: Nodes beyond which no further ones are created where rays from nodes end.
 MOST_NODES = 1 << 18
-#: How often nodes are created where rays from the last ones end. Paths continue where there are none.
+#: How often nodes are created where rays from the last ones end. Paths continue where there are
+#: none.
 GENERATIONS = 4
 #: Gather rays of a launch, at most.
 LANES = 1 << 21
