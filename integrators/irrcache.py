@@ -147,11 +147,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     A scene may contain several media (``heterogeneous`` or ``homogeneous``) in arbitrary closed
     shapes with a null BSDF, which may be disjoint, touching or nested; each has its own cache.
-    Surfaces and area emitters may be anywhere. Their reflected radiance is path traced, with one
-    path per camera sample, and is part of the ``background``. A scene with a single medium in a box
-    or sphere, and only distant and point emitters, requires no ray tracing. The solver ``sweep``
-    supports media in boxes or spheres without surfaces and other media among their voxels; with
-    surfaces elsewhere, it requires ``max_depth`` 2 or -1.
+    Surfaces and area emitters may be anywhere. If ``max_depth`` is -1, the irradiance on diffuse
+    surfaces is cached, too, where the camera and other surfaces need it; each camera sample adds
+    direct light and follows mirrors, glass and glossy surfaces by one path. With other depths,
+    surfaces are path traced. What they reflect is part of the ``background``. A scene with a single
+    medium in a box or sphere, and only distant and point emitters, requires no ray tracing. The
+    solver ``sweep`` supports media in boxes or spheres without surfaces and other media among their
+    voxels; with surfaces elsewhere, it requires ``max_depth`` 2 or -1.
     Unbounded media and sharp phase functions are rejected with an error that names them, and so are
     boundaries that overlap or contradict each other. Scenes without media, or with dielectric
     boundaries around all of them, are rendered by ``volpath`` or, if the extinction differs
@@ -224,6 +226,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         )
         self._stopping = StopCondition()
         self._sight: ClosedFormCameraRays | TracedCameraRays | None = None
+        self._parts: list | None = None  # those of the camera rays
         self._revision = 0  # revision of the builder for which the camera rays were created
         #: Mitsuba's integrators for scenes without a visible medium, by name, and the current
         #: choice
@@ -293,7 +296,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             except Stopped:
                 self._log_what_is_missing()
             if self._revision != self._builder.revision:
-                self._sight = self._make_sight()
+                earlier, self._sight = self._sight, self._make_sight()
+                is_same_scene = self._parts is self._builder.parts
+                if is_same_scene and isinstance(earlier, TracedCameraRays):
+                    self._sight.adopt(earlier)
+                self._parts = self._builder.parts
                 # Only the thread that recorded a scatter operation can evaluate it.
                 dr.eval()
                 self._revision = self._builder.revision
@@ -395,6 +402,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             if sight is None:
                 film = self._render_empty(scene, sensor, seed, spp)
             else:
+                if isinstance(sight, TracedCameraRays):
+                    sight.prepare_view(scene, sensor, self._settings.seed)
                 film = self._render(sight, scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:

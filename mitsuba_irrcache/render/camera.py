@@ -2,9 +2,10 @@
 
 In a simple scene (see `compile`) the segment inside the medium is known in closed form. In all
 others the ray continues straight through null surfaces and several media, each of which is ray
-marched with its own cache, until it hits a surface or leaves the scene. The radiance reflected by
-the surface is path traced with one path per camera sample, which ends at its first collision in a
-medium with a cache.
+marched with its own cache, until it hits a surface or leaves the scene. From there one path per
+camera sample ends at the first diffuse surface, whose irradiance is cached (`surface_irradiance`).
+With a limited depth, or where the radiance of a medium is not known, the path is traced as in
+``volpath`` instead; of all orders, it ends at its first collision in a medium with a cache.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
+from mitsuba_irrcache.cache.surface import SurfaceNodes
 from mitsuba_irrcache.cache.uncertainty import uncertainty_of
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
@@ -22,11 +24,17 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import give_back
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
+from mitsuba_irrcache.render.film import CameraSampler, scattered_rays
 from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance, has_surfaces
+from mitsuba_irrcache.render.surface_paths import SampledEmitters, SurfacePaths
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, End, Start, is_null, medium_after, trace
 
+#: Camera rays, at least about, by which nodes on surfaces are placed: in a small image, one for
+#: each pixel would miss the narrow cells in corners.
+PLACEMENT_RAYS = 1 << 16
 #: Transmittance below which surfaces are path traced with Russian roulette.
 ROULETTE_BELOW = 0.1
 
@@ -194,11 +202,37 @@ class TracedCameraRays:
         self.narrow = next(
             (p.directional.directional for p in projections if p.truncates_peak), None
         )
-        #: predicate of media whose radiance is known; caches contain all orders, so not with a
-        #: limited depth
-        self.known = self._is_known if max_depth < 0 else None
+        #: whether paths may end in media; caches contain all orders, so not with a limited depth
+        self._ends_in_media = max_depth < 0
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+        #: what irradiance on surfaces is computed with. An object that outlives the scene must not
+        #: hold its emitters: Dr.Jit would call them without their shapes.
+        self._emitters: SampledEmitters | None = None
+        if max_depth < 0 and len(projections) == len(description.media.grids):
+            self._emitters = SampledEmitters(description.emitters)
+        self._surfaces: SurfaceIrradiance | None = None
+
+    def adopt(self, earlier: TracedCameraRays) -> None:
+        """Use the nodes on surfaces of an ``earlier`` state of the caches of the same scene."""
+        if earlier._surfaces is not None:
+            self._surfaces = earlier._surfaces.renewed(self._paths(earlier._surfaces.nodes))
+
+    def _paths(self, nodes: SurfaceNodes | None = None) -> SurfacePaths:
+        return SurfacePaths(
+            self.media, self.projections, self._emitters, self.brightest, self.rr_depth, nodes
+        )
+
+    def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> None:
+        """Cache the irradiance on the surfaces that ``sensor`` sees."""
+        if self._emitters is None or not has_surfaces(scene):
+            return
+        if self._surfaces is None:
+            self._surfaces = SurfaceIrradiance(self._paths(), seed)
+        ray = scattered_rays(sensor, PLACEMENT_RAYS)
+        medium = sensor.get_medium()
+        pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
+        self._surfaces.prepare(scene, ray, pointer)
 
     def sample(
         self,
@@ -218,20 +252,28 @@ class TracedCameraRays:
         chance = dr.minimum(dr.max(transmittance) * (1 / ROULETTE_BELOW), 1)
         traced = stopped & (rng.next_float32(stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
-        start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
-        direct, reflected, interacted, path_end, _ = trace(
-            scene,
-            self.media,
-            start,
-            self.max_depth,
-            self.rr_depth,
-            self.hide_emitters,
-            rng,
-            traced,
-            self.known,
-        )
-        if self.known is not None:
-            reflected += path_end.weight * self._irradiance(path_end) * dr.inv_four_pi
+        if self._surfaces is not None:
+            on_emitter = sampler.next_2d(traced)
+            if isinstance(sampler, CameraSampler):
+                on_emitter = sampler.emitter_sample
+            direct, reflected, interacted, *_ = self._surfaces.paths.follow(
+                scene, end, pointer, rng, traced, on_emitter, self.hide_emitters
+            )
+        else:
+            start = Start(end, pointer, depth=0, pdf=0.0, clear=True)
+            direct, reflected, interacted, path_end, _ = trace(
+                scene,
+                self.media,
+                start,
+                self.max_depth,
+                self.rr_depth,
+                self.hide_emitters,
+                rng,
+                traced,
+                self._is_known if self._ends_in_media else None,
+            )
+            if self._ends_in_media:
+                reflected += path_end.weight * self._irradiance(path_end) * dr.inv_four_pi
         direct_weight = weight
         if self.narrow is not None:
             lamp = self.narrow.hits_source(ray.o, ray.d, far=mi.Bool(False), near=traced)

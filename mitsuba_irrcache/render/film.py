@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.jit import Divisor
-from mitsuba_irrcache.core.sequences import kronecker_words, unit_floats
+from mitsuba_irrcache.core.sequences import kronecker, kronecker_words, unit_floats
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import require_memory
@@ -204,6 +204,30 @@ class PixelPositions:
         bits = [dr.select(number < self.paired, b, 1 << 31) for b in bits]
         return mi.Point2f(unit_floats(bits))
 
+    def emitter_sample(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
+        """Position in [0, 1)^2 on emitters for a ``sample`` of this pass: further coordinates of
+        the sequence.
+        """
+        if not self.independent:
+            return self.sampler.next_2d()
+        shifts = (*mi.sample_tea_32(pixel, self.seed, 8), *mi.sample_tea_32(self.seed, pixel, 8))
+        return mi.Point2f(unit_floats(kronecker_words(self.first + sample, shifts)[2:]))
+
+
+class CameraSampler:
+    """A sampler of Mitsuba and, for each camera sample, a stratified position on emitters."""
+
+    def __init__(self, sampler: mi.Sampler, emitter_sample: mi.Point2f) -> None:
+        self._sampler, self.emitter_sample = sampler, emitter_sample
+
+    def next_1d(self, active: mi.Bool = True) -> mi.Float:
+        """Return the sampler's next number."""
+        return self._sampler.next_1d(active)
+
+    def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
+        """Return the sampler's next pair of numbers."""
+        return self._sampler.next_2d(active)
+
 
 def camera_ray(
     sensor: mi.Sensor, sampler: mi.Sampler, position: mi.Point2f
@@ -217,6 +241,23 @@ def camera_ray(
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     return sensor.sample_ray_differential(time, 0, on_film, aperture)
+
+
+def scattered_rays(sensor: mi.Sensor, least: int) -> mi.Ray3f:
+    """Rays from the centre of the aperture, evenly scattered over all pixels of the film: one for
+    each pixel, or more, up to 16, if there would be fewer than ``least``.
+    """
+    film = sensor.film()
+    width, height = (int(n) for n in film.crop_size())
+    per_pixel = min(max(least // (width * height), 1), 16)
+    lane = dr.arange(mi.UInt32, width * height * per_pixel)
+    pixel, k = Divisor(per_pixel).split(lane)
+    within = mi.Point2f(kronecker(k, 2, (mi.Float(0.5), mi.Float(0.5))))
+    position = mi.Vector2f(pixel_of(pixel, width)) + within
+    scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in (width, height)))
+    time = mi.Float(sensor.shutter_open() + 0.5 * sensor.shutter_open_time())
+    ray, _ = sensor.sample_ray(time, 0.5, position * scale, mi.Point2f(0.5))
+    return ray
 
 
 def _sampled(
@@ -238,7 +279,8 @@ def _sampled(
     position = pixel + spread.next(index, sample)
     ray, weight = camera_ray(sensor, sampler, position)
     ray.scale_differential(dr.rsqrt(float(spp)))
-    value, alpha, further = radiance(sampler, ray, weight, mi.Bool(True))
+    camera_sampler = CameraSampler(sampler, spread.emitter_sample(index, sample))
+    value, alpha, further = radiance(camera_sampler, ray, weight, mi.Bool(True))
     rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
     alphas = [alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
     return position, [*rgb, *alphas, *further]
