@@ -491,7 +491,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         count = sight.projection.channel_count
         names = [f"layer.{i}" for i in range(count)]
-        film = render_film(sensor, radiance, seed, spp, self.should_stop, names)
+        refine = isinstance(sight, TracedCameraRays) and sight.caches_surfaces
+        film = render_film(sensor, radiance, seed, spp, self.should_stop, names, refine)
         if not count:
             return film
         _, alpha, channels = planes(film, count)

@@ -213,6 +213,11 @@ class TracedCameraRays:
             self._emitters = SampledEmitters(description.emitters)
         self._surfaces: SurfaceIrradiance | None = None
 
+    @property
+    def caches_surfaces(self) -> bool:
+        """Whether irradiance on surfaces is cached, so that most pixels have little noise."""
+        return self._surfaces is not None
+
     def adopt(self, earlier: TracedCameraRays) -> None:
         """Use the nodes on surfaces of an ``earlier`` state of the caches of the same scene."""
         if earlier._surfaces is not None:

@@ -23,6 +23,13 @@ from mitsuba_irrcache.render.pixel_filter import pixel_of, reconstructed
 
 #: Maximum number of camera samples per kernel launch, to limit the memory of samples and sampler.
 LANES = 1 << 22
+#: Pixels are refined whose standard deviation exceeds the mean of all by this factor: by at most so
+#: many new samples for each one, and with at most this share of all samples.
+OUTLIER, MOST_FURTHER, FURTHER_SHARE = 4.0, 64, 0.5
+#: Fewest samples of a pixel from which its variance is estimated.
+FEWEST_SAMPLES = 4
+#: Decorrelates new samples from others.
+REFINEMENT = 0x9E3779B9
 #: The sampler stores the number of samples per pixel in 32 bits.
 SPP_LIMIT = 1 << 32
 
@@ -59,11 +66,13 @@ def render_film(
     spp: int,
     should_stop: Callable[[], bool] = lambda: False,
     channels: Sequence[str] = (),
+    refine: bool = False,
 ) -> mi.Film:
     """Render ``radiance`` to the sensor's film with ``spp`` samples per pixel.
 
     With ``spp`` 0 the sampler's own count is used; ``channels`` names those in addition to radiance
-    and alpha. Raises IrrcacheError for a film without pixels, and for one that exceeds the memory.
+    and alpha. To ``refine`` means to take more samples in the pixels of largest variance. Raises
+    IrrcacheError for a film without pixels, and for one that exceeds the memory.
     """
     film, sampler = sensor.film(), sensor.sampler().clone()
     check_film(film, spp, len(channels))
@@ -81,6 +90,8 @@ def render_film(
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
         samples = _sampled(sensor, sampler, spread, size, border, per_pass, spp, radiance)
+        if refine and per_pass >= FEWEST_SAMPLES:
+            samples = _refined(sensor, sampler, seed, per_pass, radiance, *samples)
         found = reconstructed(film, border, per_pass, *samples)
         sums = found if sums is None else [a + b for a, b in zip(sums, found, strict=True)]
         if per_pass < spp:
@@ -271,16 +282,82 @@ def _sampled(
     radiance: RadianceFunction,
 ) -> tuple[mi.Point2f, list[mi.Float]]:
     """Trace the samples of a pass; return their film positions and the values of all channels."""
-    film = sensor.film()
     lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
     index, sample = Divisor(per_pass).split(lane)
     pixel = mi.Vector2f(pixel_of(index, int(size.x)) - border)
-    pixel += mi.Vector2f(film.crop_offset())
+    pixel += mi.Vector2f(sensor.film().crop_offset())
     position = pixel + spread.next(index, sample)
+    on_emitter = spread.emitter_sample(index, sample)
+    return position, _values(sensor, sampler, position, on_emitter, spp, radiance)
+
+
+def _values(
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    position: mi.Point2f,
+    on_emitter: mi.Point2f,
+    spp: int,
+    radiance: RadianceFunction,
+) -> list[mi.Float]:
+    """Trace samples at these positions on the film; return the values of all channels."""
+    film = sensor.film()
     ray, weight = camera_ray(sensor, sampler, position)
     ray.scale_differential(dr.rsqrt(float(spp)))
-    camera_sampler = CameraSampler(sampler, spread.emitter_sample(index, sample))
+    camera_sampler = CameraSampler(sampler, on_emitter)
     value, alpha, further = radiance(camera_sampler, ray, weight, mi.Bool(True))
     rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
     alphas = [alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
-    return position, [*rgb, *alphas, *further]
+    return [*rgb, *alphas, *further]
+
+
+def _refined(
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    seed: int,
+    per_pass: int,
+    radiance: RadianceFunction,
+    position: mi.Point2f,
+    values: list[mi.Float],
+) -> tuple[mi.Point2f, list[mi.Float]]:
+    """Replace the samples of those few pixels whose standard deviation is far above the mean of
+    all, such as those at the edge of a lamp, by means of new samples around them.
+
+    The new samples do not depend on those by which pixels are chosen, so there is no bias.
+    """
+    count = dr.width(position)
+    everywhere = dr.zeros(mi.Float, count)
+    values = [value + everywhere for value in values]
+    dr.eval(position, values)
+    brightness = values[0] + values[1] + values[2]
+    mean = dr.block_sum(brightness, per_pass) / per_pass
+    square = dr.block_sum(dr.square(brightness), per_pass) / per_pass
+    deviation = dr.sqrt(dr.maximum(square - dr.square(mean), 0))
+    chosen = dr.compress(deviation > OUTLIER * dr.mean(deviation))
+    pixels = dr.width(chosen)
+    further = min(MOST_FURTHER, int(FURTHER_SHARE * count / max(pixels * per_pass, 1)))
+    if not pixels or further < FEWEST_SAMPLES:
+        return position, values
+    lane, k = Divisor(further).split(dr.arange(mi.UInt32, pixels * per_pass * further))
+    pixel, sample = Divisor(per_pass).split(lane)
+    source = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
+    words = mi.sample_tea_32(source, dr.opaque(mi.UInt32, REFINEMENT))
+    within = dr.gather(mi.Point2f, mi.Point2f(position), source)
+    corner = dr.floor(within)
+    step = mi.Point2f(kronecker(k, 2, unit_floats(words))) - 0.5
+    within += step * dr.rsqrt(float(per_pass)) - corner
+    within -= dr.floor(within)
+    shift = unit_floats(mi.sample_tea_32(source - sample, dr.opaque(mi.UInt32, REFINEMENT)))
+    on_emitter = mi.Point2f(kronecker(sample * further + k, 2, shift))
+    own = sampler.clone()
+    own.seed(seed ^ REFINEMENT, pixels * per_pass * further)
+    found = _values(sensor, own, corner + within, on_emitter, per_pass * further, radiance)
+    place = dr.arange(mi.UInt32, pixels * per_pass)
+    pixel, sample = Divisor(per_pass).split(place)
+    place = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
+    everywhere = dr.zeros(mi.Float, pixels * per_pass * further)
+    found = [value + everywhere for value in found]
+    dr.eval(found)
+    for target, value in zip(values, found, strict=True):
+        dr.scatter(target, dr.block_sum(value, further) * (1 / further), place)
+    dr.eval(values)
+    return position, values

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.render import film
 from tests.support.surfaces import ball, bound, colour, diffuse, fog, ground, lamp, placed
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -231,3 +232,21 @@ def test_mono(mono, scenes):
     image = scenes.image(scene_of(scenes, objects), spp=4)
     assert np.isfinite(image).all()
     assert 0.2 < image.mean() < 1.1
+
+
+def test_edges_of_lamps_get_more_samples(scenes, monkeypatch):
+    """New samples in the pixels of largest variance reduce noise, and leave the mean as it is."""
+    objects = {
+        "smoke": bound(interior=fog((0.3, 0.3, 0.3)), scale=(0.6, 0.6, 0.6)),
+        "lamp": lamp((0.8, 0.6, 0.5), (0, 0, -3), 0.3, (50, 40, 30)),
+        "floor": ground(), "emitter": {"type": "constant", "radiance": 0.2},
+    }  # fmt: skip
+    scene = scene_of(scenes, objects)
+    refined = np.array([scenes.image(scene, spp=8, seed=s)[..., 0] for s in range(12)])
+    with monkeypatch.context() as patch:
+        patch.setattr(film, "OUTLIER", 1e9)
+        plain = np.array([scenes.image(scene, spp=8, seed=s)[..., 0] for s in range(12)])
+    noise, plain_noise = (np.sqrt(x.var(axis=0, ddof=1).mean()) for x in (refined, plain))
+    assert noise < 0.7 * plain_noise
+    many = scenes.image(scene, spp=1024)[..., 0].mean()
+    assert abs(refined.mean() - many) < 4 * plain_noise / np.sqrt(12 * SIZE**2)
