@@ -16,6 +16,9 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core import properties
 from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.gradients.backward import check, parameter_gradients
+from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
 from mitsuba_irrcache.machine.versions import check_versions
@@ -31,7 +34,6 @@ from mitsuba_irrcache.scene.consistency import check_sensor
 from mitsuba_irrcache.solvers.base import registered
 
 SOLVERS = ("auto", *sorted(solver.name for solver in registered()))
-_NO_GRADIENTS = 'irrcache computes no gradients; use the integrator "prbvolpath" for them.'
 
 
 class IrradianceCachingIntegrator(mi.SamplingIntegrator):
@@ -145,11 +147,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     A scene may contain several media (``heterogeneous`` or ``homogeneous``) in arbitrary closed
     shapes with a null BSDF, which may be disjoint, touching or nested; each has its own cache.
-    Surfaces and area emitters may be anywhere. Their reflected radiance is path traced, with one
-    path per camera sample, and is part of the ``background``. A scene with a single medium in a box
-    or sphere, and only distant and point emitters, requires no ray tracing. The solver ``sweep``
-    supports media in boxes or spheres without surfaces and other media among their voxels; with
-    surfaces elsewhere, it requires ``max_depth`` 2 or -1.
+    Surfaces and area emitters may be anywhere. If ``max_depth`` is -1, the irradiance on diffuse
+    surfaces is cached, too, where the camera and other surfaces need it; each camera sample adds
+    direct light and follows mirrors, glass and glossy surfaces by one path. With other depths,
+    surfaces are path traced. What they reflect is part of the ``background``. A scene with a single
+    medium in a box or sphere, and only distant and point emitters, requires no ray tracing. The
+    solver ``sweep`` supports media in boxes or spheres without surfaces and other media among their
+    voxels; with surfaces elsewhere, it requires ``max_depth`` 2 or -1.
     Unbounded media and sharp phase functions are rejected with an error that names them, and so are
     boundaries that overlap or contradict each other. Scenes without media, or with dielectric
     boundaries around all of them, are rendered by ``volpath`` or, if the extinction differs
@@ -161,6 +165,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     from suns, point lights and lamps, whose direction is known. With the solver ``sweep``, ``hg``
     may have g up to 0.85 if ``max_depth`` is -1. Scattering into such a sharp forward peak is then
     treated as unscattered (delta-M), also in ``transmittance`` and alpha.
+
+    Gradients (``dr.backward``) are computed by ``sigma_t`` and ``albedo`` of a medium and by the
+    radiance of emitters, by solving the adjoint transport equation: for one isotropic medium in a
+    box or sphere under distant and point emitters, without surfaces, with the solver ``sweep``,
+    ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. Emissive media have gradients by
+    ``emission`` only. All other gradients, and forward mode, are refused with an error that names
+    the parameter. While parameters carry gradients, the grid of the cache is kept.
 
     .. tabs::
         .. code-tab:: xml
@@ -215,6 +226,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         )
         self._stopping = StopCondition()
         self._camera_rays: ClosedFormCameraRays | TracedCameraRays | None = None
+        self._parts: list | None = None  # those of the camera rays
         self._revision = 0  # revision of the builder for which the camera rays were created
         #: Mitsuba's integrators for scenes without a visible medium, by name, and the current
         #: choice
@@ -284,7 +296,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             except Stopped:
                 self._log_what_is_missing()
             if self._revision != self._builder.revision:
-                self._camera_rays = self._make_camera_rays()
+                earlier, self._camera_rays = self._camera_rays, self._make_camera_rays()
+                is_same_scene = self._parts is self._builder.parts
+                if is_same_scene and isinstance(earlier, TracedCameraRays):
+                    self._camera_rays.adopt(earlier)
+                self._parts = self._builder.parts
                 # Only the thread that recorded a scatter operation can evaluate it.
                 dr.eval()
                 self._revision = self._builder.revision
@@ -386,6 +402,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             if camera_rays is None:
                 film = self._render_empty(scene, sensor, seed, spp)
             else:
+                if isinstance(camera_rays, TracedCameraRays):
+                    camera_rays.prepare_view(scene, sensor, self._settings.seed)
                 film = self._render(camera_rays, scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:
@@ -418,11 +436,43 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         progress = self._stopping.raising(self.progress)
         return frames(self._builder, scene, image, Targets(**targets), progress)
 
-    def render_forward(self, *args: object, **kwargs: object) -> mi.TensorXf:
-        raise NotImplementedError(_NO_GRADIENTS)
+    def render_forward(
+        self,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> mi.TensorXf:
+        """Refuse: gradients are computed in reverse mode only."""
+        refuse_all(enabled(params), "dr.forward was called", "Call dr.backward on a loss")
 
-    def render_backward(self, *args: object, **kwargs: object) -> None:
-        raise NotImplementedError(_NO_GRADIENTS)
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        grad_in: mi.TensorXf,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> None:
+        """Add the gradients of an objective to the parameters that carry some, from those by the
+        pixels of the image, ``grad_in``.
+        """
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        keys = enabled(params)
+        if not keys:
+            return
+        with dr.suspend_grad(), self._builder.lock:
+            camera_rays = self._prepared(scene)
+            check(self._builder.parts, keys, self._layered)
+            film = FilmAdjoint(sensor, grad_in, seed, spp)
+            (part,) = self._builder.parts
+            image = camera_rays, self._step, self._emission
+            found = parameter_gradients(scene, params, keys, part, image, film)
+        for key, grad in found.items():
+            dr.accum_grad(params[key], grad)
 
     def _render(
         self,
@@ -441,7 +491,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         count = camera_rays.projection.channel_count
         names = [f"layer.{i}" for i in range(count)]
-        film = render_film(sensor, radiance, seed, spp, self.should_stop, names)
+        refine = isinstance(camera_rays, TracedCameraRays) and camera_rays.caches_surfaces
+        film = render_film(sensor, radiance, seed, spp, self.should_stop, names, refine)
         if not count:
             return film
         _, alpha, channels = planes(film, count)

@@ -16,7 +16,7 @@ class ConstantField:
     grid = None
 
     def __init__(self, values: np.ndarray, scale: float = 1.0) -> None:
-        self.channels = len(values)
+        self.channels, self.scale = len(values), scale
         opaque = [dr.opaque(mi.Float, float(v) * scale) for v in values]
         self.value = opaque[0] if self.channels == 1 else mi.Color3f(opaque)
         self.minimum = float(np.min(values)) * scale

@@ -36,10 +36,16 @@ class Emission:
         """Evaluate at the world position ``p``: a Float for one channel, else a Color3f."""
         if self.grid is None:
             return self.field.value
+        inside = self.covers(p)
+        return dr.select(inside, self.field.at_world(p, active & inside), 0)
+
+    def covers(self, p: mi.Point3f) -> mi.Bool:
+        """Whether world positions are in the emissive grid; all are if there is none."""
+        if self.grid is None:
+            return mi.Bool(True)
         u = self.grid.coordinates.point(p)
         sides = mi.Point3f([mi.Float(n) for n in self.grid.sides])
-        inside = dr.all((u >= -SLACK) & (u <= sides + SLACK))
-        return dr.select(inside, self.field.at(u, active & inside), 0)
+        return dr.all((u >= -SLACK) & (u <= sides + SLACK))
 
     def interval(self, ray: mi.Ray3f, near: mi.Float, far: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Clip a ray between ``near`` and ``far`` to the emissive grid; empty if end <= start."""

@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.cancellation import Pause
+from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.bake_emission import bake_emission
 from mitsuba_irrcache.media.emission import Emission
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -112,6 +113,8 @@ class CacheBuilder:
             if edited:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
+            # While parameters carry gradients; an objective would jump with the grid.
+            grids = _grids(self.parts) if edited and snapshot.carries_gradients else {}
             self.parts, self._snapshot = [], None
             self.revision += 1
             description = compile_scene(scene, self._baked_emission())
@@ -128,6 +131,7 @@ class CacheBuilder:
                     medium.name if len(media) > 1 else "",
                     edited,
                     self.pause,
+                    grids.get((medium.name, _data_shape(medium))),
                 )
                 for medium in media
             ]
@@ -237,6 +241,19 @@ class CacheBuilder:
             with self.lock:
                 self._checkpointed -= 1
                 self.save()
+
+
+def _data_shape(medium: MediumGrid) -> tuple[int, ...]:
+    return () if medium.sigma_t.grid is None else medium.sigma_t.grid.shape
+
+
+def _grids(parts: list[CachedMedium]) -> dict[tuple, Grid]:
+    """Grids of caches by the name of the medium and the voxels of its data."""
+    return {
+        (part.medium.name, _data_shape(part.medium)): part.cache.grid
+        for part in parts
+        if part.cache is not None
+    }
 
 
 def _progress_of_one(progress: Progress | None, number: int, count: int) -> SolverProgress | None:

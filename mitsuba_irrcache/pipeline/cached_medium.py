@@ -59,7 +59,8 @@ class CachedMedium:
 
     ``solver`` is a result of `choose_solver`; ``name`` distinguishes the medium from other visible
     ones of the scene, "" where there are none; ``edited``: the scene is an edited version of one
-    that had a cache; ``pause`` is as in `CacheBuilder`.
+    that had a cache; ``pause`` is as in `CacheBuilder`. ``grid`` is that of the cache before, which
+    is kept while parameters carry gradients: an objective would jump with it.
     """
 
     def __init__(
@@ -72,7 +73,11 @@ class CachedMedium:
         name: str,
         edited: bool,
         pause: Callable[[], None] = lambda: None,
+        grid: Grid | None = None,
     ) -> None:
+        if grid is not None and grid.shared(Grid(grid.shape, medium.frame)) is grid:
+            grid = None  # the medium has moved
+        self._grid = grid
         self.settings, self.medium, self.name = settings, medium, name
         self.description = description
         self._pause = pause
@@ -88,7 +93,8 @@ class CachedMedium:
         self.half_space: HalfSpace | None = None
         if settings.max_depth in (0, 1):
             return
-        reason = needs_no_cache(scene, medium, settings.max_depth, settings.resolution)
+        resolution = settings.resolution or (max(grid.shape) if grid is not None else 0)
+        reason = needs_no_cache(scene, medium, settings.max_depth, resolution)
         if reason is None:
             self.cache = self._start_cache(scene, edited)
             return
@@ -166,7 +172,11 @@ class CachedMedium:
             self.solver,
             self.description.media,
         )
-        grid, size_reason = choose_grid(medium, settings.resolution, solver.size_rule)
+        if self._grid is not None:
+            grid, size_reason = self._grid, "as before, since parameters carry gradients"
+            grid = grid.shared(medium.sigma_t.grid, medium.albedo.grid)
+        else:
+            grid, size_reason = choose_grid(medium, settings.resolution, solver.size_rule)
         basis = None
         if not medium.phase.is_isotropic:
             basis = AngularBasis(medium.phase, sources_of(scene))

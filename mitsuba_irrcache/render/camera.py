@@ -2,9 +2,10 @@
 
 In a simple scene (see `compile`) the segment inside the medium is known in closed form. In all
 others the ray continues straight through null surfaces and several media, each of which is ray
-marched with its own cache, until it hits a surface or leaves the scene. The radiance reflected by
-the surface is path traced with one path per camera sample, which ends at its first collision in a
-medium with a cache.
+marched with its own cache, until it hits a surface or leaves the scene. From there one path per
+camera sample ends at the first diffuse surface, whose irradiance is cached (`surface_irradiance`).
+With a limited depth, or where the radiance of a medium is not known, the path is traced as in
+``volpath`` instead; of all orders, it ends at its first collision in a medium with a cache.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
+from mitsuba_irrcache.cache.surface import SurfaceNodes
 from mitsuba_irrcache.cache.uncertainty import uncertainty_of
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
@@ -22,7 +24,10 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import release_unused_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
+from mitsuba_irrcache.render.film import CameraSampler, scattered_rays
 from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance, has_surfaces
+from mitsuba_irrcache.render.surface_paths import SampledEmitters, SurfacePaths
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import (
@@ -34,6 +39,9 @@ from mitsuba_irrcache.transport.path import (
     trace,
 )
 
+#: Camera rays, at least about, by which nodes on surfaces are placed: in a small image, one for
+#: each pixel would miss the narrow cells in corners.
+PLACEMENT_RAYS = 1 << 16
 #: Transmittance below which surfaces are path traced with Russian roulette.
 ROULETTE_BELOW = 0.1
 
@@ -128,21 +136,8 @@ class ClosedFormCameraRays:
         active: mi.Bool,
     ) -> RayResult:
         """Compute the radiance along ``ray``, which starts in ``medium``."""
-        background = mi.Spectrum(0)
-        environment = scene.environment()
-        visible = environment is not None and not self.hide_emitters and self.shows_emitters
-        if visible:
-            escaped = dr.zeros(mi.SurfaceInteraction3f)
-            escaped.wi = -ray.d
-            escaped.wavelengths = ray.wavelengths
-            background = environment.eval(escaped, active)
-        hit, near, far = self.medium.intersect(ray)
-        # As in volpath, a sensor is inside the medium only if the scene says so, and rays enter
-        # through the boundary, even if the grid covers only a part of it.
-        _, entry, leave = self.medium.boundary.intersect(ray)
-        entered = entry > -1e-5 * (leave - entry)
-        hit &= (far > 0) if medium is not None else entered
-        near = dr.maximum(near, 0)
+        visible, background = self.background(scene, ray, active)
+        hit, near, far = self.span(ray, medium)
         scattered, transmittance, gathered, emitted = self.projection.march(
             ray, near, far, background, 1 - sampler.next_1d(active), active & hit
         )
@@ -159,6 +154,30 @@ class ClosedFormCameraRays:
         if not visible:  # dr.mean would make the number of samples a constant of the kernel
             alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
         return RayResult(scattered, background, transmittance, alpha, gathered)
+
+    def background(
+        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[bool, mi.Spectrum]:
+        """Whether an environment is visible behind the medium, and its radiance along ``ray``."""
+        environment = scene.environment()
+        if environment is None or self.hide_emitters or not self.shows_emitters:
+            return False, mi.Spectrum(0)
+        escaped = dr.zeros(mi.SurfaceInteraction3f)
+        escaped.wi = -ray.d
+        escaped.wavelengths = ray.wavelengths
+        return True, environment.eval(escaped, active)
+
+    def span(self, ray: mi.Ray3f, medium: mi.Medium | None) -> tuple[mi.Bool, mi.Float, mi.Float]:
+        """Whether ``ray``, which starts in ``medium``, passes through the medium with a cache, and
+        the distances between which it does.
+        """
+        hit, near, far = self.medium.intersect(ray)
+        # As in volpath, a sensor is inside the medium only if the scene says so, and rays enter
+        # through the boundary, even if the grid covers only a part of it.
+        _, entry, leave = self.medium.boundary.intersect(ray)
+        entered = entry > -1e-5 * (leave - entry)
+        hit &= (far > 0) if medium is not None else entered
+        return hit, dr.maximum(near, 0), far
 
     def _attenuation(self, transmittance: mi.Spectrum, direction: mi.Vector3f) -> mi.Spectrum:
         """Attenuation of the environment; by the original extinction for narrow sources."""
@@ -190,11 +209,42 @@ class TracedCameraRays:
         self.narrow = next(
             (p.directional.directional for p in projections if p.truncates_peak), None
         )
-        #: predicate of media whose radiance is known; caches contain all orders, so not with a
-        #: limited depth
-        self.known = self._is_known if max_depth < 0 else None
+        #: whether paths may end in media; caches contain all orders, so not with a limited depth
+        self._ends_in_media = max_depth < 0
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+        #: what irradiance on surfaces is computed with. An object that outlives the scene must not
+        #: hold its emitters: Dr.Jit would call them without their shapes.
+        self._emitters: SampledEmitters | None = None
+        if max_depth < 0 and len(projections) == len(description.media.grids):
+            self._emitters = SampledEmitters(description.emitters)
+        self._surfaces: SurfaceIrradiance | None = None
+
+    @property
+    def caches_surfaces(self) -> bool:
+        """Whether irradiance on surfaces is cached, so that most pixels have little noise."""
+        return self._surfaces is not None
+
+    def adopt(self, earlier: TracedCameraRays) -> None:
+        """Use the nodes on surfaces of an ``earlier`` state of the caches of the same scene."""
+        if earlier._surfaces is not None:
+            self._surfaces = earlier._surfaces.renewed(self._paths(earlier._surfaces.nodes))
+
+    def _paths(self, nodes: SurfaceNodes | None = None) -> SurfacePaths:
+        return SurfacePaths(
+            self.media, self.projections, self._emitters, self.brightest, self.rr_depth, nodes
+        )
+
+    def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> None:
+        """Cache the irradiance on the surfaces that ``sensor`` sees."""
+        if self._emitters is None or not has_surfaces(scene):
+            return
+        if self._surfaces is None:
+            self._surfaces = SurfaceIrradiance(self._paths(), seed)
+        ray = scattered_rays(sensor, PLACEMENT_RAYS)
+        medium = sensor.get_medium()
+        pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
+        self._surfaces.prepare(scene, ray, pointer)
 
     def sample(
         self,
@@ -214,20 +264,28 @@ class TracedCameraRays:
         chance = dr.minimum(dr.max(transmittance) * (1 / ROULETTE_BELOW), 1)
         traced = stopped & (rng.next_float32(stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
-        start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True)
-        direct, reflected, interacted, path_end, _ = trace(
-            scene,
-            self.media,
-            start,
-            self.max_depth,
-            self.rr_depth,
-            self.hide_emitters,
-            rng,
-            traced,
-            self.known,
-        )
-        if self.known is not None:
-            reflected += path_end.weight * self._irradiance(path_end) * dr.inv_four_pi
+        if self._surfaces is not None:
+            on_emitter = sampler.next_2d(traced)
+            if isinstance(sampler, CameraSampler):
+                on_emitter = sampler.emitter_sample
+            direct, reflected, interacted, *_ = self._surfaces.paths.follow(
+                scene, end, pointer, rng, traced, on_emitter, self.hide_emitters
+            )
+        else:
+            start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True)
+            direct, reflected, interacted, path_end, _ = trace(
+                scene,
+                self.media,
+                start,
+                self.max_depth,
+                self.rr_depth,
+                self.hide_emitters,
+                rng,
+                traced,
+                self._is_known if self._ends_in_media else None,
+            )
+            if self._ends_in_media:
+                reflected += path_end.weight * self._irradiance(path_end) * dr.inv_four_pi
         direct_weight = weight
         if self.narrow is not None:
             lamp = self.narrow.hits_source(ray.o, ray.d, far=mi.Bool(False), near=traced)

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.jit import Divisor
-from mitsuba_irrcache.core.sequences import kronecker_words, unit_floats
+from mitsuba_irrcache.core.sequences import kronecker, kronecker_words, unit_floats
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import require_memory
@@ -23,6 +23,13 @@ from mitsuba_irrcache.render.pixel_filter import pixel_of, reconstructed
 
 #: Maximum number of camera samples per kernel launch, to limit the memory of samples and sampler.
 LANES = 1 << 22
+#: Pixels are refined whose standard deviation exceeds the mean of all by this factor: by at most so
+#: many new samples for each one, and with at most this share of all samples.
+OUTLIER, MOST_FURTHER, FURTHER_SHARE = 4.0, 64, 0.5
+#: Fewest samples of a pixel from which its variance is estimated.
+FEWEST_SAMPLES = 4
+#: Decorrelates new samples from others.
+REFINEMENT = 0x9E3779B9
 #: The sampler stores the number of samples per pixel in 32 bits.
 SPP_LIMIT = 1 << 32
 
@@ -59,11 +66,13 @@ def render_film(
     spp: int,
     should_stop: Callable[[], bool] = lambda: False,
     channels: Sequence[str] = (),
+    refine: bool = False,
 ) -> mi.Film:
     """Render ``radiance`` to the sensor's film with ``spp`` samples per pixel.
 
     With ``spp`` 0 the sampler's own count is used; ``channels`` names those in addition to radiance
-    and alpha. Raises IrrcacheError for a film without pixels, and for one that exceeds the memory.
+    and alpha. To ``refine`` means to take more samples in the pixels of largest variance. Raises
+    IrrcacheError for a film without pixels, and for one that exceeds the memory.
     """
     film, sampler = sensor.film(), sensor.sampler().clone()
     check_film(film, spp, len(channels))
@@ -81,6 +90,8 @@ def render_film(
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
         samples = _sampled(sensor, sampler, spread, size, border, per_pass, spp, radiance)
+        if refine and per_pass >= FEWEST_SAMPLES:
+            samples = _refined(sensor, sampler, seed, per_pass, radiance, *samples)
         found = reconstructed(film, border, per_pass, *samples)
         sums = found if sums is None else [a + b for a, b in zip(sums, found, strict=True)]
         if per_pass < spp:
@@ -204,6 +215,30 @@ class PixelPositions:
         bits = [dr.select(number < self.paired, b, 1 << 31) for b in bits]
         return mi.Point2f(unit_floats(bits))
 
+    def emitter_sample(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
+        """Position in [0, 1)^2 on emitters for a ``sample`` of this pass: further coordinates of
+        the sequence.
+        """
+        if not self.independent:
+            return self.sampler.next_2d()
+        shifts = (*mi.sample_tea_32(pixel, self.seed, 8), *mi.sample_tea_32(self.seed, pixel, 8))
+        return mi.Point2f(unit_floats(kronecker_words(self.first + sample, shifts)[2:]))
+
+
+class CameraSampler:
+    """A sampler of Mitsuba and, for each camera sample, a stratified position on emitters."""
+
+    def __init__(self, sampler: mi.Sampler, emitter_sample: mi.Point2f) -> None:
+        self._sampler, self.emitter_sample = sampler, emitter_sample
+
+    def next_1d(self, active: mi.Bool = True) -> mi.Float:
+        """Return the sampler's next number."""
+        return self._sampler.next_1d(active)
+
+    def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
+        """Return the sampler's next pair of numbers."""
+        return self._sampler.next_2d(active)
+
 
 def camera_ray(
     sensor: mi.Sensor, sampler: mi.Sampler, position: mi.Point2f
@@ -219,6 +254,23 @@ def camera_ray(
     return sensor.sample_ray_differential(time, 0, on_film, aperture)
 
 
+def scattered_rays(sensor: mi.Sensor, least: int) -> mi.Ray3f:
+    """Rays from the centre of the aperture, evenly scattered over all pixels of the film: one for
+    each pixel, or more, up to 16, if there would be fewer than ``least``.
+    """
+    film = sensor.film()
+    width, height = (int(n) for n in film.crop_size())
+    per_pixel = min(max(least // (width * height), 1), 16)
+    lane = dr.arange(mi.UInt32, width * height * per_pixel)
+    pixel, k = Divisor(per_pixel).split(lane)
+    within = mi.Point2f(kronecker(k, 2, (mi.Float(0.5), mi.Float(0.5))))
+    position = mi.Vector2f(pixel_of(pixel, width)) + within
+    scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in (width, height)))
+    time = mi.Float(sensor.shutter_open() + 0.5 * sensor.shutter_open_time())
+    ray, _ = sensor.sample_ray(time, 0.5, position * scale, mi.Point2f(0.5))
+    return ray
+
+
 def _sampled(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
@@ -230,15 +282,82 @@ def _sampled(
     radiance: RadianceFunction,
 ) -> tuple[mi.Point2f, list[mi.Float]]:
     """Trace the samples of a pass; return their film positions and the values of all channels."""
-    film = sensor.film()
     lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
     index, sample = Divisor(per_pass).split(lane)
     pixel = mi.Vector2f(pixel_of(index, int(size.x)) - border)
-    pixel += mi.Vector2f(film.crop_offset())
+    pixel += mi.Vector2f(sensor.film().crop_offset())
     position = pixel + spread.next(index, sample)
+    on_emitter = spread.emitter_sample(index, sample)
+    return position, _values(sensor, sampler, position, on_emitter, spp, radiance)
+
+
+def _values(
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    position: mi.Point2f,
+    on_emitter: mi.Point2f,
+    spp: int,
+    radiance: RadianceFunction,
+) -> list[mi.Float]:
+    """Trace samples at these positions on the film; return the values of all channels."""
+    film = sensor.film()
     ray, weight = camera_ray(sensor, sampler, position)
     ray.scale_differential(dr.rsqrt(float(spp)))
-    value, alpha, further = radiance(sampler, ray, weight, mi.Bool(True))
+    camera_sampler = CameraSampler(sampler, on_emitter)
+    value, alpha, further = radiance(camera_sampler, ray, weight, mi.Bool(True))
     rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
     alphas = [alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
-    return position, [*rgb, *alphas, *further]
+    return [*rgb, *alphas, *further]
+
+
+def _refined(
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    seed: int,
+    per_pass: int,
+    radiance: RadianceFunction,
+    position: mi.Point2f,
+    values: list[mi.Float],
+) -> tuple[mi.Point2f, list[mi.Float]]:
+    """Replace the samples of those few pixels whose standard deviation is far above the mean of
+    all, such as those at the edge of a lamp, by means of new samples around them.
+
+    The new samples do not depend on those by which pixels are chosen, so there is no bias.
+    """
+    count = dr.width(position)
+    everywhere = dr.zeros(mi.Float, count)
+    values = [value + everywhere for value in values]
+    dr.eval(position, values)
+    brightness = values[0] + values[1] + values[2]
+    mean = dr.block_sum(brightness, per_pass) / per_pass
+    square = dr.block_sum(dr.square(brightness), per_pass) / per_pass
+    deviation = dr.sqrt(dr.maximum(square - dr.square(mean), 0))
+    chosen = dr.compress(deviation > OUTLIER * dr.mean(deviation))
+    pixels = dr.width(chosen)
+    further = min(MOST_FURTHER, int(FURTHER_SHARE * count / max(pixels * per_pass, 1)))
+    if not pixels or further < FEWEST_SAMPLES:
+        return position, values
+    lane, k = Divisor(further).split(dr.arange(mi.UInt32, pixels * per_pass * further))
+    pixel, sample = Divisor(per_pass).split(lane)
+    source = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
+    words = mi.sample_tea_32(source, dr.opaque(mi.UInt32, REFINEMENT))
+    within = dr.gather(mi.Point2f, mi.Point2f(position), source)
+    corner = dr.floor(within)
+    step = mi.Point2f(kronecker(k, 2, unit_floats(words))) - 0.5
+    within += step * dr.rsqrt(float(per_pass)) - corner
+    within -= dr.floor(within)
+    shift = unit_floats(mi.sample_tea_32(source - sample, dr.opaque(mi.UInt32, REFINEMENT)))
+    on_emitter = mi.Point2f(kronecker(sample * further + k, 2, shift))
+    own = sampler.clone()
+    own.seed(seed ^ REFINEMENT, pixels * per_pass * further)
+    found = _values(sensor, own, corner + within, on_emitter, per_pass * further, radiance)
+    place = dr.arange(mi.UInt32, pixels * per_pass)
+    pixel, sample = Divisor(per_pass).split(place)
+    place = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
+    everywhere = dr.zeros(mi.Float, pixels * per_pass * further)
+    found = [value + everywhere for value in found]
+    dr.eval(found)
+    for target, value in zip(values, found, strict=True):
+        dr.scatter(target, dr.block_sum(value, further) * (1 / further), place)
+    dr.eval(values)
+    return position, values

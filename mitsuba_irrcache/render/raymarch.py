@@ -85,6 +85,9 @@ class Projection:
         # For constant fields, one step is exact.
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
         self.step = dr.opaque(mi.Float, float(length))
+        #: shortest edge of a voxel of the cache or, without one, of the medium
+        cell = irradiance.grid.voxel_size.min() if irradiance else medium.shortest_edge
+        self.cell = dr.opaque(mi.Float, float(cell))
         max_radiance = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         if directional is not None:
             max_radiance *= directional.directional.phase.peak

@@ -21,7 +21,7 @@ from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.media.phase import interaction
-from mitsuba_irrcache.transport.tracking import free_flight, transmittance
+from mitsuba_irrcache.transport.tracking import free_flight, medium_transmittance, transmittance
 
 #: Maximum number of surface crossings of a path; coincident surfaces could otherwise loop forever.
 MOST_CROSSINGS = 1024
@@ -106,6 +106,17 @@ class Media(Immutable):
             )
         return attenuation, rng
 
+    def exact_transmittance(
+        self, pointer: mi.MediumPtr, ray: mi.Ray3f, far: mi.Float, active: mi.Bool
+    ) -> mi.Spectrum:
+        """Compute the transmittance up to ``far`` without noise."""
+        attenuation = mi.Spectrum(1)
+        for grid in self.grids:
+            inside = active & (pointer == grid.pointer)
+            factor = mi.Spectrum(medium_transmittance(grid, ray, far, inside))
+            attenuation = dr.select(inside, attenuation * factor, attenuation)
+        return attenuation
+
 
 def is_null(flags: mi.UInt32) -> mi.Bool:
     """Whether a BSDF with these flags is an ideal null interface."""
@@ -136,8 +147,10 @@ def visibility(
     pointer: mi.MediumPtr,
     rng: mi.PCG32,
     active: mi.Bool,
+    exact: bool = False,
 ):
-    """Estimate the transmittance from ``vertex`` to ``target``, unbiased.
+    """Estimate the transmittance from ``vertex`` to ``target``, unbiased or, if ``exact``, without
+    noise.
 
     The line crosses all media and null surfaces, also partially transmitting ones. Also returns the
     random number generator.
@@ -152,7 +165,10 @@ def visibility(
         attenuation = dr.select(hit, attenuation * factor, attenuation)
         active &= dr.max(attenuation) > 0
         far = dr.minimum(si.t, ray.maxt)
-        factor, rng = media.transmittance(pointer, ray, far, rng, active)
+        if dr.hint(exact, mode="scalar"):
+            factor = media.exact_transmittance(pointer, ray, far, active)
+        else:
+            factor, rng = media.transmittance(pointer, ray, far, rng, active)
         attenuation = dr.select(active, attenuation * factor, attenuation)
         pointer = dr.select(hit, medium_after(si, ray.d, pointer), pointer)
         ray = si.spawn_ray_to(target)

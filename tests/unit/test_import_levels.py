@@ -22,6 +22,7 @@ LEVELS = (
     {"solvers"},
     {"pipeline"},
     {"render"},
+    {"gradients"},
     {"integrators", "cli", "compare"},
     {"view"},
 )

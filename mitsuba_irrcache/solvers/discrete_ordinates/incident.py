@@ -85,6 +85,11 @@ class DistantIllumination:
             found = [(*own, self._uniform_irradiance(*own)) for own in even]
         return [self._with_suns(pairs, *own, rng) for own in found]
 
+    @property
+    def sun_count(self) -> int:
+        """Number of suns."""
+        return len(self._suns)
+
     def sun_ordinates(self, pairs: int) -> int:
         """How many of the last ordinates of a pass are those of suns."""
         return len(self._suns) * self._tracks_per_sun(pairs)

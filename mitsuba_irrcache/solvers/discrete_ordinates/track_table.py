@@ -74,12 +74,12 @@ class PairGroup:
     """Some of the pairs of a ``table``, consecutive in its order."""
 
     def __init__(self, table: TrackTable, pairs: list[int]) -> None:
-        self.table, self._pairs = table, pairs
+        self.table, self.rows = table, pairs
         self._first = dr.opaque(mi.UInt32, table.order.index(pairs[0]))
         self.count = dr.opaque(mi.UInt32, len(pairs))
 
     def __len__(self) -> int:
-        return len(self._pairs)
+        return len(self.rows)
 
     def pair(self, number: mi.UInt32) -> mi.UInt32:
         """The index in the table of a number in the group."""

@@ -1,0 +1,243 @@
+"""Scenes of which gradients are compared with finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import mitsuba as mi
+import numpy as np
+
+import mitsuba_irrcache  # noqa: F401 (registers the plugin)
+
+EDGE = 2.0
+SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [0.6, 0.8, 1.0]}}
+WHITE = {"type": "constant", "radiance": 1.0}
+SUN = {
+    "type": "directional",
+    "direction": [0.4, -1.0, 0.55],
+    "irradiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]},
+}
+POINT = {
+    "type": "point",
+    "position": [0.4, 3.0, 1.0],
+    "intensity": {"type": "rgb", "value": [20.0, 15.0, 12.0]},
+}
+LAMP = {"type": "point", "position": [0.13, 0.2, -0.1], "intensity": 1.0}
+
+
+def blob(count: int, centre: tuple, width: float) -> np.ndarray:
+    """A Gaussian on a grid of so many voxels along each side, in units of the grid's edge."""
+    x = (np.arange(count) + 0.5) / count
+    z, y, x = np.meshgrid(x, x, x, indexing="ij")
+    cx, cy, cz = centre
+    square = (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2
+    return np.exp(-0.5 * square / width**2)
+
+
+def matter(count: int) -> np.ndarray:
+    """A smooth density of maximum 1 that falls off towards the boundary."""
+    values = 0.9 * blob(count, (0.5, 0.5, 0.5), 0.17) + 0.35 * blob(count, (0.3, 0.62, 0.4), 0.1)
+    return values / values.max()
+
+
+def sky_with_sun() -> dict:
+    """An environment map of 16 x 32 texels with a bright spot."""
+    rows, columns = np.meshgrid(np.arange(16), np.arange(32), indexing="ij")
+    values = 0.4 + 0.3 * np.cos(columns * np.pi / 16) * np.sin(rows * np.pi / 16)
+    values = values[..., None] * [0.8, 0.9, 1.0]
+    values[4, 7] += [60.0, 55.0, 40.0]
+    return {"type": "envmap", "bitmap": mi.Bitmap(values.astype(np.float32))}
+
+
+def spot() -> dict:
+    """A narrow spot light."""
+    look = mi.ScalarTransform4f().look_at([0.5, 3.0, 0.0], [0, 0, 0], [1, 0, 0])
+    return {"type": "spot", "to_world": look, "intensity": 5.0, "cutoff_angle": 12.0}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene: voxels of its data and of the cache along a side, optical depth of the densest data
+    voxel, and what differs from a grey cube under a constant sky.
+    """
+
+    data: int = 16
+    cache: int = 16
+    depth: float = 0.38
+    max_depth: int = -1
+    emitters: Callable[[], dict] = field(default=lambda: {"sky": WHITE})
+    extinction: tuple[float, ...] = (1.0,)
+    albedo: tuple[float, ...] = (0.85,)
+    empty_below: float = 0.0
+    #: no matter at larger x than this, in edges of the grid; and where perturbations are
+    empty_beyond: float = 1.0
+    changed: tuple[float, float] = (0.25, 0.75)
+    turn: float = 0.0
+    shape: str = "cube"
+    homogeneous: bool = False
+    filter: str = "box"
+    pixels: str = "rgb"
+    emissive: bool = False
+    parameters: tuple[str, ...] = ("sigma_t", "albedo")
+
+    def sigma_t(self) -> np.ndarray:
+        """Extinction (z, y, x, channel)."""
+        values = matter(self.data)
+        values = np.where(values < self.empty_below, 0, values)
+        values[:, :, round(self.empty_beyond * self.data) :] = 0
+        peak = self.depth * self.data / EDGE
+        return (values[..., None] * np.array(self.extinction) * peak).astype(np.float32)
+
+    def albedos(self) -> np.ndarray:
+        """Albedo (z, y, x, channel)."""
+        values = 1 + 0.1 * blob(self.data, (0.6, 0.4, 0.5), 0.2)[..., None]
+        return (values * np.array(self.albedo)).astype(np.float32)
+
+    def emission(self) -> np.ndarray:
+        """Emission coefficient (z, y, x, channel)."""
+        plane = 0.5 * blob(self.data, (0.5, 0.45, 0.6), 0.15)[..., None]
+        return (0.01 + plane * [1.0, 0.6, 0.3]).astype(np.float32)
+
+    def load(self, **properties: object) -> mi.Scene:
+        """Load the scene; ``properties`` are the integrator's."""
+        place = placed(self.turn)
+        integrator = {
+            "type": "irrcache",
+            "solver": "sweep",
+            "resolution": self.cache,
+            "max_depth": self.max_depth,
+        }
+        if self.emissive:
+            integrator["emission"] = _volume(self.emission(), place)
+        look = mi.ScalarTransform4f().look_at([1.0, 1.5, -5.0], [0, 0, 0], [0, 1, 0])
+        film = {
+            "type": "hdrfilm",
+            "width": 32,
+            "height": 32,
+            "pixel_format": self.pixels,
+            "component_format": "float32",
+            "rfilter": {"type": self.filter},
+        }
+        centre = mi.ScalarTransform4f(
+            place @ np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
+        )
+        return mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": integrator | properties if "type" not in properties else properties,
+                "sensor": {"type": "perspective", "fov": 34.0, "to_world": look, "film": film},
+                "shape": {
+                    "type": self.shape,
+                    "to_world": centre,
+                    "bsdf": {"type": "null"},
+                    "interior": self._medium(place),
+                },
+            }
+            | self.emitters()
+        )
+
+    def _medium(self, place: np.ndarray) -> dict:
+        if self.homogeneous:
+            peak = self.depth * self.cache / EDGE
+            extinction = [float(e) * peak for e in self.extinction]
+            return {
+                "type": "homogeneous",
+                "sigma_t": _constant(extinction),
+                "albedo": _constant(list(self.albedo)),
+            }
+        return {
+            "type": "heterogeneous",
+            "sigma_t": _volume(self.sigma_t(), place),
+            "albedo": _volume(self.albedos(), place),
+        }
+
+
+def placed(turn: float) -> np.ndarray:
+    """``to_world`` of the unit cube for a cube around the origin, turned by so many degrees."""
+    axis = np.array([0.48, 0.64, 0.6])
+    cross = np.cross(np.eye(3), axis)
+    angle = np.deg2rad(turn)
+    matrix = np.eye(4)
+    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    matrix[:3, :3] = EDGE * rotation
+    matrix[:3, 3] = -0.5 * matrix[:3, :3].sum(axis=1)
+    return matrix
+
+
+def _volume(values: np.ndarray, place: np.ndarray) -> dict:
+    grid = mi.VolumeGrid(values)
+    return {
+        "type": "gridvolume",
+        "grid": grid,
+        "raw": True,
+        "to_world": mi.ScalarTransform4f(place),
+    }
+
+
+def _constant(values: list[float]) -> dict:
+    value = {"type": "rgb", "value": values} if len(values) == 3 else values[0]
+    return {"type": "constvolume", "value": value}
+
+
+def _under(**emitters: dict) -> Callable[[], dict]:
+    return lambda: emitters
+
+
+COLOURED = {"albedo": (0.6, 0.75, 0.85), "emitters": _under(sky=SKY)}
+CASES = {
+    "sky, single": Case(max_depth=2),
+    "sky": Case(),
+    "sky, 24^3": Case(24, 24),
+    "sun, single": Case(max_depth=2, emitters=_under(sun=SUN)),
+    "sun": Case(emitters=_under(sun=SUN)),
+    "sky and sun": Case(emitters=_under(sky=SKY, sun=SUN)),
+    "point, single": Case(max_depth=2, emitters=_under(point=POINT)),
+    "point": Case(emitters=_under(point=POINT)),
+    "point in the medium, single": Case(max_depth=2, emitters=_under(point=LAMP)),
+    "point in the medium": Case(emitters=_under(point=LAMP)),
+    "spot, single": Case(max_depth=2, emitters=lambda: {"spot": spot()}),
+    "spot": Case(emitters=lambda: {"spot": spot()}),
+    "envmap with a bright spot": Case(emitters=lambda: {"sky": sky_with_sun()}),
+    "envmap, single": Case(max_depth=2, emitters=lambda: {"sky": sky_with_sun()}),
+    "attenuation alone": Case(max_depth=1, parameters=("sigma_t",)),
+    "coloured albedo": Case(**COLOURED),
+    "coloured extinction": Case(**COLOURED, extinction=(0.5, 0.8, 1.0)),
+    "coloured extinction, single": Case(**COLOURED, extinction=(0.5, 0.8, 1.0), max_depth=2),
+    "voxel depth 0.8, single": Case(depth=0.8, max_depth=2),
+    "voxel depth 0.8": Case(depth=0.8),
+    "voxel depth 1.2": Case(depth=1.2),
+    "voxel depth 2": Case(depth=2.0),
+    "voxel depth 0.8, sun": Case(depth=0.8, emitters=_under(sun=SUN)),
+    "edges of matter": Case(empty_below=0.05),
+    "empty voxels": Case(empty_beyond=0.5, changed=(0.75, 0.85)),
+    "empty voxels, single": Case(empty_beyond=0.5, changed=(0.75, 0.85), max_depth=2),
+    "no matter": Case(empty_beyond=0.0, parameters=("sigma_t",)),
+    "no matter, sun": Case(
+        empty_beyond=0.0, parameters=("sigma_t",), emitters=_under(sun=SUN), max_depth=2
+    ),
+    "data finer than the cache": Case(data=24, cache=12, depth=0.2),
+    "data coarser than the cache": Case(data=8, cache=16, depth=0.5),
+    "data of no common multiple": Case(data=10, cache=16, depth=0.5),
+    "turned": Case(turn=35.0),
+    "sphere": Case(shape="sphere"),
+    "homogeneous": Case(homogeneous=True, depth=0.1),
+    "homogeneous, single": Case(homogeneous=True, depth=0.1, max_depth=2),
+    "homogeneous, coloured": Case(
+        homogeneous=True, depth=0.1, extinction=(0.5, 0.8, 1.0), **COLOURED
+    ),
+    "homogeneous sphere": Case(homogeneous=True, depth=0.1, shape="sphere"),
+    "homogeneous, sun": Case(homogeneous=True, depth=0.1, emitters=_under(sun=SUN)),
+    "gaussian filter": Case(filter="gaussian"),
+    "radiance of sky and sun": Case(emitters=_under(sky=SKY, sun=SUN), parameters=("sky", "sun")),
+    "radiance of sky and sun, single": Case(
+        emitters=_under(sky=SKY, sun=SUN), parameters=("sky", "sun"), max_depth=2
+    ),
+    "intensity of a point": Case(emitters=_under(point=POINT), parameters=("point",)),
+    "texels of an envmap": Case(emitters=lambda: {"sky": sky_with_sun()}, parameters=("sky",)),
+    "emission": Case(emissive=True, empty_beyond=0.5, parameters=("emission",)),
+    "emission, single": Case(
+        emissive=True, empty_beyond=0.5, parameters=("emission",), max_depth=2
+    ),
+    "alpha": Case(pixels="rgba", emitters=_under(sun=SUN)),
+}

@@ -1,0 +1,151 @@
+"""A density from eight views, with this integrator and with ``prbvolpath``.
+
+    python -m experiments.gradients.optimise [--seconds 24] [--voxels 24]
+
+Adam fits the extinction of a cube under a sky and a sun, from a start without structure. Prints the
+error of two views that the optimisation does not see, relative to their mean, against CPU time;
+``prbvolpath`` with several numbers of samples and step sizes, of which the best counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from time import process_time
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from experiments.gradients.cases import SKY, SUN, Case
+from experiments.gradients.differences import key_of
+from experiments.support.options import begin
+
+VIEWS, UNSEEN = 8, 2
+SIZE = 64
+
+
+@dataclass(frozen=True)
+class Method:
+    """An integrator, camera samples of each pixel, and the step size of Adam relative to the
+    largest extinction.
+    """
+
+    integrator: str
+    spp: int
+    rate: float
+
+
+METHODS = (
+    Method("irrcache", 4, 0.02),
+    Method("irrcache", 4, 0.05),
+    Method("irrcache", 4, 0.1),
+    Method("prbvolpath", 4, 0.005),
+    Method("prbvolpath", 4, 0.02),
+    Method("prbvolpath", 16, 0.02),
+    Method("prbvolpath", 16, 0.05),
+    Method("prbvolpath", 64, 0.05),
+)
+
+
+def main() -> None:
+    """Run all methods."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--voxels", type=int, default=24)
+    parser.add_argument("--seconds", type=float, default=24.0, help="CPU time of each method")
+    options = parser.parse_args()
+    begin()
+    mi.set_variant("llvm_ad_mono")
+    mi.set_log_level(mi.LogLevel.Error)
+    case = Case(
+        options.voxels,
+        options.voxels,
+        depth=8.0 / options.voxels,
+        albedo=(0.82,),
+        emitters=lambda: {"sky": SKY, "sun": SUN},
+    )
+    scene = case.load(type="volpath", max_depth=-1)
+    truth = [np.array(mi.render(scene, sensor=view, spp=512)) for view in views()]
+    for method in METHODS:
+        marks = fit(case, method, truth, options.seconds)
+        text = ", ".join(f"{error:.3f} after {time:.0f} s" for time, error in marks)
+        print(f"{method.integrator:10} spp {method.spp:2} rate {method.rate:5}: {text}", flush=True)
+
+
+def sensor(number: int) -> dict:
+    """A sensor around the medium, without a film."""
+    turn, height = 2 * np.pi * (number * 0.618), 0.8 * np.cos(2.4 * number)
+    origin = 5 * np.array([np.cos(turn), height, np.sin(turn)]) / np.hypot(1, height)
+    look = mi.ScalarTransform4f().look_at(list(origin), [0, 0, 0], [0, 1, 0])
+    return {"type": "perspective", "fov": 32.0, "to_world": look}
+
+
+def film(count: int) -> dict:
+    """A film for so many views beside each other."""
+    size = {"width": SIZE * count, "height": SIZE}
+    form = {"component_format": "float32", "rfilter": {"type": "box"}}
+    return {"film": {"type": "hdrfilm"} | size | form}
+
+
+def views() -> list[mi.Sensor]:
+    """All sensors; the last ones are those that are not fitted."""
+    return [mi.load_dict(sensor(number) | film(1)) for number in range(VIEWS + UNSEEN)]
+
+
+def together() -> mi.Sensor:
+    """The views that are fitted in one image: they share one cache and one adjoint solve."""
+    return mi.load_dict(
+        {"type": "batch"} | film(VIEWS) | {f"view{i}": sensor(i) for i in range(VIEWS)}
+    )
+
+
+def fit(case: Case, method: Method, truth: list, seconds: float) -> list[tuple[float, float]]:
+    """Times and errors of unseen views."""
+    own = {"type": method.integrator, "max_depth": -1}
+    if method.integrator == "irrcache":  # all views at once; else one of them for each step
+        own |= {"solver": "sweep", "resolution": case.cache}
+        sensors = [together()]
+        targets = [mi.TensorXf(np.concatenate(truth[:VIEWS], axis=1))]
+    else:
+        sensors, targets = views()[:VIEWS], [mi.TensorXf(image) for image in truth[:VIEWS]]
+    scene = case.load(**own)
+    params, peak = mi.traverse(scene), float(case.sigma_t().max())
+    key = key_of(params, "sigma_t")
+    optimizer = mi.ad.Adam(lr=method.rate * peak)
+    optimizer[key] = dr.full(mi.TensorXf, 0.1 * peak, params[key].shape)
+    params.update(optimizer)
+    marks, spent, step, following = [], 0.0, 0, seconds / 4
+    while spent < seconds:
+        begun, number = process_time(), step % len(sensors)
+        view = sensors[number]
+        image = mi.render(scene, params, sensor=view, spp=method.spp, seed=step)
+        dr.backward(dr.mean(dr.square(image - targets[number])))
+        optimizer.step()
+        optimizer[key] = dr.clip(optimizer[key], 0, 3 * peak)
+        params.update(optimizer)
+        dr.eval(params[key])
+        dr.sync_thread()
+        spent, step = spent + (process_time() - begun if step else 0.0), step + 1
+        if spent >= following:
+            marks.append((spent, unseen_error(case, params[key], truth)))
+            following += seconds / 4
+    return marks
+
+
+def unseen_error(case: Case, density: mi.TensorXf, truth: list) -> float:
+    """Relative error of the images of a ``density`` that were not fitted, by volpath."""
+    scene = case.load(type="volpath", max_depth=-1)
+    params = mi.traverse(scene)
+    params[key_of(params, "sigma_t")] = dr.detach(density)
+    params.update()
+    errors = [
+        np.array(mi.render(scene, sensor=view, spp=256)) - image
+        for view, image in zip(views()[VIEWS:], truth[VIEWS:], strict=True)
+    ]
+    return float(np.sqrt(np.mean(np.square(errors))) / np.mean(truth[VIEWS:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""Gradients against finite differences of the image, and beside those of ``prbvolpath``.
+
+    python -m experiments.gradients.run [--case NAME] [--document docs/validation.md]
+
+The first table has for each case and parameter the relative error and the cosine of directional
+derivatives along smooth perturbations (`differences`), the second one errors by voxel at equal
+CPU time (`beside_prb`). ``--case`` runs the cases of the first table whose names contain it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from time import process_time
+
+import mitsuba as mi
+
+from experiments.gradients import beside_prb
+from experiments.gradients.cases import CASES, Case
+from experiments.gradients.differences import compare, gradients, pixel_weights
+from experiments.support.documents import replace_tables
+from experiments.support.options import add_document, begin
+from mitsuba_irrcache.compare.tables import Table
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--case", default="", help="part of the names of the cases to run")
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--voxels", type=int, default=32, help="along a side, beside prbvolpath")
+    add_document(parser)
+    options = parser.parse_args()
+    begin()
+    mi.set_variant(options.variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    tables = {"gradients": differences(options.case)}
+    if not options.case:
+        tables["gradients-prb"] = beside_prb.table(options.voxels)
+        print(tables["gradients-prb"].as_text())
+    if options.document:
+        replace_tables(options.document, tables)
+
+
+def differences(chosen: str) -> Table:
+    """The table of finite differences."""
+    cells = []
+    for name, case in CASES.items():
+        if chosen in name:
+            for row in _rows(name, case):
+                print("  ".join(row), flush=True)
+                cells.append(row)
+    head = ["case", "parameter", "error", "cosine", "CPU s"]
+    return Table("Gradients against finite differences", head, cells)
+
+
+def _rows(name: str, case: Case) -> list[list[str]]:
+    scene = case.load()
+    weights = pixel_weights(scene)
+    begun = process_time()
+    found = gradients(scene, case.parameters, weights)
+    seconds = process_time() - begun
+    rows = []
+    for parameter, gradient in found.items():
+        result = compare(scene, case, parameter, weights, gradient)
+        cells = f"{result.error:.2%}", f"{result.cosine:.5f}", f"{seconds:.2f}"
+        rows.append([name, parameter, *cells])
+    return rows
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,320 @@
+"""Nodes on surfaces at which irradiance is cached, found by a spatial hash.
+
+The nodes are independent of how surfaces are modelled: they need no parametrisation, and neither
+the number of triangles nor the merging of shapes matters. Around a surface point, nodes lie on a
+square lattice across the dominant axis of the geometric normal, projected onto the surface along
+that axis. Bilinear interpolation between four of them is exact for linear functions on a plane.
+
+Lattices have spacings of ``spacing / 2^level``. The coarsest level at a point grows with its
+distance from the media. A point uses finer levels until the spacing is small compared to the
+harmonic mean of the distances that its nodes see (Ward, Rubinstein and Clear, "A ray tracing
+solution for diffuse interreflection", 1988), and until the surface is nearly flat between nodes.
+
+A node is identified by a 64-bit key: axis and side, level, two lattice coordinates, and the
+interval of the third coordinate in which the surface is. So the position of a node depends on its
+key only, not on the point for which it was created.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.jit import symbolic
+
+#: Node number of keys that are not in the table.
+NONE = 0xFFFFFFFF
+#: Levels below the coarsest one at a point, and for points that only other nodes see.
+LEVELS, INDIRECT_LEVELS = 6, 3
+#: Spacing of the lattice at level 0 over the diagonal of the media's box; the distance from the
+#: box, in units of the spacing, from which on the coarsest level is coarser.
+COARSEST, COARSER_BEYOND = 0.25, 2.0
+#: Largest spacing over the harmonic mean distance of a node.
+SPACING_PER_DISTANCE = 0.25
+#: Cosine between the normals of a point and a node below which finer levels are used, and below
+#: which the node does not apply.
+FLAT, SAME_SIDE = 0.97, 0.8
+#: Largest distance of a node from the tangent plane, over the spacing.
+TANGENT = 0.3
+#: Distance of another surface from a node, over the spacing, below which this surface may lie
+#: between nodes, as in corners and below objects.
+CLEARANCE = 1.5
+#: Offset of the lattices' origin, so that planes at round coordinates are not on the boundary of
+#: two intervals.
+SHIFT = np.array([0.2137, 0.3719, 0.4482])
+#: Bits of a coordinate, and offsets that make coordinates and levels positive.
+BITS, OFFSET, LEVEL_OFFSET = 18, 1 << 17, 32
+
+
+class SurfaceNodes:
+    """A growing set of nodes on surfaces around media that fill the world box ``lower`` to
+    ``upper``.
+    """
+
+    def __init__(self, lower: np.ndarray, upper: np.ndarray) -> None:
+        spacing = COARSEST * float(np.linalg.norm(upper - lower))
+        origin = 0.5 * (lower + upper) + SHIFT * spacing
+        self.spacing = dr.opaque(mi.Float, spacing)
+        self._origin, self._lower, self._upper = (
+            mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in corner))
+            for corner in (origin, lower, upper)
+        )
+        self.count = 0
+        self.keys = mi.UInt64(0)
+        #: position and harmonic mean distance (0 where there is no surface); shading normal and
+        #: distance of the nearest other surface; geometric normal and 0
+        self._places, self._normals = mi.Float([0.0] * 4), mi.Float([0.0] * 4)
+        self._geometric = mi.Float([0.0] * 4)
+        self._slots, self._mask = mi.UInt32([NONE, NONE]), dr.opaque(mi.UInt32, 1)
+
+    # Lookup
+
+    @symbolic
+    def find(
+        self,
+        p: mi.Point3f,
+        normals: tuple[mi.Normal3f, mi.Normal3f],
+        most_levels: mi.UInt32,
+        active: mi.Bool,
+    ):
+        """Find the nodes between which to interpolate at ``p`` with these ``normals``, geometric
+        and shading.
+
+        Returns the numbers of four nodes and their weights, whose sum is 1, or 0 where some of
+        them are missing; whether another surface may lie between them; further, the keys at the
+        last level visited and whether any of them is missing.
+        """
+        # docs/primer, eq. (5.7)
+        geometric, shading = normals
+        axis, side, place, slope = _across(geometric, mi.Vector3f(p - self._origin))
+        level = self._coarsest_level(p)
+        last = level + mi.Int32(most_levels)
+        numbers = [mi.UInt32(0) for _ in range(4)]
+        weights = [mi.Float(0) for _ in range(4)]
+        keys = [mi.UInt64(0) for _ in range(4)]
+        missing, uncertain, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
+        while dr.hint(active, label="levels of surface nodes"):
+            spacing = self._spacing_at(level)
+            u, v = place.x / spacing, place.y / spacing
+            begin_u, begin_v = dr.floor(u), dr.floor(v)
+            total, incomplete = mi.Float(0), mi.Bool(False)
+            finer, divided = mi.Bool(False), mi.Bool(False)
+            corner_numbers, corner_weights = [], []
+            for k in range(4):
+                at_u, at_v = begin_u + (k & 1), begin_v + (k >> 1)
+                height = place.z / spacing + slope.x * (at_u - u) + slope.y * (at_v - v)
+                key = _packed(axis * 2 + side, level, at_u, at_v, dr.floor(height))
+                keys[k] = dr.select(active, key, keys[k])
+                number = self._number_of(key, active)
+                known = active & (number != NONE)
+                found = dr.gather(mi.Vector4f, self._places, number, known)
+                normal = dr.gather(mi.Vector4f, self._normals, number, known)
+                offset = dr.dot(mi.Vector3f(found.x, found.y, found.z) - p, geometric)
+                cosine = dr.dot(mi.Vector3f(normal.x, normal.y, normal.z), shading)
+                applies = known & (found.w > 0) & (dr.abs(offset) < TANGENT * spacing)
+                applies &= cosine > SAME_SIDE
+                finer |= applies & ((found.w * SPACING_PER_DISTANCE < spacing) | (cosine < FLAT))
+                divided |= known & (found.w > 0) & (normal.w < CLEARANCE * spacing)
+                weight = (1 - dr.abs(at_u - u)) * (1 - dr.abs(at_v - v))
+                weight = dr.select(applies, dr.maximum(weight, 1e-6), 0)
+                total += weight
+                incomplete |= active & ~known
+                corner_numbers.append(number)
+                corner_weights.append(weight)
+            # Coarser nodes than a point asks for would bias it.
+            finer |= divided | (total == 0)
+            ends = active & ~incomplete & (~finer | (level >= last)) & (total > 0)
+            uncertain |= ends & divided
+            scale = dr.rcp(total)
+            for k in range(4):
+                numbers[k] = dr.select(
+                    ends & (corner_weights[k] > 0), corner_numbers[k], numbers[k]
+                )
+                weights[k] = dr.select(ends, corner_weights[k] * scale, weights[k])
+            missing |= incomplete
+            active &= ~incomplete & finer & (level < last)
+            level = dr.select(active, level + 1, level)
+        return numbers, weights, uncertain, keys, missing
+
+    def _coarsest_level(self, p: mi.Point3f) -> mi.Int32:
+        """Level at which the search begins at ``p``."""
+        away = dr.maximum(dr.maximum(self._lower - p, p - self._upper), 0)
+        ratio = dr.norm(away) / (COARSER_BEYOND * self.spacing)
+        exponent = mi.Int32(dr.floor(dr.log2(dr.maximum(ratio, 1))))
+        return -dr.minimum(exponent, LEVEL_OFFSET - 1)
+
+    def _spacing_at(self, level: mi.Int32) -> mi.Float:
+        power = dr.reinterpret_array(mi.Float, mi.UInt32(127 - level) << 23)
+        return self.spacing * power
+
+    @symbolic
+    def _number_of(self, key: mi.UInt64, active: mi.Bool):
+        """Return the number of the node with this ``key``, NONE where there is none."""
+        number, slot = mi.UInt32(NONE), _hash(key) & self._mask
+        active = mi.Bool(active)
+        while dr.hint(active, label="hash table"):
+            candidate = dr.gather(mi.UInt32, self._slots, slot, active)
+            used = active & (candidate != NONE)
+            same = used & (dr.gather(mi.UInt64, self.keys, candidate, used) == key)
+            number = dr.select(same, candidate, number)
+            active = used & ~same
+            slot = (slot + 1) & self._mask
+        return number
+
+    # Growth
+
+    def add_keys(self, keys: Sequence[mi.UInt64]) -> mi.UInt32:
+        """Add those ``keys`` that are not in the table, each once, and return their numbers.
+
+        They have to be completed by `place`.
+        """
+        parts = [self.keys] if self.count else []
+        candidates = dr.concat([*parts, *keys])
+        count = dr.width(candidates)
+        size = 1 << max(2 * count - 1, 1).bit_length()
+        slots = dr.full(mi.UInt32, NONE, size)
+        mask = dr.opaque(mi.UInt32, size - 1)
+        lane, slot = dr.arange(mi.UInt32, count), _hash(candidates) & mask
+        is_new, active = mi.Bool(False) & (lane == lane), lane == lane
+        dr.eval(slots, slot, active, is_new, candidates)
+        while True:
+            # The lowest lane takes an empty slot, so the result does not depend on the order of
+            # execution.
+            empty = active & (dr.gather(mi.UInt32, slots, slot, active) == NONE)
+            dr.eval(empty)
+            dr.scatter_reduce(dr.ReduceOp.Min, slots, lane, slot, empty)
+            dr.eval(slots)
+            owner = dr.gather(mi.UInt32, slots, slot, active)
+            same = active & (dr.gather(mi.UInt64, candidates, owner, active) == candidates)
+            is_new |= active & (owner == lane)
+            active &= ~same
+            slot = dr.select(active, (slot + 1) & mask, slot)
+            dr.eval(is_new, active, slot)
+            if not dr.any(active)[0]:
+                break
+        is_new |= lane < self.count
+        chosen = dr.compress(is_new)
+        # Renumber: lanes become numbers of nodes.
+        renumbered = dr.zeros(mi.UInt32, count)
+        total = dr.width(chosen)
+        dr.scatter(renumbered, dr.arange(mi.UInt32, total), chosen)
+        used = slots != NONE
+        self._slots = dr.select(used, dr.gather(mi.UInt32, renumbered, slots, used), NONE)
+        self._mask, before = mask, self.count
+        self.keys = dr.gather(mi.UInt64, candidates, chosen)
+        self.count = total
+        dr.eval(self._slots, self.keys)
+        if total == before:
+            return mi.UInt32()
+        return dr.arange(mi.UInt32, total - before) + dr.opaque(mi.UInt32, before)
+
+    def rays(self, numbers: mi.UInt32) -> tuple[mi.Ray3f, mi.Float]:
+        """Rays on which the nodes with these ``numbers`` have to be found, and their lengths."""
+        key = dr.gather(mi.UInt64, self.keys, numbers)
+        coordinate = (1 << BITS) - 1
+        w, v, u = (
+            mi.Float(mi.Int32(mi.UInt32(key >> (BITS * k)) & coordinate) - OFFSET) for k in range(3)
+        )
+        rest = mi.UInt32(key >> (3 * BITS))
+        level = mi.Int32(rest & 63) - LEVEL_OFFSET
+        axis, side = rest >> 7, (rest >> 6) & 1
+        spacing = self._spacing_at(level)
+        forward = side == 1  # the surface faces the negative direction of the axis
+        start = dr.select(forward, w - 0.5, w + 1.5)
+        u, v, w = u * spacing, v * spacing, start * spacing
+        place = mi.Vector3f(
+            dr.select(axis == 0, w, u),
+            dr.select(axis == 1, w, dr.select(axis == 0, u, v)),
+            dr.select(axis == 2, w, v),
+        )
+        step = dr.select(forward, mi.Float(1), -1)
+        direction = mi.Vector3f(
+            dr.select(axis == 0, step, 0),
+            dr.select(axis == 1, step, 0),
+            dr.select(axis == 2, step, 0),
+        )
+        return mi.Ray3f(self._origin + place, direction), 2 * spacing
+
+    def place(
+        self,
+        p: mi.Point3f,
+        normals: tuple[mi.Normal3f, mi.Normal3f],
+        distance: mi.Float,
+        clearance: mi.Float,
+    ) -> None:
+        """Complete the nodes added last: positions, normals (geometric and shading), harmonic
+        mean distances, 0 where there is no surface, and distances of the nearest other surface.
+        """
+        known = self.count - dr.width(p)
+        geometric, shading = normals
+        zero = dr.zeros(mi.Float, dr.width(p))
+        new = (
+            dr.ravel(mi.Vector4f(p.x, p.y, p.z, distance)),
+            dr.ravel(mi.Vector4f(shading.x, shading.y, shading.z, clearance)),
+            dr.ravel(mi.Vector4f(geometric.x, geometric.y, geometric.z, zero)),
+        )
+        old = self._places, self._normals, self._geometric
+        joined = [dr.concat([a, b]) if known else b for a, b in zip(old, new, strict=True)]
+        self._places, self._normals, self._geometric = joined
+        dr.eval(joined)
+
+    def positions(
+        self, numbers: mi.UInt32, active: mi.Bool = True
+    ) -> tuple[mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Float]:
+        """Position, geometric and shading normal, and harmonic mean distance of nodes."""
+        found = dr.gather(mi.Vector4f, self._places, numbers, active)
+        geometric = dr.gather(mi.Vector4f, self._geometric, numbers, active)
+        shading = dr.gather(mi.Vector4f, self._normals, numbers, active)
+        return (
+            mi.Point3f(found.x, found.y, found.z),
+            mi.Normal3f(geometric.x, geometric.y, geometric.z),
+            mi.Normal3f(shading.x, shading.y, shading.z),
+            found.w,
+        )
+
+    def streams(self, numbers: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """Two random words of each node, which depend on its key only."""
+        key = dr.gather(mi.UInt64, self.keys, numbers)
+        return mi.sample_tea_32(mi.UInt32(key), mi.UInt32(key >> 32))
+
+
+def _across(
+    normal: mi.Normal3f, place: mi.Vector3f
+) -> tuple[mi.UInt32, mi.UInt32, mi.Vector3f, mi.Vector2f]:
+    """Return the dominant axis of ``normal``, 1 where it points in the negative direction, the
+    coordinates of ``place`` across the axis and along it, and the slopes of the tangent plane.
+    """
+    size = dr.abs(mi.Vector3f(normal))
+    is_x = (size.x >= size.y) & (size.x >= size.z)
+    is_y = ~is_x & (size.y >= size.z)
+    axis = dr.select(is_x, mi.UInt32(0), dr.select(is_y, mi.UInt32(1), 2))
+
+    def ordered(v: mi.Vector3f) -> mi.Vector3f:
+        return mi.Vector3f(
+            dr.select(is_x, v.y, v.x),
+            dr.select(is_x | is_y, v.z, v.y),
+            dr.select(is_x, v.x, dr.select(is_y, v.y, v.z)),
+        )
+
+    normal = ordered(mi.Vector3f(normal))
+    slope = mi.Vector2f(-normal.x / normal.z, -normal.y / normal.z)
+    return axis, dr.select(normal.z < 0, mi.UInt32(1), 0), ordered(place), slope
+
+
+def _packed(
+    axis_and_side: mi.UInt32, level: mi.Int32, u: mi.Float, v: mi.Float, w: mi.Float
+) -> mi.UInt64:
+    """Pack a key: 3 bits, 6 bits, and three coordinates."""
+    key = mi.UInt64(axis_and_side) << 6 | mi.UInt64(mi.UInt32(level + LEVEL_OFFSET))
+    for x in (u, v, w):
+        coordinate = mi.UInt32(mi.Int32(dr.clip(x, 1 - OFFSET, OFFSET - 1)) + OFFSET)
+        key = key << BITS | mi.UInt64(coordinate)
+    return key
+
+
+def _hash(key: mi.UInt64) -> mi.UInt32:
+    first, second = mi.sample_tea_32(mi.UInt32(key), mi.UInt32(key >> 32), 4)
+    return first ^ second

@@ -1,0 +1,1 @@
+"""Gradients of images by the continuous adjoint of radiative transfer."""

@@ -1,0 +1,149 @@
+"""Derivatives by the radiance of emitters, on which images depend linearly.
+
+What enters the medium along each ordinate, and reaches the camera past it, is worth its adjoint
+radiance there. Mitsuba's own emitters carry these derivatives on to their parameters: they are
+evaluated once more, with derivatives, for the same directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.gradients.resampling import volume_of
+from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives, repeated
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import environment_radiance
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+
+
+class EmitterAdjoint:
+    """Derivatives by the radiance of the emitters ``wanted`` of ``scene``, which are added to the
+    parameters of these as they are found.
+    """
+
+    def __init__(self, scene: mi.Scene, wanted: Sequence[mi.Emitter]) -> None:
+        self._scene, self._wanted = scene, list(wanted)
+        environment = scene.environment()
+        self._environment = environment if environment in self._wanted else None
+
+    def __len__(self) -> int:
+        return len(self._wanted)
+
+    def add_background(self, ray: mi.Ray3f, adjoint: mi.Spectrum) -> None:
+        """Add what camera rays see of the environment, each worth ``adjoint``."""
+        if self._environment is not None:
+            self._add_environment(-ray.d, adjoint)
+
+    def add_transport(self, transport: AdjointTransport, found: Derivatives) -> None:
+        """Add what emitters send to the voxels, each of which is worth ``found.direct``."""
+        for emitter, irradiance in zip(transport.point_lights, transport.from_points, strict=True):
+            if emitter in self._wanted:
+                _add_point(emitter, transport, irradiance, found)
+        suns = [
+            emitter for emitter in self._scene.emitters() if kind_of(emitter) is EmitterKind.SUN
+        ]
+        if self._environment is None and not any(sun in self._wanted for sun in suns):
+            return
+        worth = self._worth_of_ordinates(transport, found)
+        directions, incoming, *_ = transport.ordinates
+        tracks = transport.sun_tracks
+        end = len(directions) - len(suns) * tracks
+        for number, sun in enumerate(suns):
+            if sun in self._wanted:
+                rows = worth[end + number * tracks : end + (number + 1) * tracks, 0]
+                _add_sun(sun, rows.mean(axis=0))
+        if self._environment is not None:
+            both = np.stack([directions[:end], -directions[:end]], axis=1).reshape(-1, 3)
+            angle = _solid_angles(self._environment, both, incoming[:end])
+            towards = mi.Vector3f(both.T.astype(np.float32))
+            adjoint = (worth[:end] * angle).reshape(len(both), -1)
+            self._add_environment(towards, mi.Spectrum(adjoint.T.astype(np.float32)))
+
+    def _add_environment(self, direction: mi.Vector3f, adjoint: mi.Spectrum) -> None:
+        """Add what travels from the environment along each ``direction``, worth ``adjoint``."""
+        interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
+        interaction.wi = direction
+        dr.eval(interaction, adjoint)
+        with dr.resume_grad():
+            _pull(self._environment.eval(interaction), adjoint)
+
+    def _worth_of_ordinates(self, transport: AdjointTransport, found: Derivatives) -> np.ndarray:
+        """Derivatives (n, 2, channels) by the irradiance that enters along both ways of pairs."""
+        worth = [np.zeros(0)] * transport.channels
+        for tracks, channels in transport.tracks:
+            weights = [found.direct[c] for c in channels]
+            for c, values in zip(channels, _received(tracks, transport, weights), strict=True):
+                worth[c] = values
+        return np.stack(worth, axis=-1)
+
+
+def _received(
+    tracks: Tracks, transport: AdjointTransport, weights: list[mi.Float]
+) -> list[np.ndarray]:
+    """For each of ``weights`` of the voxels, integrals (n, 2) over the voxels of the transmittance
+    from where each ordinate enters.
+    """
+    # docs/primer, eq. (8.10)
+    directions, _, unused, offsets = transport.ordinates
+    count, voxels = len(directions), transport.grid.voxel_count
+    table = tracks.table(directions, np.ones((count, 2)), 0 * unused, offsets)
+    none, found = dr.zeros(mi.Float, voxels), [np.zeros((count, 2)) for _ in weights]
+    forward = table.geometry.forward
+    for _, group, copies in tracks.sweep_separately(
+        table, lambda group: repeated(none, group, voxels)
+    ):
+        place = dr.arange(mi.UInt32, 2 * len(group) * voxels)
+        light, voxel = dr.gather(mi.Float, copies, place * 4 + 1), place % voxels
+        for weight, result in zip(weights, found, strict=True):
+            sums = dr.block_sum(light * dr.gather(mi.Float, weight, voxel), voxels)
+            ways = np.array(sums, dtype=np.float64).reshape(-1, 2)
+            rows = np.array(group.rows)
+            # A table holds the way along the dominant axis first.
+            result[rows] = np.where(forward[rows, None], ways, ways[:, ::-1])
+    return [result * volume_of(transport.grid) for result in found]
+
+
+def _solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray) -> np.ndarray:
+    """What the radiance along each ordinate and its opposite is multiplied by."""
+    radiance = environment_radiance(environment, both).reshape(-1, 2, incoming.shape[-1])
+    known = radiance > 0
+    angle = np.where(known, incoming / np.where(known, radiance, 1), 0)
+    most = angle.max(axis=-1, keepdims=True)
+    return np.where(known, angle, most)
+
+
+def _add_point(
+    emitter: mi.Emitter,
+    transport: AdjointTransport,
+    irradiance: mi.Spectrum,
+    found: Derivatives,
+) -> None:
+    at = dr.zeros(mi.Interaction3f, transport.grid.voxel_count)
+    at.p = transport.positions
+    _, unattenuated = emitter.sample_direction(at, mi.Point2f(0.5))
+    lit = unattenuated > 0
+    passed = dr.select(lit, irradiance / dr.select(lit, unattenuated, 1), 0)
+    share = dr.opaque(mi.Float, volume_of(transport.grid))
+    adjoint = passed * mi.Spectrum(*found.direct) * share
+    dr.eval(at, adjoint)
+    with dr.resume_grad():
+        _, value = emitter.sample_direction(at, mi.Point2f(0.5))
+        _pull(value, adjoint)
+
+
+def _add_sun(emitter: mi.Emitter, adjoint: np.ndarray) -> None:
+    worth = mi.Spectrum([dr.opaque(mi.Float, float(v)) for v in adjoint])
+    with dr.resume_grad():
+        _, value = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1), mi.Point2f(0.5))
+        _pull(value, worth)
+
+
+def _pull(value: mi.Spectrum, adjoint: mi.Spectrum) -> None:
+    """Add to the parameters that ``value`` depends on their derivatives of ``value . adjoint``."""
+    if dr.grad_enabled(value):
+        # Edges are kept: an emitter is evaluated more than once.
+        dr.backward_from(dr.sum(dr.dot(value, adjoint)), flags=dr.ADFlag.ClearVertices)

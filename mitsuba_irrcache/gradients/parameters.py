@@ -1,0 +1,115 @@
+"""Which parameters of a scene gradients are computed for, and the refusal of all others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.media.bake import children
+
+#: What a parameter can be of a medium.
+SIGMA_T, ALBEDO, EMISSION = "sigma_t", "albedo", "emission"
+#: Textures of emitters on which their radiance depends linearly.
+RADIANCE = ("radiance", "irradiance", "intensity")
+
+
+def enabled(params: Mapping) -> list[str]:
+    """Keys of the parameters that carry gradients.
+
+    Raises IrrcacheError where an integrator around this one has hidden them.
+    """
+    if not hasattr(params, "keys"):
+        raise IrrcacheError(
+            "irrcache computes no gradients within another integrator, which does not hand on the "
+            'parameters; render with irrcache itself, or use the integrator "prbvolpath".'
+        )
+    return [key for key in params.keys() if _is_enabled(params[key])]
+
+
+def _is_enabled(value: object) -> bool:
+    if not dr.is_array_v(value):
+        value = getattr(value, "matrix", None)  # of a transform
+    return value is not None and dr.grad_enabled(value)
+
+
+def roles_of(
+    params: mi.SceneParameters,
+    keys: list[str],
+    medium: mi.Medium,
+    scene: mi.Scene,
+    emission: object = None,
+) -> dict[str, str | mi.Emitter]:
+    """What each of the parameters ``keys`` is: `SIGMA_T` or `ALBEDO` of ``medium``, its `EMISSION`
+    if it belongs to that volume of the integrator, or the emitter whose radiance it is.
+
+    Raises IrrcacheError for any other parameter.
+    """
+    own = children(medium)
+    volumes = {SIGMA_T: own["sigma_t"], ALBEDO: own["albedo"]}
+    if isinstance(emission, mi.Volume):
+        volumes[EMISSION] = emission
+    nodes: dict[mi.Object, str | mi.Emitter] = {}
+    for role, volume in volumes.items():
+        for node in (volume, *children(volume).values()):
+            if nodes.get(node, role) != role:
+                refuse(
+                    _first_key_of(params, node, keys), f"both {nodes[node]} and {role} depend on it"
+                )
+            nodes[node] = role
+    for emitter in scene.emitters():
+        nodes[emitter] = emitter
+        nodes |= {node: emitter for name, node in children(emitter).items() if name in RADIANCE}
+    roles = {}
+    for key in keys:
+        node = params.properties[key][2]
+        last = key.rpartition(".")[2]
+        is_texels = node.class_name() == "EnvironmentMapEmitter" and last == "data"
+        if isinstance(node, mi.Emitter) and not is_texels:
+            refuse(key, f'"{last}" is not the radiance of the {node.class_name()}')
+        if node not in nodes or last not in ("data", "value"):
+            refuse(key, f"it belongs to a {node.class_name()}")
+        roles[key] = nodes[node]
+    return roles
+
+
+def _first_key_of(params: mi.SceneParameters, node: mi.Object, keys: list[str]) -> str:
+    return next((key for key in keys if params.properties[key][2] == node), "sigma_t")
+
+
+def refuse(key: str, reason: str) -> None:
+    """Raise the error for a parameter without gradients."""
+    raise IrrcacheError(
+        f'irrcache computes no gradient of the parameter "{key}": {reason}. Gradients are known of '
+        "sigma_t and albedo of a medium and of the radiance of emitters and emission; detach this "
+        'parameter (dr.disable_grad, params.update), or use the integrator "prbvolpath".'
+    )
+
+
+def refuse_all(keys: list[str], reason: str, remedy: str) -> None:
+    """Raise the error for a scene or setting in which no gradients are computed."""
+    names = ", ".join(f'"{key}"' for key in keys[:3]) + (", ..." if len(keys) > 3 else "")
+    raise IrrcacheError(
+        f"irrcache computes no gradient of {names} here: {reason}. {remedy}, or use the integrator "
+        '"prbvolpath".'
+    )
+
+
+def channels_of(value: object) -> int:
+    """How many channels a constant has."""
+    return len(value) if dr.depth_v(value) > 1 else 1
+
+
+def shaped_like(value: object, grad: mi.Float) -> object:
+    """A gradient, given as a flat array, in the type of the parameter's ``value``."""
+    kind = type(value)
+    if dr.is_tensor_v(value):
+        return kind(grad, value.shape)
+    if dr.depth_v(value) == 1:
+        return kind(dr.sum(grad) if dr.width(grad) != dr.width(value) else grad)
+    count = dr.width(grad)
+    return kind(
+        *(dr.gather(mi.Float, grad, mi.UInt32(min(i, count - 1))) for i in range(len(value)))
+    )

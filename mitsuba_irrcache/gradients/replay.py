@@ -1,0 +1,166 @@
+"""Replay of camera rays: what an image depends on along them, and the adjoint fluence that they
+leave in the medium.
+
+A ray's radiance is L = sum_k T_k (1 - e^-tau_k) q_k + T B, with the source q = albedo Phi / (4 pi)
+in the middle of each step, and the radiance B behind the medium. It is marched twice: once for L,
+and again with the radiance that is still ahead, which is L minus what was gathered (Vicini et al.
+2021 replay paths for the same reason).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
+from mitsuba_irrcache.core.fast_math import absorptance, minimum
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums, of_channels
+from mitsuba_irrcache.grids.fields import GridField
+from mitsuba_irrcache.lights.falloff import InverseSquareFactor
+from mitsuba_irrcache.media.medium import MediumGrid
+
+#: Steps, relative to those of the image, whose quadrature rule is of higher order.
+STEP = 0.5
+#: Transmittance below which nothing ahead matters.
+OPAQUE = 1e-6
+
+
+class CameraSplats:
+    """Where the replay adds derivatives: by extinction, albedo and emission at positions, and the
+    adjoint fluence of collisions in voxels. None where a derivative is not wanted.
+
+    It is no dataclass, whose fields would be state of the recorded loop.
+    """
+
+    def __init__(
+        self,
+        sigma_t: GridSplat | ConstantSplat | None,
+        albedo: GridSplat | ConstantSplat | None,
+        collisions: VoxelSums | None,
+        emission: GridSplat | ConstantSplat | None = None,
+    ) -> None:
+        self.sigma_t, self.albedo, self.emission = sigma_t, albedo, emission
+        self.collisions = collisions
+
+
+class LitMedium:
+    """A medium and its irradiance in single precision, as camera rays see them.
+
+    ``irradiance`` is None where nothing is scattered.
+    """
+
+    def __init__(
+        self,
+        medium: MediumGrid,
+        irradiance: GridField | None,
+        falloff: InverseSquareFactor | None,
+        direct_lights: list[DirectLightAlongRays],
+        step: float,
+    ) -> None:
+        self.medium, self.irradiance = medium, irradiance
+        self._falloff, self._direct_lights = falloff, direct_lights
+        #: factors of the irradiance of all channels; None where each has its own
+        self.colour: mi.Spectrum | None = None
+        fields = medium.sigma_t, medium.albedo, irradiance
+        edges = [f.grid.voxel_size.min() for f in fields if f is not None and f.grid is not None]
+        length = min(edges, default=float(max(abs(medium.frame[:3, :3]).max(), 1e-30) / 64))
+        self.step = dr.opaque(mi.Float, float(length) * step * STEP)
+
+    def sigma_t(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
+        return mi.Spectrum(self.medium.sigma_t.at_world(p, active))
+
+    def albedo(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
+        return mi.Spectrum(self.medium.albedo.at_world(p, active))
+
+    def mean_radiance(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
+        """Phi / (4 pi)."""
+        if self.irradiance is None:
+            return mi.Spectrum(0)
+        phi = mi.Spectrum(self.irradiance.at_world(p, active))
+        if self.colour is not None:
+            phi = phi * self.colour
+        if self._falloff is not None:
+            phi = phi * self._falloff.at(p)
+        for light in self._direct_lights:
+            phi = phi + light.at(p, active)
+        return phi * dr.inv_four_pi
+
+    @symbolic
+    def radiance(
+        self,
+        ray: mi.Ray3f,
+        span: tuple[mi.Float, mi.Float],
+        adjoint: mi.Spectrum,
+        behind: mi.Spectrum,
+        offset: mi.Float,
+        active: mi.Bool,
+    ):
+        """The radiance that the medium scatters into rays, times ``adjoint``, plus ``behind``
+        through the medium; and the transmittance. ``span`` are the distances at which rays enter
+        and leave, ``offset`` in (0, 1] is the first step in steps.
+        """
+        near, far = span
+        k, t, total = mi.Float(0), mi.Float(near), mi.Spectrum(0)
+        transmittance, active = mi.Spectrum(1), mi.Bool(active) & (near < far)
+        while dr.hint(active, label="camera rays"):
+            end = minimum(dr.fma(k + offset, self.step, near), far)
+            p = ray(0.5 * (t + end))
+            absorbed = absorptance(self.sigma_t(p, active) * (end - t))
+            source = self.albedo(p, active) * self.mean_radiance(p, active)
+            total += transmittance * absorbed * source
+            transmittance *= 1 - absorbed
+            t = end
+            k += 1
+            active &= (t < far) & (dr.max(transmittance) > OPAQUE)
+        return total * adjoint + transmittance * behind, transmittance
+
+    @symbolic
+    def replay(
+        self,
+        ray: mi.Ray3f,
+        span: tuple[mi.Float, mi.Float],
+        adjoint: mi.Spectrum,
+        ahead: mi.Spectrum,
+        offset: mi.Float,
+        active: mi.Bool,
+        splats: CameraSplats,
+    ):
+        """March again, and add to ``splats``. ``adjoint`` is the derivative of the objective by
+        the rays' radiance; ``ahead`` and the other arguments are those and the result of
+        `radiance`.
+        """
+        # docs/primer, eqs. (8.2), (8.3)
+        near, far = span
+        k, t, ahead = mi.Float(0), mi.Float(near), mi.Spectrum(ahead)
+        passed, active = mi.Spectrum(adjoint), mi.Bool(active) & (near < far)
+        transmittance = mi.Spectrum(1)
+        while dr.hint(active, label="camera rays"):
+            end = minimum(dr.fma(k + offset, self.step, near), far)
+            p, length = ray(0.5 * (t + end)), end - t
+            tau = self.sigma_t(p, active) * length
+            absorbed = absorptance(tau)
+            mean, albedo = self.mean_radiance(p, active), self.albedo(p, active)
+            ahead -= passed * absorbed * albedo * mean
+            following = passed * (1 - absorbed)
+            if dr.hint(splats.sigma_t is not None, mode="scalar"):
+                change = length * (following * albedo * mean - ahead)
+                splats.sigma_t.add(p, of_channels(change, splats.sigma_t.channels), active)
+            if dr.hint(splats.albedo is not None, mode="scalar"):
+                change = passed * absorbed * mean
+                splats.albedo.add(p, of_channels(change, splats.albedo.channels), active)
+            if dr.hint(splats.emission is not None, mode="scalar"):
+                thin = tau < 1e-4
+                share = dr.select(thin, 1 - 0.5 * tau, absorbed / dr.select(thin, 1, tau))
+                change = of_channels(passed * share * length, splats.emission.channels)
+                splats.emission.add(p, change, active & self.medium.emission.covers(p))
+            if dr.hint(splats.collisions is not None, mode="scalar"):
+                collided = passed * absorbed
+                one = dr.hint(self.colour is not None, mode="scalar")
+                values = [dr.sum(collided * self.colour)] if one else list(collided)
+                splats.collisions.add(p, values, active)
+            passed = following
+            transmittance *= 1 - absorbed
+            t = end
+            k += 1
+            active &= (t < far) & (dr.max(transmittance) > OPAQUE)

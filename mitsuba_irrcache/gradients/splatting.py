@@ -1,0 +1,120 @@
+"""Transposes of interpolation: contributions at positions are added to the voxels that a lookup
+there reads.
+
+Many contributions fall on each voxel, in an order that differs from run to run. They are added in
+64-bit fixed point, where the order does not matter: the same seed gives the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.fast_math import clipped
+from mitsuba_irrcache.grids.grid import Grid
+
+#: Bits of the largest sum of magnitudes.
+BITS = 60
+#: Sums of a constant field: contributions to a single address would wait for each other.
+SLOTS = 1 << 12
+
+
+class FixedPointSums:
+    """``size`` sums of scattered numbers, the same bits whatever the order of additions.
+
+    ``bound`` is an upper bound of the sum of the magnitudes of all contributions.
+    """
+
+    def __init__(self, size: int, bound: float) -> None:
+        exponent = BITS - math.ceil(math.log2(bound)) if 0 < bound < math.inf else 0
+        self._exponent = int(np.clip(exponent, -100, 120))
+        self._scale = dr.opaque(mi.Float, 2.0**self._exponent)
+        self._limit = dr.opaque(mi.Float, 2.0**BITS)
+        self.sums = dr.zeros(mi.Int64, size)
+        dr.make_opaque(self.sums)
+
+    def add(self, index: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
+        """Add a ``value`` to the sum at ``index``."""
+        scaled = clipped(value * self._scale, -self._limit, self._limit)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.sums, mi.Int64(scaled), index, active)
+
+    def values(self) -> mi.Float:
+        """The sums."""
+        double = dr.float64_array_t(mi.Float)
+        result = mi.Float(double(self.sums) * dr.opaque(double, 2.0**-self._exponent))
+        dr.eval(result)
+        return result
+
+
+class GridSplat:
+    """The transpose of trilinear interpolation on ``grid`` of ``channels`` interleaved values."""
+
+    def __init__(self, grid: Grid, channels: int, bound: float) -> None:
+        self.grid, self.channels = grid, channels
+        self._sums = FixedPointSums(grid.voxel_count * channels, bound)
+
+    def add(self, p: mi.Point3f, values: Sequence[mi.Float], active: mi.Bool) -> None:
+        """Add one value for each channel at world positions."""
+        for index, weight in self.grid.corners(self.grid.coordinates.point(p)):
+            for c, value in enumerate(values):
+                place = index * self.channels + c
+                self._sums.add(place, value * weight, active & (weight > 0))
+
+    def values(self) -> mi.Float:
+        return self._sums.values()
+
+
+class VoxelSums:
+    """Integrals over the voxels of ``grid`` of ``channels`` values."""
+
+    def __init__(self, grid: Grid, channels: int, bound: float) -> None:
+        self.grid, self.channels = grid, channels
+        self._sums = FixedPointSums(grid.voxel_count * channels, bound)
+
+    def add(self, p: mi.Point3f, values: Sequence[mi.Float], active: mi.Bool) -> None:
+        """Add one value for each channel to the voxels around world positions."""
+        place = [
+            dr.clip(mi.Int32(dr.floor(clipped(x, -1.0, mi.Float(n)))), 0, n - 1)
+            for x, n in zip(self.grid.coordinates.point(p), self.grid.sides, strict=True)
+        ]
+        index = self.grid.index(*place) * self.channels
+        for c, value in enumerate(values):
+            self._sums.add(index + c, value, active)
+
+    def values(self) -> list[mi.Float]:
+        """The integrals of each channel."""
+        sums = self._sums.values()
+        place = dr.arange(mi.UInt32, self.grid.voxel_count) * self.channels
+        found = [dr.gather(mi.Float, sums, place + c) for c in range(self.channels)]
+        dr.eval(found)
+        return found
+
+
+class ConstantSplat:
+    """The transpose of the lookup of a constant of ``channels`` values."""
+
+    def __init__(self, channels: int, bound: float) -> None:
+        self.channels = channels
+        self._sums = FixedPointSums(SLOTS * channels, bound)
+
+    def add(self, p: mi.Point3f, values: Sequence[mi.Float], active: mi.Bool) -> None:
+        """Add one value for each channel, wherever ``p`` is."""
+        bits = sum(dr.reinterpret_array(mi.UInt32, x) * 2654435761 for x in p)
+        slot = bits >> (32 - SLOTS.bit_length() + 1)
+        for c, value in enumerate(values):
+            self._sums.add(slot * self.channels + c, value, active)
+
+    def values(self) -> mi.Float:
+        sums = np.array(self._sums.values(), dtype=np.float64).reshape(SLOTS, self.channels)
+        return mi.Float(sums.sum(axis=0).tolist())
+
+
+def of_channels(values: mi.Spectrum, channels: int) -> list[mi.Float]:
+    """The derivative by each channel of a field from that by each channel of the radiance: grey
+    fields take part in all.
+    """
+    return [dr.sum(values)] if channels == 1 else list(values)

@@ -1,0 +1,255 @@
+"""Irradiance cached on the surfaces that a camera sees, and on those that these receive it from.
+
+Nodes (`SurfaceNodes`) are created where camera rays meet diffuse surfaces, and then where rays from
+these nodes do. Each node gathers the radiance of all directions along cosine-distributed rays:
+in-scattered radiance of the media by ray marching, emission, and light that other surfaces reflect,
+which is linear in the irradiance of their nodes. So the irradiances are the solution of
+E = E_0 + H E, found by iteration (Goral et al., "Modeling the interaction of light between diffuse
+surfaces", 1984). Emitters that cast sharp shadows are excluded: they are sampled where camera rays
+end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.core.jit import Divisor, symbolic
+from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
+from mitsuba_irrcache.render.surface_paths import SurfacePaths, facing, lambertian
+from mitsuba_irrcache.scene.medium_probe import probe
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+
+#: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance;
+#: by which those gather it that only other nodes see.
+PROBES, GATHERED, GATHERED_INDIRECT = 32, 128, 32
+#: Nodes beyond which no further ones are created where rays from nodes end.
+MOST_NODES = 1 << 18
+#: How often nodes are created where rays from the last ones end. Paths continue where there are
+#: none.
+GENERATIONS = 4
+#: Gather rays of a launch, at most.
+LANES = 1 << 21
+#: Relative change of the irradiances at which the iteration ends, and the most iterations.
+CONVERGED, MOST_ITERATIONS = 1e-4, 500
+
+
+class SurfaceIrradiance:
+    """The cached irradiance on the surfaces of a scene."""
+
+    def __init__(self, paths: SurfacePaths, seed: int) -> None:
+        self.paths, self.nodes, self.seed = paths, paths.nodes, seed
+        self._seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+        self._channels = range(dr.size_v(mi.Spectrum))
+        #: the first of consecutive nodes, the end, and the number of rays that gather radiance
+        self._groups: list[tuple[int, int, int]] = []
+        self._exchange: list[Exchange] = []
+        self._gathered = 0  # groups
+
+    def renewed(self, paths: SurfacePaths) -> SurfaceIrradiance:
+        """The same nodes, with irradiance that is gathered anew along ``paths``."""
+        new = SurfaceIrradiance(paths, self.seed)
+        new._groups = list(self._groups)
+        return new
+
+    def prepare(self, scene: mi.Scene, ray: mi.Ray3f, pointer: mi.MediumPtr) -> None:
+        """Create the nodes that camera rays like these need, and compute their irradiance."""
+        rng = random_stream(mi.sample_tea_32(dr.arange(mi.UInt32, dr.width(ray)), self._seed))
+        p, normals, found, _ = self.paths.walk(scene, ray, pointer, rng, mi.Bool(True))
+        self._cover(scene, p, normals, found)
+        for first, end, rays in self._groups[self._gathered :]:
+            self._gather(scene, first, end, rays)
+        if self._gathered < len(self._groups):
+            self._gathered = len(self._groups)
+            self._solve()
+
+    # Placement
+
+    def _cover(
+        self,
+        scene: mi.Scene,
+        p: mi.Point3f,
+        normals: tuple[mi.Normal3f, mi.Normal3f],
+        active: mi.Bool,
+    ) -> None:
+        """Create all nodes for interpolation at points, and then those for the points that rays
+        from these nodes meet.
+        """
+        first = seen = self.nodes.count
+        for generation in range(GENERATIONS):
+            found = []
+            while self.nodes.count < MOST_NODES:
+                index = dr.compress(active)
+                if not dr.width(index):
+                    break
+                p = dr.gather(mi.Point3f, p, index)
+                normals = tuple(dr.gather(mi.Normal3f, n, index) for n in normals)
+                levels = self.paths.indirect_levels if generation else self.paths.levels
+                *_, keys, active = self.nodes.find(p, normals, levels, mi.Bool(True))
+                dr.eval(p, normals, keys, active)
+                missing = dr.compress(active)
+                if not dr.width(missing):
+                    break
+                new = self.nodes.add_keys([dr.gather(mi.UInt64, key, missing) for key in keys])
+                if dr.width(new):
+                    found.append(self._place(scene, new))
+            if not generation:
+                seen = self.nodes.count
+            if not found:
+                break
+            p, normals, active = (_joined(parts) for parts in zip(*found, strict=True))
+        groups = (first, seen, GATHERED), (seen, self.nodes.count, GATHERED_INDIRECT)
+        self._groups += [group for group in groups if group[0] < group[1]]
+
+    def _place(self, scene: mi.Scene, numbers: mi.UInt32) -> tuple:
+        """Find new nodes on surfaces; return the points where rays from them meet others."""
+        ray, length = self.nodes.rays(numbers)
+        p, normals, valid = _first_surface(scene, ray, length)
+        dr.eval(p, normals, valid)
+        count = dr.width(numbers)
+        lane, k = Divisor(PROBES).split(dr.arange(mi.UInt32, count * PROBES))
+        start, rng = self._ray_from(scene, p, normals, numbers, (lane, k), PROBES)
+        pointer = probe(scene, start.o, start.d)
+        active = dr.gather(mi.Bool, valid, lane)
+        q, others, found, (nearest, surface) = self.paths.walk(scene, start, pointer, rng, active)
+        closeness = dr.select(active & (nearest > 0), dr.rcp(nearest), 0)
+        dr.eval(q, others, found, closeness, surface)
+        mean = dr.block_sum(closeness, PROBES) / PROBES
+        distance = dr.select(valid, dr.rcp(dr.maximum(mean, 1e-18)), 0)
+        self.nodes.place(p, normals, distance, dr.block_reduce(dr.ReduceOp.Min, surface, PROBES))
+        return q, others, found
+
+    def _ray_from(
+        self,
+        scene: mi.Scene,
+        p: mi.Point3f,
+        normals: tuple[mi.Normal3f, mi.Normal3f],
+        numbers: mi.UInt32,
+        ray: tuple[mi.UInt32, mi.UInt32],
+        count: int,
+    ) -> tuple[mi.Ray3f, mi.PCG32]:
+        """Sample cosine-distributed rays: number k of so many from each node, given by its lane."""
+        lane, k = ray
+        words = mi.sample_tea_32(
+            dr.gather(mi.UInt32, self.nodes.streams(numbers)[0], lane), self._seed
+        )
+        shift = unit_floats(words)
+        index = mi.Float(k) * (1 / count)
+        u = (index + shift[0] * (1 / count), kronecker(k, 1, [shift[1]])[0])
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*u))
+        geometric, shading = (dr.gather(mi.Normal3f, n, lane) for n in normals)
+        vertex = dr.zeros(mi.Interaction3f, dr.width(lane))
+        vertex.p, vertex.n = dr.gather(mi.Point3f, p, lane), geometric
+        rng = random_stream(mi.sample_tea_32(words[0] ^ k, words[1]))
+        return vertex.spawn_ray(mi.Frame3f(shading).to_world(local)), rng
+
+    # Irradiance
+
+    def _gather(self, scene: mi.Scene, first: int, end: int, rays: int) -> None:
+        """Gather radiance along so many ``rays`` from each of the nodes ``first`` to ``end``."""
+        per_launch = LANES // rays
+        for begin in range(first, end, per_launch):
+            count = min(per_launch, end - begin)
+            numbers = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, begin)
+            p, *normals, distance = self.nodes.positions(numbers)
+            dr.eval(p, normals, distance)
+            lane, k = Divisor(rays).split(dr.arange(mi.UInt32, count * rays))
+            ray, rng = self._ray_from(scene, p, normals, numbers, (lane, k), rays)
+            pointer = probe(scene, ray.o, ray.d)
+            active = dr.gather(mi.Float, distance, lane) > 0
+            emitted, radiance, _, other, factor = self.paths.follow(
+                scene, ray, pointer, rng, active
+            )
+            weight = dr.opaque(mi.Float, dr.pi / rays)
+            radiance, factor = (emitted + radiance) * weight, factor * weight
+            dr.eval(radiance, other, factor)  # in one launch
+            own = [dr.block_sum(c, rays) for c in list(radiance)]
+            dr.eval(own)
+            self._exchange.append(Exchange(rays, own, other, list(factor)))
+
+    def _solve(self) -> None:
+        """Solve E = E_0 + H E by iteration."""
+        # docs/primer, eq. (5.8)
+        total = [dr.concat([part.own[c] for part in self._exchange]) for c in self._channels]
+        for _ in range(MOST_ITERATIONS):
+            parts = [part.gathered(total) for part in self._exchange]
+            following = [dr.concat([part[c] for part in parts]) for c in self._channels]
+            change = sum(dr.sum(dr.abs(a - b)) for a, b in zip(following, total, strict=True))
+            scale = sum(dr.sum(a) for a in following)
+            dr.eval(following, change, scale)
+            total = following
+            if not change[0] > CONVERGED * scale[0]:
+                break
+        self.paths.irradiance = total
+
+
+class Exchange:
+    """What consecutive nodes receive: ``own`` irradiance, and the ``factors`` of the irradiance of
+    the ``other`` nodes that their rays meet, so many ``rays`` for each node.
+    """
+
+    def __init__(
+        self, rays: int, own: list[mi.Float], other: mi.UInt32, factors: list[mi.Float]
+    ) -> None:
+        self.rays, self.own, self.other, self.factors = rays, own, other, factors
+
+    def gathered(self, total: list[mi.Float]) -> list[mi.Float]:
+        """The irradiance in each channel, where that of all nodes is ``total``."""
+        received = [
+            factor * dr.gather(mi.Float, values, self.other)
+            for factor, values in zip(self.factors, total, strict=True)
+        ]
+        dr.eval(received)
+        return [a + dr.block_sum(b, self.rays) for a, b in zip(self.own, received, strict=True)]
+
+
+def _joined(parts: Sequence) -> object:
+    """Concatenate arrays, or tuples of them."""
+    first = parts[0]
+    if isinstance(first, tuple):
+        return tuple(_joined(each) for each in zip(*parts, strict=True))
+    if isinstance(first, (mi.Point3f, mi.Normal3f)):
+        return type(first)(*(dr.concat([part[k] for part in parts]) for k in range(3)))
+    return dr.concat(list(parts))
+
+
+def has_surfaces(scene: mi.Scene) -> bool:
+    """Whether any shape is more than the boundary of a medium."""
+    return any(
+        shape.bsdf() is not None and not is_null(int(shape.bsdf().flags()))
+        for shape in scene.shapes()
+    )
+
+
+@symbolic
+def _first_surface(scene: mi.Scene, ray: mi.Ray3f, length: mi.Float):
+    """Find the first surface along ``ray`` that is not null and reflects diffusely.
+
+    Returns its position, its geometric and shading normal, and whether there is one.
+    """
+    ray, remaining = mi.Ray3f(ray), mi.Float(length)
+    position, geometric, shading = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
+    found, active, crossings = mi.Bool(False), mi.Bool(True), mi.UInt32(0)
+    while dr.hint(active, label="place nodes"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid() & (si.t <= remaining)
+        remaining -= si.t
+        null = is_null(si.bsdf().flags())
+        diffuse, _ = lambertian(si, active & ~null)
+        normals = facing(si, ray.d)
+        steep = dr.abs(dr.dot(normals[0], ray.d)) < MIN_SLOPE
+        position = dr.select(diffuse, si.p, position)
+        geometric = dr.select(diffuse, normals[0], geometric)
+        shading = dr.select(diffuse, normals[1], shading)
+        found |= diffuse & ~steep
+        active &= null
+        ray = si.spawn_ray(ray.d)
+        crossings += 1
+        active &= crossings < MOST_CROSSINGS
+    return position, (geometric, shading), found
+
+
+#: Smallest cosine between the normal of a node's surface and the axis along which it was found.
+MIN_SLOPE = 0.3

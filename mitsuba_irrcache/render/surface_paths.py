@@ -1,0 +1,420 @@
+"""Paths between surfaces, with ray-marched media and cached irradiance at their last vertex.
+
+A path ends at the first diffuse surface whose irradiance can be interpolated. Mirrors, glass and
+glossy surfaces are sampled as in path tracing. Between surfaces the in-scattered radiance of the
+media is integrated by ray marching of their caches, which is free of the noise of sampled
+collisions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cache.surface import INDIRECT_LEVELS, LEVELS, SurfaceNodes
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.sequences import kronecker
+from mitsuba_irrcache.core.spectrum import luminance
+from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
+from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.transport.path import (
+    MAX_SURVIVAL,
+    MOST_CROSSINGS,
+    Media,
+    is_null,
+    medium_after,
+    power_heuristic,
+    visibility,
+)
+
+#: Vertices without a diffuse surface up to which positions for nodes are searched.
+MOST_BOUNCES = 6
+#: Distance, in voxels of its cache, over which the radiance of a medium varies: nodes within the
+#: medium need not be closer than a part of it.
+MEDIUM_CELLS = 8.0
+#: Height above the surface, over their distance, at which the visibility between a point and a node
+#: is tested: chords of curved surfaces lie below these.
+CHORD = 0.1
+#: Luminance over its mean from which on a direction of an environment counts as a peak, which
+#: casts shadows; samples of such an environment at each vertex.
+PEAK, ENVIRONMENT_SAMPLES = 8.0, 8
+#: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
+LAMBERTIAN = 1e-4
+#: Corners of the unit cube in homogeneous coordinates.
+UNIT_CUBE = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0, 1)]).T
+
+
+class SampledEmitters:
+    """Emitters that are sampled at the vertices of paths: all but smooth environments.
+
+    Of an environment with a peak, such as a sun in a map of the sky, only the excess over
+    ``threshold`` (a luminance) is sampled; the remainder is gathered along all directions. Each
+    point-like or distant emitter is sampled once, an environment `ENVIRONMENT_SAMPLES` times.
+    """
+
+    def __init__(self, emitters: EmittersByKind) -> None:
+        slots = [(emitter, 0.0, 1.0) for emitter, kind in emitters if not kind.is_environment]
+        threshold = dr.inf
+        for environment in emitters.of(EmitterKind.ENVIRONMENT_MAP):
+            threshold = peak_threshold(environment)
+            if threshold < dr.inf:
+                share = 1 / ENVIRONMENT_SAMPLES
+                slots += [(environment, k * share, share) for k in range(ENVIRONMENT_SAMPLES)]
+        self.threshold = dr.opaque(mi.Float, threshold)
+        self.count = dr.opaque(mi.UInt32, len(slots))
+        self._emitters = dr.zeros(mi.EmitterPtr, max(len(slots), 1))
+        for i, (emitter, *_) in enumerate(slots):
+            dr.scatter(self._emitters, mi.EmitterPtr(emitter), mi.UInt32(i))
+        self._first = mi.Float([first for _, first, _ in slots] or [0.0])
+        self._share = mi.Float([share for *_, share in slots] or [1.0])
+        dr.eval(self._emitters, self._first, self._share)
+
+    def excess(self, emitter: mi.EmitterPtr, radiance: mi.Spectrum) -> mi.Float:
+        """The part of a ``radiance`` of an emitter that is sampled."""
+        peak = dr.maximum(1 - self.threshold / dr.maximum(luminance(radiance), 1e-30), 0)
+        return dr.select(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite), peak, 1)
+
+    def sample(
+        self, number: mi.UInt32, vertex: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """Sample a direction; return it with its radiance, without what is gathered, over its
+        density.
+        """
+        emitter = dr.gather(mi.EmitterPtr, self._emitters, number, active)
+        share = dr.gather(mi.Float, self._share, number, active)
+        first = dr.gather(mi.Float, self._first, number, active)
+        u = mi.Point2f(u.x, first + u.y * share)
+        record, value = emitter.sample_direction(vertex, u, active)
+        infinite = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) & ~record.delta
+        excess = self.excess(emitter, value * record.pdf)
+        return record, value * share * dr.select(infinite, excess, 1)
+
+
+def peak_threshold(environment: mi.Emitter) -> float:
+    """The luminance beyond which an environment counts as a peak; infinite without peaks."""
+    u = np.random.default_rng(1).random((2, 1 << 14), dtype=np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f, u.shape[1])
+    si.wi = -mi.warp.square_to_uniform_sphere(mi.Point2f(u))
+    mean = float(dr.mean(luminance(environment.eval(si)))[0])
+    record, _ = environment.sample_direction(si, mi.Point2f(u))
+    si.wi = -record.d
+    highest = float(dr.max(luminance(environment.eval(si)))[0])
+    return PEAK * mean if highest > PEAK * mean else dr.inf
+
+
+class SurfacePaths:
+    """Paths in a scene with caches of its media (``projections``) and on its surfaces.
+
+    Irradiance at the ``nodes`` excludes what comes straight from the `SampledEmitters`, which are
+    sampled wherever a path ends.
+    """
+
+    def __init__(
+        self,
+        media: Media,
+        projections: Sequence[Projection],
+        emitters: SampledEmitters,
+        brightest: mi.Float,
+        rr_depth: mi.UInt32,
+        nodes: SurfaceNodes | None = None,
+    ) -> None:
+        """Use these ``nodes``, or none yet."""
+        self.media, self.projections, self.emitters = media, projections, emitters
+        self.brightest, self.rr_depth = brightest, rr_depth
+        if nodes is None:
+            corners = [(p.medium.frame @ UNIT_CUBE)[:3] for p in projections]
+            nodes = SurfaceNodes(np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2)))
+        self.nodes = nodes
+        #: levels of nodes for points that the camera sees, and for others
+        self.levels, self.indirect_levels = (
+            dr.opaque(mi.UInt32, n) for n in (LEVELS, INDIRECT_LEVELS)
+        )
+        #: irradiance of the nodes, one array for each channel
+        self.irradiance = [mi.Float(0) for _ in range(dr.size_v(mi.Spectrum))]
+
+    @symbolic
+    def follow(
+        self,
+        scene: mi.Scene,
+        ray: mi.Ray3f,
+        pointer: mi.MediumPtr,
+        rng: mi.PCG32,
+        active: mi.Bool,
+        on_emitter: mi.Point2f | None = None,
+        hide_emitters: bool = False,
+    ):
+        """Follow paths that begin with ``ray`` in the medium ``pointer``: at a node or, if samples
+        ``on_emitter`` for the first vertex are given, at a camera ray's end before a surface.
+
+        Returns the radiance of emitters at the first surface, all other radiance, whether there was
+        any interaction, and the node whose irradiance has to be added with the returned factor
+        (only for rays from nodes; else it is included).
+        """
+        from_node = on_emitter is None
+        emitted, radiance = mi.Spectrum(0), mi.Spectrum(0)
+        throughput, eta = mi.Spectrum(1), mi.Float(1)
+        ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
+        pdf, last = mi.Float(0), dr.zeros(mi.Interaction3f)
+        last.p = ray.o
+        first, interacted = mi.Bool(True), mi.Bool(False)
+        clear = mi.Bool(not from_node)
+        end_number, end_factor = mi.UInt32(0), mi.Spectrum(0)
+        depth, crossings = mi.UInt32(0), mi.UInt32(0)
+        context, active = mi.BSDFContext(), mi.Bool(active)
+        while dr.hint(active, label="surface paths"):
+            survival = dr.minimum(dr.max(throughput) * dr.square(eta), MAX_SURVIVAL)
+            survival = dr.select(depth > self.rr_depth, survival, 1)
+            active &= (rng.next_float32(active) < survival) & (dr.max(throughput) > 0)
+            throughput = dr.select(active, throughput / survival, throughput)
+
+            # Ray march the media up to the next surface.
+            si = scene.ray_intersect(ray, active)
+            offset = 1 - rng.next_float32(active)
+            for projection in self.projections:
+                hit, entry, leave = projection.medium.intersect(ray)
+                entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
+                hit &= active & ~clear & (pointer == projection.medium.pointer)
+                found, transmittance, _, glow = projection.march(
+                    ray, entry, leave, mi.Spectrum(self.brightest), offset, hit
+                )
+                radiance += dr.select(hit, throughput * (found + glow), 0)
+                throughput = dr.select(hit, throughput * transmittance, throughput)
+            clear = mi.Bool(False)
+
+            # Add emission, with multiple importance sampling where the last vertex sampled it.
+            valid = active & si.is_valid()
+            emitter = si.emitter(scene, active)
+            is_emitter = active & (emitter != None)  # noqa: E711
+            if dr.hint(hide_emitters and not from_node, mode="scalar"):
+                is_emitter &= ~first
+            value = emitter.eval(si, is_emitter)
+            excess = self.emitters.excess(emitter, value)
+            value *= throughput
+            record = mi.DirectionSample3f(scene, si, last)
+            sampled = is_emitter & (pdf > 0) & (excess > 0)
+            density = emitter.pdf_direction(last, record, sampled)
+            weight = dr.select(sampled, power_heuristic(pdf, density), 1)
+            if dr.hint(from_node, mode="scalar"):
+                weight = dr.select(first, 0, weight)
+            value = dr.select(is_emitter, value * (1 - excess + excess * weight), 0)
+            emitted += dr.select(first, value, 0)
+            radiance += dr.select(first, 0, value)
+
+            # End at a diffuse surface with nodes: docs/primer, eq. (5.9).
+            bsdf = si.bsdf()
+            crosses = valid & is_null(bsdf.flags())
+            surface = valid & ~crosses
+            diffuse, factor = lambertian(si, surface)
+            normals = facing(si, ray.d)
+            levels = self.indirect_levels if from_node else self.levels
+            numbers, weights, uncertain, _, _ = self.nodes.find(si.p, normals, levels, diffuse)
+            weights = self.visible(scene, si, numbers, weights, diffuse & uncertain)
+            ends = diffuse & (weights[0] + weights[1] + weights[2] + weights[3] > 0)
+            if dr.hint(from_node, mode="scalar"):
+                end_number = dr.select(ends, chosen(numbers, weights, rng.next_float32(ends)), 0)
+                end_factor = dr.select(ends, throughput * factor, end_factor)
+            else:
+                known = self.irradiance_at(numbers, weights, ends)
+                radiance += dr.select(ends, throughput * factor * known, 0)
+            interacted |= ends
+
+            # Sample the emitters, and the BSDF where the path continues.
+            scatters = surface & ~ends
+            smooth = surface & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            u = mi.Point2f(rng.next_float32(smooth), rng.next_float32(smooth))
+            if dr.hint(not from_node, mode="scalar"):
+                u = dr.select(first, on_emitter, u)
+            direct, rng = self.direct(scene, si, pointer, u, rng, smooth, ends, not from_node)
+            radiance += dr.select(smooth, throughput * direct, 0)
+            vertex = vertex_at(si)
+            choice = rng.next_float32(scatters)
+            sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
+            bsdf_sample, f = bsdf.sample(context, si, choice, sample, scatters)
+            throughput = dr.select(scatters, throughput * f, throughput)
+            eta = dr.select(scatters, eta * bsdf_sample.eta, eta)
+            is_vertex = scatters & ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
+            delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+            pdf = dr.select(is_vertex, dr.select(delta, 0, bsdf_sample.pdf), pdf)
+            last = dr.select(is_vertex, vertex, last)
+            first &= ~is_vertex
+            interacted |= is_vertex
+            depth = dr.select(is_vertex, depth + 1, depth)
+            direction = dr.select(scatters, si.to_world(bsdf_sample.wo), ray.d)
+            pointer = dr.select(crosses | scatters, medium_after(si, direction, pointer), pointer)
+            ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
+            crossings += 1
+            active &= (crosses | scatters) & (crossings < MOST_CROSSINGS)
+        return emitted, radiance, interacted, end_number, end_factor
+
+    @symbolic
+    def direct(self, scene, si, pointer, u, rng, active, ends, exact: bool):
+        """Return the radiance reflected at ``si`` that comes straight from the sampled emitters.
+
+        The sample ``u`` is shifted by a golden-ratio sequence for each of them. With multiple
+        importance sampling unless the path ``ends`` here. The transmittance has no noise if it is
+        to be ``exact``.
+        """
+        result, number, context = mi.Spectrum(0), mi.UInt32(0), mi.BSDFContext()
+        vertex, active = vertex_at(si), mi.Bool(active) & (self.emitters.count > 0)
+        while dr.hint(active, label="sampled emitters"):
+            shifted = mi.Point2f(*kronecker(number, 2, (u.x, u.y)))
+            record, value = self.emitters.sample(number, vertex, shifted, active)
+            f, density = si.bsdf().eval_pdf(context, si, si.to_local(record.d), active)
+            value *= f
+            reflects = active & (record.pdf > 0) & (dr.max(value) > 0)
+            behind = medium_after(si, record.d, pointer)
+            passed, rng = visibility(
+                scene, self.media, vertex, record.p, behind, rng, reflects, exact
+            )
+            weight = power_heuristic(record.pdf, dr.select(record.delta | ends, 0, density))
+            result += dr.select(reflects, value * passed * weight, 0)
+            number += 1
+            active &= number < self.emitters.count
+        return result, rng
+
+    def visible(self, scene, si, numbers, weights, active):
+        """Reduce the ``weights`` of nodes, where ``active``, to those that are visible from a
+        point, and normalise them.
+        """
+        seen = []
+        for number, weight in zip(numbers, weights, strict=True):
+            tested = active & (weight > 0)
+            p, geometric, *_ = self.nodes.positions(number, tested)
+            height = CHORD * dr.norm(p - si.p)
+            vertex = dr.zeros(mi.Interaction3f)
+            vertex.p, vertex.n = si.p + height * geometric, si.n
+            clear = unobstructed(scene, vertex.spawn_ray_to(p + height * geometric), tested)
+            seen.append(dr.select(active & ~clear, 0, weight))
+        total = seen[0] + seen[1] + seen[2] + seen[3]
+        scale = dr.select(total > 0, dr.rcp(total), 0)
+        return [
+            dr.select(active, w * scale, weight) for w, weight in zip(seen, weights, strict=True)
+        ]
+
+    def irradiance_at(
+        self, numbers: list[mi.UInt32], weights: list[mi.Float], active: mi.Bool
+    ) -> mi.Spectrum:
+        """Interpolate the irradiance between nodes."""
+        channels = []
+        for values in self.irradiance:
+            total = mi.Float(0)
+            for number, weight in zip(numbers, weights, strict=True):
+                total += weight * dr.gather(mi.Float, values, number, active & (weight > 0))
+            channels.append(total)
+        return mi.Spectrum(*channels)
+
+    @symbolic
+    def walk(self, scene, ray, pointer, rng, active):
+        """Follow rays through null, glossy and specular surfaces to the first diffuse one.
+
+        Returns its position and its geometric and shading normal; whether there is one; and the
+        distances of the first surface or medium, and of the first surface (infinite where there is
+        none).
+        """
+        ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
+        position, geometric, shading = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
+        found, nearest, travelled = mi.Bool(False), mi.Float(dr.inf), mi.Float(0)
+        nearest_surface = mi.Float(dr.inf)
+        bounces, crossings, active = mi.UInt32(0), mi.UInt32(0), mi.Bool(active)
+        context = mi.BSDFContext()
+        while dr.hint(active, label="towards a diffuse surface"):
+            for projection in self.projections:
+                inside = active & (bounces == 0) & (pointer == projection.medium.pointer)
+                scale = projection.cell * MEDIUM_CELLS
+                nearest = dr.select(
+                    inside, dr.minimum(nearest, dr.maximum(travelled, scale)), nearest
+                )
+            si = scene.ray_intersect(ray, active)
+            active &= si.is_valid()
+            travelled += dr.select(active, si.t, 0)
+            crosses = active & is_null(si.bsdf().flags())
+            surface = active & ~crosses
+            nearest_surface = dr.select(surface & (bounces == 0), travelled, nearest_surface)
+            diffuse, _ = lambertian(si, surface)
+            normals = facing(si, ray.d)
+            position = dr.select(diffuse, si.p, position)
+            geometric = dr.select(diffuse, normals[0], geometric)
+            shading = dr.select(diffuse, normals[1], shading)
+            found |= diffuse
+            scatters = surface & ~diffuse
+            choice = rng.next_float32(scatters)
+            sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
+            bsdf_sample, f = si.bsdf().sample(context, si, choice, sample, scatters)
+            scatters &= dr.max(f) > 0
+            direction = dr.select(scatters, si.to_world(bsdf_sample.wo), ray.d)
+            pointer = dr.select(crosses | scatters, medium_after(si, direction, pointer), pointer)
+            ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
+            bounces = dr.select(scatters, bounces + 1, bounces)
+            crossings += 1
+            active &= (crosses | scatters) & (bounces < MOST_BOUNCES)
+            active &= crossings < MOST_CROSSINGS
+        distances = dr.minimum(nearest, nearest_surface), nearest_surface
+        return position, (geometric, shading), found, distances
+
+
+@symbolic
+def unobstructed(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
+    """Whether no surface but null ones lies on ``ray`` up to its end."""
+    ray, clear, active = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)
+    crossings = mi.UInt32(0)
+    while dr.hint(active, label="visible nodes"):
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid()
+        null = is_null(si.bsdf().flags())
+        clear &= ~(hit & ~null)
+        remaining = ray.maxt - si.t
+        ray = si.spawn_ray(ray.d)
+        ray.maxt = remaining
+        crossings += 1
+        active &= hit & null & (crossings < MOST_CROSSINGS)
+    return clear
+
+
+def vertex_at(si: mi.SurfaceInteraction3f) -> mi.Interaction3f:
+    """The interaction from which emitters are sampled."""
+    vertex = dr.zeros(mi.Interaction3f)
+    vertex.p, vertex.n = si.p, si.n
+    vertex.time, vertex.wavelengths = si.time, si.wavelengths
+    return vertex
+
+
+def facing(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> tuple[mi.Normal3f, mi.Normal3f]:
+    """Geometric and shading normal on the side from which a ray arrives in ``direction``."""
+    geometric, shading = si.n, si.sh_frame.n
+    geometric = dr.select(dr.dot(geometric, direction) < 0, geometric, -geometric)
+    shading = dr.select(dr.dot(shading, direction) < 0, shading, -shading)
+    return mi.Normal3f(geometric), mi.Normal3f(shading)
+
+
+def lambertian(si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
+    """Whether the BSDF reflects alike in all directions, and its value f = reflectance / pi.
+
+    By flags and, since the normals of bump maps differ from those of the surface, by its values.
+    """
+    bsdf, context = si.bsdf(), mi.BSDFContext()
+    flags = bsdf.flags() & int(mi.BSDFFlags.All)
+    active = active & (flags == int(mi.BSDFFlags.DiffuseReflection))
+    side = dr.select(si.wi.z < 0, mi.Float(-1), 1)
+    value = bsdf.eval(context, si, mi.Vector3f(0, 0, side), active)
+    for x, y in ((0.6, 0.0), (-0.3, 0.51961524)):
+        other = bsdf.eval(context, si, mi.Vector3f(x, y, 0.8 * side), active) / 0.8
+        active = active & (dr.max(dr.abs(other - value)) <= LAMBERTIAN * dr.max(value))
+    return active, value
+
+
+def chosen(numbers: list[mi.UInt32], weights: list[mi.Float], u: mi.Float) -> mi.UInt32:
+    """Choose one of the ``numbers`` with probabilities ``weights``."""
+    result, largest = mi.UInt32(numbers[0]), mi.Float(weights[0])
+    for number, weight in zip(numbers[1:], weights[1:], strict=True):
+        result = dr.select(weight > largest, number, result)  # in case of rounding
+        largest = dr.maximum(weight, largest)
+    remaining, settled = mi.Float(u), mi.Bool(False)
+    for number, weight in zip(numbers, weights, strict=True):
+        here = ~settled & (remaining < weight)
+        result = dr.select(here, number, result)
+        settled |= here
+        remaining -= weight
+    return result

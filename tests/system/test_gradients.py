@@ -1,0 +1,344 @@
+"""Gradients of images: against finite differences of the image, within an optimisation, and what
+is refused.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from experiments.gradients.cases import CASES, POINT, SKY, SUN, Case, sky_with_sun
+from experiments.gradients.differences import compare, gradients, key_of, pixel_weights
+from mitsuba_irrcache.errors import IrrcacheError
+
+#: Largest relative error of directional derivatives along smooth perturbations, and the least
+#: cosine; the first also where voxels are empty.
+ERROR, COSINE, EMPTY_ERROR = 0.03, 0.999, 0.05
+GREY = ("sky, single", "sky", "sun, single", "sun", "point", "spot, single", "voxel depth 0.8")
+#: Perturbations of each parameter.
+BLOBS = 3
+COLOURED = (
+    "coloured extinction",
+    "envmap with a bright spot",
+    "homogeneous, coloured",
+    "data of no common multiple",
+    "sphere",
+    "emission",
+)
+
+
+def check(case: Case, error: float = ERROR) -> None:
+    scene = case.load()
+    weights = pixel_weights(scene)
+    found = gradients(scene, case.parameters, weights)
+    for name, gradient in found.items():
+        result = compare(scene, case, name, weights, gradient, BLOBS)
+        assert result.error < error, name
+        assert result.cosine > COSINE, name
+
+
+@pytest.mark.parametrize("name", GREY)
+def test_gradients_are_those_of_the_image(mono, name):
+    check(CASES[name])
+
+
+@pytest.mark.parametrize("name", COLOURED)
+def test_gradients_in_colour_are_those_of_the_image(rgb, name):
+    check(CASES[name])
+
+
+@pytest.mark.parametrize("name", ["empty voxels", "no matter", "no matter, sun"])
+def test_empty_voxels_have_gradients(mono, name):
+    check(CASES[name], EMPTY_ERROR)
+
+
+def test_emission_has_gradients_with_single_scattering(rgb):
+    check(CASES["emission, single"])
+
+
+EMITTERS = {
+    "sky": (lambda: {"sky": SKY, "sun": SUN}, "sky.radiance.value"),
+    "sun": (lambda: {"sky": SKY, "sun": SUN}, "sun.irradiance.value"),
+    "point": (lambda: {"point": POINT}, "point.intensity.value"),
+    "texels": (lambda: {"sky": sky_with_sun()}, "sky.data"),
+}
+
+
+@pytest.mark.parametrize("name", EMITTERS)
+@pytest.mark.parametrize("max_depth", [2, -1])
+def test_images_are_linear_in_the_radiance_of_emitters(rgb, name, max_depth):
+    emitters, key = EMITTERS[name]
+    scene = Case(emitters=emitters, max_depth=max_depth).load()
+    weights, params = pixel_weights(scene), mi.traverse(scene)
+    value = np.array(params[key])
+    leaf = type(params[key])(value)
+    dr.enable_grad(leaf)
+    params[key] = leaf
+    params.update()
+    image = mi.render(scene, params, spp=64, seed=3)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32))))
+    gradient = np.array(dr.grad(leaf), dtype=np.float64)
+
+    def objective(changed: np.ndarray) -> float:
+        params[key] = type(leaf)(changed.astype(np.float32))
+        params.update()
+        return float((np.array(mi.render(scene, spp=64), dtype=np.float64) * weights).sum())
+
+    step = 0.2 * value
+    expected = (objective(value + step) - objective(value - step)) / 2
+    assert (gradient * step).sum() == pytest.approx(expected, rel=0.02)
+
+
+# Interface
+
+
+def small(**properties) -> tuple[mi.Scene, mi.SceneParameters, str]:
+    scene = Case(data=8, cache=8).load(**properties)
+    params = mi.traverse(scene)
+    return scene, params, key_of(params, "sigma_t")
+
+
+def gradient_of(scene, params, key, **options) -> np.ndarray:
+    params[key] = mi.TensorXf(dr.detach(params[key]))
+    dr.enable_grad(params[key])
+    params.update()
+    dr.backward(dr.mean(dr.square(mi.render(scene, params, **{"spp": 4} | options) - 0.3)))
+    return np.array(dr.grad(params[key]))
+
+
+def test_the_same_seed_gives_the_same_bits(rgb):
+    scene, params, key = small()
+    first, again, other = (gradient_of(scene, params, key, seed=s) for s in (1, 1, 2))
+    assert first.tobytes() == again.tobytes()
+    assert first.tobytes() != other.tobytes()
+
+
+def test_upstream_variables_receive_gradients(rgb):
+    """A common factor of the extinction, as Mitsuba's ``scale``, which is no array."""
+    scene, params, key = small()
+    data = mi.TensorXf(dr.detach(params[key]))
+    by_data = gradient_of(scene, params, key, seed=1)
+    scale = mi.Float(1)
+    dr.enable_grad(scale)
+    params[key] = data * scale
+    params.update()
+    dr.backward(dr.mean(dr.square(mi.render(scene, params, spp=4, seed=1) - 0.3)))
+    expected = (by_data * np.array(data)).sum()
+    assert dr.grad(scale)[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_scale_of_the_medium_multiplies_gradients(rgb):
+    """Three times the extinction by ``scale`` or by the data."""
+    scene, params, key = small()
+    params[key] = params[key] * 3
+    params.update()
+    by_data = gradient_of(scene, params, key, seed=1)
+    params[key] = dr.detach(params[key]) / 3
+    params[key.replace("sigma_t.data", "scale")] = 3.0
+    params.update()
+    by_scale = gradient_of(scene, params, key, seed=1)
+    np.testing.assert_allclose(by_scale, 3 * by_data, rtol=1e-2, atol=1e-3 * by_scale.max())
+
+
+def test_views_add_up(rgb):
+    """Two sensors, one after the other, in one loss."""
+    scene, params, key = small()
+    near = mi.ScalarTransform4f().look_at([3.0, -1.0, 2.0], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    other = mi.load_dict({"type": "perspective", "fov": 40.0, "to_world": near, "film": film})
+    one, two = (gradient_of(scene, params, key, seed=1, sensor=s) for s in (0, other))
+    params[key] = mi.TensorXf(dr.detach(params[key]))
+    dr.enable_grad(params[key])
+    params.update()
+    images = [mi.render(scene, params, spp=4, seed=1, sensor=s) for s in (0, other)]
+    dr.backward(sum(dr.mean(dr.square(image - 0.3)) for image in images))
+    both = np.array(dr.grad(params[key]))
+    np.testing.assert_allclose(both, one + two, rtol=1e-4, atol=1e-6 * np.abs(both).max())
+
+
+def test_a_batch_sensor_is_all_of_its_views(rgb):
+    """They share one adjoint solve; its ordinates and samples are others."""
+    scene, params, key = small()
+    film = {"type": "hdrfilm", "height": 16, "rfilter": {"type": "box"}}
+    views = []
+    for origin in ([5.0, 1.0, 0.0], [0.0, 1.0, 5.0]):
+        look = mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
+        views.append({"type": "perspective", "fov": 32.0, "to_world": look})
+    both = {"type": "batch", "a": views[0], "b": views[1], "film": film | {"width": 32}}
+    sensors = [mi.load_dict(view | {"film": film | {"width": 16}}) for view in views]
+    one, two = (gradient_of(scene, params, key, spp=64, sensor=s) for s in sensors)
+    found = gradient_of(scene, params, key, spp=64, sensor=mi.load_dict(both))
+    expected = 0.5 * (one + two)  # the loss is a mean over pixels
+    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("max_depth", [2, -1])
+def test_adam_finds_a_density(mono, max_depth):
+    """An optimisation that starts without matter."""
+    case = Case(data=8, cache=8, max_depth=max_depth)
+    scene = case.load()
+    target = mi.TensorXf(mi.render(scene, spp=16))
+    params = mi.traverse(scene)
+    key = key_of(params, "sigma_t")
+    optimizer = mi.ad.Adam(lr=0.05)
+    optimizer["density"] = dr.zeros(mi.TensorXf, params[key].shape)
+    losses = []
+    for step in range(12):
+        optimizer["density"] = dr.clip(optimizer["density"], 0, 5)
+        params[key] = optimizer["density"]
+        params.update()
+        loss = dr.mean(dr.square(mi.render(scene, params, spp=8, seed=step) - target))
+        dr.backward(loss)
+        optimizer.step()
+        losses.append(float(np.array(loss).item()))
+    assert losses[-1] < 0.2 * losses[0]
+
+
+def test_the_grid_is_kept_while_parameters_carry_gradients(rgb):
+    """With ``resolution`` 0 a denser medium gets a finer cache, but not within an optimisation."""
+    scene, params, key = small(resolution=0)
+    data, shapes = dr.full(mi.TensorXf, 0.5, params[key].shape), []
+    for scale, attached in ((1.0, False), (10.0, True), (10.0, False)):
+        params[key] = data * scale
+        if attached:
+            dr.enable_grad(params[key])
+        params.update()
+        mi.render(scene, params, spp=1)
+        shapes.append(scene.integrator().cache.grid.shape)
+    assert shapes[0] == shapes[1] != shapes[2]
+
+
+def test_parameters_without_gradients_cost_nothing(rgb, kernels):
+    scene, params, _ = small()
+    image = mi.render(scene, params, spp=1)
+    integrator = scene.integrator()
+    assert (
+        kernels(
+            lambda: integrator.render_backward(scene, params, dr.ones(mi.TensorXf, image.shape))
+        )
+        == []
+    )
+
+
+def test_an_objective_that_does_not_depend_on_the_image(rgb):
+    scene, params, key = small()
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, spp=1)
+    dr.backward(dr.sum(image * mi.TensorXf(np.zeros(image.shape, np.float32))))
+    assert not np.array(dr.grad(params[key])).any()
+
+
+def test_only_what_is_wanted_is_computed(rgb, monkeypatch):
+    """The radiance of a sun needs no derivatives by the extinction."""
+    from mitsuba_irrcache.gradients import resampling
+
+    scene = Case(data=8, cache=8, emitters=lambda: {"sun": SUN}).load()
+    params, calls = mi.traverse(scene), []
+    add = resampling.VoxelQuadrature.add
+    monkeypatch.setattr(
+        resampling.VoxelQuadrature, "add", lambda *args: calls.append(args) or add(*args)
+    )
+    gradient_of_colour(scene, params, "sun.irradiance.value")
+    assert not calls
+    gradient_of(scene, params, key_of(params, "sigma_t"))
+    assert len(calls) == 1
+
+
+def gradient_of_colour(scene, params, key) -> None:
+    dr.enable_grad(params[key])
+    params.update()
+    dr.backward(dr.mean(mi.render(scene, params, spp=1)))
+    params[key] = dr.detach(params[key])
+    params.update()
+
+
+# What is refused
+
+
+def refused(scene: mi.Scene, suffix: str) -> str:
+    """The message of the error for the gradient of a parameter whose key ends like this."""
+    params = mi.traverse(scene)
+    (key,) = [k for k in params.keys() if k.endswith(suffix)]
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(IrrcacheError) as error:
+        dr.backward(dr.mean(mi.render(scene, params, spp=1)))
+    assert f'"{key}"' in str(error.value) and "prbvolpath" in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "reason"),
+    [
+        ("vertex_positions", "it belongs to a Cube"),
+        ("sensor.x_fov", "it belongs to a PerspectiveCamera"),
+        ("sun.to_world", '"to_world" is not the radiance of the DirectionalEmitter'),
+        ("point.position", '"position" is not the radiance of the PointLight'),
+    ],
+)
+def test_other_parameters_are_refused_by_name(rgb, suffix, reason):
+    emitters = {"sun": SUN, "point": POINT}
+    scene = Case(data=8, cache=8, emitters=lambda: emitters).load()
+    assert reason in refused(scene, suffix)
+
+
+@pytest.mark.parametrize(
+    ("properties", "reason"),
+    [
+        ({"solver": "path", "cache_spp": 8}, 'the solver is "path"'),
+        ({"max_depth": 4}, "max_depth is 4"),
+        ({"filter": "bilateral"}, "filtered or has aovs"),
+        ({"aovs": "z:depth"}, "filtered or has aovs"),
+        ({"emission": 0.1}, "is emissive"),
+    ],
+)
+def test_settings_without_gradients_are_refused(rgb, properties, reason):
+    assert reason in refused(Case(data=8, cache=8).load(**properties), "sigma_t.data")
+
+
+def test_scenes_without_gradients_are_refused(rgb, scenes):
+    place = scenes.placement()
+    density = scenes.texture((6, 6, 6, 1), 0.0, 1.0, 1)
+    ours = {"type": "irrcache", "solver": "sweep", "resolution": 6}
+    ball = {"type": "sphere", "radius": 0.1, "center": [0, -3, 0]}
+    shape = scenes.boundary(scenes.medium(density, 0.8, place), place)
+    assert "there are surfaces" in refused(scenes.load(ours, shape, 8, ball=ball), "sigma_t.data")
+    phase = {"type": "hg", "g": 0.3}
+    shape = scenes.boundary(scenes.medium(density, 0.8, place, phase=phase), place)
+    assert "is not isotropic" in refused(scenes.load(ours, shape, 8), "sigma_t.data")
+    shape = scenes.boundary(scenes.medium(500.0, 0.8, place), place)
+    opaque = scenes.load(ours | {"resolution": 0}, shape, 8)
+    assert "has no cache" in refused(opaque, "sigma_t.value.value")
+
+
+def test_emission_of_zero_is_refused(rgb):
+    scene = Case(data=8, cache=8, emissive=True).load()
+    params = mi.traverse(scene)
+    key = key_of(params, "emission")
+    params[key] = dr.zeros(mi.TensorXf, params[key].shape)
+    params.update()
+    assert "the emission is 0 everywhere" in refused(scene, "emission.data")
+
+
+def test_forward_mode_is_refused(rgb):
+    scene, params, key = small()
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(IrrcacheError, match=r"sigma_t\.data.*dr\.forward was called"):
+        dr.forward_to(mi.render(scene, params, spp=1))
+
+
+# Numbers
+
+
+@pytest.mark.parametrize("depth", [1e-12, 1e-4, 50.0, 1e6])
+@pytest.mark.parametrize("albedo", [0.0, 1.0])
+def test_gradients_are_finite(mono, depth, albedo):
+    case = Case(data=6, cache=6, depth=depth, albedo=(albedo / 1.1,))
+    scene = case.load()
+    found = gradients(scene, ("sigma_t", "albedo"), pixel_weights(scene), spp=4)
+    assert all(np.isfinite(g).all() for g in found.values())
+    assert np.abs(found["sigma_t"]).max() > 0

@@ -1,0 +1,252 @@
+"""Irradiance cached on surfaces, in images.
+
+`test_surfaces` compares with volpath; here the reference is this integrator without nodes, whose
+paths are unbiased with respect to the same caches of the media.
+"""
+
+from __future__ import annotations
+
+import gc
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.render import film
+from tests.support.surfaces import ball, bound, colour, diffuse, fog, ground, lamp, placed
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SIZE = 24
+
+
+def scene_of(scenes, objects: dict, **settings) -> mi.Scene:
+    integrator = {"type": "irrcache", "max_depth": -1, "resolution": 12, "cache_spp": 32}
+    objects = {"emitter": None, "sun": None} | objects
+    return scenes.load(integrator | settings, None, SIZE, **objects, default_solver="auto")
+
+
+def nodes_of(scene: mi.Scene):
+    """Return the nodes on the surfaces that were rendered last, None without any."""
+    surfaces = scene.integrator()._camera_rays._surfaces
+    return None if surfaces is None else surfaces.nodes
+
+
+def box(center, scale, bsdf) -> dict:
+    return {"type": "cube", "to_world": placed(center, scale), "bsdf": bsdf}
+
+
+def wall(center, towards, bsdf=None) -> dict:
+    place = placed(center, (2.0, 2.0, 1), towards)
+    return {"type": "rectangle", "to_world": place, "bsdf": bsdf or diffuse(0.7, 0.7, 0.7)}
+
+
+def room() -> dict:
+    """Return walls that extend beyond the corners of a room, in which a lamp hangs."""
+    return {
+        "smoke": bound(interior=fog((0.8, 0.8, 0.8)), scale=(0.9, 0.9, 0.9)),
+        "floor": wall((0, -1.5, 0), (0, 0, 0.001)), "ceiling": wall((0, 1.5, 0), (0, 0, 0.001)),
+        "left": wall((-1.5, 0, 0), (0, 0, 0), diffuse(0.6, 0.1, 0.1)),
+        "right": wall((1.5, 0, 0), (0, 0, 0), diffuse(0.1, 0.5, 0.1)),
+        "back": wall((0, 0, 1.5), (0, 0, 0)), "lamp": lamp((0, 1.2, 0), (0, -1, 0.001), 0.4),
+    }  # fmt: skip
+
+
+def still_life() -> dict:
+    """Return objects of many BSDFs that stand on a floor, with a mesh-like cube in a corner."""
+    checker = {"type": "checkerboard", "color0": colour(0.1, 0.2, 0.6), "color1": colour(1, 1, 1)}
+    checker["to_uv"] = mi.ScalarTransform4f().scale([9, 9, 1])
+    half = {
+        "type": "mask",
+        "opacity": 0.5,
+        "nested": {"type": "twosided", "n": diffuse(0.7, 0.5, 0)},
+    }
+    return {
+        "smoke": bound(interior=fog((0.8, 1.2, 1.6)), center=(0, 0.2, 0), scale=(0.6, 0.6, 0.6)),
+        "floor": ground(bsdf={"type": "diffuse", "reflectance": checker}),
+        "mirror": ball((1.1, -0.7, -0.3), 0.35, bsdf={"type": "conductor"}),
+        "glass": ball((-1.1, -0.7, -0.3), 0.35, bsdf={"type": "dielectric"}),
+        "metal": ball((0.4, -0.85, -1.0), 0.2, bsdf={"type": "roughconductor", "alpha": 0.2}),
+        "plastic": box((-0.4, -0.95, -1.0), (0.15, 0.15, 0.15), {"type": "plastic"}),
+        "sheet": box((0, -0.8, -0.8), (0.3, 0.2, 0.001), half),
+        "emitter": {"type": "constant", "radiance": colour(0.5, 0.7, 1.0)},
+        "sun": {"type": "directional", "direction": [0.4, -1.0, 0.55], "irradiance": 2.0},
+    }  # fmt: skip
+
+
+def sun_in_a_map() -> dict:
+    """Return a ground and a sheet under an environment map with a bright spot."""
+    sky = np.full((16, 32, 3), 0.5, np.float32)
+    sky[4, 10] = 500.0
+    return {
+        "smoke": bound(interior=fog(), center=(0, 0.2, 0), scale=(0.6, 0.6, 0.6)),
+        "floor": ground(), "sheet": box((0.9, -0.6, 0), (0.02, 0.4, 0.4), diffuse(0.8, 0.2, 0.2)),
+        "emitter": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
+    }  # fmt: skip
+
+
+def within() -> dict:
+    """Return a ground that cuts the medium, and a black and a coloured object in it."""
+    return {
+        "smoke": bound(interior=fog((1.5, 1.5, 1.5))), "floor": ground(-0.5),
+        "ball": ball((0.3, 0, 0), 0.3, bsdf=diffuse(0.9, 0.3, 0.2)),
+        "black": box((-0.4, -0.2, -0.3), (0.1, 0.3, 0.1), diffuse(0, 0, 0)),
+        "spot": {
+            "type": "spot", "to_world": placed((-2, 2, -2), (1, 1, 1), (0, 0, 0)),
+            "intensity": 20.0, "cutoff_angle": 30.0,
+        },
+        "emitter": {"type": "constant", "radiance": 0.3},
+    }  # fmt: skip
+
+
+SCENES = {
+    "room": (room, {"without": 40}),
+    "still life": (still_life, {}),
+    "sun in a map": (sun_in_a_map, {}),
+    "within the medium": (within, {}),
+}
+
+
+@pytest.mark.parametrize(("build", "options"), SCENES.values(), ids=SCENES)
+def test_nodes_do_not_bias_the_image(scenes, build, options):
+    """Blocks of 6 x 6 pixels agree with those of paths that end in media only."""
+    scene = scene_of(scenes, build())
+    with_nodes = np.mean([scenes.image(scene, spp=64, seed=s) for s in (1, 2)], axis=0)
+    assert nodes_of(scene).count > 100
+    rays, surfaces = scene.integrator()._camera_rays, scene.integrator()._camera_rays._surfaces
+    rays._surfaces, rays._emitters, emitters = None, None, rays._emitters
+    without = options.get("without", 16)
+    halves = [
+        np.mean([scenes.image(scene, spp=64, seed=10 + 2 * s + h) for s in range(without // 2)], 0)
+        for h in range(2)
+    ]
+    rays._surfaces, rays._emitters = surfaces, emitters
+    a, b, image = (
+        x.reshape(4, 6, 4, 6, -1).mean(axis=(1, 3))[..., :3] for x in (*halves, with_nodes)
+    )
+    mean = 0.5 * (a + b).mean()
+    noise = np.sqrt(((a - b) ** 2).mean() / 4) / mean
+    error = (image - 0.5 * (a + b)) / mean
+    assert noise < 0.015
+    assert np.abs(error).max() < 0.01 + 6 * noise
+    assert abs(error.mean()) < 0.002 + 3 * noise / np.sqrt(error.size)
+
+
+def test_a_white_scene_is_white(scenes):
+    """Everything that conserves energy under a constant environment has its radiance."""
+    white = diffuse(1, 1, 1)
+    objects = {
+        "cloud": bound(interior=fog(albedo=(1, 1, 1)), center=(0, 0.1, 0), scale=(0.7, 0.7, 0.7)),
+        "floor": ground(-0.9, white), "ball": ball((1.1, -0.5, 0), 0.4, bsdf=white),
+        "box": box((-1.1, -0.6, -0.4), (0.3, 0.3, 0.3), white),
+        "emitter": {"type": "constant", "radiance": 1.0},
+    }  # fmt: skip
+    image = scenes.image(scene_of(scenes, objects, cache_spp=256), spp=32)[..., :3]
+    assert abs(image.mean() - 1) < 0.003
+    blocks = image.reshape(4, 6, 4, 6, 3).mean(axis=(1, 3))
+    assert np.abs(blocks - 1).max() < 0.01
+
+
+def test_a_ground_under_sun_and_sky_has_hardly_any_noise(scenes):
+    objects = {
+        "cloud": bound(interior=fog(), scale=(0.7, 0.7, 0.7)), "floor": ground(),
+        "emitter": {"type": "constant", "radiance": 0.5},
+        "sun": {"type": "directional", "direction": [0.3, -1.0, 0.2], "irradiance": 2.0},
+    }  # fmt: skip
+    scene = scene_of(scenes, objects)
+    a, b = (scenes.image(scene, spp=4, seed=s)[SIZE // 2 :] for s in (1, 2))
+    # The edge of the ground and of the shadow are those of the pixels.
+    assert np.median(np.abs(a - b)) < 2e-3 * a.mean()
+
+
+def test_the_same_seed_gives_the_same_bits(scenes):
+    first = scenes.image(scene_of(scenes, still_life()), spp=4)
+    gc.collect()
+    np.testing.assert_array_equal(scenes.image(scene_of(scenes, still_life()), spp=4), first)
+
+
+def test_nodes_are_reused_by_another_camera(scenes):
+    scene = scene_of(scenes, within())
+    image = scenes.image(scene, spp=2)
+    nodes, count = nodes_of(scene), nodes_of(scene).count
+    np.testing.assert_array_equal(scenes.image(scene, spp=2), image)
+    assert nodes_of(scene) is nodes
+    assert nodes.count == count
+    params = mi.traverse(scene.sensors()[0])
+    matrix = np.array(params["to_world"].matrix).reshape(4, 4)
+    matrix[0, 3] += 0.3
+    params["to_world"] = mi.ScalarTransform4f(matrix)
+    params.update()
+    scenes.image(scene, spp=2)
+    assert nodes_of(scene) is nodes
+    assert count < nodes.count < 1.6 * count
+
+
+def test_nodes_are_kept_while_the_cache_is_refined(scenes):
+    scene = scene_of(scenes, within(), cache_spp=8)
+    scenes.image(scene, spp=2)
+    nodes = nodes_of(scene)
+    scene.integrator().cache_spp = 32
+    refined = scenes.image(scene, spp=2)
+    assert nodes_of(scene) is nodes
+    fresh = scenes.image(scene_of(scenes, within(), cache_spp=32), spp=2)
+    np.testing.assert_allclose(refined, fresh, rtol=2e-3, atol=1e-4)
+
+
+def test_edits_of_a_surface_are_seen(scenes):
+    scene = scene_of(scenes, within())
+    scenes.image(scene, spp=2)
+    params = mi.traverse(scene)
+    key = "ball.bsdf.reflectance.value"
+    params[key] = mi.Color3f(0.1, 0.9, 0.1)
+    params.update()
+    edited = scenes.image(scene, spp=2)
+    objects = within()
+    objects["ball"]["bsdf"] = diffuse(0.1, 0.9, 0.1)
+    np.testing.assert_allclose(
+        edited, scenes.image(scene_of(scenes, objects), spp=2), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_limited_depths_and_unknown_media_are_path_traced(scenes):
+    scene = scene_of(scenes, within(), max_depth=3)
+    scenes.image(scene, spp=1)
+    assert nodes_of(scene) is None
+    glass = ball((-1.5, 0.5, 0), 0.4, bsdf={"type": "dielectric"}, interior=fog((2, 2, 2)))
+    scene = scene_of(scenes, within() | {"jar": glass})
+    scenes.image(scene, spp=1)
+    assert nodes_of(scene) is None
+
+
+def test_another_scene_may_follow_with_volpath(scenes):
+    """Nothing keeps emitters of a scene that is gone: Dr.Jit would call them without shapes."""
+    scenes.image(scene_of(scenes, room()), spp=1)
+    scene = scenes.load(
+        {"type": "volpath"}, None, SIZE, **({"emitter": None, "sun": None} | room())
+    )
+    assert np.isfinite(scenes.image(scene, spp=1)).all()
+
+
+def test_mono(mono, scenes):
+    objects = {"floor": ground(), "smoke": bound(interior=fog()), "emitter": {"type": "constant"}}
+    image = scenes.image(scene_of(scenes, objects), spp=4)
+    assert np.isfinite(image).all()
+    assert 0.2 < image.mean() < 1.1
+
+
+def test_edges_of_lamps_get_more_samples(scenes, monkeypatch):
+    """New samples in the pixels of largest variance reduce noise, and leave the mean as it is."""
+    objects = {
+        "smoke": bound(interior=fog((0.3, 0.3, 0.3)), scale=(0.6, 0.6, 0.6)),
+        "lamp": lamp((0.8, 0.6, 0.5), (0, 0, -3), 0.3, (50, 40, 30)),
+        "floor": ground(), "emitter": {"type": "constant", "radiance": 0.2},
+    }  # fmt: skip
+    scene = scene_of(scenes, objects)
+    refined = np.array([scenes.image(scene, spp=8, seed=s)[..., 0] for s in range(12)])
+    with monkeypatch.context() as patch:
+        patch.setattr(film, "OUTLIER", 1e9)
+        plain = np.array([scenes.image(scene, spp=8, seed=s)[..., 0] for s in range(12)])
+    noise, plain_noise = (np.sqrt(x.var(axis=0, ddof=1).mean()) for x in (refined, plain))
+    assert noise < 0.7 * plain_noise
+    many = scenes.image(scene, spp=1024)[..., 0].mean()
+    assert abs(refined.mean() - many) < 4 * plain_noise / np.sqrt(12 * SIZE**2)

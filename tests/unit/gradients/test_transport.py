@@ -1,0 +1,83 @@
+"""The sweep is its own transpose, and resampling has an exact one."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from experiments.gradients.cases import Case
+from mitsuba_irrcache.gradients.resampling import VoxelQuadrature
+from mitsuba_irrcache.gradients.splatting import GridSplat
+from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.scene.compile import compile_scene
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+def medium_of(case: Case):
+    scene = case.load()
+    (medium,) = compile_scene(scene).visible
+    return scene, medium
+
+
+def test_a_sweep_is_its_own_transpose():
+    """Weighted by the scattering coefficient, for smooth fields."""
+    case = Case(data=20, cache=20)
+    scene, medium = medium_of(case)
+    transport = AdjointTransport(
+        scene, medium, Grid.near_cubic(medium.frame, 20), (0, 1), 64, False
+    )
+    ((level, own),) = transport._levels
+    table = level.tracks.table(*transport.ordinates.scattering().without_incoming())
+    z, y, x = np.mgrid[:20, :20, :20] / 20
+    pair = (1 + np.sin(3 * x + y), 1 + np.cos(2 * z - 4 * y))
+    fields = [mi.Float(np.repeat(f.ravel(), len(own)).tolist()) for f in pair]
+    swept = [level.sweep(field, table)[1] for field in fields]
+    first = level._scattered_sums(fields[0] * swept[1])
+    second = level._scattered_sums(fields[1] * swept[0])
+    np.testing.assert_allclose(first, second, rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        Case(data=8, cache=8),
+        Case(data=16, cache=8),
+        Case(data=7, cache=16, turn=30.0),
+        Case(data=8, cache=8, shape="sphere"),
+    ],
+    ids=["same grid", "finer data", "coarser data, turned", "sphere"],
+)
+def test_resampling_has_an_exact_transpose(case):
+    """Sums of derivatives at voxels times means of a perturbation there are sums over the data."""
+    _, medium = medium_of(case)
+    grid = Grid.near_cubic(medium.frame, case.cache)
+    quadrature, count = VoxelQuadrature(medium, grid), grid.voxel_count
+    worth = [mi.Float(1 + 0.5 * np.sin(np.arange(count) * (c + 1.0))) for c in range(3)]
+    none = [dr.zeros(mi.Float, count)] * 3
+    splat = GridSplat(medium.sigma_t.grid, 1, 100.0)
+    found = Derivatives(worth, none, none, [])
+    quadrature.add(splat, None, found, [mi.Float(0)] * 3)
+    data = np.array(medium.sigma_t.data, dtype=np.float64) * medium.sigma_t.scale[0]
+    means = np.array(quadrature.extinction(), dtype=np.float64)
+    if quadrature.points < 4:  # `extinction` has more points: a grid of so many is needed
+        means = means_at(quadrature, medium, grid)
+    volume = abs(np.linalg.det(grid.to_world[:3, :3])) / count
+    expected = (np.array(worth, dtype=np.float64) * means).sum() * volume
+    assert np.array(splat.values(), dtype=np.float64) @ data == pytest.approx(expected, rel=1e-5)
+
+
+def means_at(quadrature: VoxelQuadrature, medium, grid: Grid) -> np.ndarray:
+    """Means of the extinction over the points of ``quadrature``."""
+    n, corner = (
+        quadrature.points,
+        mi.Point3f(*grid.voxel_indices(dr.arange(mi.UInt32, grid.voxel_count))),
+    )
+    total = np.zeros(grid.voxel_count)
+    for z, y, x in np.ndindex(n, n, n):
+        p = grid.world.point(corner + mi.Point3f((x + 0.5) / n, (y + 0.5) / n, (z + 0.5) / n))
+        total += np.array(medium.sigma_t.at_world(p), dtype=np.float64)
+    return np.repeat(total[None] / n**3, 3, axis=0)
