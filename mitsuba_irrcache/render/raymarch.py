@@ -86,7 +86,8 @@ class Projection:
         length = min((g.voxel_size.min() for g in grids), default=dr.inf) * step
         self.step = dr.opaque(mi.Float, float(length))
         #: shortest edge of a voxel of the cache or, without one, of the medium
-        cell = irradiance.grid.voxel_size.min() if irradiance else medium.shortest_edge
+        on_grid = irradiance is not None and irradiance.grid is not None
+        cell = irradiance.grid.voxel_size.min() if on_grid else medium.shortest_edge
         self.cell = dr.opaque(mi.Float, float(cell))
         max_radiance = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         if directional is not None:
