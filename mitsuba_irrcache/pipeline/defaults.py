@@ -111,7 +111,9 @@ def needs_no_cache(
     if resolution or max_depth > half_space.MOST_ORDERS:
         return None
     error = half_space.series_error(medium)
-    if not np.isfinite(error) or not half_space.is_seen_from_outside(scene, medium):
+    if not np.isfinite(error) or not half_space.supports_emitters(scene):
+        return None
+    if not half_space.is_seen_from_outside(scene, medium):
         return None
     error *= max_depth != 2  # single scattering is exact
     grid, _ = choose_grid(medium, 0, registered()[0].size_rule)

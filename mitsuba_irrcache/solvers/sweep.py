@@ -8,7 +8,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.grids.occupancy import active_voxels
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
@@ -18,7 +18,15 @@ from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.grid_size import TARGET_ERROR, SizeRule, choose_grid
 
 #: Kinds of emitters whose radiance can enter along tracks or be sampled from the voxels.
-EMITTERS = frozenset(EmitterKind) - {EmitterKind.DIRECTIONAL_AREA, EmitterKind.UNKNOWN}
+EMITTERS = frozenset(
+    (
+        EmitterKind.CONSTANT_ENVIRONMENT,
+        EmitterKind.ENVIRONMENT_MAP,
+        EmitterKind.SUN,
+        *POINT_LIKE,
+        EmitterKind.AREA,
+    )
+)
 #: Directions per voxel by default: for all orders of scattering, and among surfaces, where images
 #: have the noise of their samples besides. Twice
 #: as many for single scattering of irradiance, where each is less work and blurs less.
@@ -47,8 +55,8 @@ class SweepSolver(Solver):
             if kind_of(emitter) not in EMITTERS:
                 kind = f'"{emitter.id()}" ({emitter.class_name()})'
                 return (
-                    f"emitter {kind} is neither far away nor a point nor an area that emits in all "
-                    "directions"
+                    f"emitter {kind} is neither far away (with an even beam) nor a point nor an "
+                    "area that emits in all directions"
                 )
         if medium.is_isolated:
             return None
