@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.grids.occupancy import active_voxels
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import active_voxels, occupied_box
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
@@ -41,6 +42,7 @@ class SweepSolver(Solver):
     """Solves for all voxels at once, in media that no surface and no other medium reaches into."""
 
     name = "sweep"
+    precedence = 10
     size_rule = SizeRule(TARGET_ERROR, fewest=32, most_by_contrast=64, most_by_border=128)
     is_correlated = True
     is_kept = True
@@ -71,7 +73,7 @@ class SweepSolver(Solver):
         active = active_voxels(medium, grid)
         if not dr.width(active):
             return None
-        box = sn_solver.occupied_box(grid, active)
+        box = occupied_box(grid, active)
         for other in medium.others:
             if boxes_meet(grid, *box, corners_of(other.frame)):
                 return f'medium "{other.name}" reaches into {name}'
@@ -114,6 +116,12 @@ class SweepSolver(Solver):
         numbers = 5 + 2 * channels + (0 if once else 5 + 12 * sets + 3 * channels)
         # Moments of one channel are solved for at a time.
         return numbers + moments * (3 * channels + (4 if once else 10))
+
+    @classmethod
+    def knows_direct_lights(
+        cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
+    ) -> bool:
+        return True
 
     def __init__(self, task: SolverTask) -> None:
         kind = Sweep if task.cache.directional is None else AnisotropicSweep

@@ -21,9 +21,10 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
-from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers.base import Progress
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merged
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emission_irradiance
@@ -58,9 +59,6 @@ TOGETHER = 1 << 24
 #: Relative change of the irradiance below which further orders of scattering are omitted, as single
 #: precision has it; tested every so many orders.
 NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
-
-#: called with (samples done, samples in all), both in voxels times ordinates
-Progress = Callable[[int, int], None]
 
 
 def swept_together(medium: MediumGrid, voxels: int) -> bool:
@@ -442,10 +440,3 @@ def is_grey(spectra: Sequence[mi.Spectrum]) -> bool:
     same = [dr.all(c == spectrum[0]) for spectrum in spectra for c in list(spectrum)[1:]]
     dr.eval(same)
     return all(s[0] for s in same)
-
-
-def occupied_box(grid: Grid, active: mi.UInt32) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest box of voxels (x, y, z; lower end, upper end) around all ``active`` ones."""
-    ends = [(dr.min(p), dr.max(p)) for p in grid.voxel_indices(active)]
-    dr.eval(ends)
-    return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])
