@@ -28,9 +28,9 @@ EMITTERS = frozenset(
         EmitterKind.AREA,
     )
 )
-#: Directions per voxel by default: for all orders of scattering, and among surfaces, where images
-#: have the noise of their samples besides. Twice
-#: as many for single scattering of irradiance, where each is less work and blurs less.
+#: Directions per voxel by default: for all orders of scattering, and among surfaces, where camera
+#: paths add noise of their own. Twice as many for single scattering of irradiance, where each is
+#: less work and blurs less.
 SWEPT, SWEPT_AMONG_SURFACES = 128, 64
 #: The same among surfaces where the phase function has a forward peak: 128 leave an error of 1.5 %
 #: under a sky with a wide sun, these 0.9 %.

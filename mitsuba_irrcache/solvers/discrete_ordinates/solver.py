@@ -1,9 +1,13 @@
 """The solver ``sweep``: discrete ordinates along long characteristics, all voxels at once.
 
 A batch consists of passes; a pass is a transport sweep of one ordinate set along tracks through all
-voxels (`tracks`). The first pass of a batch solves for all orders of scattering but the last by
-source iteration with multigrid and Anderson acceleration (`multigrid`); every other pass then
-sweeps the resulting source along ordinates of its own, so that their mean has little angular noise.
+voxels (`tracks`). For all orders of scattering (``max_depth`` -1) the first pass of a batch solves
+by source iteration with multigrid and Anderson acceleration (`multigrid`); every other pass then
+sweeps the resulting source along ordinates of its own, so that their mean has little angular noise,
+and improves the source for the passes that follow. For a number of orders the first pass sweeps
+once for each but the last, and the others sweep the source that it leaves. For single scattering
+(``max_depth`` 2) there is one pass.
+
 Emission of the medium and small or point-like emitters are sampled voxel by voxel
 (`direct_emission`, `direct_light`).
 
