@@ -48,11 +48,12 @@ def defined(path: Path) -> set[str]:
             names |= {found.id for found in ast.walk(node) if isinstance(found, ast.Name)}
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             names.add(node.name)
-            names |= {
-                f"{node.name}.{own.name}"
-                for own in getattr(node, "body", [])
-                if isinstance(node, ast.ClassDef) and isinstance(own, ast.FunctionDef)
-            }
+        if isinstance(node, ast.ClassDef):
+            for own in node.body:
+                if isinstance(own, ast.FunctionDef):
+                    names.add(f"{node.name}.{own.name}")
+                if isinstance(own, ast.AnnAssign) and isinstance(own.target, ast.Name):
+                    names.add(f"{node.name}.{own.target.id}")
     return names
 
 
