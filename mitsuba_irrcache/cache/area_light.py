@@ -78,10 +78,10 @@ class AreaLight(DirectLight):
 
     def _direction(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
         """Return the direction to the closest point of the emitter and its distance."""
-        way = self._solid_angle.closest(p) - p
-        distance = dr.norm(way)
+        offset = self._solid_angle.closest(p) - p
+        distance = dr.norm(offset)
         upwards = mi.Vector3f(0, 0, 1)
-        return dr.select(distance > 0, way / distance, upwards), distance
+        return dr.select(distance > 0, offset / distance, upwards), distance
 
     def _attenuation(
         self, scene: mi.Scene, p: mi.Point3f, line: tuple

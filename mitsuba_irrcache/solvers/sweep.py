@@ -31,10 +31,10 @@ EMITTERS = frozenset(
 #: Directions per voxel by default: for all orders of scattering, and among surfaces, where camera
 #: paths add noise of their own. Twice as many for single scattering of irradiance, where each is
 #: less work and blurs less.
-SWEPT, SWEPT_AMONG_SURFACES = 128, 64
+DIRECTIONS, DIRECTIONS_AMONG_SURFACES = 128, 64
 #: The same among surfaces where the phase function has a forward peak: 128 leave an error of 1.5 %
 #: under a sky with a wide sun, these 0.9 %.
-SWEPT_SHARP = 256
+DIRECTIONS_OF_SHARP_SCATTERING = 256
 
 
 @register
@@ -94,9 +94,10 @@ class SweepSolver(Solver):
     @classmethod
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
         if medium.phase.forward and not medium.is_isolated:
-            return SWEPT_SHARP
+            return DIRECTIONS_OF_SHARP_SCATTERING
         once = max_depth == 2 and medium.phase.is_isotropic
-        return (SWEPT if medium.is_isolated else SWEPT_AMONG_SURFACES) * (2 if once else 1)
+        count = DIRECTIONS if medium.is_isolated else DIRECTIONS_AMONG_SURFACES
+        return 2 * count if once else count
 
     @classmethod
     def batch_size(

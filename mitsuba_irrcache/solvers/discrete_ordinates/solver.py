@@ -59,7 +59,7 @@ BATCH, LARGEST_BATCH = 32, 256
 DIRECTIONS = 16
 #: Voxels of a cache beyond which channels are swept one by one: together they take several times
 #: the memory.
-TOGETHER = 1 << 24
+MOST_VOXELS_SWEPT_TOGETHER = 1 << 24
 #: Relative change of the irradiance below which further orders of scattering are omitted, as single
 #: precision has it; tested every so many orders.
 NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
@@ -68,7 +68,7 @@ NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
 def swept_together(medium: MediumGrid, voxels: int) -> bool:
     """Whether all channels of a cache of so many ``voxels`` are swept at once."""
     isotropic = medium.phase.is_isotropic
-    return isotropic and medium.sigma_t.channels == 1 and voxels <= TOGETHER
+    return isotropic and medium.sigma_t.channels == 1 and voxels <= MOST_VOXELS_SWEPT_TOGETHER
 
 
 def batch_of(samples: int, multiple: int) -> int:
@@ -347,7 +347,7 @@ class Sweep:
         the first; channels are interleaved.
         """
         first, *sets = sets
-        phi, total = self._collided(level, first, channels, len(sets)), mi.Float(0)
+        phi, total = self._irradiance_of_collisions(level, first, channels, len(sets)), mi.Float(0)
         used, share = mi.Float(0), dr.opaque(mi.Float, 1 / len(sets))
         for known, each in enumerate(sets, 1):
             irradiance, again = each.sweep(level, phi)
@@ -366,7 +366,7 @@ class Sweep:
         change = level.propagated_change(phi - used * share, ordinates, len(sets))
         return dr.fma(total, share, change)
 
-    def _collided(
+    def _irradiance_of_collisions(
         self,
         level: MultigridLevel,
         first: OrdinateSet | BoundaryOrdinateSet,
