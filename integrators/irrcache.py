@@ -63,7 +63,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - How the cache is computed: ``sweep`` (discrete ordinates along long characteristics that
          all voxels share), ``path`` (Monte Carlo path tracing from every voxel), or ``auto``:
          ``sweep`` unless surfaces or other media are among the voxels. The log states the choice
-         and its reason. (Default: ``auto``)
+         and its reason. Whatever the solver, an opaque homogeneous medium without a ``resolution``
+         has no cache but is treated as a half-space. (Default: ``auto``)
 
      * - resolution
        - |int|
@@ -79,7 +80,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
      * - cache_spp
        - |int|
        - Samples (``path``) or directions (``sweep``) per cache voxel, rounded up to whole batches
-         of 8 samples or 32 to 256 directions;
+         of 8 samples or 32 to 256 directions. These are directions of scattering: the pass that
+         solves, suns, samples of an environment and entry from surfaces come on top;
          0: 128 directions, 64 with surfaces (256 for sharp phase functions), twice as many for
          single scattering with an isotropic phase function; 16 to 256 samples, about 2^24 for
          all voxels, 2^22 with surfaces.
@@ -161,10 +163,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     Phase functions may be ``isotropic``, ``hg`` with |g| up to 0.58, ``rayleigh``, or others that
     depend only on the scattering angle and are as broad. For anisotropic phase functions, the cache
-    also stores spherical harmonics of the radiance up to degree 4 and, separately, the irradiance
-    from suns, point lights and lamps, whose direction is known. With the solver ``sweep``, ``hg``
-    may have g up to 0.85 if ``max_depth`` is -1. Scattering into such a sharp forward peak is then
-    treated as unscattered (delta-M), also in ``transmittance`` and alpha.
+    also stores spherical harmonics of the radiance up to degree 4, or 6 with delta-M (below), and,
+    separately, the irradiance from suns, point lights and lamps, whose direction is known. With the
+    solver ``sweep``, ``hg`` may have g up to 0.85 if ``max_depth`` is -1. Scattering into such a
+    sharp forward peak is then treated as unscattered (delta-M), also in ``transmittance`` and
+    alpha.
 
     Gradients (``dr.backward``) are computed by ``sigma_t`` and ``albedo`` of a medium and by the
     radiance of emitters, by solving the adjoint transport equation: for one isotropic medium in a

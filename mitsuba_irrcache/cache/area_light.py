@@ -98,9 +98,9 @@ class AreaLight(DirectLight):
         """
         if not self._follows_closest_line:
             return dr.full(mi.Float, 1, dr.width(p))
-        way = self._solid_angle.closest(p) - p
-        distance = dr.norm(way)
-        direction = dr.select(distance > 0, way / distance, mi.Vector3f(0, 0, 1))
+        offset = self._solid_angle.closest(p) - p
+        distance = dr.norm(offset)
+        direction = dr.select(distance > 0, offset / distance, mi.Vector3f(0, 0, 1))
         hit, near, far = self._medium.intersect(mi.Ray3f(p, direction))
         near, far = dr.maximum(near, 0), dr.minimum(far, distance)
         return dr.maximum(dr.select(hit, far - near, 0), 0)

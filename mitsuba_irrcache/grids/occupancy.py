@@ -42,6 +42,13 @@ def active_voxels(medium, grid: Grid) -> mi.UInt32:
     return marked
 
 
+def occupied_box(grid: Grid, active: mi.UInt32) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest box of voxels (x, y, z; lower end, upper end) around all ``active`` ones."""
+    ends = [(dr.min(p), dr.max(p)) for p in grid.voxel_indices(active)]
+    dr.eval(ends)
+    return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])
+
+
 def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], list[mi.Int32]]:
     """First and last voxel along x, y, z whose trilinear support overlaps each macrocell."""
     nz, ny, nx = cells.shape

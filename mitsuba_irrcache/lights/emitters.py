@@ -18,14 +18,16 @@ ORTHONORMAL_TOLERANCE = 2e-3
 class EmitterKind(Enum):
     """Kind of an emitter, by its extent and its directional distribution.
 
-    A new kind is added here and in `kind_of`; each solver states which kinds it supports.
+    A new kind is added here and in `kind_of`. It is refused by `sweep` until it is in its
+    ``EMITTERS`` and in `DistantIllumination`, and media under it are not treated as half-spaces
+    until it is in ``half_space.EMITTERS``; ``path`` samples all kinds by Mitsuba's interface.
     """
 
     #: infinitely far away, with the same radiance from all directions
     CONSTANT_ENVIRONMENT = "constant environment"
     #: infinitely far away, with a radiance that depends on the direction
     ENVIRONMENT_MAP = "environment map"
-    #: infinitely far away, from a single direction
+    #: infinitely far away, from a single direction, with the same irradiance across the beam
     SUN = "sun"
     #: at a position, with the same intensity in all directions
     POINT = "point"
@@ -70,7 +72,7 @@ def kind_of(emitter: mi.Emitter) -> EmitterKind:
             return EmitterKind.UNKNOWN
         return EmitterKind.AREA
     if mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
-        return EmitterKind.SUN
+        return EmitterKind.UNKNOWN if varies_in_space(emitter) else EmitterKind.SUN
     if mi.has_flag(flags, mi.EmitterFlags.DeltaPosition):
         kinds = {"PointLight": EmitterKind.POINT, "SpotLight": EmitterKind.SPOT}
         return kinds.get(name, EmitterKind.PROJECTOR)
@@ -78,6 +80,11 @@ def kind_of(emitter: mi.Emitter) -> EmitterKind:
         is_constant = name == "ConstantBackgroundEmitter"
         return EmitterKind.CONSTANT_ENVIRONMENT if is_constant else EmitterKind.ENVIRONMENT_MAP
     return EmitterKind.UNKNOWN
+
+
+def varies_in_space(emitter: mi.Emitter) -> bool:
+    """Whether the radiance of a surface, or the irradiance of a beam, depends on the position."""
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
 class EmittersByKind(Immutable):
@@ -159,11 +166,6 @@ def point_lights(scene: mi.Scene) -> list[mi.Emitter]:
 def spot_lights(scene: mi.Scene) -> list[mi.Emitter]:
     """Return the point-like emitters of a scene whose intensity depends on the direction."""
     return EmittersByKind(scene.emitters()).of(*SPOT_LIKE)
-
-
-def varies(emitter: mi.Emitter) -> bool:
-    """Whether the radiance of an emitter depends on the position on its surface."""
-    return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
 def position_of(emitter: mi.Emitter) -> np.ndarray:

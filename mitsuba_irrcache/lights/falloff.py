@@ -56,9 +56,9 @@ class VoxelSamplePoints:
         """Return the world positions for the voxels of these flat indices."""
         p = self.grid.centers(voxel)
         for lamp in self._lamps:
-            way = p - lamp
-            distance = dr.norm(way)
-            away = dr.select(distance > 0, way / distance, mi.Vector3f(0, 0, 1))
+            offset = p - lamp
+            distance = dr.norm(offset)
+            away = dr.select(distance > 0, offset / distance, mi.Vector3f(0, 0, 1))
             p = dr.select(
                 distance < self._minimum_distance, lamp + self._minimum_distance * away, p
             )
@@ -126,9 +126,9 @@ class InverseSquareFactor:
         """Precompute the arguments of `means` for a ray."""
         found = []
         for position, strength, squared in self._points:
-            way = position - ray.o
-            nearest = dr.dot(way, ray.d)
-            distance = dr.sqrt(dr.squared_norm(way - nearest * ray.d) + squared)
+            offset = position - ray.o
+            nearest = dr.dot(offset, ray.d)
+            distance = dr.sqrt(dr.squared_norm(offset - nearest * ray.d) + squared)
             found.append((nearest, distance, strength))
         return found
 
@@ -161,8 +161,8 @@ class InverseSquareFactor:
         corner = mi.Point3f(*grid.voxel_indices(voxel))
         near = mi.Bool(False)
         for position, _, _ in self._points:
-            way = grid.coordinates.point(position) - corner - 0.5
-            near |= dr.max(dr.abs(mi.Vector3f(way))) < CLOSE
+            offset = grid.coordinates.point(position) - corner - 0.5
+            near |= dr.max(dr.abs(mi.Vector3f(offset))) < CLOSE
         points = dr.select(near, mi.UInt32(FINEST), 2)
         count = points * points * points
         # The mean of 1/r^2 over a cube of edge d at a distance r >> d from an emitter is

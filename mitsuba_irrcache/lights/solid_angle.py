@@ -15,7 +15,7 @@ import numpy as np
 
 from mitsuba_irrcache.grids.boundary import Boundary, box_frame, sphere_frame
 from mitsuba_irrcache.grids.grid import Affine
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, varies
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, varies_in_space
 
 #: Number of sides of the regular polygon of the same area that represents a disk.
 DISK_SIDES = 16
@@ -56,7 +56,7 @@ class SolidAngle:
     def of(cls, emitter: mi.Emitter) -> SolidAngle | None:
         """Return the solid angle of an emitter; None if its shape or radiance is not supported."""
         shape = emitter.get_shape()
-        if kind_of(emitter) is not EmitterKind.AREA or shape is None or varies(emitter):
+        if kind_of(emitter) is not EmitterKind.AREA or shape is None or varies_in_space(emitter):
             return None
         found = _shape_frame(shape)
         if found is None:

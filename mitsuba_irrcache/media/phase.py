@@ -185,11 +185,17 @@ def _check(plugin: mi.PhaseFunction, boundary: Boundary, name: str) -> None:
         )
 
 
+def _rounded_down(limit: float) -> float:
+    """Return a limit with two digits that is within it."""
+    return int(100 * limit) / 100
+
+
 def refuse_sharp(phase: Phase, name: str) -> None:
     """Raise UnsupportedSceneError, with the limits, if ``phase`` is too sharp for a cache."""
     if phase.order is not None:
         return
-    limit, most = MAX_TAIL ** (1 / (MAX_ORDER + 1)), LARGEST_PEAK ** (1 / (MAX_TRUNCATED_ORDER + 1))
+    limit = _rounded_down(MAX_TAIL ** (1 / (MAX_ORDER + 1)))
+    most = _rounded_down(LARGEST_PEAK ** (1 / (MAX_TRUNCATED_ORDER + 1)))
     raise UnsupportedSceneError(
         f"irrcache: {name} has the phase function {phase.plugin.class_name()} with the mean cosine "
         f"{phase.moments[1]:.2f}, too sharp for a cache: its largest Legendre moment beyond order "

@@ -18,6 +18,7 @@ from mitsuba_irrcache.solvers.grid_size import (
     TARGET_ERROR,
     choose_grid,
 )
+from mitsuba_irrcache.solvers.sweep import SweepSolver
 
 #: Ratio of the largest to the smallest channel of the extinction above which ``volpathmis`` needs
 #: less time than ``volpath`` for the same error. Measured on a glass ball filled with fog: 1.4
@@ -53,7 +54,7 @@ def choose_solver(
 ) -> tuple[type[Solver], str]:
     """Choose the solver for a ``medium`` of a scene; also return the reason.
 
-    ``solver`` is a name, or ``auto`` for the first registered solver that supports the scene.
+    ``solver`` is a name, or ``auto`` for the first, by `Solver.precedence`, that supports it.
     Raises IrrcacheError if the named solver, or none at all, supports it.
     """
     candidates = registered() if solver == "auto" else (solver_named(solver),)
@@ -111,10 +112,12 @@ def needs_no_cache(
     if resolution or max_depth > half_space.MOST_ORDERS:
         return None
     error = half_space.series_error(medium)
-    if not np.isfinite(error) or not half_space.is_seen_from_outside(scene, medium):
+    if not np.isfinite(error) or not half_space.supports_emitters(scene):
+        return None
+    if not half_space.is_seen_from_outside(scene, medium):
         return None
     error *= max_depth != 2  # single scattering is exact
-    grid, _ = choose_grid(medium, 0, registered()[0].size_rule)
+    grid, _ = choose_grid(medium, 0, SweepSolver.size_rule)
     depth = medium.sigma_t.maximum * grid.voxel_size.max()
     cached = BORDER_ERROR * depth**BORDER_ORDER
     if cached <= max(error, 1.2 * TARGET_ERROR):

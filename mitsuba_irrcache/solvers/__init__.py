@@ -1,5 +1,5 @@
 """Solvers, each of which fills caches. Importing a module registers its solver; ``auto`` tries them
-in this order.
+by their ``precedence``.
 """
 
 from mitsuba_irrcache.solvers import sweep

@@ -24,7 +24,8 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.grid_size import SizeRule
 from mitsuba_irrcache.transport.path import Media
 
-#: called with (samples done, samples in all), both in voxels times samples
+#: called with (samples done, samples in all), both in voxels times samples, which are directions in
+#: ``sweep``
 Progress = Callable[[int, int], None]
 
 
@@ -74,6 +75,9 @@ class Solver(ABC):
 
     #: value of the integrator's property ``solver``
     name: ClassVar[str]
+    #: place among the candidates of ``auto``, which tries low numbers first: by default after
+    #: ``sweep`` and before ``path``, which supports all scenes
+    precedence: ClassVar[int] = 50
     #: voxels of a cache with ``resolution`` 0
     size_rule: ClassVar[SizeRule]
     #: whether all voxels share their samples, and so their errors
@@ -128,8 +132,12 @@ class Solver(ABC):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        """Whether it takes the irradiance of some emitters from `DirectLight` and `AreaLight`."""
-        return True
+        """Whether the uncollided layer holds, for each of ``cache.direct_lights``, exactly its
+        ``irradiance``, which lookups subtract.
+
+        Otherwise the cache gets no direct lights.
+        """
+        return False
 
     @abstractmethod
     def __init__(self, task: SolverTask) -> None: ...
@@ -151,7 +159,7 @@ _REGISTRY: dict[str, type[Solver]] = {}
 
 
 def register(solver: type[Solver]) -> type[Solver]:
-    """Register a solver by its name; ``auto`` prefers solvers registered earlier."""
+    """Register a solver by its name."""
     if solver.name in _REGISTRY or solver.name == "auto":
         raise ValueError(f'there is a solver "{solver.name}" already')
     _REGISTRY[solver.name] = solver
@@ -160,12 +168,13 @@ def register(solver: type[Solver]) -> type[Solver]:
 
 def registered() -> tuple[type[Solver], ...]:
     """Return all solvers in the order in which ``auto`` tries them."""
-    return tuple(_REGISTRY.values())
+    return tuple(sorted(_REGISTRY.values(), key=lambda solver: solver.precedence))
 
 
 def solver_named(name: str) -> type[Solver]:
     """Return the solver of this name; raise IrrcacheError if there is none."""
     if name not in _REGISTRY:
-        names = ", ".join(f'"{known}"' for known in ("auto", *_REGISTRY))
+        known = ("auto", *(solver.name for solver in registered()))
+        names = ", ".join(f'"{each}"' for each in known)
         raise IrrcacheError(f'irrcache: there is no solver "{name}"; set solver to one of {names}.')
     return _REGISTRY[name]

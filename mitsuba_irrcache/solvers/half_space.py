@@ -30,12 +30,27 @@ import numpy as np
 
 from mitsuba_irrcache.core.fast_math import clipped
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.lights.emitters import point_lights, position_of
+from mitsuba_irrcache.lights.emitters import (
+    POINT_LIKE,
+    EmitterKind,
+    kind_of,
+    point_lights,
+    position_of,
+)
 from mitsuba_irrcache.media.medium import MediumGrid
 
 #: Error of the image [%] due to the half-space approximation, times the radius of a sphere, or the
 #: shortest edge of a box, in mean free paths.
 SPHERE_ERROR, BOX_ERROR = 25.0, 300.0
+#: Supported kinds of emitters: their irradiance is about uniform over a mean free path.
+EMITTERS = frozenset(
+    (
+        EmitterKind.CONSTANT_ENVIRONMENT,
+        EmitterKind.ENVIRONMENT_MAP,
+        EmitterKind.SUN,
+        *POINT_LIKE,
+    )
+)
 #: Number of direction samples of an environment, and of collision samples for each other emitter,
 #: per camera sample.
 ENVIRONMENT_SAMPLES, EMITTER_SAMPLES = 64, 8
@@ -74,6 +89,11 @@ def is_seen_from_outside(scene: mi.Scene, medium: MediumGrid) -> bool:
     return not any(inside) and all(s.get_medium() is None for s in scene.sensors())
 
 
+def supports_emitters(scene: mi.Scene) -> bool:
+    """Whether all emitters of the scene are of the kinds ``EMITTERS``."""
+    return all(kind_of(emitter) in EMITTERS for emitter in scene.emitters())
+
+
 class HalfSpace:
     """Scattered radiance of an opaque homogeneous ``medium`` seen from outside.
 
@@ -86,7 +106,7 @@ class HalfSpace:
     def __init__(self, scene: mi.Scene, medium: MediumGrid, max_depth: int) -> None:
         self.medium = medium
         self._environment = scene.environment()
-        self._others = [e for e in scene.emitters() if not e.is_environment()]
+        self._others = [e for e in scene.emitters() if not kind_of(e).is_environment]
         albedo = np.broadcast_to(_channels(medium.albedo.value), (dr.size_v(mi.Spectrum),))
         self._albedo = mi.Spectrum([dr.opaque(mi.Float, float(a)) for a in albedo])
         orders = max_depth - 1 if max_depth >= 0 else 0

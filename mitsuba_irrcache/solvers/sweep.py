@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.grids.occupancy import active_voxels
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import active_voxels, occupied_box
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
@@ -18,14 +19,22 @@ from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.grid_size import TARGET_ERROR, SizeRule, choose_grid
 
 #: Kinds of emitters whose radiance can enter along tracks or be sampled from the voxels.
-EMITTERS = frozenset(EmitterKind) - {EmitterKind.DIRECTIONAL_AREA, EmitterKind.UNKNOWN}
-#: Directions per voxel by default: for all orders of scattering, and among surfaces, where images
-#: have the noise of their samples besides. Twice
-#: as many for single scattering of irradiance, where each is less work and blurs less.
-SWEPT, SWEPT_AMONG_SURFACES = 128, 64
+EMITTERS = frozenset(
+    (
+        EmitterKind.CONSTANT_ENVIRONMENT,
+        EmitterKind.ENVIRONMENT_MAP,
+        EmitterKind.SUN,
+        *POINT_LIKE,
+        EmitterKind.AREA,
+    )
+)
+#: Directions per voxel by default: for all orders of scattering, and among surfaces, where camera
+#: paths add noise of their own. Twice as many for single scattering of irradiance, where each is
+#: less work and blurs less.
+DIRECTIONS, DIRECTIONS_AMONG_SURFACES = 128, 64
 #: The same among surfaces where the phase function has a forward peak: 128 leave an error of 1.5 %
 #: under a sky with a wide sun, these 0.9 %.
-SWEPT_SHARP = 256
+DIRECTIONS_OF_SHARP_SCATTERING = 256
 
 
 @register
@@ -33,6 +42,7 @@ class SweepSolver(Solver):
     """Solves for all voxels at once, in media that no surface and no other medium reaches into."""
 
     name = "sweep"
+    precedence = 10
     size_rule = SizeRule(TARGET_ERROR, fewest=32, most_by_contrast=64, most_by_border=128)
     is_correlated = True
     is_kept = True
@@ -47,8 +57,8 @@ class SweepSolver(Solver):
             if kind_of(emitter) not in EMITTERS:
                 kind = f'"{emitter.id()}" ({emitter.class_name()})'
                 return (
-                    f"emitter {kind} is neither far away nor a point nor an area that emits in all "
-                    "directions"
+                    f"emitter {kind} is neither far away (with an even beam) nor a point nor an "
+                    "area that emits in all directions"
                 )
         if medium.is_isolated:
             return None
@@ -63,7 +73,7 @@ class SweepSolver(Solver):
         active = active_voxels(medium, grid)
         if not dr.width(active):
             return None
-        box = sn_solver.occupied_box(grid, active)
+        box = occupied_box(grid, active)
         for other in medium.others:
             if boxes_meet(grid, *box, corners_of(other.frame)):
                 return f'medium "{other.name}" reaches into {name}'
@@ -84,9 +94,10 @@ class SweepSolver(Solver):
     @classmethod
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
         if medium.phase.forward and not medium.is_isolated:
-            return SWEPT_SHARP
+            return DIRECTIONS_OF_SHARP_SCATTERING
         once = max_depth == 2 and medium.phase.is_isotropic
-        return (SWEPT if medium.is_isolated else SWEPT_AMONG_SURFACES) * (2 if once else 1)
+        count = DIRECTIONS if medium.is_isolated else DIRECTIONS_AMONG_SURFACES
+        return 2 * count if once else count
 
     @classmethod
     def batch_size(
@@ -106,6 +117,12 @@ class SweepSolver(Solver):
         numbers = 5 + 2 * channels + (0 if once else 5 + 12 * sets + 3 * channels)
         # Moments of one channel are solved for at a time.
         return numbers + moments * (3 * channels + (4 if once else 10))
+
+    @classmethod
+    def knows_direct_lights(
+        cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
+    ) -> bool:
+        return True
 
     def __init__(self, task: SolverTask) -> None:
         kind = Sweep if task.cache.directional is None else AnisotropicSweep

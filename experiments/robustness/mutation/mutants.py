@@ -335,7 +335,7 @@ MUTANTS = (
         ("tests/unit/cache/test_conservative.py",),
     ),
     Mutant(
-        "directions of passes not even together",
+        "directions are not rotated",
         "solvers/discrete_ordinates/angular_quadrature.py",
         "points = points @ _rotation(rng).T",
         "points = points",

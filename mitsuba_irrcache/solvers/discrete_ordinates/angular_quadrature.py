@@ -4,6 +4,7 @@ Ordinates come in pairs of opposite directions. A set is a Fibonacci spiral on a
 at random, so that every ordinate alone is uniformly distributed. Weights are the nearest to equal
 ones that integrate all polynomials of degree 2 in the direction exactly, and, with the opposite
 ordinates, of degree 3: inside dense matter radiance has no higher terms, whatever the rotation.
+(If one of them would be below a quarter of the mean, as in some sets of few pairs, all are equal.)
 
 The sets of several passes are parts of one larger spiral. Each is even, and so is their union:
 independent rotations would leave three times the noise.

@@ -25,7 +25,7 @@ from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 #: Mean solid angle [sr] of an emitter, seen from the voxels, above which it is left to the tracks.
-LARGE = 2.0
+LARGE_SOLID_ANGLE = 2.0
 #: Number of pairs of a point in the voxels' box and one on the emitter for this estimate.
 POINTS = 1024
 #: Number of points on all area emitters sampled from each voxel in a batch, and the maximum number
@@ -49,7 +49,7 @@ def split_by_solid_angle(
     for emitter in scene.emitters():
         if is_area_emitter(emitter):
             angle = _solid_angle(emitter, grid, lower, upper)
-            (small if angle < LARGE else large).append(emitter)
+            (small if angle < LARGE_SOLID_ANGLE else large).append(emitter)
     return small, large
 
 
@@ -59,9 +59,9 @@ def _solid_angle(emitter: mi.Emitter, grid: Grid, lower: np.ndarray, upper: np.n
     u = np.float32(rng.random((5, POINTS)))
     found = emitter.get_shape().sample_position(0.0, mi.Point2f(u[:2]))
     box = np.float32(lower[:, None] + u[2:] * (upper - lower)[:, None])
-    way = found.p - grid.world.point(mi.Point3f(box))
-    distance = dr.norm(way)
-    cosine = dr.abs(dr.dot(way, found.n)) / distance
+    offset = found.p - grid.world.point(mi.Point3f(box))
+    distance = dr.norm(offset)
+    cosine = dr.abs(dr.dot(offset, found.n)) / distance
     angle = cosine / (dr.square(distance) * found.pdf)
     return float(dr.mean(dr.minimum(angle, 2 * dr.pi))[0])
 

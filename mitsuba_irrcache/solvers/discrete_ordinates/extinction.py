@@ -1,5 +1,5 @@
-"""The extinction as tracks read it: quantised to 16 bits, with the neighbours of each value beside
-it, so that one memory access suffices for bilinear interpolation.
+"""The extinction as tracks read it: dithered to 16 bits, in the same way for all batches, with the
+neighbours of each value beside it, so that one memory access suffices for bilinear interpolation.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
 )
 
 #: Largest optical depth of a voxel that the quantised extinction distinguishes; values beyond are
-#: clamped. Between 0 and the largest value they are rounded up or down at random.
+#: clamped. Between 0 and the largest value they are rounded up or down (`_dithered`).
 MAX_OPTICAL_DEPTH = 16.0
 LEVELS = (1 << 16) - 1
 #: Optical depth of a voxel from which on sweeps with a source distinguish the extinction of its two
@@ -113,8 +113,8 @@ def _level(words: mi.UInt32, index: mi.UInt32) -> mi.UInt32:
 
 
 def _dithered(values: mi.Float, shift: float = 0.0) -> mi.UInt32:
-    """Integers, rounded up or down by a golden-ratio sequence: correct on average over any few
-    neighbours, where rounding to the nearest would lose thin matter beside dense.
+    """Integers, rounded up or down by a golden-ratio sequence (not at random): correct on average
+    over any few neighbours, where rounding to the nearest would lose thin matter beside dense.
     """
     index = dr.arange(mi.UInt32, dr.width(values))
     (dither,) = unit_floats([golden_words(index, int(shift * 2**32))])

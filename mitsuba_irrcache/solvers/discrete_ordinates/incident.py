@@ -16,6 +16,7 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import spots_of
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.core.sequences import kronecker_steps, lattice_points
+from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
@@ -34,7 +35,9 @@ PAIRS_PER_SUN_TRACKS, PAIRS_PER_SAMPLE = 8, 2
 
 class DistantIllumination:
     """The emitters of a scene, seen from the medium: an environment, suns (infinitely distant, of
-    one direction), and point-like lights nearby, which are left to others.
+    one direction), and point-like lights nearby, which are left to others, as area emitters are.
+
+    Raises UnsupportedSceneError for an emitter of any other kind, which would be left out.
     """
 
     def __init__(self, scene: mi.Scene, has_other_sources: bool = False) -> None:
@@ -49,6 +52,12 @@ class DistantIllumination:
                 self._suns.append(_sun(emitter))
             elif kind.is_point_like:
                 self.point_lights.append(emitter)
+            elif not kind.is_environment and kind is not EmitterKind.AREA:
+                raise UnsupportedSceneError(
+                    f'irrcache: emitter "{emitter.id()}" ({emitter.class_name()}) is of a kind '
+                    f'({kind.value}) that the solver "sweep" does not support; set solver to '
+                    '"path" or "auto".'
+                )
 
     def factored_ordinates(
         self, passes: int, pairs: int, channels: int, rng: np.random.Generator, first: int = 0

@@ -346,7 +346,8 @@ class _PairSweep:
             self._offsets = self.boundary_source.channel_offsets()
         self._source_elsewhere = volume.source is not volume.values
         self.weight, self.scale = record.weight, record.quantum * record.length
-        # Cross section of a track over that of a voxel, times voxel length over track length.
+        # Cross section of the tube for which a track stands over the volume of a voxel: the tubes
+        # of an ordinate fill the volume.
         self.area = dr.rcp(record.length)
         #: what optical depths are multiplied by
         self.solid_angle = mi.Float(1) if self.separate else record.weight
@@ -375,7 +376,8 @@ class _PairSweep:
             _Visit(voxel, voxel + begin, active)
             for voxel, begin, active in zip(voxels, self.begins, needed, strict=True)
         ]
-        # In the middle slice both ways are in the same voxel: the first to write writes for both.
+        # In the middle slice both ways are in the same voxel, as positions are integers: the first
+        # to write writes for both.
         middle = forward.offset == backward.offset
         if self.volume.source is None:
             radiance = self._attenuate(values, states, radiance, extinction, visits, middle)
@@ -489,7 +491,7 @@ class _PairSweep:
         radiance lost, optical depth), for a source that is constant in it.
         """
         # docs/primer, eqs. (4.6), (4.7)
-        # A track stands for a cross section that is the less the longer it stays in a voxel.
+        # Tubes are the narrower the longer their tracks are in a voxel.
         area, count = self.area, self.solid_angle
         first, second = (half * self.scale for half in extinction)
         to_middle = dr.select(state.since_entry < 1, state.since_entry, 0.5) * first

@@ -1,13 +1,14 @@
 """Multiple scattering: source iteration on a hierarchy of grids (multigrid).
 
 The mean irradiance of collisions phi solves phi = A phi + b. The operator A is one transport sweep
-over a fixed set of ordinates with the source albedo phi / (4 pi); b is the irradiance that has been
-scattered once. Source iteration (phi <- A phi + b) adds one order of scattering per sweep: in dense
-media with an albedo near 1, thousands. The slowly converging errors are smooth, and are corrected
-on coarser grids by the same operator: a sweep on each grid, then the correction of its error from
-the next coarser one (multigrid; for acceleration of discrete-ordinates methods in general see
-Adams and Larsen, *Fast iterative methods for discrete-ordinates particle transport calculations*,
-Progress in Nuclear Energy 40, 2002). Anderson acceleration (`anderson`) combines the cycles.
+over a fixed set of ordinates with the source albedo phi / (4 pi); b is the uncollided irradiance,
+averaged over collisions (order 0). Source iteration (phi <- A phi + b) adds one order of scattering
+per sweep: in dense media with an albedo near 1, thousands. The slowly converging errors are smooth,
+and are corrected on coarser grids by the same operator: a sweep, then the correction of its error
+from the next coarser grid, where one sweep more finds the right side (multigrid; for acceleration
+of discrete-ordinates methods in general see Adams and Larsen, *Fast iterative methods for
+discrete-ordinates particle transport calculations*, Progress in Nuclear Energy 40, 2002). Anderson
+acceleration (`anderson`) combines the cycles.
 """
 
 from __future__ import annotations

@@ -71,8 +71,8 @@ class OrdinateSet:
         return level.sweep(phi, level.tracks.table(*self.ordinates))
 
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
-        """All orders of scattering, of which ``b`` is the first, for so many further ``passes``:
-        these correct the remaining error, and divide it by their number.
+        """All orders of scattering, given the uncollided ``b``. The error that may remain is the
+        larger the more ``passes`` follow, each of which reduces it and their mean, too.
         """
         return level.solve(b, self.scattering, tolerance=max(1.0, passes / 2))
 
@@ -150,7 +150,7 @@ class BoundaryOrdinateSet:
         return swept
 
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
-        """All orders, of which ``b`` is the first; between two, radiance may leave the medium."""
+        """All orders, given the uncollided ``b``; between two, radiance may leave the medium."""
         numbers = np.arange(len(self.scattering.directions))
         return level.solve(
             b,

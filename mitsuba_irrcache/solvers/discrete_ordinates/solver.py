@@ -1,9 +1,13 @@
 """The solver ``sweep``: discrete ordinates along long characteristics, all voxels at once.
 
 A batch consists of passes; a pass is a transport sweep of one ordinate set along tracks through all
-voxels (`tracks`). The first pass of a batch solves for all orders of scattering but the last by
-source iteration with multigrid and Anderson acceleration (`multigrid`); every other pass then
-sweeps the resulting source along ordinates of its own, so that their mean has little angular noise.
+voxels (`tracks`). For all orders of scattering (``max_depth`` -1) the first pass of a batch solves
+by source iteration with multigrid and Anderson acceleration (`multigrid`); every other pass then
+sweeps the resulting source along ordinates of its own, so that their mean has little angular noise,
+and improves the source for the passes that follow. For a number of orders the first pass sweeps
+once for each but the last, and the others sweep the source that it leaves. For single scattering
+(``max_depth`` 2) there is one pass.
+
 Emission of the medium and small or point-like emitters are sampled voxel by voxel
 (`direct_emission`, `direct_light`).
 
@@ -21,9 +25,10 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
-from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers.base import Progress
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merged
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emission_irradiance
@@ -54,19 +59,16 @@ BATCH, LARGEST_BATCH = 32, 256
 DIRECTIONS = 16
 #: Voxels of a cache beyond which channels are swept one by one: together they take several times
 #: the memory.
-TOGETHER = 1 << 24
+MOST_VOXELS_SWEPT_TOGETHER = 1 << 24
 #: Relative change of the irradiance below which further orders of scattering are omitted, as single
 #: precision has it; tested every so many orders.
 NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
-
-#: called with (samples done, samples in all), both in voxels times ordinates
-Progress = Callable[[int, int], None]
 
 
 def swept_together(medium: MediumGrid, voxels: int) -> bool:
     """Whether all channels of a cache of so many ``voxels`` are swept at once."""
     isotropic = medium.phase.is_isotropic
-    return isotropic and medium.sigma_t.channels == 1 and voxels <= TOGETHER
+    return isotropic and medium.sigma_t.channels == 1 and voxels <= MOST_VOXELS_SWEPT_TOGETHER
 
 
 def batch_of(samples: int, multiple: int) -> int:
@@ -345,7 +347,7 @@ class Sweep:
         the first; channels are interleaved.
         """
         first, *sets = sets
-        phi, total = self._collided(level, first, channels, len(sets)), mi.Float(0)
+        phi, total = self._irradiance_of_collisions(level, first, channels, len(sets)), mi.Float(0)
         used, share = mi.Float(0), dr.opaque(mi.Float, 1 / len(sets))
         for known, each in enumerate(sets, 1):
             irradiance, again = each.sweep(level, phi)
@@ -364,7 +366,7 @@ class Sweep:
         change = level.propagated_change(phi - used * share, ordinates, len(sets))
         return dr.fma(total, share, change)
 
-    def _collided(
+    def _irradiance_of_collisions(
         self,
         level: MultigridLevel,
         first: OrdinateSet | BoundaryOrdinateSet,
@@ -442,10 +444,3 @@ def is_grey(spectra: Sequence[mi.Spectrum]) -> bool:
     same = [dr.all(c == spectrum[0]) for spectrum in spectra for c in list(spectrum)[1:]]
     dr.eval(same)
     return all(s[0] for s in same)
-
-
-def occupied_box(grid: Grid, active: mi.UInt32) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest box of voxels (x, y, z; lower end, upper end) around all ``active`` ones."""
-    ends = [(dr.min(p), dr.max(p)) for p in grid.voxel_indices(active)]
-    dr.eval(ends)
-    return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])

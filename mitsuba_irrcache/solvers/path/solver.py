@@ -23,12 +23,12 @@ from mitsuba_irrcache.cache.volume import BATCH, LAYERS, IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import hole_in
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask, register
-from mitsuba_irrcache.solvers.discrete_ordinates.solver import occupied_box
 from mitsuba_irrcache.solvers.grid_size import SizeAmongSurfaces, SizeRule
 from mitsuba_irrcache.solvers.path import estimator as volume_path
 from mitsuba_irrcache.transport.path import Media
@@ -49,6 +49,8 @@ class PathSolver(Solver):
     """Traces paths from the voxel centres, in any scene."""
 
     name = "path"
+    #: last, since it supports all scenes
+    precedence = 100
     #: Its noise in smaller voxels would exceed the error of larger ones, and its work grows with
     #: their number; among surfaces the number of paths does not depend on that of the voxels.
     size_rule = SizeRule(

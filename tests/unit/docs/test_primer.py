@@ -41,16 +41,19 @@ def citations() -> dict[str, set[str]]:
 
 
 def defined(path: Path) -> set[str]:
-    """Functions, classes, and the methods of these, of a module."""
+    """Functions, classes, the methods of these, and constants of a module."""
     names = set()
     for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            names |= {found.id for found in ast.walk(node) if isinstance(found, ast.Name)}
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             names.add(node.name)
-            names |= {
-                f"{node.name}.{own.name}"
-                for own in getattr(node, "body", [])
-                if isinstance(node, ast.ClassDef) and isinstance(own, ast.FunctionDef)
-            }
+        if isinstance(node, ast.ClassDef):
+            for own in node.body:
+                if isinstance(own, ast.FunctionDef):
+                    names.add(f"{node.name}.{own.name}")
+                if isinstance(own, ast.AnnAssign) and isinstance(own.target, ast.Name):
+                    names.add(f"{node.name}.{own.target.id}")
     return names
 
 

@@ -1,4 +1,6 @@
-"""The kind of an emitter is decided in one place, for every emitter plugin of Mitsuba."""
+"""The kind of an emitter is decided in one place, for every emitter plugin of Mitsuba but
+``timed_sunsky``, on which ``volpath`` fails.
+"""
 
 from __future__ import annotations
 

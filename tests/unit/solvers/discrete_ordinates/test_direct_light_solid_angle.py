@@ -40,4 +40,6 @@ def test_solid_angle_of_a_disc(distance, scale):
     angle, small, large = seen({"type": "disk", "to_world": place}, scale)
     expected = 2 * np.pi * (1 - distance / np.hypot(distance, 1))
     assert angle == pytest.approx(expected, rel=0.05)
-    assert (len(small), len(large)) == ((1, 0) if expected < direct_light.LARGE else (0, 1))
+    assert (len(small), len(large)) == (
+        (1, 0) if expected < direct_light.LARGE_SOLID_ANGLE else (0, 1)
+    )
