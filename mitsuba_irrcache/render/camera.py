@@ -265,9 +265,8 @@ class TracedCameraRays:
         traced = stopped & (rng.next_float32(stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
         if self._surfaces is not None:
-            on_emitter = sampler.next_2d(traced)
-            if isinstance(sampler, CameraSampler):
-                on_emitter = sampler.emitter_sample
+            is_stratified = isinstance(sampler, CameraSampler)
+            on_emitter = sampler.emitter_sample() if is_stratified else sampler.next_2d(traced)
             direct, reflected, interacted, *_ = self._surfaces.paths.follow(
                 scene, end, pointer, rng, traced, on_emitter, self.hide_emitters
             )

@@ -226,9 +226,11 @@ class PixelPositions:
 
 
 class CameraSampler:
-    """A sampler of Mitsuba and, for each camera sample, a stratified position on emitters."""
+    """A sampler of Mitsuba; ``emitter_sample`` returns a stratified position on emitters for each
+    camera sample.
+    """
 
-    def __init__(self, sampler: mi.Sampler, emitter_sample: mi.Point2f) -> None:
+    def __init__(self, sampler: mi.Sampler, emitter_sample: Callable[[], mi.Point2f]) -> None:
         self._sampler, self.emitter_sample = sampler, emitter_sample
 
     def next_1d(self, active: mi.Bool = True) -> mi.Float:
@@ -287,7 +289,10 @@ def _sampled(
     pixel = mi.Vector2f(pixel_of(index, int(size.x)) - border)
     pixel += mi.Vector2f(sensor.film().crop_offset())
     position = pixel + spread.next(index, sample)
-    on_emitter = spread.emitter_sample(index, sample)
+
+    def on_emitter() -> mi.Point2f:
+        return spread.emitter_sample(index, sample)
+
     return position, _values(sensor, sampler, position, on_emitter, spp, radiance)
 
 
@@ -295,7 +300,7 @@ def _values(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
     position: mi.Point2f,
-    on_emitter: mi.Point2f,
+    on_emitter: Callable[[], mi.Point2f],
     spp: int,
     radiance: RadianceFunction,
 ) -> list[mi.Float]:
@@ -350,7 +355,7 @@ def _refined(
     on_emitter = mi.Point2f(kronecker(sample * further + k, 2, shift))
     own = sampler.clone()
     own.seed(seed ^ REFINEMENT, pixels * per_pass * further)
-    found = _values(sensor, own, corner + within, on_emitter, per_pass * further, radiance)
+    found = _values(sensor, own, corner + within, lambda: on_emitter, per_pass * further, radiance)
     place = dr.arange(mi.UInt32, pixels * per_pass)
     pixel, sample = Divisor(per_pass).split(place)
     place = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
