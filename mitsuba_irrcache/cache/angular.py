@@ -24,8 +24,9 @@ import numpy as np
 
 from mitsuba_irrcache.core.sequences import GOLDEN_STEP, lattice_points
 from mitsuba_irrcache.core.spectrum import interleaved
+from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.emitters import kind_of
+from mitsuba_irrcache.lights.emitters import EmitterKind, emits_in_one_direction, kind_of
 from mitsuba_irrcache.media.phase import Phase
 
 #: Maximum sine of the angular radius of a lamp that is treated as narrow.
@@ -315,16 +316,26 @@ class AngularField:
 
 
 def sources_of(scene: mi.Scene) -> list[Source]:
-    """Find the narrow sources of a scene."""
+    """Find the narrow sources of a scene.
+
+    Raises UnsupportedSceneError for emitters of unknown kinds, which may be narrow, unless they
+    have a single direction: moments would represent them wrongly.
+    """
     found, lamps = [], []
     for emitter in scene.emitters():
         kind = kind_of(emitter)
-        if kind.has_one_direction:
+        if emits_in_one_direction(emitter):
             found.append(Source(_sampled(emitter).d.numpy().ravel(), MIN_ANGULAR_RADIUS, far=True))
         elif kind.is_point_like:
             found.append(Source(_sampled(emitter).p.numpy().ravel(), 0.0, far=False))
         elif kind.is_environment:
             found += spots_of(emitter)[0]
+        elif kind is not EmitterKind.AREA:
+            raise UnsupportedSceneError(
+                f'irrcache: emitter "{emitter.id()}" ({emitter.class_name()}) is of a kind '
+                f"({kind.value}) that media with anisotropic phase functions do not support. Make "
+                'the phase function isotropic, or render this scene with "volpath".'
+            )
     for shape in scene.shapes():
         if shape.is_emitter():
             lamps.append(_lamp(shape))

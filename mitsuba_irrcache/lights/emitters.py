@@ -20,7 +20,8 @@ class EmitterKind(Enum):
 
     A new kind is added here and in `kind_of`. It is refused by `sweep` until it is in its
     ``EMITTERS`` and in `DistantIllumination`, and media under it are not treated as half-spaces
-    until it is in ``half_space.EMITTERS``; ``path`` samples all kinds by Mitsuba's interface.
+    until it is in ``half_space.EMITTERS``; ``path`` samples all kinds by Mitsuba's interface, but
+    needs narrow ones in `sources_of` if scattering is anisotropic.
     """
 
     #: infinitely far away, with the same radiance from all directions
@@ -80,6 +81,11 @@ def kind_of(emitter: mi.Emitter) -> EmitterKind:
         is_constant = name == "ConstantBackgroundEmitter"
         return EmitterKind.CONSTANT_ENVIRONMENT if is_constant else EmitterKind.ENVIRONMENT_MAP
     return EmitterKind.UNKNOWN
+
+
+def emits_in_one_direction(emitter: mi.Emitter) -> bool:
+    """Whether its radiance has the same single direction everywhere, whatever its kind."""
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
 
 
 def varies_in_space(emitter: mi.Emitter) -> bool:

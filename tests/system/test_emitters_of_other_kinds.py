@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.cache import angular
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.pipeline.defaults import choose_solver, needs_no_cache
@@ -19,17 +20,20 @@ pytestmark = pytest.mark.usefixtures("rgb")
 VOLPATH = {"type": "volpath"}
 
 
-def under_a_beam(scenes, integrator: dict, density: float = 1.0) -> mi.Scene:
+def under_a_beam(scenes, integrator: dict, density: float = 1.0, **properties) -> mi.Scene:
     beam = {"type": register_beam(mi.variant()), "id": "beam"}
-    shape = scenes.boundary(scenes.medium(density, 0.8))
+    shape = scenes.boundary(scenes.medium(density, 0.8, **properties))
     return scenes.load(integrator, shape, 16, emitter=beam, default_solver="auto")
 
 
+@pytest.mark.parametrize("phase", [{}, {"phase": {"type": "hg", "g": 0.58}}], ids=["", "hg"])
 @pytest.mark.parametrize("max_depth", [2, -1])
-def test_path_samples_a_beam_that_varies(scenes, max_depth):
+def test_path_samples_a_beam_that_varies(scenes, max_depth, phase):
+    """With anisotropic scattering, too, where its direction is known though its kind is not."""
     ours = {"type": "irrcache", "max_depth": max_depth, "resolution": 24, "cache_spp": 64}
-    mine = scenes.image(under_a_beam(scenes, ours), spp=64)
-    reference = scenes.image(under_a_beam(scenes, VOLPATH | {"max_depth": max_depth}), spp=2048)
+    mine = scenes.image(under_a_beam(scenes, ours, **phase), spp=64)
+    depth = {"max_depth": max_depth}
+    reference = scenes.image(under_a_beam(scenes, VOLPATH | depth, **phase), spp=2048)
     for image in (mine, reference):
         halves = np.sort([image[:, :8].mean(), image[:, 8:].mean()])
         assert halves[1] > 1.5 * halves[0]
@@ -50,6 +54,19 @@ def test_others_refuse_a_beam_that_varies(scenes):
     assert needs_no_cache(scene, medium, -1, 0) is None
     sunlit = scenes.load(VOLPATH, scenes.boundary(scenes.medium(500.0, 0.8)))
     assert needs_no_cache(sunlit, compile_scene(sunlit).visible[0], -1, 0) is not None
+
+
+def test_unknown_emitters_without_one_direction_are_refused_where_moments_are_needed(
+    scenes, monkeypatch
+):
+    """Narrow emitters are no part of the moments, whose truncated series would be far off."""
+    monkeypatch.setattr(angular, "emits_in_one_direction", lambda emitter: False)
+    medium = scenes.medium(1.0, 0.8, phase={"type": "hg", "g": 0.5})
+    beam = {"type": register_beam(mi.variant()), "id": "beam"}
+    ours = {"type": "irrcache", "solver": "path", "resolution": 8}
+    scene = scenes.load(ours, scenes.boundary(medium), 4, emitter=beam)
+    with pytest.raises(UnsupportedSceneError, match=r'emitter "beam".*anisotropic'):
+        scene.integrator().prepare(scene)
 
 
 def test_new_kinds_are_refused_until_they_are_listed():
