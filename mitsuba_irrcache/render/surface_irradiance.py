@@ -25,6 +25,9 @@ from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 #: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance;
 #: by which those gather it that only other nodes see.
 PROBES, GATHERED, GATHERED_INDIRECT = 32, 128, 32
+#: Nodes of a view up to which all rays are used: more nodes are close to each other, so that their
+#: errors average out within a pixel.
+FINE_NODES = 1 << 15
 #: Nodes beyond which no further ones are created where rays from nodes end.
 MOST_NODES = 1 << 18
 #: How often nodes are created where rays from the last ones end. Paths continue where there are
@@ -100,7 +103,8 @@ class SurfaceIrradiance:
             if not found:
                 break
             p, normals, active = (_joined(parts) for parts in zip(*found, strict=True))
-        groups = (first, seen, GATHERED), (seen, self.nodes.count, GATHERED_INDIRECT)
+        rays = GATHERED if seen - first <= FINE_NODES else GATHERED_INDIRECT
+        groups = (first, seen, rays), (seen, self.nodes.count, GATHERED_INDIRECT)
         self._groups += [group for group in groups if group[0] < group[1]]
 
     def _place(self, scene: mi.Scene, numbers: mi.UInt32) -> tuple:

@@ -41,6 +41,8 @@ CHORD = 0.1
 #: Luminance over its mean from which on a direction of an environment counts as a peak, which
 #: casts shadows; samples of such an environment at each vertex.
 PEAK, ENVIRONMENT_SAMPLES = 8.0, 8
+#: Samples of emitters at each vertex, at most: if there are more emitters, each stands for several.
+MOST_EMITTERS = 16
 #: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
 LAMBERTIAN = 1e-4
 #: Corners of the unit cube in homogeneous coordinates.
@@ -64,7 +66,10 @@ class SampledEmitters:
                 share = 1 / ENVIRONMENT_SAMPLES
                 slots += [(environment, k * share, share) for k in range(ENVIRONMENT_SAMPLES)]
         self.threshold = dr.opaque(mi.Float, threshold)
-        self.count = dr.opaque(mi.UInt32, len(slots))
+        #: samples at each vertex, and how many emitters one of them stands for
+        self.count = dr.opaque(mi.UInt32, min(len(slots), MOST_EMITTERS))
+        self.stride = dr.opaque(mi.Float, max(len(slots) / MOST_EMITTERS, 1))
+        self._last = dr.opaque(mi.UInt32, max(len(slots) - 1, 0))
         self._emitters = dr.zeros(mi.EmitterPtr, max(len(slots), 1))
         for i, (emitter, *_) in enumerate(slots):
             dr.scatter(self._emitters, mi.EmitterPtr(emitter), mi.UInt32(i))
@@ -78,15 +83,19 @@ class SampledEmitters:
         return dr.select(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite), peak, 1)
 
     def sample(
-        self, number: mi.UInt32, vertex: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+        self, number: mi.Float, vertex: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """Sample a direction; return it with its radiance, without what is gathered, over its
         density.
+
+        ``number`` is that of a sample, plus a random fraction, by which one emitter is chosen of
+        those that it stands for.
         """
+        number = dr.minimum(mi.UInt32(number * self.stride), self._last)
         emitter = dr.gather(mi.EmitterPtr, self._emitters, number, active)
-        share = dr.gather(mi.Float, self._share, number, active)
+        share = dr.gather(mi.Float, self._share, number, active) * self.stride
         first = dr.gather(mi.Float, self._first, number, active)
-        u = mi.Point2f(u.x, first + u.y * share)
+        u = mi.Point2f(u.x, first + u.y * dr.gather(mi.Float, self._share, number, active))
         record, value = emitter.sample_direction(vertex, u, active)
         infinite = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) & ~record.delta
         excess = self.excess(emitter, value * record.pdf)
@@ -261,7 +270,8 @@ class SurfacePaths:
         vertex, active = vertex_at(si), mi.Bool(active) & (self.emitters.count > 0)
         while dr.hint(active, label="sampled emitters"):
             shifted = mi.Point2f(*kronecker(number, 2, (u.x, u.y)))
-            record, value = self.emitters.sample(number, vertex, shifted, active)
+            chosen_by = mi.Float(number) + rng.next_float32(active)
+            record, value = self.emitters.sample(chosen_by, vertex, shifted, active)
             f, density = si.bsdf().eval_pdf(context, si, si.to_local(record.d), active)
             value *= f
             reflects = active & (record.pdf > 0) & (dr.max(value) > 0)

@@ -99,7 +99,18 @@ def within() -> dict:
     }  # fmt: skip
 
 
+def many_lights() -> dict:
+    """Return a ground with more lights than are sampled at each vertex."""
+    u = np.random.default_rng(1).random((40, 3)) * [4, 1, 4] + [-2, 0.2, -2]
+    lights = {
+        f"light{i}": {"type": "point", "position": list(map(float, p)), "intensity": 0.1 + 0.02 * i}
+        for i, p in enumerate(u)
+    }
+    return lights | {"smoke": bound(interior=fog(), scale=(0.5, 0.5, 0.5)), "floor": ground()}
+
+
 SCENES = {
+    "many lights": (many_lights, {}),
     "room": (room, {"without": 40}),
     "still life": (still_life, {}),
     "sun in a map": (sun_in_a_map, {}),
