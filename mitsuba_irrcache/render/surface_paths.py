@@ -186,10 +186,10 @@ class SurfacePaths:
                 hit, entry, leave = projection.medium.intersect(ray)
                 entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
                 hit &= active & ~clear & (pointer == projection.medium.pointer)
-                found, transmittance, _, glow = projection.march(
+                scattered, transmittance, _, volume_emission = projection.march(
                     ray, entry, leave, mi.Spectrum(self.brightest), offset, hit
                 )
-                radiance += dr.select(hit, throughput * (found + glow), 0)
+                radiance += dr.select(hit, throughput * (scattered + volume_emission), 0)
                 throughput = dr.select(hit, throughput * transmittance, throughput)
             clear = mi.Bool(False)
 
