@@ -406,7 +406,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                 film = self._render_empty(scene, sensor, seed, spp)
             else:
                 if isinstance(camera_rays, TracedCameraRays):
-                    camera_rays.prepare_view(scene, sensor, self._settings.seed)
+                    camera_rays.prepare_view(scene, sensor, spp, self._settings.seed)
                 film = self._render(camera_rays, scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:

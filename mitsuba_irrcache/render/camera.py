@@ -42,6 +42,8 @@ from mitsuba_irrcache.transport.path import (
 #: Camera rays, at least about, by which nodes on surfaces are placed: in a small image, one for
 #: each pixel would miss the narrow cells in corners.
 PLACEMENT_RAYS = 1 << 16
+#: Samples of an image from which on irradiance is cached on surfaces: a smaller one has less work.
+FEWEST_SAMPLES = 1 << 15
 #: Transmittance below which surfaces are path traced with Russian roulette.
 ROULETTE_BELOW = 0.1
 
@@ -219,11 +221,8 @@ class TracedCameraRays:
         if max_depth < 0 and len(projections) == len(description.media.grids):
             self._emitters = SampledEmitters(description.emitters)
         self._surfaces: SurfaceIrradiance | None = None
-
-    @property
-    def caches_surfaces(self) -> bool:
-        """Whether irradiance on surfaces is cached, so that most pixels have little noise."""
-        return self._surfaces is not None
+        #: whether the current image uses irradiance on surfaces
+        self.caches_surfaces = False
 
     def adopt(self, earlier: TracedCameraRays) -> None:
         """Use the nodes on surfaces of an ``earlier`` state of the caches of the same scene."""
@@ -235,9 +234,14 @@ class TracedCameraRays:
             self.media, self.projections, self._emitters, self.brightest, self.rr_depth, nodes
         )
 
-    def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> None:
-        """Cache the irradiance on the surfaces that ``sensor`` sees."""
-        if self._emitters is None or not has_surfaces(scene):
+    def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int = 0) -> None:
+        """Cache the irradiance on the surfaces that ``sensor`` sees, if it is used for an image of
+        ``spp`` samples per pixel (0: the sampler's number).
+        """
+        width, height = (int(n) for n in sensor.film().crop_size())
+        samples = width * height * (spp or sensor.sampler().sample_count())
+        self.caches_surfaces = False
+        if self._emitters is None or samples < FEWEST_SAMPLES or not has_surfaces(scene):
             return
         if self._surfaces is None:
             self._surfaces = SurfaceIrradiance(self._paths(), seed)
@@ -245,6 +249,7 @@ class TracedCameraRays:
         medium = sensor.get_medium()
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
         self._surfaces.prepare(scene, ray, pointer)
+        self.caches_surfaces = True
 
     def sample(
         self,
@@ -264,7 +269,7 @@ class TracedCameraRays:
         chance = dr.minimum(dr.max(transmittance) * (1 / ROULETTE_BELOW), 1)
         traced = stopped & (rng.next_float32(stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
-        if self._surfaces is not None:
+        if self.caches_surfaces:
             is_stratified = isinstance(sampler, CameraSampler)
             on_emitter = sampler.emitter_sample() if is_stratified else sampler.next_2d(traced)
             direct, reflected, interacted, *_ = self._surfaces.paths.follow(

@@ -12,12 +12,18 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.render import film
+from mitsuba_irrcache.render import camera, film
 from tests.support.surfaces import ball, bound, colour, diffuse, fog, ground, lamp, placed
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 SIZE = 24
+
+
+@pytest.fixture(autouse=True)
+def _in_small_images(monkeypatch):
+    """Cache irradiance on surfaces in images of few samples, too."""
+    monkeypatch.setattr(camera, "FEWEST_SAMPLES", 0)
 
 
 def scene_of(scenes, objects: dict, **settings) -> mi.Scene:
@@ -227,6 +233,16 @@ def test_limited_depths_and_unknown_media_are_path_traced(scenes):
     scene = scene_of(scenes, within() | {"jar": glass})
     scenes.image(scene, spp=1)
     assert nodes_of(scene) is None
+
+
+def test_an_image_of_few_samples_is_path_traced(scenes, monkeypatch):
+    monkeypatch.setattr(camera, "FEWEST_SAMPLES", 8 * SIZE**2)
+    scene = scene_of(scenes, within())
+    few = scenes.image(scene, spp=4)
+    assert nodes_of(scene) is None
+    scenes.image(scene, spp=8)
+    assert nodes_of(scene).count > 0
+    np.testing.assert_array_equal(scenes.image(scene, spp=4), few)
 
 
 def test_another_scene_may_follow_with_volpath(scenes):
