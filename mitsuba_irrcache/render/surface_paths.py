@@ -66,6 +66,9 @@ class SampledEmitters:
                 share = 1 / ENVIRONMENT_SAMPLES
                 slots += [(environment, k * share, share) for k in range(ENVIRONMENT_SAMPLES)]
         self.threshold = dr.opaque(mi.Float, threshold)
+        environments = [emitter for emitter, kind in emitters if kind.is_environment]
+        self._environment = mi.EmitterPtr(environments[0] if environments else None)
+        dr.make_opaque(self._environment)
         #: samples at each vertex, and how many emitters one of them stands for
         self.count = dr.opaque(mi.UInt32, min(len(slots), MOST_EMITTERS))
         self.stride = dr.opaque(mi.Float, max(len(slots) / MOST_EMITTERS, 1))
@@ -80,7 +83,7 @@ class SampledEmitters:
     def excess(self, emitter: mi.EmitterPtr, radiance: mi.Spectrum) -> mi.Float:
         """The part of a ``radiance`` of an emitter that is sampled."""
         peak = dr.maximum(1 - self.threshold / dr.maximum(luminance(radiance), 1e-30), 0)
-        return dr.select(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite), peak, 1)
+        return dr.select(emitter == self._environment, peak, 1)
 
     def sample(
         self, number: mi.Float, vertex: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
@@ -97,9 +100,7 @@ class SampledEmitters:
         first = dr.gather(mi.Float, self._first, number, active)
         u = mi.Point2f(u.x, first + u.y * dr.gather(mi.Float, self._share, number, active))
         record, value = emitter.sample_direction(vertex, u, active)
-        infinite = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) & ~record.delta
-        excess = self.excess(emitter, value * record.pdf)
-        return record, value * share * dr.select(infinite, excess, 1)
+        return record, value * share * self.excess(emitter, value * record.pdf)
 
 
 def peak_threshold(environment: mi.Emitter) -> float:
