@@ -93,7 +93,7 @@ class AreaLight(DirectLight):
         """Return the length in the medium of the line to the closest point of the emitter, or 1.
 
         The optical depth over that length is smooth next to the emitter and to the face through
-        which it shines. Where lines to different points leave the medium through different faces,
+        which its radiance enters. Where lines to different points leave through different faces,
         the optical depth itself is smoother; what is better for a scene is measured.
         """
         if not self._follows_closest_line:
@@ -200,7 +200,7 @@ class AreaLight(DirectLight):
         """Create the field of the optical depth over `length`, extrapolated beyond the outermost
         voxels.
 
-        Next to a face through which the emitter shines sideways it changes within a voxel.
+        Next to a face that the emitter irradiates from the side it changes within a voxel.
         """
         field = super()._field_of_extinction(mean, classes)
         known = marked(self._grid, self._voxels)

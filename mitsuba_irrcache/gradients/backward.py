@@ -203,7 +203,7 @@ class MediumAdjoint:
         count, voxels = grid.voxel_count, dr.arange(mi.UInt32, grid.voxel_count)
         channels, colour = self._transport.channels, self._transport.colour
         cached, all_channels = cache.irradiance.array, cache.channels
-        # Of all that differ by a factor, the brightest.
+        # The brightest of all channels that differ by a factor.
         own = range(channels) if channels == all_channels else [int(colour.argmax())]
         place = voxels * all_channels
         known = [

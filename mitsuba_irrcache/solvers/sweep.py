@@ -111,7 +111,7 @@ class SweepSolver(Solver):
         cls, medium: MediumGrid, max_depth: int, moments: int, voxels: int, channels: int
     ) -> int:
         # Extinction with its neighbours, the radiance along tracks, sums and spreads; and for
-        # further orders of scattering, the voxels' own and what is kept between sweeps.
+        # further orders of scattering, the values of voxels and those stored between sweeps.
         once = max_depth == 2
         sets = channels if sn_solver.swept_together(medium, voxels) else 1
         numbers = 5 + 2 * channels + (0 if once else 5 + 12 * sets + 3 * channels)

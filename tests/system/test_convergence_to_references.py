@@ -38,7 +38,7 @@ SWEEP = {
     Case("rectangle near"): (64, 32, 0.001),
     Case("sphere near"): (64, 32, 0.001),
     Case("disk near"): (64, 32, 0.001),
-    # Wider than the medium: it shines through the sides, where transmittance is not exponential.
+    # Wider than the medium: radiance enters through the sides; transmittance is not exponential.
     Case("rectangle large"): (64, 32, 0.008),
     Case("point outside", grid="3x5x2"): (64, 32, 0.001),
     Case("point outside", grid="1x1x6"): (64, 32, 0.001),

@@ -118,7 +118,7 @@ class _TrackState:
 
     @property
     def at(self) -> tuple:
-        """Voxels and positions, as of `BoundarySource.irradiance`."""
+        """Voxels and positions, as `BoundarySource.irradiance` takes them."""
         return self.b, self.c, self.position_b, self.position_c
 
 
