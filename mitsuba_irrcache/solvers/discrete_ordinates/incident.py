@@ -63,8 +63,8 @@ class DistantIllumination:
         self, passes: int, pairs: int, channels: int, rng: np.random.Generator, first: int = 0
     ) -> tuple[list[Ordinates], np.ndarray]:
         """Ordinates of a number of passes, as `ordinates` returns them; before these, on request,
-        those of a ``first`` pass of so many pairs. And factors (channels) of their results: where channels
-        differ by a factor only, ``incoming`` has a single one.
+        those of a ``first`` pass of so many pairs. And factors (channels) of their results: where
+        channels differ by a factor only, ``incoming`` has a single one.
         """
         sets = self.ordinates(1, first, rng) if first else []
         sets += self.ordinates(passes, pairs, rng)
