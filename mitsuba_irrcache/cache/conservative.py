@@ -24,18 +24,24 @@ NOISY = 0.5
 
 
 def conserving(
-    grid: Grid, roots: mi.Float, known: mi.Bool, channels: int = 1, share: mi.Float | None = None
+    grid: Grid,
+    roots: mi.Float,
+    known: mi.Bool,
+    channels: int = 1,
+    share: mi.Float | None = None,
+    separated: tuple[mi.Bool, mi.Bool, mi.Bool] | None = None,
 ) -> mi.Float:
     """Correct square ``roots`` such that interpolation preserves the values of ``known`` voxels.
 
     ``share`` in [0, 1] (per voxel): the power to which the correction is applied, 1 without it.
 
-    The correction acts along axes along which both neighbours are known. Noise that differs between
-    neighbours counts as curvature and is amplified by a third.
+    The correction acts along axes along which both neighbours are known, and not ``separated`` by
+    surfaces (`VoxelClasses`), where interpolation does not mix their values. Noise that differs
+    between neighbours counts as curvature and is amplified by a third.
     """
     # docs/primer, eq. (2.2)
     smoothed = roots  # M r
-    for second_difference in _second_differences(grid, known, channels):
+    for second_difference in _second_differences(grid, known, channels, separated):
         dr.eval(smoothed)
         smoothed = smoothed + second_difference(smoothed) / 6
     ratio = dr.select(smoothed > 0, roots / smoothed, 1)
@@ -89,18 +95,23 @@ def unbiased(grid: Grid, values: mi.Float, known: mi.Bool, channels: int = 1) ->
     return result
 
 
-def _second_differences(grid: Grid, known: mi.Bool, channels: int) -> Iterator[Callable]:
+def _second_differences(
+    grid: Grid, known: mi.Bool, channels: int, separated: tuple | None = None
+) -> Iterator[Callable]:
     """Yield for each axis a function that computes second differences along it.
 
-    They are 0 unless both neighbours are ``known``.
+    They are 0 unless both neighbours are ``known``, and not ``separated``.
     """
     index = dr.arange(mi.UInt32, grid.voxel_count * channels)
     voxel = index // channels if channels > 1 else index
     own_known, stride = dr.gather(mi.Bool, known, voxel), mi.UInt32(1)
-    for place, side in zip(grid.voxel_indices(voxel), grid.sides, strict=True):
+    for axis, (place, side) in enumerate(zip(grid.voxel_indices(voxel), grid.sides, strict=True)):
         inside = own_known & (place > 0) & (place + 1 < mi.UInt32(side))
         for there in (voxel - stride, voxel + stride):
             inside &= dr.gather(mi.Bool, known, there, inside)
+        if separated is not None:
+            for there in (voxel - stride, voxel):
+                inside &= ~dr.gather(mi.Bool, separated[axis], there, inside)
         step = stride * channels
 
         def second_difference(values: mi.Float, step=step, inside=inside) -> mi.Float:

@@ -236,7 +236,8 @@ class IrradianceCache:
         values = self._tensor(roots).array
         if not self.correlated:
             variance = self._tensor(noise[:channels]).array
-        values = conserving(self.grid, values, known, channels, share)
+        separated = None if self.voxel_classes is None else self.voxel_classes.separated
+        values = conserving(self.grid, values, known, channels, share, separated)
         if self.voxel_classes is not None:
             values = self.voxel_classes.filled(values, channels)
         field = RootField(self.grid, values, channels, variance)

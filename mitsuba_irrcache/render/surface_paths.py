@@ -69,6 +69,11 @@ class SampledEmitters:
         environments = [emitter for emitter, kind in emitters if kind.is_environment]
         self._environment = mi.EmitterPtr(environments[0] if environments else None)
         dr.make_opaque(self._environment)
+        #: whether rays can meet what is sampled
+        self.have_extent = threshold < dr.inf or any(
+            not (kind.is_environment or kind.has_one_direction or kind.is_point_like)
+            for _, kind in emitters
+        )
         #: samples at each vertex, and how many emitters one of them stands for
         self.count = dr.opaque(mi.UInt32, min(len(slots), MOST_EMITTERS))
         self.stride = dr.opaque(mi.Float, max(len(slots) / MOST_EMITTERS, 1))
@@ -264,8 +269,8 @@ class SurfacePaths:
         """Return the radiance reflected at ``si`` that comes straight from the sampled emitters.
 
         The sample ``u`` is shifted by a golden-ratio sequence for each of them. With multiple
-        importance sampling unless the path ``ends`` here. The transmittance has no noise if it is
-        to be ``exact``.
+        importance sampling: where the path ``ends``, a ray is sampled from the BSDF for it here.
+        The transmittance has no noise if it is to be ``exact``.
         """
         result, number, context = mi.Spectrum(0), mi.UInt32(0), mi.BSDFContext()
         vertex, active = vertex_at(si), mi.Bool(active) & (self.emitters.count > 0)
@@ -280,11 +285,37 @@ class SurfacePaths:
             passed, rng = visibility(
                 scene, self.media, vertex, record.p, behind, rng, reflects, exact
             )
-            weight = power_heuristic(record.pdf, dr.select(record.delta | ends, 0, density))
+            weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
             result += dr.select(reflects, value * passed * weight, 0)
             number += 1
             active &= number < self.emitters.count
+        if dr.hint(self.emitters.have_extent, mode="scalar"):
+            met, rng = self.met_by_bsdf(scene, si, pointer, rng, ends, exact)
+            result += met
         return result, rng
+
+    def met_by_bsdf(self, scene, si, pointer, rng, active, exact: bool):
+        """Return the radiance reflected at ``si`` from a sampled emitter that a ray meets which is
+        sampled from the BSDF, with multiple importance sampling.
+        """
+        choice = rng.next_float32(active)
+        u = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+        sample, f = si.bsdf().sample(mi.BSDFContext(), si, choice, u, active)
+        active = active & (sample.pdf > 0) & (dr.max(f) > 0)
+        direction, vertex = si.to_world(sample.wo), vertex_at(si)
+        pointer = medium_after(si, direction, pointer)
+        end, passed, rng = first_opaque(
+            scene, self.media, si.spawn_ray(direction), pointer, rng, active, exact
+        )
+        emitter = end.emitter(scene, active)
+        is_emitter = active & (emitter != None)  # noqa: E711
+        value = emitter.eval(end, is_emitter)
+        excess = self.emitters.excess(emitter, value)
+        is_emitter &= (excess > 0) & (dr.max(value) > 0)
+        record = mi.DirectionSample3f(scene, end, vertex)
+        density = emitter.pdf_direction(vertex, record, is_emitter)
+        weight = power_heuristic(sample.pdf, density)
+        return dr.select(is_emitter, f * value * excess * weight * passed, 0), rng
 
     def visible(self, scene, si, numbers, weights, active):
         """Reduce the ``weights`` of nodes, where ``active``, to those that are visible from a
@@ -364,6 +395,43 @@ class SurfacePaths:
             active &= crossings < MOST_CROSSINGS
         distances = dr.minimum(nearest, nearest_surface), nearest_surface
         return position, (geometric, shading), found, distances
+
+
+@symbolic
+def first_opaque(
+    scene: mi.Scene,
+    media: Media,
+    ray: mi.Ray3f,
+    pointer: mi.MediumPtr,
+    rng: mi.PCG32,
+    active: mi.Bool,
+    exact: bool,
+):
+    """Find the first surface along ``ray`` that is not null, invalid where there is none.
+
+    Returns it with the transmittance of null surfaces and media before it, without noise if
+    ``exact``, and the random generator.
+    """
+    ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
+    end, attenuation = dr.zeros(mi.SurfaceInteraction3f), mi.Spectrum(1)
+    crossings = mi.UInt32(0)
+    while dr.hint(active, label="first opaque surface"):
+        si = scene.ray_intersect(ray, active)
+        if dr.hint(exact, mode="scalar"):
+            factor = media.exact_transmittance(pointer, ray, si.t, active)
+        else:
+            factor, rng = media.transmittance(pointer, ray, si.t, rng, active)
+        attenuation = dr.select(active, attenuation * factor, attenuation)
+        null = active & si.is_valid() & is_null(si.bsdf().flags())
+        end = dr.select(active & ~null, si, end)
+        factor = si.bsdf().eval_null_transmission(si, null)
+        attenuation = dr.select(null, attenuation * factor, attenuation)
+        pointer = dr.select(null, medium_after(si, ray.d, pointer), pointer)
+        ray = si.spawn_ray(ray.d)
+        crossings += 1
+        active &= null & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)
+    # A line that exceeds the maximum number of crossings does not contribute.
+    return end, dr.select(crossings < MOST_CROSSINGS, attenuation, 0), rng
 
 
 @symbolic

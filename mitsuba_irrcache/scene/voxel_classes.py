@@ -13,6 +13,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.scene.medium_probe import probe
+from mitsuba_irrcache.scene.occluders import first_surface, hole_in
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
 
 #: Number of rays from each voxel that determine its medium.
@@ -29,12 +30,18 @@ class VoxelClasses(Immutable):
             and their neighbours.
         enclosed: the voxels from whose centres only backs of surfaces are visible.
         cut_cells: cells between voxels that surfaces cut; None where there are none.
+        separated: for x, y, z, whether a surface lies between the centre of a voxel and that of the
+            next one along this axis; None where there are no cut cells.
     """
 
     def __init__(self, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid) -> None:
         self.grid = grid
         index = dr.arange(mi.UInt32, grid.voxel_count)
-        *votes, within, backs = _probed(scene, media, medium, grid, index)
+        box = np.zeros(3, int), grid.resolution
+        # Rays can miss a boundary that nearly coincides with walls; its closed form cannot.
+        exact = medium.has_exact_boundary and not medium.others
+        exact = exact and hole_in(scene, medium, grid, box) is None
+        *votes, within, backs = _probed(scene, media, medium, grid, index, exact)
         within, enclosed = within > 0, backs == RAYS
         dr.eval(votes, within, enclosed)
         best, number = mi.UInt32(0), mi.UInt32(0)
@@ -45,6 +52,9 @@ class VoxelClasses(Immutable):
         cut_cells = CutCells(scene, grid)
         self.medium_number, self.enclosed = number, enclosed
         self.cut_cells = cut_cells if cut_cells.count else None
+        self.separated = None
+        if cut_cells.count:
+            self.separated = tuple(_separated(scene, grid, axis) for axis in range(3))
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.readable = within | (total > 0)
         dr.eval(self.readable)
@@ -70,10 +80,13 @@ class VoxelClasses(Immutable):
 
 
 @symbolic
-def _probed(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index: mi.UInt32):
+def _probed(
+    scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index: mi.UInt32, exact: bool
+):
     """Numbers of rays from each voxel: those whose origin, the voxel's centre, is in no medium and
     in each medium; those whose origin, a random position in the voxel, is in ``medium``; those that
-    hit the back of a surface first.
+    hit the back of a surface first. ``exact``: positions within the medium's boundary, and only
+    these, are in it, whatever the rays meet.
     """
     corner = mi.Point3f(*grid.voxel_indices(index))
     votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
@@ -81,16 +94,27 @@ def _probed(scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, RAYS)
     while dr.hint(k < count, label="voxel classes"):
         u, direction = kronecker(k, 3), fibonacci_direction(k, RAYS, azimuth=0.4)
-        pointer = probe(scene, grid.world.point(corner + 0.5), direction)
+        pointer = _medium_at(scene, medium, grid.world.point(corner + 0.5), direction, exact)
         meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction)
         backs += dr.select(meets_back, mi.UInt32(1), 0)
         votes[0] += dr.select(pointer == None, mi.UInt32(1), 0)  # noqa: E711
         for i in range(len(media.grids)):
             votes[i + 1] += dr.select(pointer == media.grids[i].pointer, mi.UInt32(1), 0)
-        pointer = probe(scene, grid.world.point(corner + mi.Point3f(u)), direction)
+        p = grid.world.point(corner + mi.Point3f(u))
+        pointer = _medium_at(scene, medium, p, direction, exact)
         within += dr.select(pointer == medium.pointer, mi.UInt32(1), 0)
         k += 1
     return [*votes, within, backs]
+
+
+def _medium_at(
+    scene: mi.Scene, medium: MediumGrid, p: mi.Point3f, direction: mi.Vector3f, exact: bool
+) -> mi.MediumPtr:
+    """The medium at ``p``: by rays or, if ``exact``, by the boundary of ``medium``, the only one."""
+    if not exact:
+        return probe(scene, p, direction)
+    none = dr.zeros(mi.MediumPtr, dr.width(p))
+    return dr.select(medium.contains(p), medium.pointer, none)
 
 
 @symbolic
@@ -107,6 +131,21 @@ def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
         crossings += 1
         active &= ~solid & (crossings < MOST_CROSSINGS)
     return back
+
+
+def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
+    """Whether a surface lies between each voxel's centre and that of the next one along ``axis``;
+    false for the last voxels.
+    """
+    index = dr.arange(mi.UInt32, grid.voxel_count)
+    at = list(grid.voxel_indices(index))
+    start = grid.centers(index)
+    exists = at[axis] + 1 < mi.UInt32(grid.sides[axis])
+    at[axis] = at[axis] + 1
+    stop = grid.world.point(mi.Point3f(*at) + 0.5)
+    _, found = first_surface(scene, start, stop, exists)
+    dr.eval(found)
+    return found
 
 
 def neighbourhood(

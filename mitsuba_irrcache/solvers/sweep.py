@@ -12,11 +12,13 @@ from mitsuba_irrcache.grids.occupancy import active_voxels, occupied_box
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, minimum_batch
 from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.grid_size import TARGET_ERROR, SizeRule, choose_grid
+from mitsuba_irrcache.transport.path import Media
 
 #: Kinds of emitters whose radiance can enter along tracks or be sampled from the voxels.
 EMITTERS = frozenset(
@@ -80,10 +82,13 @@ class SweepSolver(Solver):
         hole = hole_in(scene, medium, grid, box)
         if hole:
             return f"{hole} is a hole in {name}, or bounds another medium in it"
+        if medium.phase.is_isotropic and medium.emission is None:
+            return None
         # Emission without extinction must not be occluded either.
         box = box if medium.emission is None else (np.zeros(3, int), grid.resolution)
         found = obstacle(scene, grid, *box)
-        return found and f"{found} reaches into {name}"
+        what = "is emissive" if medium.phase.is_isotropic else "scatters anisotropically"
+        return found and f"{found} reaches into {name}, which {what}"
 
     @classmethod
     def why(cls, medium: MediumGrid) -> str:
@@ -117,6 +122,17 @@ class SweepSolver(Solver):
         numbers = 5 + 2 * channels + (0 if once else 5 + 12 * sets + 3 * channels)
         # Moments of one channel are solved for at a time.
         return numbers + moments * (3 * channels + (4 if once else 10))
+
+    @classmethod
+    def voxel_classes(
+        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid
+    ) -> VoxelClasses | None:
+        if medium.is_isolated:
+            return None
+        active = active_voxels(medium, grid)
+        if not dr.width(active) or obstacle(scene, grid, *occupied_box(grid, active)) is None:
+            return None
+        return VoxelClasses(scene, media, medium, grid)
 
     @classmethod
     def knows_direct_lights(

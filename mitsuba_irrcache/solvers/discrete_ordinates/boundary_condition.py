@@ -9,6 +9,9 @@ A path that meets the medium again ends at its first collision there. The radian
 it from that voxel is known only when the solver has found it. So what enters is
 ``emitted + reflected phi(voxel)``, linear in phi, with voxels and factors that are constant while
 the solver iterates: surfaces become part of the operator A of phi = A phi + b (`multigrid`).
+
+Where tracks cross surfaces among the voxels (`crossings`), radiance that leaves these enters in the
+same way, along one path for each crossing.
 """
 
 from __future__ import annotations
@@ -27,6 +30,11 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
+from mitsuba_irrcache.solvers.discrete_ordinates.crossings import (
+    SurfaceCrossings,
+    SurfaceVoxels,
+    voxel_at,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
@@ -39,6 +47,8 @@ from mitsuba_irrcache.transport.path import Media, PathStart, trace, trace_to_in
 PATH_CELLS, EMITTER_CELLS = 1 << 11, 1 << 16
 #: Paths begin at this distance inside the box [voxels]: surfaces may lie on its faces.
 INSET = 1e-3
+#: Number that is added to that of a random stream for paths from surfaces among the voxels.
+CROSSING_STREAM = 0x5F00
 #: Parameters of an ordinate that the kernel reads, see `IncomingRadiance._parameters`.
 _INTEGERS = ("first", "width", "axis", "axis_b")
 _REALS = (
@@ -52,7 +62,7 @@ class SurfaceBoundary:
 
     ``area_emitters`` are those that tracks meet by chance; what other emitters send straight to a
     voxel is computed otherwise. ``rr_depth`` is that of paths. ``angular_basis`` is None where the
-    medium scatters isotropically.
+    medium scatters isotropically. ``surfaces`` are the voxels near surfaces, if any.
     """
 
     def __init__(
@@ -62,7 +72,9 @@ class SurfaceBoundary:
         area_emitters: Sequence[mi.EmitterPtr],
         rr_depth: int,
         angular_basis: AngularBasis | None = None,
+        surfaces: SurfaceVoxels | None = None,
     ) -> None:
+        self.surfaces = surfaces
         self.scene, self.media = scene, Media.around(medium)
         self.pointer, self.area_emitters = medium.pointer, list(area_emitters)
         #: without this medium, which is convex: a ray that leaves it straight never meets it again
@@ -75,6 +87,13 @@ class SurfaceBoundary:
     def has_sources(self) -> bool:
         """Whether tracks meet emitters or emissive media by chance."""
         return bool(self.area_emitters) or self.other_media.is_emissive
+
+    def crossings(self, tracks: Tracks, ordinates: Ordinates) -> SurfaceCrossings | None:
+        """Where tracks along ``ordinates`` cross surfaces among the voxels."""
+        if self.surfaces is None:
+            return None
+        geometry = tracks.table(*ordinates).geometry
+        return SurfaceCrossings(self.surfaces, tracks.lower, geometry)
 
 
 class IncomingRadiance:
@@ -103,8 +122,13 @@ class IncomingRadiance:
         self.has_emitters[0] |= (weights > 0) & boundary.has_sources
         self._geometry = tracks.table(directions, incoming[..., 0], weights, offsets).geometry
         self._lay_out_cells(np.where(weights > 0, PATH_CELLS, EMITTER_CELLS))
+        #: where tracks cross surfaces among the voxels
+        self.crossings = boundary.crossings(tracks, ordinates)
         parameters = self._parameters(directions, parts, weights)
         found = _trace_cells(boundary, self, *parameters, paths, seed)
+        if self.crossings is not None and self.crossings.count:
+            of_crossings = _trace_crossings(boundary, self, *parameters, paths, seed)
+            found = _joined(found, of_crossings)
         #: for each channel: straight from emitters, in the parts of `has_emitters`; all that does
         #: not depend on phi; factors of phi. And the voxels of phi, and the directions in which
         #: radiance leaves these (None for isotropic scattering).
@@ -124,7 +148,14 @@ class IncomingRadiance:
         """
         values = concatenated([self.unscattered[part][c] for c in channels])
         cells = self._cells_of(self.tracks, table, numbers)
-        return BoundarySource(*cells, values, len(channels))
+        if self.crossings is not None:
+            table.crossings = self.crossings.of_table(numbers)
+        return BoundarySource(*cells, values, len(channels), self._first_crossing)
+
+    @property
+    def _first_crossing(self) -> int | None:
+        """Index of the value of the first crossing."""
+        return None if self.crossings is None else self._count
 
     def reflected_source(
         self,
@@ -145,6 +176,13 @@ class IncomingRadiance:
         start, count = int(cells[0, 0]), int(self._ends[numbers[-1]] - cells[0, 0])
         cells[:, 0] -= start
         here = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
+        first_crossing = None
+        if self.crossings is not None and tracks is self.tracks:
+            # Coarser levels, which only correct the solution, do without surfaces among the voxels.
+            table.crossings = self.crossings.of_table(numbers)
+            begin, end = (int(2 * self.crossings.starts[n]) for n in (numbers[0], numbers[-1] + 1))
+            own = dr.arange(mi.UInt32, end - begin) + dr.opaque(mi.UInt32, self._count + begin)
+            here, first_crossing = concatenated([here, own]), count - begin
         values = [
             concatenated([dr.gather(mi.Float, kind[c], here) for c in channels])
             for kind in (self.reflected, *([self.emitted] if emitted else []))
@@ -159,7 +197,7 @@ class IncomingRadiance:
             direction = mi.Vector3f(*(dr.gather(mi.Float, x, here) for x in self._direction))
         dr.eval(values, indices, direction)
         return ReflectedBoundarySource(
-            level, len(channels), (transforms, cells), indices, direction, *values
+            level, len(channels), (transforms, cells, first_crossing), indices, direction, *values
         )
 
     def sample_rays(
@@ -268,13 +306,14 @@ class ReflectedBoundarySource(BoundarySource):
         self,
         level: MultigridLevel,
         channels: int,
-        cells: tuple[np.ndarray, np.ndarray],
+        cells: tuple[np.ndarray, np.ndarray, int | None],
         index: mi.UInt32,
         direction: mi.Vector3f | None,
         reflected: mi.Float,
         emitted: mi.Float | None = None,
     ) -> None:
-        super().__init__(*cells, None, channels)
+        transforms, cells, first_crossing = cells
+        super().__init__(transforms, cells, None, channels, first_crossing)
         self._level, self._index, self._direction = level, index, direction
         self._reflected, self._emitted = reflected, emitted
 
@@ -339,7 +378,55 @@ def _trace_cells(
     """What enters along the tracks of all cells, both ways in turn; see `IncomingRadiance`."""
     way, weight, hit, ray, rng = incoming.sample_rays(parameters, seed)
     pointer = probe(boundary.scene, ray.o, ray.d)
+    return _trace(boundary, incoming, (way, weight, hit, ray, rng, pointer), distant, paths)
 
+
+def _trace_crossings(
+    boundary: SurfaceBoundary,
+    incoming: IncomingRadiance,
+    parameters: tuple[mi.UInt32, mi.Float],
+    distant: list[mi.Float],
+    paths: bool,
+    seed: tuple[int, int, int],
+) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
+    """The same where tracks leave surfaces among the voxels."""
+    way, hit, ray = incoming.crossings.rays()
+    weight = dr.gather(mi.Float, parameters[1], (way >> 1) * len(_REALS) + _REALS.index("weight"))
+    *batch, use = seed
+    stream = hashed_seed(batch)[0] + dr.opaque(mi.UInt32, use + CROSSING_STREAM)
+    lanes = dr.arange(mi.UInt32, dr.width(way))
+    rng = random_stream(mi.sample_tea_32(lanes, stream))
+    pointer = dr.zeros(mi.MediumPtr, dr.width(way))
+    pointer = dr.select(True, boundary.pointer, pointer)
+    return _trace(boundary, incoming, (way, weight, hit, ray, rng, pointer), distant, paths)
+
+
+def _joined(first: tuple, second: tuple) -> tuple:
+    """The results of `_trace` for one set of rays after the other."""
+    unscattered, emitted, reflected, voxel, direction = (
+        zip(a, b, strict=True) if isinstance(a, list) else (a, b)
+        for a, b in zip(first, second, strict=True)
+    )
+    unscattered = [
+        [concatenated(pair) for pair in zip(*parts, strict=True)] for parts in unscattered
+    ]
+    emitted, reflected = ([concatenated(p) for p in pairs] for pairs in (emitted, reflected))
+    if direction[0] is not None:
+        direction = mi.Vector3f(*(concatenated([a, b]) for a, b in zip(*direction, strict=True)))
+    else:
+        direction = None
+    return unscattered, emitted, reflected, concatenated(voxel), direction
+
+
+def _trace(
+    boundary: SurfaceBoundary,
+    incoming: IncomingRadiance,
+    rays: tuple,
+    distant: list[mi.Float],
+    paths: bool,
+) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
+    """Radiance along rays with these numbers of the ways, weights, and media."""
+    way, weight, hit, ray, rng, pointer = rays
     parts = [dr.gather(mi.Spectrum, each, way) for each in distant]
     visible = hit & (dr.max(sum(parts)) > 0)
     if boundary.has_sources:
@@ -361,7 +448,10 @@ def _trace_cells(
         emitted = emitted + weight * scattered
         direction = end.direction
         reflected = weight * end.weight * dr.inv_four_pi
-        voxel = _voxel_at(incoming.tracks.grid, end.p)
+        if boundary.surfaces is None:
+            voxel = voxel_at(incoming.tracks.grid, end.p)
+        else:
+            voxel = boundary.surfaces.nearest(end.p, dr.max(end.weight) > 0)
     none = dr.zeros(mi.Float, dr.width(weight))
     unscattered = [[v + none for v in part] for part in unscattered]
     emitted, reflected = ([v + none for v in spectrum] for spectrum in (emitted, reflected))
@@ -369,13 +459,3 @@ def _trace_cells(
     direction = None if boundary.angular_basis is None else direction + none
     dr.eval(unscattered, emitted, reflected, voxel, direction)
     return unscattered, emitted, reflected, voxel, direction
-
-
-def _voxel_at(grid: Grid, p: mi.Point3f) -> mi.UInt32:
-    """Flat index of the voxel that contains a world position, or of the nearest one."""
-    u = grid.coordinates.point(p)
-    at = (
-        mi.Int32(dr.clip(dr.floor(v), 0, mi.Float(n - 1)))
-        for v, n in zip(u, grid.sides, strict=True)
-    )
-    return grid.index(*at)

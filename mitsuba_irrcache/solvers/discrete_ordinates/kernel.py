@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.fast_math import absorbed, clipped, decay, minimum
+from mitsuba_irrcache.core.fast_math import absorbed, clipped, decay, maximum, minimum
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import CELL
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
@@ -115,6 +115,9 @@ class _TrackState:
     #: slices crossed, and whether there are more
     crossed: mi.Int32
     active: mi.Bool
+    #: slices since the track left a surface behind the middle of the previous slice, 1 otherwise;
+    #: None where no surfaces are among the voxels, or where a sweep has a source
+    since_surface: mi.Float | None = None
 
     @property
     def at(self) -> tuple:
@@ -185,8 +188,10 @@ class _Way:
         self.b = _TransverseMotion(b, -b.slope if number else b.slope)
         self.c = _TransverseMotion(c, -c.slope if number else c.slope)
 
-    def begin(self, track: mi.Int32, channels: int) -> _TrackState:
-        """The state before the first slice that this way crosses."""
+    def begin(self, track: mi.Int32, channels: int, restarts: bool) -> _TrackState:
+        """The state before the first slice that this way crosses; ``restarts``: with
+        ``since_surface``.
+        """
         record, (fields_b, fields_c) = self.record, self.record.transverse
         # The divisor is 0 where a vector of lanes is not filled.
         c = track // dr.maximum(fields_b.size, 1)
@@ -194,14 +199,14 @@ class _Way:
         active = (c < fields_c.size) & (record.slices > 0)
         zero = 0 * track  # makes uniform values as wide as the lanes
         position_b, position_c = fields_b.start + zero, fields_c.start + zero
-        offset, extinction_offset = record.first_voxel + zero, record.first_extinction + zero
+        offset, extinction_offset = record.first_value + zero, record.first_extinction + zero
         if self.number:
             last = record.slices - 1
             b, c = b + fields_b.last_shift, c + fields_c.last_shift
             b = dr.select(b >= fields_b.size, b - fields_b.size, b)
             c = dr.select(c >= fields_c.size, c - fields_c.size, c)
             position_b, position_c = fields_b.last_position + zero, fields_c.last_position + zero
-            offset = record.first_voxel + record.stride * last + zero
+            offset = record.first_value + record.stride * last + zero
             extinction_offset = record.first_extinction + record.extinction_stride * last + zero
         return _TrackState(
             b=b,
@@ -215,10 +220,16 @@ class _Way:
             previous=mi.Float(0),
             crossed=mi.Int32(0),
             active=active,
+            since_surface=mi.Float(1) if restarts else None,
         )
 
     def advance(
-        self, state: _TrackState, slices: mi.Int32 | int, radiance: list, previous: mi.Float
+        self,
+        state: _TrackState,
+        slices: mi.Int32 | int,
+        radiance: list,
+        previous: mi.Float,
+        since_surface: mi.Float | None,
     ) -> _TrackState:
         """The state some ``slices`` on, with what tracks carry behind this one."""
         record = self.record
@@ -241,6 +252,7 @@ class _Way:
             previous=previous,
             crossed=crossed,
             active=state.active & (crossed < record.slices),
+            since_surface=since_surface,
         )
 
     def slice_of(self, state: _TrackState) -> mi.Int32:
@@ -251,6 +263,12 @@ class _Way:
         """Flat index of the voxel."""
         b, c = self.record.transverse
         return mi.UInt32(state.b * b.stride + state.c * c.stride + state.offset)
+
+    def grid_voxel(self, state: _TrackState) -> mi.UInt32:
+        """Flat index of the voxel in the grid, whatever the layout of the swept volume."""
+        (b, c), record = self.record.transverse, self.record
+        place = state.b * b.voxel_stride + state.c * c.voxel_stride + record.first_voxel
+        return mi.UInt32(place + self.slice_of(state) * record.voxel_stride)
 
     def empty_slices(self, empty: mi.UInt32, state: _TrackState) -> mi.Int32:
         """Slices that may be skipped from here on, 0 where this one is needed."""
@@ -344,6 +362,9 @@ class _PairSweep:
         if self.boundary_source is not None:
             self._cells = self.boundary_source.read_pair(pair)
             self._offsets = self.boundary_source.channel_offsets()
+        self.crossings = table.crossings
+        if self.crossings is not None:
+            self._first_crossing = self.crossings.first(pair)
         self._source_elsewhere = volume.source is not volume.values
         self.weight, self.scale = record.weight, record.quantum * record.length
         # Cross section of the tube for which a track stands over the volume of a voxel: the tubes
@@ -353,7 +374,9 @@ class _PairSweep:
         self.solid_angle = mi.Float(1) if self.separate else record.weight
 
     def begin(self, track: mi.Int32) -> tuple[_TrackState, _TrackState]:
-        forward, backward = (way.begin(track, self.volume.channels) for way in self.ways)
+        restarts = self.crossings is not None and self.volume.source is None
+        channels = self.volume.channels
+        forward, backward = (way.begin(track, channels, restarts) for way in self.ways)
         return forward, backward
 
     def cross_slice(
@@ -379,14 +402,15 @@ class _PairSweep:
         # In the middle slice both ways are in the same voxel, as positions are integers: the first
         # to write writes for both.
         middle = forward.offset == backward.offset
+        since = [None, None]
         if self.volume.source is None:
-            radiance = self._attenuate(values, states, radiance, extinction, visits, middle)
+            radiance, since = self._attenuate(values, states, radiance, extinction, visits, middle)
         else:
             radiance = self._collide(values, states, radiance, extinction, visits, middle)
         forward, backward = (
-            way.advance(state, n, light, second)
-            for way, state, n, light, (_, second) in zip(
-                self.ways, states, slices, radiance, extinction, strict=True
+            way.advance(state, n, light, second, left)
+            for way, state, n, light, (_, second), left in zip(
+                self.ways, states, slices, radiance, extinction, since, strict=True
             )
         )
         if self.medium.empty is None:
@@ -423,19 +447,30 @@ class _PairSweep:
         extinction: list,
         visits: list[_Visit],
         middle: mi.Bool,
-    ) -> list[list[mi.Float]]:
-        """Attenuates the radiance up to the middle of the slice and adds it to the voxels."""
+    ) -> tuple[list[list[mi.Float]], list]:
+        """Attenuates the radiance up to the middle of the slice and adds it to the voxels; returns
+        what tracks carry on, and slices since they left a surface.
+        """
         radiance = [
             _scale(light, _transmittance(state, first, self.scale))
             for state, light, (first, _) in zip(states, radiance, extinction, strict=True)
         ]
+        added, since = radiance, [None, None]
+        if self.crossings is not None:
+            found = [
+                _attenuate_at_surface(self, way, light, first, self._slot(way, state, visit.active))
+                for way, state, light, (first, _), visit in zip(
+                    self.ways, states, radiance, extinction, visits, strict=True
+                )
+            ]
+            added, radiance, since = ([way[i] for way in found] for i in range(3))
         if self.separate:
-            for light, visit in zip(radiance, visits, strict=True):
+            for light, visit in zip(added, visits, strict=True):
                 visit.write(values, light)
         else:
             before = [visit.read(mi.Float, values, self.volume.channels) for visit in visits]
-            self._add_both(values, before, radiance, visits, middle)
-        return radiance
+            self._add_both(values, before, added, visits, middle)
+        return radiance, since
 
     def _collide(
         self,
@@ -465,6 +500,16 @@ class _PairSweep:
                 states, radiance, sources, extinction, strict=True
             )
         ]
+        if self.crossings is not None:
+            crossed = [
+                _collide_at_surface(
+                    self, way, state, light, sent, halves, *result,
+                    self._slot(way, state, visit.active),
+                )
+                for way, state, light, sent, halves, result, visit in zip(
+                    self.ways, states, radiance, sources, extinction, crossed, visits, strict=True
+                )
+            ]  # fmt: skip
         radiance, tallies = ([way[i] for way in crossed] for i in range(2))
         if self.separate:
             for visit, tally, sent in zip(visits, tallies, sources, strict=True):
@@ -507,6 +552,118 @@ class _PairSweep:
             tally.append(mi.Vector4f(0, middle, lost * area, count * tau * area))
         return behind, tally
 
+    # Surfaces among the voxels
+
+    def _slot(self, way: _Way, state: _TrackState, active: mi.Bool) -> mi.UInt32:
+        """1 + the index of the crossing with a surface in this slice; 0 without one."""
+        return self.crossings.slot(self._first_crossing, way.grid_voxel(state), active)
+
+    def _crossing(self, way: _Way, slot: mi.UInt32, active: mi.Bool) -> tuple:
+        """Where this way crosses surfaces, first and last, in slices from the middle, whether the
+        parts before and behind them belong to the voxel, and the radiance behind.
+        """
+        first, last, before, behind = self.crossings.record(slot, active)
+        if way.number:
+            first, last, before, behind = -last, -first, behind, before
+            # Without a crossing there is only the part before.
+            before = dr.select(first > last, behind, before)
+        left = [mi.Float(0)] * self.volume.channels
+        if self.boundary_source is not None:
+            left = self.boundary_source.from_surface(slot, self._offsets, way.number, active)
+        return first, last, before, behind, left
+
+    def _attenuated_parts(
+        self, way: _Way, radiance: list, extinction: mi.Float, slot: mi.UInt32
+    ) -> tuple[list, list, mi.Float]:
+        """See `_attenuate_at_surface`."""
+        first, last, before, behind, left = self._crossing(way, slot, slot > 0)
+        crosses = first <= last
+        reaches, leaves = ~crosses | (first > 0), crosses & (last <= 0)
+        to_middle = decay(maximum(-last, 0.0) * extinction * self.scale)
+        behind = dr.select(leaves, behind, 0)
+        received, carried = [], []
+        for x, y in zip(radiance, left, strict=True):
+            carried.append(dr.select(crosses, dr.select(leaves, y * to_middle, y), x))
+            received.append(dr.select(reaches, x * before, carried[-1] * behind))
+        since = dr.select(crosses & ~leaves, clipped(1 - last, 0.0, 1.0), 1)
+        return received, carried, since
+
+    def _cross_parts(
+        self,
+        way: _Way,
+        state: _TrackState,
+        radiance: list,
+        source: list,
+        extinction: tuple,
+        slot: mi.UInt32,
+    ) -> tuple[list, list]:
+        """See `_collide_at_surface`."""
+        # docs/primer, eq. (4.14)
+        first, last, before, behind, left = self._crossing(way, slot, slot > 0)
+        crosses = first <= last
+        lower, upper = (half * self.scale for half in extinction)
+        begin = -dr.select(state.since_entry < 1, state.since_entry, 0.5)
+        end, restart = (clipped(x, begin, 0.5) for x in (first, last))
+        # Parts on the far side of a surface attenuate nothing: their source is not the voxel's.
+        ahead = before * _depth(begin, end, lower, upper)
+        beyond = dr.select(crosses, behind, 0) * _depth(restart, mi.Float(0.5), lower, upper)
+        shares = [absorbed(tau, decay(tau)) for tau in (ahead, beyond)]
+        to_centre, from_surface = decay(-begin * lower), decay(maximum(-last, 0.0) * lower)
+        depth = self.solid_angle * (ahead + beyond) * self.area
+        carried, tallies = [], []
+        for x, sent, y in zip(radiance, source, left, strict=True):
+            lost = [(value - sent) * share for value, share in zip((x, y), shares, strict=True)]
+            centre = dr.select(
+                ~crosses | (first > 0),
+                before * dr.fma(x - sent, to_centre, sent),
+                dr.select(last < 0, behind * dr.fma(y - sent, from_surface, sent), 0),
+            )
+            carried.append(dr.select(crosses, y - lost[1], x - lost[0]))
+            tallies.append(mi.Vector4f(0, centre, (lost[0] + lost[1]) * self.area, depth))
+        return carried, tallies
+
+
+@symbolic
+def _attenuate_at_surface(
+    sweep: _PairSweep, way: _Way, radiance: list, extinction: mi.Float, slot: mi.UInt32
+):
+    """What a voxel receives from ``radiance``, attenuated to the middle of the slice, where a
+    surface is near; what the track carries on, and how many slices ago it left a surface in the
+    next one. ``extinction`` is that of the first half.
+    """
+    received, carried, since = list(radiance), list(radiance), mi.Float(1)
+    if slot > 0:
+        received, carried, since = sweep._attenuated_parts(way, radiance, extinction, slot)
+    return received, carried, since
+
+
+@symbolic
+def _collide_at_surface(
+    sweep: _PairSweep,
+    way: _Way,
+    state: _TrackState,
+    radiance: list,
+    source: list,
+    extinction: tuple,
+    carried: list,
+    tallies: list,
+    slot: mi.UInt32,
+):
+    """``carried`` and ``tallies``, the results of `_PairSweep._cross_voxel`, where no surface is
+    near; else the same for the parts of the track that belong to the voxel.
+    """
+    if slot > 0:
+        carried, tallies = sweep._cross_parts(way, state, radiance, source, extinction, slot)
+    return carried, tallies
+
+
+def _depth(a: mi.Float, b: mi.Float, lower: mi.Float, upper: mi.Float) -> mi.Float:
+    """Optical depth between two positions, in slices from the middle, where the extinction differs
+    in both halves.
+    """
+    below, above = dr.minimum(b, 0) - dr.minimum(a, 0), dr.maximum(b, 0) - dr.maximum(a, 0)
+    return dr.fma(lower, below, upper * above)
+
 
 def _transmittance(state: _TrackState, here: mi.Float, scale: mi.Float) -> mi.Float:
     """Transmittance from the middle of the previous slice to that of this one, or from the point of
@@ -514,6 +671,8 @@ def _transmittance(state: _TrackState, here: mi.Float, scale: mi.Float) -> mi.Fl
     """
     # docs/primer, eq. (4.4)
     since = state.since_entry
+    if state.since_surface is not None:
+        since = dr.minimum(since, state.since_surface)
     return decay(dr.select(since < 1, here * since, 0.5 * (state.previous + here)) * scale)
 
 

@@ -68,6 +68,12 @@ class MultigridLevel:
         self._coarser: MultigridLevel | None = None
         self._tolerance = COARSEST_TOLERANCE
         self._children: list[tuple[mi.UInt32, mi.Float]] = []
+        #: values of voxels that surfaces cut
+        self._is_cut: mi.Bool | None = None
+        if tracks.surfaces is not None:
+            place, _ = voxel_and_channel(tracks.active_count, self.channels)
+            self._is_cut = tracks.surfaces.is_cut_at(dr.gather(mi.UInt32, tracks.active, place))
+            dr.eval(self._is_cut)
 
     @property
     def coarsest(self) -> bool:
@@ -184,6 +190,9 @@ class MultigridLevel:
         # Radiance of collisions times 4 pi, the integral of 1 over directions.
         collided = 4 * dr.pi * (source + lost / dr.select(depth > 0, depth, 1))
         collided = self.collided_irradiance(depth, collided, phi)
+        if self._is_cut is not None:
+            # The middles of tracks may lie behind the surface: the mean over their parts.
+            phi = dr.select(self._is_cut, collided, phi)
         dr.eval(phi, collided)
         return phi, collided
 

@@ -24,6 +24,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import (
     IncomingRadiance,
     SurfaceBoundary,
 )
+from mitsuba_irrcache.solvers.discrete_ordinates.crossings import SurfaceCrossings
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
@@ -93,8 +94,9 @@ class BoundaryOrdinateSet:
 
     ``incoming`` is the radiance that enters along the ``ordinates``, which begin at number
     ``start`` there. ``reflected`` is that which leaves the medium and returns to it along the
-    scattering ordinates while all orders are solved for, if this set does so. Some ``channels`` are
-    taken of both.
+    scattering ordinates while all orders are solved for, if this set does so. ``crossings`` are
+    those of the tracks of scattering ordinates with surfaces among the voxels. Some ``channels``
+    are taken of ``incoming`` and ``reflected``.
     """
 
     def __init__(
@@ -104,9 +106,10 @@ class BoundaryOrdinateSet:
         incoming: IncomingRadiance,
         start: int,
         reflected: IncomingRadiance | None,
+        crossings: SurfaceCrossings | None,
         channels: Sequence[int],
     ) -> None:
-        self.ordinates, self.scattering = ordinates, scattering
+        self.ordinates, self.scattering, self._crossings = ordinates, scattering, crossings
         self.incoming, self.reflected, self.channels = incoming, reflected, channels
         self.numbers = np.arange(start, start + len(ordinates.directions))
 
@@ -133,10 +136,24 @@ class BoundaryOrdinateSet:
         if phi is None:
             return found
         # Separately: the collisions of either balance what its own tracks lose.
-        scattered = level.sweep(phi, level.tracks.table(*self.scattering))
+        scattered = self.exchanged(level, phi)
         both = tuple(a + b for a, b in zip(found, scattered, strict=True))
         dr.eval(both)
         return both
+
+    def exchanged(self, level: MultigridLevel, phi: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """`MultigridLevel.sweep` of radiance between voxels alone."""
+        table = level.tracks.table(*self.scattering)
+        if self._crossings is not None:
+            table.crossings = self._crossings.of_table(np.arange(len(self.scattering.directions)))
+        return level.sweep(phi, table)
+
+    def uncollided_collisions(self, level: MultigridLevel) -> mi.Float:
+        """The mean irradiance of collisions due to radiance straight from emitters."""
+        table = level.tracks.table(*self.ordinates)
+        source = self.incoming.emitter_source(self.channels, table, self.numbers)
+        table.boundary_source = source
+        return level.sweep(None, table)[1]
 
     def _table(self, level: MultigridLevel) -> TrackTable:
         """The ordinates, with the radiance that enters along them."""
@@ -197,9 +214,10 @@ def boundary_ordinate_sets(
     else:
         scattering = _scattering_ordinates(passes, pairs, rng)
     incoming = IncomingRadiance(boundary, tracks, merged(sets), several, (*seed, 0))
-    reflected = None
+    reflected, crossings = None, [None] * passes
     if several:
         reflected = IncomingRadiance(boundary, tracks, scattering[0], several, (*seed, 1))
+        crossings = [boundary.crossings(tracks, each) for each in scattering]
     starts = np.cumsum([0] + [len(each.directions) for each in sets])
     spectra = [*incoming.spectra, *(reflected.spectra if several else ())]
 
@@ -212,9 +230,12 @@ def boundary_ordinate_sets(
                 incoming,
                 start,
                 None if number else reflected,
+                crossed,
                 channels,
             )
-            for number, (each, own, start) in enumerate(zip(sets, scattering, starts, strict=False))
+            for number, (each, own, start, crossed) in enumerate(
+                zip(sets, scattering, starts, crossings, strict=False)
+            )
         ]
 
     return of, spectra

@@ -28,9 +28,11 @@ from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
 from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.scene.occluders import obstacle
 from mitsuba_irrcache.solvers.base import Progress
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merged
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
+from mitsuba_irrcache.solvers.discrete_ordinates.crossings import SurfaceVoxels
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_emission import emission_irradiance
 from mitsuba_irrcache.solvers.discrete_ordinates.direct_light import (
     EmitterSampling,
@@ -104,6 +106,7 @@ class Sweep:
         self._medium = medium
         # The tracks come first: `occupied_box` evaluates the coordinates of all voxels, which the
         # sample points would otherwise share and store.
+        self._surfaces = _surfaces_among(scene, medium, cache)
         self._prepare_tracks(pause)
         self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
         #: mean of 1/r^2 over a voxel, over its value at the sample point, in multiple scattering:
@@ -133,7 +136,9 @@ class Sweep:
             [emitter for emitter in emitters if emitter not in known]
             for emitters in split_by_solid_angle(scene, cache.grid, *box)
         )
-        self._boundary = SurfaceBoundary(scene, medium, large, rr_depth, cache.directional)
+        self._boundary = SurfaceBoundary(
+            scene, medium, large, rr_depth, cache.directional, self._surfaces
+        )
         emitters = small, self._illumination.point_lights
         self._emitter_sampling = EmitterSampling(
             scene, medium, *emitters, self._sample_points, cache.directional
@@ -149,12 +154,12 @@ class Sweep:
         # beyond the active voxels.
         data = medium.sigma_t.grid
         sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
-        rest = *box, detail, cache.active, sparse, pause
+        rest = *box, detail, cache.active, sparse, pause, self._surfaces
         self._tracks = [Tracks(grid, sigma_t, *rest) for sigma_t in extinction]
         self._levels: dict[tuple[int, ...], MultigridLevel] = {}
         # The albedo does not matter to single scattering here.
         self._sigma_t = self._albedo = [mi.Float(0)]
-        if cache.max_depth != 2:
+        if cache.max_depth != 2 or self._surfaces is not None:
             if detail is not grid:
                 extinction = resampled(medium, medium.sigma_t, grid)
             self._sigma_t = self._at_active(extinction)
@@ -308,11 +313,32 @@ class Sweep:
         if self._sun_irradiance and self.cache.max_depth != 2:  # it is scattered, too
             from_suns = self._mean_irradiance(tracks, suns[0], share, len(channels))
             swept = [a + b for a, b in zip(swept, from_suns, strict=True)]
+        if self._surfaces is not None:
+            interpolated = swept = self._with_cut_voxels(interpolated, sets, share, channels)
         emitters = *self._direct, *self._emission
         return swept, [
             phi + sum(irradiance[c] for irradiance, *_ in emitters) + self._from_suns(c)
             for c, phi in zip(channels, interpolated, strict=True)
         ]
+
+    def _with_cut_voxels(
+        self,
+        irradiance: list[mi.Float],
+        sets: list[BoundaryOrdinateSet],
+        share: mi.Float,
+        channels: tuple[int, ...],
+    ) -> list[mi.Float]:
+        """Replace the uncollided irradiance in voxels that surfaces cut by that of collisions."""
+        level = self._level(channels)
+        collided = sum(each.uncollided_collisions(level) for each in sets) * share
+        is_cut = self._surfaces.is_cut_at(self.cache.active)
+        places = self._interleaved_places(channels)
+        found = [
+            dr.select(is_cut, dr.gather(mi.Float, collided, place), phi)
+            for place, phi in zip(places, irradiance, strict=True)
+        ]
+        dr.eval(found)
+        return found
 
     def _mean_irradiance(
         self, tracks: Tracks, arguments: tuple, share: mi.Float, channels: int
@@ -362,8 +388,12 @@ class Sweep:
             return total * share
         # The first passes used a noisier phi than the final one. Without this correction their
         # noise would count three times as much as that of others.
-        ordinates = merged([each.scattering for each in sets])
-        change = level.propagated_change(phi - used * share, ordinates, len(sets))
+        change = phi - used * share
+        if self._surfaces is None:
+            ordinates = merged([each.scattering for each in sets])
+            change = level.propagated_change(change, ordinates, len(sets))
+        else:  # coarser levels have no surfaces among the voxels
+            change, _ = sets[0].exchanged(level, change)
         return dr.fma(total, share, change)
 
     def _irradiance_of_collisions(
@@ -430,6 +460,19 @@ class Sweep:
         """Indices of each channel's values in an array with interleaved channels."""
         place = dr.arange(mi.UInt32, self.cache.active_count) * len(channels)
         return [place + c for c in range(len(channels))]
+
+
+def _surfaces_among(
+    scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache
+) -> SurfaceVoxels | None:
+    """The voxels near surfaces, None where there are none in the box of the active voxels."""
+    if medium.is_isolated:
+        return None
+    box = occupied_box(cache.grid, cache.active)
+    if obstacle(scene, cache.grid, *box) is None:
+        return None
+    surfaces = SurfaceVoxels(scene, cache.grid, *box)
+    return surfaces if surfaces.count else None
 
 
 def _change(before: mi.Float, after: mi.Float) -> float:

@@ -28,11 +28,12 @@ class TransverseFields:
 
     #: voxels of the box of tracks
     size: Integer
-    #: step of the flat index of the swept volume, of the extinction, and of the cells of empty
-    #: space
+    #: step of the flat index of the swept volume, of the extinction, of the cells of empty space,
+    #: and of the grid's voxels
     stride: Integer
     extinction_stride: Integer
     empty_stride: Integer
+    voxel_stride: Integer
     #: what a track moves by from slice to slice [voxels / `FIXED_POINT_ONE`]
     slope: Integer
     #: position of all tracks within their voxels in the first slice
@@ -59,9 +60,12 @@ class TrackRecord:
     stride: Integer
     extinction_stride: Integer
     empty_stride: Integer
-    #: flat indices of the box's first voxel, and of what it reads of the extinction
-    first_voxel: Integer
+    voxel_stride: Integer
+    #: flat indices of the box's first voxel in the swept volume, of what it reads of the
+    #: extinction, and of that voxel in the grid
+    first_value: Integer
     first_extinction: Integer
+    first_voxel: Integer
     #: length of a track between two slices [scene units]
     length: Real
     #: ordinate weight: the solid angle that each of the pair stands for [sr]

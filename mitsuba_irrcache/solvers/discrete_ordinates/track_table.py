@@ -52,6 +52,8 @@ class TrackTable:
         self.geometry = TrackGeometry(axis, forward, record)
         #: replaces ``incoming`` where that is not the same for all tracks of an ordinate
         self.boundary_source: BoundarySource | None = None
+        #: where tracks cross surfaces among the voxels, if there are any
+        self.crossings: TrackCrossings | None = None
         self.records = PackedRecords(record, len(axis))
         self._incoming = mi.Float(incoming.astype(np.float32).ravel())
         self.channels = incoming.shape[2]
@@ -94,6 +96,34 @@ class PairGroup:
         return self.table.records.direction(self.pair(number))
 
 
+class TrackCrossings:
+    """Crossings of the tracks of a table with surfaces among the voxels, see `SurfaceCrossings`."""
+
+    def __init__(
+        self, number: mi.UInt32, first: np.ndarray, slots: mi.UInt32, records: mi.Float
+    ) -> None:
+        """``number`` is 1 + the place of each voxel of the grid among those near surfaces, 0 for
+        others; ``first`` (n) the index in ``slots`` of the first of these voxels for each pair.
+        ``slots`` has 1 + the index of the crossing in ``records``, 0 where there is none.
+        """
+        self._number, self._slots, self._records = number, slots, records
+        # One more, since kernels that read an array of a single value are different ones.
+        self._first = mi.UInt32([*first.tolist(), 0, 0])
+
+    def first(self, pair: mi.UInt32) -> mi.UInt32:
+        """What `slot` needs for each pair."""
+        return dr.gather(mi.UInt32, self._first, pair)
+
+    def slot(self, first: mi.UInt32, voxel: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """1 + the index of the crossing in a voxel of the grid; 0 without one."""
+        number = dr.gather(mi.UInt32, self._number, voxel, active)
+        return dr.gather(mi.UInt32, self._slots, first + number - 1, active & (number > 0))
+
+    def record(self, slot: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
+        """The record of the crossing with this `slot`."""
+        return dr.gather(mi.Vector4f, self._records, slot - 1, active)
+
+
 class BoundarySource:
     """Irradiance (radiance times solid angle) that enters the box, track by track.
 
@@ -109,10 +139,15 @@ class BoundarySource:
         cells: np.ndarray,
         values: mi.Float | None = None,
         channels: int = 1,
+        first_crossing: int | None = None,
     ) -> None:
         """``transforms`` (n, 5): scale, shifts (2) and slopes (2) of the tracks of each pair;
-        ``cells`` (n, 3): index of the first value, and the number of cells along both axes.
+        ``cells`` (n, 3): index of the first value, and the number of cells along both axes. Those
+        of crossing 0 among the voxels would be at ``first_crossing`` (None: no values of these).
         """
+        self._first_crossing = None
+        if first_crossing is not None:
+            self._first_crossing = dr.opaque(mi.UInt32, first_crossing & 0xFFFFFFFF)
         self._transforms = mi.Float(transforms.ravel().tolist())
         self._cells = mi.UInt32(cells.ravel().tolist())
         self.values, self.channels = values, channels
@@ -141,5 +176,16 @@ class BoundarySource:
         b, c = (mi.Int32(dr.floor(dr.fma(x, scale, m))) for x, m in ((b, shift_b), (c, shift_c)))
         active = active & (b >= 0) & (c >= 0) & (b < mi.Int32(nb)) & (c < mi.Int32(nc))
         index = first + (mi.UInt32(c) * nb + mi.UInt32(b)) * 2 + way
+        return self._read(index, offsets, active)
+
+    def from_surface(
+        self, slot: mi.UInt32, offsets: list, way: int, active: mi.Bool
+    ) -> list[mi.Float]:
+        """Irradiance that leaves a surface among the voxels along the tracks behind it."""
+        if self._first_crossing is None:
+            return [mi.Float(0)] * self.channels
+        return self._read(self._first_crossing + (slot - 1) * 2 + way, offsets, active)
+
+    def _read(self, index: mi.UInt32, offsets: list, active: mi.Bool) -> list[mi.Float]:
         indices = [index, *(index + offset for offset in offsets)]
         return [dr.gather(mi.Float, self.values, i, active) for i in indices]

@@ -31,6 +31,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.solvers.discrete_ordinates.crossings import SurfaceVoxels
 from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import EmptySpace
 from mitsuba_irrcache.solvers.discrete_ordinates.extinction import Extinction
 from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
@@ -77,7 +78,7 @@ class Tracks:
     over the same box (None: the same grid). Results are found at the voxels ``active`` (flat
     indices; None: all). Where these contain all matter, ``sparse`` lets sweeps skip the empty space
     between them, if that saves time. ``pause`` is called after every launch (see
-    `CacheBuilder.pause`).
+    `CacheBuilder.pause`). ``surfaces`` are the voxels near surfaces, if any.
     """
 
     def __init__(
@@ -90,7 +91,9 @@ class Tracks:
         active: mi.UInt32 | None = None,
         sparse: bool = False,
         pause: Callable[[], None] = lambda: None,
+        surfaces: SurfaceVoxels | None = None,
     ) -> None:
+        self.surfaces = surfaces
         self.grid, self.extinction_grid = grid, extinction_grid or grid
         self.pause = pause
         self.lower, self.size = np.array(lower), np.array(upper) - np.array(lower)
@@ -107,7 +110,10 @@ class Tracks:
         self._active_index: mi.UInt32 | None = None
         self.sparse, self._empty = sparse, None
         if sparse and not self.one_launch:
-            self._empty = EmptySpace.find(grid, self.active, lower, upper)
+            needed = self.active
+            if surfaces is not None:
+                needed = concatenated([needed, surfaces.voxels])
+            self._empty = EmptySpace.find(grid, needed, lower, upper)
         #: where the extinction of each axis begins in an array for all of them
         self._first_extinction = [0, 0, 0]
         if self.one_launch:
@@ -151,6 +157,7 @@ class Tracks:
         along = velocities[pairs, axis]
         strides, extinction_strides = self._strides(axis, by_slice)
         empty_strides = np.array(self._empty.strides if self._empty else (0, 0, 0))
+        voxels = np.array(strides_of(self.grid.resolution))
         per_voxel = self._per_voxel(has_source=not by_slice)
         if per_voxel:
             first_extinction = extinction_strides @ self.lower
@@ -161,7 +168,7 @@ class Tracks:
         def transverse(number: int) -> TransverseFields:
             k = TRANSVERSE[axis, number]
             slope = velocities[pairs, k] / along
-            step = strides[pairs, k], extinction_strides[pairs, k], empty_strides[k]
+            step = strides[pairs, k], extinction_strides[pairs, k], empty_strides[k], voxels[k]
             return self._transverse_fields(axis, k, slope, offsets[:, number], step, last[k])
 
         along_axis = directions * np.sign(along)[:, None]
@@ -171,8 +178,10 @@ class Tracks:
             stride=strides[pairs, axis],
             extinction_stride=extinction_strides[pairs, axis],
             empty_stride=empty_strides[axis],
-            first_voxel=strides @ self.lower,
+            voxel_stride=voxels[axis],
+            first_value=strides @ self.lower,
             first_extinction=first_extinction + np.array(self._first_extinction)[axis],
+            first_voxel=voxels @ self.lower,
             length=1 / np.abs(along),
             weight=weights,
             quantum=self._extinction.quantum,
@@ -205,7 +214,9 @@ class Tracks:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)
             self._sweep_axis(volume, False, table, axis, pairs)
             for c in range(channels):
-                values = values_at_centres(volume, self.grid, *box, axis, self.active, c, channels)
+                where = axis, self.active, c, channels
+                cut = None if self.surfaces is None else self.surfaces.is_cut
+                values = values_at_centres(volume, self.grid, *box, *where, cut=cut)
                 index = dr.arange(mi.UInt32, active)
                 index = index + dr.opaque(mi.UInt32, active * c) if c else index
                 # In place: a sum would be a second array.
@@ -265,11 +276,11 @@ class Tracks:
         k: np.ndarray,
         slope: np.ndarray,
         offset: np.ndarray,
-        steps: tuple[np.ndarray, np.ndarray, np.ndarray],
+        steps: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         last: np.ndarray,
     ) -> TransverseFields:
         """Fields of n pairs with these dominant axes for the transverse axes ``k``: voxels by which
-        tracks move per slice, random shifts, steps of the three flat indices, and the coordinates
+        tracks move per slice, random shifts, steps of the four flat indices, and the coordinates
         of the last extinction value.
         """
         size = self.size
@@ -283,6 +294,7 @@ class Tracks:
             stride=steps[0],
             extinction_stride=steps[1],
             empty_stride=steps[2],
+            voxel_stride=steps[3],
             slope=slope,
             start=start,
             last_shift=(end >> FIXED_POINT_BITS) % size[k],
@@ -380,13 +392,15 @@ def values_at_centres(
     channel: int = 0,
     channels: int = 1,
     begin: mi.UInt32 | int = 0,
+    cut: mi.Bool | None = None,
 ) -> mi.Float:
     """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z), from
     ``means`` over the cross sections of all voxels across ``axis``.
 
     Tracks with a random shift sample a voxel's cross section uniformly; second differences along
     both transverse axes take back the smoothing. Results are never negative. ``means``, laid out by
-    slices from ``begin`` on, have several ``channels``, of which one is taken.
+    slices from ``begin`` on, have several ``channels``, of which one is taken. Voxels ``cut`` by
+    surfaces, and their neighbours, have no second differences.
     """
     # docs/primer, eq. (4.5)
     places, strides = grid.voxel_indices(index), strides_of(grid.resolution, slicewise(axis))
@@ -407,5 +421,22 @@ def values_at_centres(
         centre = place + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
         here, below, above = (read(i, inside) for i in (centre, centre - stride, centre + stride))
         # Voxels that no radiance has reached have no second difference.
-        change += dr.select((below > 0) & (above > 0), 2 * here - below - above, 0)
+        known = (below > 0) & (above > 0)
+        if cut is not None:
+            known &= ~_any_cut(grid, cut, places, k, (at == first, at == last), inside)
+        change += dr.select(known, 2 * here - below - above, 0)
     return dr.maximum(dr.fma(change, dr.opaque(mi.Float, SECOND_DIFFERENCE), value), 0)
+
+
+def _any_cut(
+    grid: Grid, cut: mi.Bool, places: tuple, k: int, ends: tuple, active: mi.Bool
+) -> mi.Bool:
+    """Whether surfaces cut one of the three voxels of a second difference along axis ``k``."""
+    at_first, at_last = ends
+    centre = mi.Int32(places[k]) + dr.select(at_first, 1, 0) - dr.select(at_last, 1, 0)
+    result = mi.Bool(False)
+    for shift in (-1, 0, 1):
+        at = [mi.Int32(p) for p in places]
+        at[k] = centre + shift
+        result |= dr.gather(mi.Bool, cut, grid.index(*at), active)
+    return result

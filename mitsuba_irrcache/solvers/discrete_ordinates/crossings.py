@@ -1,0 +1,332 @@
+"""Surfaces among the voxels: where the tracks of ordinates cross them.
+
+In every slice each voxel has exactly one track of an ordinate (`tracks`), so the segment of a track
+in a voxel is identified by the ordinate and the voxel. For all voxels near surfaces and all
+ordinates, these segments are intersected with the scene once, before sweeps. A track that crosses
+surfaces between the positions ``first`` and ``last`` of a segment ends at ``first`` and begins
+anew at ``last``, with the radiance that leaves the surface there (`boundary_condition`).
+
+A voxel that a surface cuts has one value, which is that of the side on which its centre lies: only
+parts of segments that see the centre are tallied (primer, section 4.8).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.scene.occluders import first_surface
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated, layer_and_index
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackCrossings, TrackGeometry
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+
+#: Rays along each edge of a voxel's face that detect surfaces in it.
+RAYS_PER_EDGE = 6
+#: Segments end at this distance inside the box [slices]: surfaces on its faces belong to the
+#: radiance that enters.
+INSET = 1e-3
+#: By this length consecutive segments overlap, so that no surface is between them [slices].
+OVERLAP = 1e-4
+#: Segments that are intersected in one launch, at most.
+LANES = 1 << 22
+#: A position that no segment reaches [slices from its middle].
+BEYOND = 2.0
+
+
+class SurfaceVoxels:
+    """The voxels near surfaces, in the box of ``grid`` between ``lower`` and ``upper`` (x, y, z).
+
+    Attributes:
+        voxels: flat indices of the voxels that surfaces cut and of their neighbours, ascending.
+        number: for each voxel of the grid, 1 + its place in ``voxels``; 0 for others.
+        is_cut: for each voxel of the grid, whether a surface cuts it.
+    """
+
+    def __init__(self, scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> None:
+        self.scene, self.grid, self.lower, self.upper = scene, grid, lower, upper
+        marks = dr.zeros(mi.UInt32, grid.voxel_count)
+        for axis in range(3):
+            start, direction, length = _lattice(grid, lower, upper, axis)
+            _mark_hits(scene, grid, start, direction, length, marks)
+            dr.eval(marks)
+        self.is_cut = self._within(marks > 0)
+        dr.eval(self.is_cut)
+        self.voxels = dr.compress(self._within(_dilated(grid, self.is_cut)))
+        self.count = dr.width(self.voxels)
+        self.number = dr.zeros(mi.UInt32, grid.voxel_count)
+        if self.count:
+            dr.scatter(self.number, dr.arange(mi.UInt32, self.count) + 1, self.voxels)
+        dr.eval(self.number)
+
+    def is_cut_at(self, voxel: mi.UInt32) -> mi.Bool:
+        """Whether surfaces cut these voxels of the grid."""
+        return dr.gather(mi.Bool, self.is_cut, voxel)
+
+    @symbolic
+    def nearest(self, p: mi.Point3f, active: mi.Bool):
+        """The voxel whose value applies at world positions: that which contains them, or the
+        nearest of its neighbours whose centre is on the same side of surfaces.
+        """
+        u = self.grid.coordinates.point(p)
+        own = voxel_at(self.grid, p)
+        voxel = mi.UInt32(own)
+        active = mi.Bool(active) & dr.gather(mi.Bool, self.is_cut, own, active)
+        best, k = mi.Float(dr.inf), mi.UInt32(0)
+        while dr.hint(active & (k < 27), label="nearest voxel"):
+            at, there = _neighbour(self.grid, u, k)
+            distance = dr.squared_norm(at - u)
+            _, hidden = first_surface(
+                self.scene, p, self.grid.world.point(at), active & (distance < best)
+            )
+            nearer = ~hidden & (distance < best)
+            best, voxel = dr.select(nearer, distance, best), dr.select(nearer, there, voxel)
+            k += 1
+        return voxel
+
+    def _within(self, marks: mi.Bool) -> mi.Bool:
+        """Restrict marks of all voxels to those in the box."""
+        at = self.grid.voxel_indices(dr.arange(mi.UInt32, self.grid.voxel_count))
+        for k, low, high in zip(at, self.lower, self.upper, strict=True):
+            marks = marks & (k >= int(low)) & (k < int(high))
+        return marks
+
+
+class SurfaceCrossings:
+    """Crossings of the tracks of n ordinates with surfaces, with ``geometry`` of these tracks.
+
+    ``records`` has four values for each: the positions ``first`` and ``last`` along the dominant
+    axis, in slices from the middle of the segment, and whether the parts before and behind them
+    see the centre of the voxel. ``first`` > ``last`` where the segment is on the far side of a
+    surface but does not cross it.
+    """
+
+    def __init__(self, surfaces: SurfaceVoxels, lower: np.ndarray, geometry: TrackGeometry) -> None:
+        self.surfaces, self._lower = surfaces, lower
+        ordinates = len(geometry.axis)
+        self._parameters = _parameters(geometry)
+        count = surfaces.count
+        self.slots = dr.zeros(mi.UInt32, ordinates * count)
+        records, found_at, total = [], [], 0
+        most = max(1, LANES // max(count, 1))
+        #: number of the first crossing of each ordinate, and of all
+        self.starts = np.zeros(ordinates + 1, np.int64)
+        for begin in range(0, ordinates, most):
+            number, place = layer_and_index(count, min(most, ordinates - begin))
+            number += dr.opaque(mi.UInt32, begin)
+            first, last, before, behind = _intersect(self, number, place)
+            wanted = (first <= last) | (before < 1)
+            dr.eval(wanted, first, last, before, behind)
+            index = dr.compress(wanted)
+            width = dr.width(index)
+            if not width:
+                continue
+            found = first, last, before, behind
+            values = dr.ravel(mi.Vector4f(*(dr.gather(mi.Float, x, index) for x in found)))
+            lane = index + dr.opaque(mi.UInt32, begin * count)
+            slot = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, total)
+            dr.scatter(self.slots, slot + 1, lane)
+            dr.eval(values, lane, self.slots)
+            records.append(values)
+            found_at.append(lane)
+            total += width
+        self.count = total
+        self._lanes = concatenated(found_at) if found_at else mi.UInt32()
+        self.records = concatenated(records) if records else mi.Float([0, 0, 0, 0])
+        if total:
+            ordinate = np.array(self._lanes) // count
+            self.starts[1:] = np.cumsum(np.bincount(ordinate, minlength=ordinates))
+
+    def of_table(self, numbers: np.ndarray) -> TrackCrossings:
+        """For a table of the same tracks, with these ``numbers`` of the ordinates."""
+        return TrackCrossings(
+            self.surfaces.number, numbers * self.surfaces.count, self.slots, self.records
+        )
+
+    def rays(self) -> tuple[mi.UInt32, mi.Bool, mi.Ray3f]:
+        """For each crossing, both ways in turn: the number of the way (two for each ordinate),
+        whether there is radiance that leaves the surface, and the ray to the surface, against the
+        direction of travel.
+        """
+        lane = dr.arange(mi.UInt32, 2 * self.count)
+        back, slot = (lane & 1) == 1, lane >> 1
+        record = dr.gather(mi.Vector4f, self.records, slot)
+        at = dr.gather(mi.UInt32, self._lanes, slot)
+        number = at // max(self.surfaces.count, 1)
+        segment = _Segment(self, number, at - number * self.surfaces.count)
+        origin = dr.select(back, segment.start, segment.end)
+        direction = dr.select(back, 1.0, -1.0) * segment.direction
+        return number * 2 + dr.select(back, 1, 0), record.x <= record.y, mi.Ray3f(origin, direction)
+
+
+class _Segment:
+    """The segments of tracks in voxels near surfaces: lane by lane the ``number`` of the ordinate
+    and the ``place`` of the voxel.
+    """
+
+    def __init__(self, crossings: SurfaceCrossings, number: mi.UInt32, place: mi.UInt32) -> None:
+        surfaces = crossings.surfaces
+        integers, reals = crossings._parameters
+        axis, axis_b, slope_b, slope_c, start_b, start_c, slices = (
+            dr.gather(mi.Int32, integers, number * 7 + i) for i in range(7)
+        )
+        sizes = [dr.gather(mi.Float, reals, number * 2 + i) for i in range(2)]
+        self.voxel = dr.gather(mi.UInt32, surfaces.voxels, place)
+        at = [mi.Int32(i) for i in surfaces.grid.voxel_indices(self.voxel)]
+        low = [dr.opaque(mi.Int32, int(n)) for n in crossings._lower]
+        own = [i - n for i, n in zip(at, low, strict=True)]
+        slice_ = dr.select(axis == 0, own[0], dr.select(axis == 1, own[1], own[2]))
+        b = dr.select(axis_b == 0, own[0], own[1])
+        c = dr.select(axis == 2, own[1], own[2])
+        # The same integers as in the kernel: see `_TransverseMotion.advance`.
+        middle, steps, ahead, back = [mi.Float(slice_) + 0.5], [mi.Float(1)], [], []
+        for i, slope, start, size in (
+            (b, slope_b, start_b, sizes[0]),
+            (c, slope_c, start_c, sizes[1]),
+        ):
+            position = (start + slice_ * slope) & (FIXED_POINT_ONE - 1)
+            x = dr.fma(mi.Float(position), 1 / FIXED_POINT_ONE, mi.Float(i))
+            step = mi.Float(slope) * (1 / FIXED_POINT_ONE)
+            low_end, high_end = x / dr.abs(step), (size - x) / dr.abs(step)
+            ahead.append(dr.select(slope > 0, high_end, low_end))
+            back.append(dr.select(slope > 0, low_end, high_end))
+            middle.append(x)
+            steps.append(step)
+
+        def reach(sides: list[mi.Float], at_end: mi.Bool) -> mi.Float:
+            # Tracks that entered since the middle of the previous slice begin where they did.
+            side = dr.minimum(sides[0], sides[1])
+            side = dr.select(at_end, dr.minimum(side, 0.5), side)
+            return dr.select(at_end | (side < 1), side - INSET, 0.5 + OVERLAP)
+
+        self.back = dr.maximum(reach(back, slice_ == 0), 0)
+        self.ahead = dr.maximum(reach(ahead, slice_ == slices - 1), 0)
+        order = [
+            [
+                dr.select(axis == 0, m[0], m[1]),
+                dr.select(axis == 1, m[0], dr.select(axis == 0, m[1], m[2])),
+                dr.select(axis == 2, m[0], m[2]),
+            ]
+            for m in (middle, steps)
+        ]
+        world = surfaces.grid.world
+        lower = mi.Point3f(*(mi.Float(n) for n in low))
+        self.middle = world.point(mi.Point3f(*order[0]) + lower)
+        self.step = world.vector(mi.Vector3f(*order[1]))  # from slice to slice
+        self.direction = dr.normalize(self.step)
+        self.start, self.end = self.at(-self.back), self.at(self.ahead)
+        self.centre = world.point(mi.Point3f(*at) + 0.5)
+
+    def at(self, position: mi.Float) -> mi.Point3f:
+        """World position, so many slices from the middle."""
+        return self.middle + self.step * position
+
+
+def _intersect(crossings: SurfaceCrossings, number: mi.UInt32, place: mi.UInt32) -> tuple:
+    """Intersect segments with surfaces; see `SurfaceCrossings`."""
+    segment, scene = _Segment(crossings, number, place), crossings.surfaces.scene
+    slice_length = dr.norm(segment.step)
+    near, hit = first_surface(scene, segment.start, segment.end, mi.Bool(True))
+    far, _ = first_surface(scene, segment.end, segment.start, hit)
+    first = dr.select(hit, near / slice_length - segment.back, BEYOND)
+    last = dr.select(hit, segment.ahead - far / slice_length, -BEYOND)
+    last = dr.select(hit, dr.maximum(first, last), last)
+    # The middle of each part; without a crossing there is one, the whole segment.
+    middle_before = dr.select(hit, 0.5 * (first - segment.back), 0)
+    middle_behind = 0.5 * (last + segment.ahead)
+    is_cut = dr.gather(mi.Bool, crossings.surfaces.is_cut, segment.voxel)
+    _, hidden = first_surface(scene, segment.centre, segment.at(middle_before), is_cut | hit)
+    before = dr.select(hidden, mi.Float(0), 1)
+    _, hidden = first_surface(scene, segment.centre, segment.at(middle_behind), hit)
+    behind = dr.select(hidden, mi.Float(0), 1)
+    return first, last, before, behind
+
+
+def _parameters(geometry: TrackGeometry) -> tuple[mi.Int32, mi.Float]:
+    """What `_Segment` reads for each ordinate."""
+    fixed = [np.rint(x * FIXED_POINT_ONE) for x in (geometry.slopes, geometry.starts)]
+    columns = [geometry.axis, geometry.transverse[:, 0], *fixed, geometry.sizes[:, 2]]
+    integers = np.column_stack(columns).astype(np.int64)
+    sizes = geometry.sizes[:, :2]
+    return mi.Int32(integers.ravel().tolist()), mi.Float(sizes.ravel().tolist())
+
+
+def _lattice(
+    grid: Grid, lower: np.ndarray, upper: np.ndarray, axis: int
+) -> tuple[mi.Point3f, mi.Vector3f, float]:
+    """Rays along an axis of the grid, several in each row of voxels of the box: where they start,
+    their direction, and their length.
+    """
+    across = [k for k in range(3) if k != axis]
+    count = [int(upper[k] - lower[k]) * RAYS_PER_EDGE for k in across]
+    row, column = layer_and_index(count[0], count[1])
+    place = [dr.opaque(mi.Float, float(n)) for n in lower]
+    for k, i in zip(across, (column, row), strict=True):
+        place[k] = place[k] + (mi.Float(i) + 0.5) * (1 / RAYS_PER_EDGE)
+    step = grid.world.matrix[:3, axis] * float(upper[axis] - lower[axis])
+    length = float(np.linalg.norm(step))
+    direction = mi.Vector3f([dr.opaque(mi.Float, float(v)) for v in step / length])
+    return grid.world.point(mi.Point3f(place)), direction, length
+
+
+@symbolic
+def _mark_hits(
+    scene: mi.Scene,
+    grid: Grid,
+    start: mi.Point3f,
+    direction: mi.Vector3f,
+    length: float,
+    marks: mi.UInt32,
+):
+    """Mark the voxels in which rays hit surfaces that are not null boundaries."""
+    length = dr.opaque(mi.Float, length)
+    ray, active, crossings = mi.Ray3f(start, direction), mi.Bool(True), mi.UInt32(0)
+    ray.maxt = mi.Float(length)
+    while dr.hint(active, label="surface voxels"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        solid = active & (~is_null(si.bsdf().flags()) | (si.shape.emitter() != None))  # noqa: E711
+        dr.scatter(marks, mi.UInt32(1), voxel_at(grid, si.p), solid)
+        ray = si.spawn_ray(direction)
+        ray.maxt = dr.maximum(length - dr.norm(si.p - start), 0)
+        crossings += 1
+        active &= crossings < MOST_CROSSINGS
+
+
+def _neighbour(grid: Grid, u: mi.Point3f, k: mi.UInt32) -> tuple[mi.Point3f, mi.UInt32]:
+    """Number ``k`` of the 27 voxels around voxel coordinates ``u``: its centre and flat index."""
+    shifts = k % 3, (k // 3) % 3, k // 9
+    at = [
+        mi.Int32(dr.clip(dr.floor(v) + mi.Float(s) - 1, 0, mi.Float(n - 1)))
+        for v, s, n in zip(u, shifts, grid.sides, strict=True)
+    ]
+    return mi.Point3f(*(mi.Float(i) + 0.5 for i in at)), grid.index(*at)
+
+
+def voxel_at(grid: Grid, p: mi.Point3f) -> mi.UInt32:
+    """Flat index of the voxel that contains a world position, or of the nearest one."""
+    u = grid.coordinates.point(p)
+    at = (
+        mi.Int32(dr.clip(dr.floor(v), 0, mi.Float(n - 1)))
+        for v, n in zip(u, grid.sides, strict=True)
+    )
+    return grid.index(*at)
+
+
+def _dilated(grid: Grid, marks: mi.Bool) -> mi.Bool:
+    """The marked voxels and their 26 neighbours."""
+    values = dr.select(marks, mi.UInt32(1), 0)
+    at = [mi.Int32(i) for i in grid.voxel_indices(dr.arange(mi.UInt32, grid.voxel_count))]
+    for axis in range(3):
+        dr.eval(values)
+        total = mi.UInt32(values)
+        for shift in (-1, 1):
+            place = list(at)
+            place[axis] = at[axis] + shift
+            inside = (place[axis] >= 0) & (place[axis] < grid.sides[axis])
+            total |= dr.gather(mi.UInt32, values, grid.index(*place), inside)
+        values = total
+    return values > 0
