@@ -110,7 +110,7 @@ def _probed(
 def _medium_at(
     scene: mi.Scene, medium: MediumGrid, p: mi.Point3f, direction: mi.Vector3f, exact: bool
 ) -> mi.MediumPtr:
-    """The medium at ``p``: by rays or, if ``exact``, by the boundary of ``medium``, the only one."""
+    """The medium at ``p``; if ``exact``, by the boundary of ``medium``, which is the only one."""
     if not exact:
         return probe(scene, p, direction)
     none = dr.zeros(mi.MediumPtr, dr.width(p))

@@ -215,19 +215,22 @@ def test_point_light_and_several_media(scenes):
 
 
 def test_the_choice_of_solver(scenes):
-    """``auto`` selects sweep unless an object reaches into the medium or max_depth is small.
+    """``auto`` selects sweep unless other media reach into the medium, or objects into one that
+    scatters anisotropically, or max_depth is small.
 
     A request for ``sweep`` in these cases is refused with the reason.
     """
     ball = {"type": "sphere", "center": [0, 0, 0], "radius": 0.2, "bsdf": grey(0.5)}
     veil = square((0, 0, 0), (0, 0, 1), 3, bsdf=grey(0.5))
     shape = cloud(scenes, 8)
+    phase = {"phase_function": {"type": "hg", "g": 0.4}}
+    forward = shape | {"interior": shape["interior"] | phase}
     around = {"shape": shape | {"interior": mi.load_dict(shape["interior"])}}
     other = scenes.boundary(scenes.medium(1.0, 0.9), scenes.placement((1, 1, 1)))
     around["other"] = other | {"exterior": around["shape"]["interior"]}
     refused = {
-        '"ball".*reaches into': {"ball": ball},
-        '"veil".*reaches into': {"veil": veil},
+        '"ball".*reaches into.*anisotropically': {"ball": ball, "shape": forward},
+        '"veil".*reaches into.*anisotropically': {"veil": veil, "shape": forward},
         "medium.*reaches into": around,
         "max_depth 4": {},
     }
@@ -238,9 +241,10 @@ def test_the_choice_of_solver(scenes):
         assert choose_solver(scene, medium, "auto", depth)[0].name == "path"
         with pytest.raises(IrrcacheError, match=f"(?s)sweep.*{reason}.*path"):
             filled(scene, max_depth=depth)
-    scene = load(scenes, scene_occluder(scenes))
-    (medium,) = compile_scene(scene).visible
-    assert choose_solver(scene, medium, "auto")[0].name == "sweep"
+    for objects in (scene_occluder(scenes), scene_sky(scenes) | {"ball": ball, "veil": veil}):
+        scene = load(scenes, objects)
+        (medium,) = compile_scene(scene).visible
+        assert choose_solver(scene, medium, "auto")[0].name == "sweep"
 
 
 def test_standard_error_is_the_scatter(scenes):

@@ -16,17 +16,12 @@ from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import (
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+from tests.support.incoming_radiance import sampled_rays, without_paths
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 DIRECTIONS = np.array([[0.2, 0.5, 1.0], [1.0, -0.7, 0.4], [-0.3, -1.0, 0.6], [0.0, 0.0, -1.0]])
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
-
-
-class Nothing:
-    """Surroundings of a medium, not used here."""
-
-    has_sources, angular_basis = False, None
 
 
 def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, offset) -> np.ndarray:
@@ -43,9 +38,7 @@ def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, of
 @pytest.fixture
 def alone(monkeypatch):
     """Return incoming radiance without surfaces."""
-    monkeypatch.setattr(
-        boundary_condition, "_trace_cells", lambda *args: (None, None, None, mi.UInt32(0), None)
-    )
+    without_paths(monkeypatch)
 
 
 @pytest.mark.parametrize("way", [0, 1])
@@ -64,11 +57,7 @@ def test_tracks_carry_the_radiance_of_their_entry(scenes, monkeypatch, alone, wa
     lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])
     fine = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
     offsets = np.random.default_rng(3).random((len(DIRECTIONS), 2))
-    rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
-    found = IncomingRadiance(Nothing, fine, rows, True, (0, 0, 0))
-    _, _, hit, ray, _ = found.sample_rays(
-        found._parameters(rows[0], [rows[1]], rows[2])[0], (0, 0, 0)
-    )
+    found, (_, _, hit, ray, _) = sampled_rays(fine, DIRECTIONS, offsets)
     lattice, low, high = fine, lower, upper
     if coarse:
         half = Grid((6, 5, 4), place)

@@ -10,10 +10,10 @@ import pytest
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.phase import Phase
-from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import IncomingRadiance
 from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+from tests.support.incoming_radiance import sampled_rays, without_paths
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -110,30 +110,17 @@ def test_scattering_voxel_radiates_forward():
     assert np.abs(share).max() == pytest.approx(bounds, rel=0.05)
 
 
-class Nothing:
-    """Surroundings of a medium, not used here."""
-
-    has_sources, angular_basis = False, None
-
-
 def test_paths_continue_their_tracks(scenes, monkeypatch):
     """A path that continues a track passes the centres of all slices at points of the lattice.
 
     These are a whole number of voxels from the first track.
     """
-    monkeypatch.setattr(
-        "mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition._trace_cells",
-        lambda *args: (None, None, None, mi.UInt32(0), None),
-    )
+    without_paths(monkeypatch)
     grid = Grid((12, 10, 8), scenes.placement((1.0, 3.0, 2.0), turn=35))
     lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])
     lattice = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
     offsets = np.random.default_rng(3).random((len(WAYS), 2))
-    rows = WAYS, np.zeros((len(WAYS), 2, 3)), np.ones(len(WAYS)), offsets
-    found = IncomingRadiance(Nothing, lattice, rows, True, (0, 0, 0))
-    number, _, hit, ray, _ = found.sample_rays(
-        found._parameters(rows[0], [rows[1]], rows[2])[0], (0, 0, 0)
-    )
+    _, (number, _, hit, ray, _) = sampled_rays(lattice, WAYS, offsets)
     row, hit = np.array(number) // 2, np.array(hit)
     start = np.array(grid.coordinates.point(ray.o), np.float64)[:, hit].T
     velocities = WAYS @ grid.coordinates.matrix[:3, :3].T

@@ -1,0 +1,186 @@
+"""The solver ``sweep`` with surfaces among the voxels of the medium (primer, section 4.8)."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.support.surfaces import ball, blocks, bound, diffuse, fog, images, placed, ref
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+VOXELS = 24
+
+
+def rendered(scenes, objects: dict, spp: int = 1, **settings) -> tuple[np.ndarray, object]:
+    """Return the image and the cache of the first medium."""
+    integrator = {"type": "irrcache", "solver": "sweep", "resolution": VOXELS} | settings
+    scene = scenes.load(integrator, None, **objects)
+    return scenes.image(scene, spp=spp), scene.integrator().cache
+
+
+def luminous(reflectance: float) -> dict:
+    """Return properties of a surface whose radiance is 1 if its surroundings have radiance 1."""
+    emitter = {"type": "area", "radiance": 1 - reflectance}
+    return {"bsdf": diffuse(*[reflectance] * 3), "emitter": emitter}
+
+
+def furnace(size: float, reflectance: float) -> dict:
+    """Return a closed room of half-edge 1 in a box of fog of half-edge ``size``, seen from within:
+    nothing absorbs.
+    """
+    inside = mi.ScalarTransform4f().look_at([0.9, 0.2, 0.9], [-0.5, -0.2, -0.5], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}}
+    camera = {"type": "perspective", "fov": 50, "to_world": inside, "film": film}
+    return {
+        "fog": fog((0.5,) * 3, (1.0,) * 3),
+        "sensor": camera | {"medium": ref("fog")},
+        "box": bound("cube", ref("fog"), scale=[size] * 3),
+        "room": {"type": "cube", "flip_normals": True} | luminous(reflectance),
+        "emitter": ball((0.1, -0.3, 0.05)) | luminous(reflectance),
+    }
+
+
+# Walls within a voxel, at a third of it, next to the side of the box, and on sides of voxels.
+@pytest.mark.parametrize("size", [1.2, 1.13, 1.0001, 4 / 3])
+def test_a_furnace_has_radiance_one(scenes, size):
+    """The radiance is 1 in the room, and 0 outside: no radiance passes through the walls."""
+    image, cache = rendered(scenes, furnace(size, 0.5), spp=16)
+    values = np.array(cache.irradiance)[..., 0] / (4 * np.pi)
+    x = ((np.arange(VOXELS) + 0.5) / VOXELS * 2 - 1) * size
+    z, y, x = np.meshgrid(x, x, x, indexing="ij")
+    room = np.maximum(np.maximum(abs(x), abs(y)), abs(z)) < 1
+    body = np.sqrt((x - 0.1) ** 2 + (y + 0.3) ** 2 + (z - 0.05) ** 2) < 0.4
+    assert values[room & ~body].mean() == pytest.approx(1, abs=0.005)
+    assert values[room & ~body].std() < 0.03
+    assert image.mean() == pytest.approx(1, abs=0.006)
+    assert values[~room].max(initial=0) < 1e-3
+    assert values[body].mean() < 0.02
+
+
+def test_luminous_walls_have_little_noise(scenes):
+    """Where paths end at cached irradiance, emitters close by are found by two strategies: with
+    samples of the emitters alone the standard deviation is 7 %, and the median 2 % too small.
+    """
+    image, _ = rendered(scenes, furnace(1.2, 0.5), spp=64, cache_spp=16)
+    assert image.std() < 0.025
+    assert np.median(image) == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("height", [0.13, 0.0, -0.41])
+def test_shadow_of_a_sheet(scenes, height):
+    """Below a black sheet that cuts the whole medium there is no radiance of the sun; above it the
+    irradiance is that of Beer's law.
+    """
+    objects = {
+        "fog": bound("cube", fog((1.5,) * 3, (0.5,) * 3)),
+        "sheet": {
+            "type": "rectangle",
+            "to_world": placed((0, height, 0), (3, 3, 1), (0, height + 1, 1e-6)),
+            "bsdf": {"type": "twosided", "bsdf": diffuse(0, 0, 0)},
+        },
+        "emitter": {"type": "directional", "direction": [0, -1, 0], "irradiance": 2.0},
+    }
+    _, cache = rendered(scenes, objects, max_depth=2)
+    values = np.array(cache.uncollided)[..., 0].mean(axis=(0, 2))
+    y = (np.arange(VOXELS) + 0.5) / VOXELS * 2 - 1
+    above = y > height + 1e-6
+    expected = 2 * np.exp(-1.5 * (1 - y[above]))
+    # A voxel that the sheet cuts has the mean over its upper part.
+    edge = np.exp(1.5 / VOXELS) - 1
+    np.testing.assert_allclose(values[above], expected, rtol=0.01 + edge / 2)
+    np.testing.assert_allclose(values[above][2:], expected[2:], rtol=0.005)
+    assert np.abs(values[~above]).max() == 0
+
+
+OBJECTS = {
+    "coloured ball": {"object": ball((0.2, 0.1, 0), bsdf=diffuse(0.8, 0.3, 0.2))},
+    "rod": {
+        "object": {
+            "type": "cylinder", "p0": [-0.7, -0.5, 0.1], "p1": [0.7, 0.6, -0.2], "radius": 0.08,
+            "bsdf": diffuse(0, 0, 0),
+        }
+    },
+    "two-sided sheet": {
+        "object": {
+            "type": "rectangle",
+            "to_world": placed((0, 0.1, 0), (0.6, 0.6, 1), (0.3, 1, 0.2)),
+            "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.7, 0.7)},
+        }
+    },
+    "ground that cuts": {
+        "object": {
+            "type": "rectangle",
+            "to_world": placed((0, -0.55, 0), (5, 5, 1), (0, 1, 0.001)),
+            "bsdf": diffuse(0.6, 0.5, 0.4),
+        }
+    },
+    "luminous ball": {
+        "object": ball((-0.2, 0.2, 0.1), 0.3, bsdf=diffuse(0.5, 0.5, 0.5))
+        | {"emitter": {"type": "area", "radiance": 3.0}}
+    },
+    "mirror": {"object": ball((0.2, 0, 0.1), 0.35, bsdf={"type": "conductor"})},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+@pytest.mark.parametrize("depth", [2, -1])
+def test_voxels_equal_those_of_the_solver_path(scenes, name, depth):
+    """The irradiance of both solvers agrees: in the mean within 0.5 %, in blocks of voxels within
+    3 % of the mean or four standard errors.
+    """
+    objects = OBJECTS[name] | {"fog": bound("cube", fog((1.2,) * 3)), "emitter": scenes.sky}
+    options = {"max_depth": depth, "resolution": 16, "cache_spp": 256}
+    _, sweep = rendered(scenes, objects, **options)
+    _, path = rendered(scenes, objects, **options, solver="path")
+    assert sweep.correlated and not path.correlated
+    found, expected = (np.array(c.irradiance, dtype=np.float64) for c in (sweep, path))
+    visible = ~np.array(path.voxel_classes.enclosed).reshape(found.shape[:3])
+    assert found[visible].mean() == pytest.approx(expected[visible].mean(), rel=0.005)
+    both = [
+        np.where(visible[..., None], values, 0).reshape(4, 4, 4, 4, 4, 4, 3).mean(axis=(1, 3, 5))
+        for values in (found, expected)
+    ]
+    noise = np.array(path.standard_error).max() / 8
+    assert np.abs(both[0] - both[1]).max() < 0.03 * expected.mean() + 4 * noise
+
+
+def test_images_equal_those_of_volpath(scenes):
+    """With a camera in the fog, several objects and a sun."""
+    objects = {
+        "fog": fog((0.8,) * 3, (0.9, 0.85, 0.8)),
+        "box": bound("cube", ref("fog")),
+        "ball": ball((0.3, -0.2, 0.2), 0.35, bsdf=diffuse(0.2, 0.6, 0.3)),
+        "wall": {
+            "type": "cube", "to_world": placed((-0.5, -0.5, 0), (0.05, 0.5, 0.6)),
+            "bsdf": diffuse(0.7, 0.7, 0.7),
+        },
+    }  # fmt: skip
+    found = images(scenes, objects, {"solver": "sweep"}, {"max_depth": -1}, (64, 512))
+    means = [np.mean([blocks(i) for i in pair], axis=0) for pair in (found[:2], found[2:])]
+    noise = np.abs(blocks(found[2]) - blocks(found[3])).mean()
+    assert np.abs(means[0] - means[1]).max() < 0.015 * means[1].mean() + 4.5 * noise
+
+
+def test_the_same_seed_gives_the_same_bits(scenes):
+    objects = OBJECTS["coloured ball"] | {"fog": bound("cube", fog())}
+    first, again = (rendered(scenes, objects, resolution=16) for _ in range(2))
+    assert np.array_equal(np.array(first[1].irradiance), np.array(again[1].irradiance))
+
+
+def test_edited_objects_are_solved_for_anew(scenes):
+    """An object that is moved, or painted, gives the image of a fresh scene."""
+    objects = OBJECTS["coloured ball"] | {"fog": bound("cube", fog())}
+    integrator = {"type": "irrcache", "solver": "sweep", "resolution": 16}
+    scene = scenes.load(integrator, None, **objects)
+    scenes.image(scene, spp=4)
+    params = mi.traverse(scene)
+    params["object.bsdf.reflectance.value"] = mi.Color3f(0.1, 0.7, 0.9)
+    params["object.to_world"] = mi.ScalarTransform4f().translate([-0.3, 0, 0.1]).scale(0.3)
+    params.update()
+    edited = ball((-0.3, 0, 0.1), 0.3, bsdf=diffuse(0.1, 0.7, 0.9))
+    fresh = scenes.load(integrator, None, **(objects | {"object": edited}))
+    np.testing.assert_allclose(
+        scenes.image(scene, spp=4), scenes.image(fresh, spp=4), rtol=2e-3, atol=1e-4
+    )
