@@ -65,7 +65,7 @@ class SurfaceNodes:
         self.count = 0
         self.keys = mi.UInt64(0)
         #: position and harmonic mean distance (0 where there is no surface); shading normal and
-        #: distance of the nearest other surface; geometric normal and 0
+        #: distance of the nearest other surface; geometric normal and number of the medium
         self._places, self._normals = mi.Float([0.0] * 4), mi.Float([0.0] * 4)
         self._geometric = mi.Float([0.0] * 4)
         self._slots, self._mask = mi.UInt32([NONE, NONE]), dr.opaque(mi.UInt32, 1)
@@ -166,8 +166,9 @@ class SurfaceNodes:
 
     # Growth
 
-    def add_keys(self, keys: Sequence[mi.UInt64]) -> mi.UInt32:
-        """Add those ``keys`` that are not in the table, each once, and return their numbers.
+    def add_keys(self, keys: Sequence[mi.UInt64]) -> tuple[mi.UInt32, mi.UInt32]:
+        """Add those ``keys`` that are not in the table, each once; return their numbers, and the
+        first of the places in ``keys`` where each is.
 
         They have to be completed by `place`.
         """
@@ -208,8 +209,12 @@ class SurfaceNodes:
         self.count = total
         dr.eval(self._slots, self.keys)
         if total == before:
-            return mi.UInt32()
-        return dr.arange(mi.UInt32, total - before) + dr.opaque(mi.UInt32, before)
+            return mi.UInt32(), mi.UInt32()
+        first = dr.opaque(mi.UInt32, before)
+        numbers = dr.arange(mi.UInt32, total - before) + first
+        # The keys of the table come first and are all in use.
+        place = dr.gather(mi.UInt32, chosen, numbers) - first
+        return numbers, place % dr.opaque(mi.UInt32, dr.width(keys[0]))
 
     def rays(self, numbers: mi.UInt32) -> tuple[mi.Ray3f, mi.Float]:
         """Rays on which the nodes with these ``numbers`` have to be found, and their lengths."""
@@ -244,17 +249,18 @@ class SurfaceNodes:
         normals: tuple[mi.Normal3f, mi.Normal3f],
         distance: mi.Float,
         clearance: mi.Float,
+        medium: mi.UInt32,
     ) -> None:
         """Complete the nodes added last: positions, normals (geometric and shading), harmonic
-        mean distances, 0 where there is no surface, and distances of the nearest other surface.
+        mean distances, 0 where there is no surface, distances of the nearest other surface, and
+        numbers of the media before the surface.
         """
         known = self.count - dr.width(p)
         geometric, shading = normals
-        zero = dr.zeros(mi.Float, dr.width(p))
         new = (
             dr.ravel(mi.Vector4f(p.x, p.y, p.z, distance)),
             dr.ravel(mi.Vector4f(shading.x, shading.y, shading.z, clearance)),
-            dr.ravel(mi.Vector4f(geometric.x, geometric.y, geometric.z, zero)),
+            dr.ravel(mi.Vector4f(geometric.x, geometric.y, geometric.z, mi.Float(medium))),
         )
         old = self._places, self._normals, self._geometric
         joined = [dr.concat([a, b]) if known else b for a, b in zip(old, new, strict=True)]
@@ -274,6 +280,10 @@ class SurfaceNodes:
             mi.Normal3f(shading.x, shading.y, shading.z),
             found.w,
         )
+
+    def medium_number(self, numbers: mi.UInt32) -> mi.UInt32:
+        """Number of the medium before the surface of nodes, 0 for none."""
+        return mi.UInt32(dr.gather(mi.Vector4f, self._geometric, numbers).w)
 
     def streams(self, numbers: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """Two random words of each node, which depend on its key only."""

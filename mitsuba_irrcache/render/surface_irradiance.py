@@ -19,7 +19,6 @@ import mitsuba as mi
 from mitsuba_irrcache.core.jit import Divisor, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
 from mitsuba_irrcache.render.surface_paths import SurfacePaths, facing, lambertian
-from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
 #: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance;
@@ -60,8 +59,8 @@ class SurfaceIrradiance:
     def prepare(self, scene: mi.Scene, ray: mi.Ray3f, pointer: mi.MediumPtr) -> None:
         """Create the nodes that camera rays like these need, and compute their irradiance."""
         rng = random_stream(mi.sample_tea_32(dr.arange(mi.UInt32, dr.width(ray)), self._seed))
-        p, normals, found, _ = self.paths.walk(scene, ray, pointer, rng, mi.Bool(True))
-        self._cover(scene, p, normals, found)
+        place, found, _ = self.paths.walk(scene, ray, pointer, rng, mi.Bool(True))
+        self._cover(scene, place, found)
         for first, end, rays in self._groups[self._gathered :]:
             self._gather(scene, first, end, rays)
         if self._gathered < len(self._groups):
@@ -70,15 +69,9 @@ class SurfaceIrradiance:
 
     # Placement
 
-    def _cover(
-        self,
-        scene: mi.Scene,
-        p: mi.Point3f,
-        normals: tuple[mi.Normal3f, mi.Normal3f],
-        active: mi.Bool,
-    ) -> None:
-        """Create all nodes for interpolation at points, and then those for the points that rays
-        from these nodes meet.
+    def _cover(self, scene: mi.Scene, place: tuple, active: mi.Bool) -> None:
+        """Create all nodes for interpolation at places (results of `SurfacePaths.walk`), and then
+        those for the places that rays from these nodes meet.
         """
         first = seen = self.nodes.count
         for generation in range(GENERATIONS):
@@ -87,43 +80,50 @@ class SurfaceIrradiance:
                 index = dr.compress(active)
                 if not dr.width(index):
                     break
-                p = dr.gather(mi.Point3f, p, index)
+                p, normals, medium = place
+                p, medium = dr.gather(mi.Point3f, p, index), dr.gather(mi.UInt32, medium, index)
                 normals = tuple(dr.gather(mi.Normal3f, n, index) for n in normals)
+                place = p, normals, medium
                 levels = self.paths.indirect_levels if generation else self.paths.levels
                 *_, keys, active = self.nodes.find(p, normals, levels, mi.Bool(True))
-                dr.eval(p, normals, keys, active)
+                dr.eval(place, keys, active)
                 missing = dr.compress(active)
                 if not dr.width(missing):
                     break
-                new = self.nodes.add_keys([dr.gather(mi.UInt64, key, missing) for key in keys])
+                keys = [dr.gather(mi.UInt64, key, missing) for key in keys]
+                new, origin = self.nodes.add_keys(keys)
                 if dr.width(new):
-                    found.append(self._place(scene, new))
+                    origin = dr.gather(mi.UInt32, missing, origin)
+                    found.append(self._place(scene, new, dr.gather(mi.UInt32, medium, origin)))
             if not generation:
                 seen = self.nodes.count
             if not found:
                 break
-            p, normals, active = (_joined(parts) for parts in zip(*found, strict=True))
+            place, active = (_joined(parts) for parts in zip(*found, strict=True))
         rays = GATHERED if seen - first <= FINE_NODES else GATHERED_INDIRECT
         groups = (first, seen, rays), (seen, self.nodes.count, GATHERED_INDIRECT)
         self._groups += [group for group in groups if group[0] < group[1]]
 
-    def _place(self, scene: mi.Scene, numbers: mi.UInt32) -> tuple:
-        """Find new nodes on surfaces; return the points where rays from them meet others."""
+    def _place(self, scene: mi.Scene, numbers: mi.UInt32, medium: mi.UInt32) -> tuple:
+        """Find new nodes on surfaces in front of which is the ``medium``; return the places where
+        rays from them meet others, and whether they do.
+        """
         ray, length = self.nodes.rays(numbers)
         p, normals, valid = _first_surface(scene, ray, length)
         dr.eval(p, normals, valid)
         count = dr.width(numbers)
         lane, k = Divisor(PROBES).split(dr.arange(mi.UInt32, count * PROBES))
         start, rng = self._ray_from(scene, p, normals, numbers, (lane, k), PROBES)
-        pointer = probe(scene, start.o, start.d)
+        pointer = self.paths.media.pointer_of(dr.gather(mi.UInt32, medium, lane))
         active = dr.gather(mi.Bool, valid, lane)
-        q, others, found, (nearest, surface) = self.paths.walk(scene, start, pointer, rng, active)
+        other, found, (nearest, surface) = self.paths.walk(scene, start, pointer, rng, active)
         closeness = dr.select(active & (nearest > 0), dr.rcp(nearest), 0)
-        dr.eval(q, others, found, closeness, surface)
+        dr.eval(other, found, closeness, surface)
         mean = dr.block_sum(closeness, PROBES) / PROBES
         distance = dr.select(valid, dr.rcp(dr.maximum(mean, 1e-18)), 0)
-        self.nodes.place(p, normals, distance, dr.block_reduce(dr.ReduceOp.Min, surface, PROBES))
-        return q, others, found
+        clearance = dr.block_reduce(dr.ReduceOp.Min, surface, PROBES)
+        self.nodes.place(p, normals, distance, clearance, medium)
+        return other, found
 
     def _ray_from(
         self,
@@ -158,10 +158,11 @@ class SurfaceIrradiance:
             count = min(per_launch, end - begin)
             numbers = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, begin)
             p, *normals, distance = self.nodes.positions(numbers)
-            dr.eval(p, normals, distance)
+            medium = self.nodes.medium_number(numbers)
+            dr.eval(p, normals, distance, medium)
             lane, k = Divisor(rays).split(dr.arange(mi.UInt32, count * rays))
             ray, rng = self._ray_from(scene, p, normals, numbers, (lane, k), rays)
-            pointer = probe(scene, ray.o, ray.d)
+            pointer = self.paths.media.pointer_of(dr.gather(mi.UInt32, medium, lane))
             active = dr.gather(mi.Float, distance, lane) > 0
             emitted, radiance, _, other, factor = self.paths.follow(
                 scene, ray, pointer, rng, active

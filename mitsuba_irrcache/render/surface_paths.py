@@ -352,12 +352,13 @@ class SurfacePaths:
     def walk(self, scene, ray, pointer, rng, active):
         """Follow rays through null, glossy and specular surfaces to the first diffuse one.
 
-        Returns its position and its geometric and shading normal; whether there is one; and the
-        distances of the first surface or medium, and of the first surface (infinite where there is
-        none).
+        Returns its position, its geometric and shading normal, and the number of the medium before
+        it; whether there is one; and the distances of the first surface or medium, and of the first
+        surface (infinite where there is none).
         """
         ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
         position, geometric, shading = mi.Point3f(0), mi.Normal3f(0), mi.Normal3f(0)
+        before = mi.MediumPtr(pointer)
         found, nearest, travelled = mi.Bool(False), mi.Float(dr.inf), mi.Float(0)
         nearest_surface = mi.Float(dr.inf)
         bounces, crossings, active = mi.UInt32(0), mi.UInt32(0), mi.Bool(active)
@@ -380,6 +381,7 @@ class SurfacePaths:
             position = dr.select(diffuse, si.p, position)
             geometric = dr.select(diffuse, normals[0], geometric)
             shading = dr.select(diffuse, normals[1], shading)
+            before = dr.select(diffuse, pointer, before)
             found |= diffuse
             scatters = surface & ~diffuse
             choice = rng.next_float32(scatters)
@@ -394,7 +396,8 @@ class SurfacePaths:
             active &= (crosses | scatters) & (bounces < MOST_BOUNCES)
             active &= crossings < MOST_CROSSINGS
         distances = dr.minimum(nearest, nearest_surface), nearest_surface
-        return position, (geometric, shading), found, distances
+        place = position, (geometric, shading), self.media.number_of(before)
+        return place, found, distances
 
 
 @symbolic

@@ -57,6 +57,13 @@ class Media(Immutable):
             pointer = dr.select(number == i + 1, grid.pointer, pointer)
         return pointer
 
+    def number_of(self, pointer: mi.MediumPtr) -> mi.UInt32:
+        """Return the number of Mitsuba's medium, the inverse of `pointer_of`."""
+        number = mi.UInt32(0)
+        for i, grid in enumerate(self.grids):
+            number = dr.select(pointer == grid.pointer, i + 1, number)
+        return number
+
     def without(self, medium: MediumGrid) -> Media:
         """Return all media except one."""
         return Media([grid for grid in self.grids if grid is not medium])

@@ -39,7 +39,7 @@ def cover(nodes: SurfaceNodes, plane: tuple, p: np.ndarray, distance: float, cle
         index = dr.compress(missing)
         if not dr.width(index):
             return p, normals, rounds
-        new = nodes.add_keys([dr.gather(mi.UInt64, key, index) for key in keys])
+        new, _ = nodes.add_keys([dr.gather(mi.UInt64, key, index) for key in keys])
         ray, length = nodes.rays(new)
         n = mi.Normal3f(*(dr.opaque(mi.Float, float(x)) for x in normal))
         t = (offset - dr.dot(n, ray.o)) / dr.dot(n, ray.d)
@@ -47,7 +47,11 @@ def cover(nodes: SurfaceNodes, plane: tuple, p: np.ndarray, distance: float, cle
         count = dr.width(new)
         full = mi.Normal3f(*(dr.full(mi.Float, float(x), count) for x in normal))
         nodes.place(
-            ray(t), (full, full), dr.select(hit, distance, 0), dr.full(mi.Float, clearance, count)
+            ray(t),
+            (full, full),
+            dr.select(hit, distance, 0),
+            dr.full(mi.Float, clearance, count),
+            dr.zeros(mi.UInt32, count),
         )
     raise AssertionError("nodes are missing for ever")
 
@@ -122,8 +126,8 @@ def test_a_key_is_stored_once():
     nodes = SurfaceNodes(LOWER, UPPER)
     keys = mi.UInt64(np.random.default_rng(1).integers(0, 2**62, 5000) // 7 % 1000 * 2**40)
     unique = len(np.unique(np.array(keys)))
-    assert dr.width(nodes.add_keys([keys])) == unique == nodes.count
-    assert dr.width(nodes.add_keys([keys])) == 0
+    assert dr.width(nodes.add_keys([keys])[0]) == unique == nodes.count
+    assert dr.width(nodes.add_keys([keys])[0]) == 0
     assert nodes.count == unique
     found = nodes._number_of(keys, mi.Bool(True))
     np.testing.assert_array_equal(np.array(dr.gather(mi.UInt64, nodes.keys, found)), np.array(keys))

@@ -34,7 +34,7 @@ def sphere(radius: float, **more) -> dict:
 
 def test_cut_voxels_are_those_that_the_sphere_passes():
     """All voxels with corners on both sides, and none that the sphere does not touch."""
-    scene, surfaces = of(sphere(0.6))
+    _, surfaces = of(sphere(0.6))
     cut = np.array(surfaces.is_cut).reshape(N, N, N)
     corners = np.arange(N + 1) / N * 2 - 1
     z, y, x = np.meshgrid(corners, corners, corners, indexing="ij")
@@ -50,7 +50,7 @@ def test_cut_voxels_are_those_that_the_sphere_passes():
 
 
 def test_null_surfaces_are_no_surfaces():
-    scene, surfaces = of(sphere(0.6, bsdf={"type": "null"}))
+    _, surfaces = of(sphere(0.6, bsdf={"type": "null"}))
     assert surfaces.count == 0 and not np.array(surfaces.is_cut).any()
 
 
@@ -81,7 +81,7 @@ def test_crossings_lie_on_the_sphere():
 
 def test_the_nearest_voxel_is_on_the_same_side():
     """Positions next to the sphere get voxels whose centres are on their side."""
-    scene, surfaces = of(sphere(0.6))
+    _, surfaces = of(sphere(0.6))
     rng = np.random.default_rng(2)
     d = rng.normal(size=(500, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
