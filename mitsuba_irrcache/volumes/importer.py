@@ -32,7 +32,7 @@ from mitsuba_irrcache.volumes.transfer import (
 #: Mean cosine of scattering by the droplets of a water cloud in visible light.
 CLOUD_ASYMMETRY = 0.85
 #: Radiance of the sky and irradiance of the sun in scenes of clouds, in arbitrary units.
-CLOUD_SKY, CLOUD_SUN = 0.2, 2.0
+CLOUD_SKY, CLOUD_SUN = 0.1, 4.0
 _PHANTOMS = ("thorax", "cloud")
 # Air is -1000 HU; data in Hounsfield units without air are rare.
 _AIR_LIKE = -200

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,13 @@ _PLACEMENT = ("spacing", "origin", "direction")
 _MAGIC = b"\x93NUMPY"
 
 
+class _Header(NamedTuple):
+    """What the header of an array states."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
 def read(path: Path, options: ReadOptions) -> VolumeData:
     """Read a volume; without a ``spacing`` voxels have edges of length 1.
 
@@ -36,7 +43,8 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
     if path.suffix.lower() == ".npz":
         return _read_archive(path, options)
     with path.open("rb") as stream:
-        _check_array(str(path), stream, path.stat().st_size)
+        header = _check_array(str(path), stream, path.stat().st_size)
+    readable_type(str(path), header.dtype)
     array = np.load(path, mmap_mode="r", allow_pickle=False)
     return VolumeData(_volume(str(path), array, options), source=str(path))
 
@@ -47,14 +55,15 @@ def _read_archive(path: Path, options: ReadOptions) -> VolumeData:
             f"{path} is not an .npz archive, or truncated; write it with numpy.savez"
         )
     with zipfile.ZipFile(path) as archive:
-        shapes = {}
+        headers = {}
         for member in archive.infolist():
             if member.filename.endswith(".npy"):
                 name = member.filename.removesuffix(".npy")
                 with archive.open(member) as stream:
-                    shapes[name] = _check_array(f"{path}[{name}]", stream, member.file_size)
-    volumes = [name for name, shape in shapes.items() if name not in _PLACEMENT and len(shape) > 2]
+                    headers[name] = _check_array(f"{path}[{name}]", stream, member.file_size)
+    volumes = [n for n, h in headers.items() if n not in _PLACEMENT and len(h.shape) > 2]
     name = chosen_field(str(path), volumes, options.field, "array")
+    readable_type(f"{path}[{name}]", headers[name].dtype)
     with np.load(path, allow_pickle=False) as arrays:
         placement = {key: arrays[key].tolist() for key in _PLACEMENT if key in arrays}
         unit = str(arrays["unit"]) if "unit" in arrays else ""
@@ -63,8 +72,8 @@ def _read_archive(path: Path, options: ReadOptions) -> VolumeData:
     return VolumeData(values, **placement, unit=unit, source=f"{path}[{name}]")
 
 
-def _check_array(source: str, stream: BinaryIO, size: int) -> tuple[int, ...]:
-    """Compare the header of an array with its ``size`` in bytes, and return its shape."""
+def _check_array(source: str, stream: BinaryIO, size: int) -> _Header:
+    """Compare the header of an array with its ``size`` in bytes, and return it."""
     if stream.read(len(_MAGIC)) != _MAGIC:
         raise IrrcacheError(f"{source} is no NumPy array; write it with numpy.save")
     major, minor = stream.read(2)
@@ -80,11 +89,10 @@ def _check_array(source: str, stream: BinaryIO, size: int) -> tuple[int, ...]:
             f"{source} is truncated: {size} bytes, but its header promises {expected} bytes of "
             f"values {shape}; copy or save it again"
         )
-    return shape
+    return _Header(shape, dtype)
 
 
 def _volume(source: str, array: np.ndarray, options: ReadOptions) -> np.ndarray:
-    readable_type(source, array.dtype)
     axes = plain_axes(source, array.shape)
     return scalar_volume(source, array, axes, options)
 

@@ -52,7 +52,7 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
         magic = stream.read(8)
     if magic != _MAGIC:
         raise IrrcacheError(f"{path} is no OpenVDB file: it begins with {magic!r}, not {_MAGIC!r}")
-    openvdb = _openvdb(path)
+    openvdb = load_openvdb(path)
     described = {grid.name: grid for grid in openvdb.readAllGridMetadata(str(path))}
     name = chosen_field(str(path), described, options.field, "grid")
     source = f"{path}[{name}]"
@@ -77,6 +77,34 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
         scalar_volume(source, values, "xyzc"[: values.ndim], options),
         **placement_of(_index_to_world(grid.transform, low)),
         source=source,
+    )
+
+
+def load_openvdb(path: Path) -> ModuleType:
+    """Return OpenVDB's module: one that is installed, or the one in the folder of ``bpy``.
+
+    Raises:
+        MissingPackageError: there is none; the message names the file ``path`` that needs it.
+    """
+    for name in ("openvdb", "pyopenvdb"):
+        if importlib.util.find_spec(name) is not None:
+            return importlib.import_module(name)
+    # Import neither bpy, which takes seconds and changes the search path, nor its folder of
+    # packages, whose OpenImageIO would replace the one in use.
+    blender = importlib.util.find_spec("bpy")
+    for folder in (blender and blender.submodule_search_locations) or ():
+        pattern = os.path.join(folder, "*", "python", "lib", "python*", "site-packages")
+        for file in glob.glob(os.path.join(pattern, "openvdb*.so")):
+            spec = importlib.util.spec_from_file_location("openvdb", file)
+            module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+            sys.modules["openvdb"] = module
+            return module
+    raise MissingPackageError(
+        f'reading {path} needs the module "openvdb", which is not installed. Remedy: '
+        f'"{sys.executable} -m pip install --no-deps bpy" (Blender, 0.4 GB, for Python 3.11 or '
+        "3.13), or install openvdb from conda-forge, or convert the file: nanovdb_convert (part of "
+        "OpenVDB) writes .nvdb, which the extra [nanovdb] reads"
     )
 
 
@@ -108,27 +136,3 @@ def _index_to_world(transform: Any, low: np.ndarray) -> np.ndarray:
         matrix[:3, axis] = np.array(transform.indexToWorld(tuple(beside))) - corner
     matrix[:3, 3] = corner
     return matrix
-
-
-def _openvdb(path: Path) -> ModuleType:
-    """Return OpenVDB's module: one that is installed, or the one in the folder of ``bpy``."""
-    for name in ("openvdb", "pyopenvdb"):
-        if importlib.util.find_spec(name) is not None:
-            return importlib.import_module(name)
-    # Import neither bpy, which takes seconds and changes the search path, nor its folder of
-    # packages, whose OpenImageIO would replace the one in use.
-    blender = importlib.util.find_spec("bpy")
-    for folder in (blender and blender.submodule_search_locations) or ():
-        pattern = os.path.join(folder, "*", "python", "lib", "python*", "site-packages")
-        for file in glob.glob(os.path.join(pattern, "openvdb*.so")):
-            spec = importlib.util.spec_from_file_location("openvdb", file)
-            module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-            sys.modules["openvdb"] = module
-            return module
-    raise MissingPackageError(
-        f'reading {path} needs the module "openvdb", which is not installed. Remedy: '
-        f'"{sys.executable} -m pip install --no-deps bpy" (Blender, 0.4 GB, for Python 3.11 or '
-        "3.13), or install openvdb from conda-forge, or convert the file: nanovdb_convert (part of "
-        "OpenVDB) writes .nvdb, which the extra [nanovdb] reads"
-    )

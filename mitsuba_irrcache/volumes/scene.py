@@ -119,7 +119,10 @@ def camera(volume: VolumeData, sigma_t: np.ndarray, up: str = "z") -> tuple[np.n
     relative = occupied - target
     along = relative @ towards
     aside = np.maximum(np.abs(relative @ right), np.abs(relative @ np.cross(towards, right)))
-    distance = (along + _MARGIN * aside / np.tan(np.radians(_FIELD_OF_VIEW / 2))).max()
+    slope = np.tan(np.radians(_FIELD_OF_VIEW / 2))
+    # A single voxel has no extent between its ends.
+    voxel = float(np.linalg.norm(volume.spacing)) / slope
+    distance = max((along + _MARGIN * aside / slope).max(), voxel)
     return target + distance * towards, target, up_vector
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -26,7 +28,7 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
         IrrcacheError: a truncated file, a single slice, or several series, channels or frames and
             none chosen.
     """
-    with tifffile.TiffFile(path) as tiff:
+    with _complete(path) as tiff:
         names = [series.name or str(i) for i, series in enumerate(tiff.series)]
         name = chosen_field(str(path), dict.fromkeys(names), options.field, "series")
         series = tiff.series[names.index(name)]
@@ -56,7 +58,7 @@ def read_slices(paths: Sequence[Path], options: ReadOptions) -> VolumeData:
     slices = []
     for index, path in enumerate(ordered):
         try:
-            with tifffile.TiffFile(path) as tiff:
+            with _complete(path) as tiff:
                 _check_segments(path, tiff.series[0])
                 part = tiff.series[0]
                 if index == 0:
@@ -80,6 +82,36 @@ def read_slices(paths: Sequence[Path], options: ReadOptions) -> VolumeData:
     source = f"{ordered[0]} ... {ordered[-1].name}"
     axes = "zyx" if slices[0].ndim == 2 else "zyxc"
     return VolumeData(scalar_volume(source, np.stack(slices), axes, options), source=source)
+
+
+class _Log(logging.Handler):
+    """Collects the errors that tifffile logs, and does not raise, for data that are missing."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.messages.append(record.getMessage())
+
+
+@contextmanager
+def _complete(path: Path) -> Iterator[tifffile.TiffFile]:
+    """Open a file whose tags are all inside of it; they hold the voxel size, among other things."""
+    log, logger = _Log(), logging.getLogger("tifffile")
+    logger.addHandler(log)
+    propagated, logger.propagate = logger.propagate, False
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            lost = [message for message in log.messages if "offset" in message]
+            if lost:
+                raise IrrcacheError(
+                    f"{path} is truncated or damaged ({lost[0]}); copy or export it again"
+                )
+            yield tiff
+    finally:
+        logger.removeHandler(log)
+        logger.propagate = propagated
 
 
 def _check_segments(path: Path, series: tifffile.TiffPageSeries) -> None:

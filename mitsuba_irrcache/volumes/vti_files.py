@@ -33,6 +33,10 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
             or components and none chosen.
     """
     content = path.read_bytes()
+    if not content.rstrip().endswith(b"</VTKFile>"):
+        raise IrrcacheError(
+            f"{path} is truncated: it does not end with </VTKFile>; copy or export it again"
+        )
     appended = _APPENDED.search(content)
     # Appended data may be binary, which is not XML.
     text = content[: appended.start()] + b"</VTKFile>" if appended else content

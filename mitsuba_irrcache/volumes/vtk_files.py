@@ -121,10 +121,10 @@ class _Parser:
         while self._position < len(self._content):
             words = self._line().split()
             if words:
-                yield [words[0].upper(), *words[1:]]
+                yield words
 
     def _read_entry(self, words: list[str]) -> None:
-        keyword, *values = words
+        keyword, values = words[0].upper(), words[1:]
         if keyword == "DATASET":
             if values[0].upper() != "STRUCTURED_POINTS":
                 raise IrrcacheError(
@@ -159,7 +159,7 @@ class _Parser:
     def _read_field(self, count: int) -> None:
         read = 0
         for words in self._keywords():
-            if words[0] == "METADATA":
+            if words[0].upper() == "METADATA":
                 self._read_entry(words)
                 continue
             name, components, tuples, kind = words

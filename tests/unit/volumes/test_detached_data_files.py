@@ -123,7 +123,9 @@ def test_data_files_of_slices(folders, case):
         path = written(own, case, names, SLICES)
         with pytest.raises(IrrcacheError, match="outside of its own folder"):
             read_volume(path)
-        np.testing.assert_array_equal(read_volume(path, options=ReadOptions(data_folders=[other])).values, VALUES)
+        np.testing.assert_array_equal(
+            read_volume(path, options=ReadOptions(data_folders=[other])).values, VALUES
+        )
     with pytest.raises(IrrcacheError, match="outside of its own folder"):
         read_volume(written(own, case, ["alias0.raw", "alias1.raw"], SLICES))
     if "list" in case:
