@@ -227,6 +227,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._timeout = properties.number(
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
+        properties.refuse_misspelt(props.wrapped, props.values)
         self._stopping = StopCondition()
         self._camera_rays: ClosedFormCameraRays | TracedCameraRays | None = None
         self._parts: list | None = None  # those of the camera rays

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from mitsuba_irrcache.core.argument_types import argument, finite, finite_number, whole
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.core.stage_display import StageDisplay
+from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.volumes import processing
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.detached import OPTION
@@ -103,14 +104,18 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         IrrcacheError: invalid input; no files are written then.
     """
-    volume, mapping = _volume(args)
-    resampled, sigma_t, albedo = processing.bake(
-        volume, mapping, _target_size(volume, args), args.supersample
-    )
+    display = StageDisplay(is_updated=False)  # large volumes have progress bars
+    with display.stage(f"reading {args.input[0]}"):
+        volume, mapping = _volume(args)
+    with display.stage("computing extinction and albedo"):
+        resampled, sigma_t, albedo = processing.bake(
+            volume, mapping, _target_size(volume, args), args.supersample
+        )
     settings = scene_settings(args)
-    written = write_scene(
-        args.output, resampled, mapping, sigma_t, albedo, settings, overwrite=args.overwrite
-    )
+    with display.stage(f"writing {args.output}"):
+        written = write_scene(
+            args.output, resampled, mapping, sigma_t, albedo, settings, overwrite=args.overwrite
+        )
     print(_summary(resampled, sigma_t, albedo, written, args.output))
     return 0
 
@@ -319,7 +324,7 @@ def _phantom(source: str) -> VolumeData:
     name, _, size = source.removeprefix("phantom:").partition(":")
     if name not in _PHANTOMS:
         known = " and ".join(f"phantom:{known}" for known in _PHANTOMS)
-        raise IrrcacheError(f"no phantom {name!r}; there are {known}")
+        raise IrrcacheError(f"no phantom {name!r}{suggestion(name, _PHANTOMS)}; there are {known}")
     make = getattr(phantom, name)
     if not size:
         return make()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.machine.memory import require_memory
 
 #: Maximum number of names that an error message lists.
@@ -78,13 +77,6 @@ def chosen_field(source: str, names: Iterable[str], wanted: str | None, what: st
     raise IrrcacheError(
         f"{source} has {len(names)} volumes, {_listed(names)}; choose one with --field NAME"
     )
-
-
-def suggestion(wanted: str, names: Iterable[str]) -> str:
-    """Return ``' (did you mean "..."?)'`` for the name most similar to ``wanted``, or ``""``."""
-    by_lower_case = {name.lower(): name for name in names}
-    close = difflib.get_close_matches(wanted.lower(), by_lower_case, n=1)
-    return f' (did you mean "{by_lower_case[close[0]]}"?)' if close else ""
 
 
 def picked(source: str, what: str, count: int, wanted: int | None) -> int:
