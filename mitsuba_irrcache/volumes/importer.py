@@ -14,7 +14,7 @@ import numpy as np
 from mitsuba_irrcache.core.argument_types import argument, finite, finite_number, whole
 from mitsuba_irrcache.core.stage_display import StageDisplay
 from mitsuba_irrcache.errors import IrrcacheError, suggestion
-from mitsuba_irrcache.volumes import processing
+from mitsuba_irrcache.volumes import processing, transfer_files
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.detached import OPTION
 from mitsuba_irrcache.volumes.formats import format_of, suffixes
@@ -26,7 +26,6 @@ from mitsuba_irrcache.volumes.transfer import (
     DensityMapping,
     TransferFunction,
     load_preset,
-    load_transfer_function,
     preset_names,
 )
 
@@ -162,7 +161,11 @@ def has_appearance(args: argparse.Namespace) -> bool:
 def _add_appearance(group: argparse._ArgumentGroup, required: bool) -> None:
     choice = group.add_mutually_exclusive_group(required=required)
     choice.add_argument("--preset", metavar="NAME", help=", ".join(preset_names()))
-    choice.add_argument("--transfer-function", metavar="FILE", help="a JSON file")
+    choice.add_argument(
+        "--transfer-function",
+        metavar="FILE",
+        help="a JSON file, of VPT, too, or 3D Slicer's volume property: .vp, or presets.xml:NAME",
+    )
     choice.add_argument(
         "--density",
         type=finite,
@@ -272,7 +275,7 @@ def _mapping(args: argparse.Namespace) -> TransferFunction | DensityMapping:
     if args.preset is not None:
         return load_preset(args.preset)
     if args.transfer_function is not None:
-        return load_transfer_function(args.transfer_function)
+        return transfer_files.load(args.transfer_function)
     albedo = args.albedo or (1.0,)
     scale = 1.0 if args.cloud else args.density
     return DensityMapping(scale, albedo * 3 if len(albedo) == 1 else albedo)
