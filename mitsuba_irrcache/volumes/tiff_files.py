@@ -12,6 +12,7 @@ import numpy as np
 import tifffile
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.machine.extras import remedy
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.options import ReadOptions, chosen_field, readable_type, scalar_volume
@@ -140,8 +141,8 @@ def _decoded(path: Path, series: tifffile.TiffPageSeries) -> np.ndarray:
             raise
         kind = series.keyframe.compression.name
         raise IrrcacheError(
-            f"{path} is compressed by {kind}, which needs the package imagecodecs: install it, or "
-            "save the file without compression"
+            f'{path} is compressed by {kind}, which needs "imagecodecs", which is not installed. '
+            f"Remedy: {remedy('microscopy')}, or save the file without compression"
         ) from error
 
 

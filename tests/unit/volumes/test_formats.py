@@ -274,6 +274,22 @@ def test_tiff_slices_of_other_shape_are_refused(tmp_path):
         read_volume(folder)
 
 
+def test_codec_of_a_tiff_that_is_missing_is_named(tmp_path, monkeypatch):
+    """LZW needs a package beside tifffile."""
+    tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed")
+    pytest.importorskip("imagecodecs", reason="imagecodecs is not installed, to write the file")
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, ramp(), photometric="minisblack", compression="lzw")
+    np.testing.assert_array_equal(read_volume(path).values, ramp())
+
+    def decode(self):
+        raise ValueError("<COMPRESSION.LZW: 5> requires the 'imagecodecs' package")
+
+    monkeypatch.setattr(tifffile.TiffPageSeries, "asarray", decode)
+    with pytest.raises(IrrcacheError, match=r"a\.tif is compressed by LZW.*irrcache\[microscopy\]"):
+        read_volume(path)
+
+
 def test_tiff_of_one_page_is_one_slice(tmp_path):
     tifffile = pytest.importorskip("tifffile", reason="tifffile is not installed")
     tifffile.imwrite(tmp_path / "a.tif", ramp()[0])
