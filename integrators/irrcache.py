@@ -5,6 +5,7 @@ This file is executed once for every variant, because its base class differs bet
 
 from __future__ import annotations
 
+import html
 from collections.abc import Iterator
 from time import perf_counter
 
@@ -227,6 +228,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._timeout = properties.number(
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
+        properties.refuse_misspelt(props.wrapped, props.values)
         self._stopping = StopCondition()
         self._camera_rays: ClosedFormCameraRays | TracedCameraRays | None = None
         self._parts: list | None = None  # those of the camera rays
@@ -567,6 +569,15 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         aovs = ", ".join(f"{name}:{kind}" for name, kind in self._aovs.items())
         values = self._properties.values | {"cache_spp": self.cache_spp, "aovs": aovs}
         return f"IrradianceCachingIntegrator[\n{properties.described(values)}\n]"
+
+    def _repr_html_(self) -> str:
+        """Properties, and slices of every cache, for notebooks."""
+        caches = "".join(
+            f"<h4>{html.escape(name)}</h4>{cache._repr_html_()}"
+            for name, cache in self.caches.items()
+            if cache is not None
+        )
+        return f"<pre>{html.escape(self.to_string())}</pre>{caches}"
 
 
 mi.register_integrator("irrcache", IrradianceCachingIntegrator)

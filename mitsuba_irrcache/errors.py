@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 
 class IrrcacheError(ValueError):
@@ -17,6 +18,15 @@ class UnsupportedSceneError(IrrcacheError):
 
 class CacheFileError(IrrcacheError):
     """The cache file is damaged, of another format, or computed for a different scene."""
+
+
+def suggestion(wanted: str, names: Iterable[str]) -> str:
+    """Return ``' (did you mean "..."?)'`` for the name most similar to ``wanted``, or ``""``."""
+    import difflib  # imported here because only misspelt names need it
+
+    by_lower_case = {name.lower(): name for name in names}
+    close = difflib.get_close_matches(wanted.lower(), by_lower_case, n=1)
+    return f' (did you mean "{by_lower_case[close[0]]}"?)' if close else ""
 
 
 def origin(error: BaseException) -> BaseException:

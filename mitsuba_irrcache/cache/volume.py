@@ -16,6 +16,7 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
 from mitsuba_irrcache.cache.direct_light import DirectLight
+from mitsuba_irrcache.cache.display import as_html, as_text
 from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation
 from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
 from mitsuba_irrcache.cache.storage import (
@@ -107,6 +108,14 @@ class IrradianceCache:
         self._spreads: list = [None] * channels
         # Sums of batch means for each moment and channel, in float32.
         self._moments: list = [None] * (moments * channels)
+
+    @_consistent
+    def __repr__(self) -> str:
+        return as_text(self)
+
+    @_consistent
+    def _repr_html_(self) -> str:
+        return as_html(self)
 
     @property
     def directional(self) -> AngularBasis | None:

@@ -13,10 +13,10 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
 
 from mitsuba_irrcache import __version__
 from mitsuba_irrcache.core.argument_types import whole
+from mitsuba_irrcache.core.stage_display import StageDisplay
 from mitsuba_irrcache.errors import IrrcacheError, origin
 from mitsuba_irrcache.io.images import check_output, write_image
 from mitsuba_irrcache.io.scene_files import (
@@ -96,7 +96,8 @@ def run(args: argparse.Namespace) -> int:
     mi.set_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     seconds: dict[str, float] = {}
-    with _stopwatch(seconds, "load"):
+    display = StageDisplay()
+    with _stopwatch(seconds, "load"), display.stage(f"loading {source.name}"):
         parameters = parse_parameters(args.define)
         integrator = args.integrator
         if integrator is None and integrator_of(source, parameters) in REPLACED:
@@ -109,20 +110,23 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.budget or args.error:
         _require_progressive(scene, integrator or integrator_of(source, parameters))
-        _render_progressive(scene, args, seconds, output)
+        _render_progressive(scene, args, seconds, output, display)
     else:
-        image = _render(scene, args, seconds)
+        image = _render(scene, args, seconds, display)
         _write(output, image, scene, _describe(scene, args, seconds), seconds)
     return 0
 
 
-def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]) -> np.ndarray:
+def _render(
+    scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], display: StageDisplay
+) -> np.ndarray:
     integrator = scene.integrator()
+    name = "projection" if has_cache(scene) else "render"
     try:
         if has_cache(scene):
-            with _stopwatch(seconds, "cache"), progress_bar(integrator):
+            with _kernel_stopwatch(seconds, "cache"), progress_bar(integrator, display):
                 integrator.prepare(scene)
-        with _stopwatch(seconds, "projection" if "cache" in seconds else "render"):
+        with _kernel_stopwatch(seconds, name), display.stage("rendering (compiling kernels first)"):
             image = mi.render(scene, sensor=args.sensor, seed=args.seed, spp=args.spp)
             dr.sync_thread()
     except (KeyboardInterrupt, RuntimeError) as error:
@@ -132,21 +136,25 @@ def _render(scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float]
 
 
 def _render_progressive(
-    scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], output: Path
+    scene: mi.Scene,
+    args: argparse.Namespace,
+    seconds: dict[str, float],
+    output: Path,
+    display: StageDisplay,
 ) -> None:
     """Render progressively and write the last image, also if the run is interrupted."""
     frame = None
     targets = {"seconds": args.budget or math.inf, "standard_error": args.error or 0.0}
     try:
         with (
-            progress_bar(scene.integrator()),
+            progress_bar(scene.integrator(), display),
             _terminated_like_interrupted(),
             closing(
                 render_progressive(scene, args.sensor, args.spp, args.seed, **targets)
             ) as frames,
         ):
             for frame in frames:
-                tqdm.write(f"{frame.elapsed:8.2f} s  {_reached(frame)}")
+                display.print(f"{frame.elapsed:8.2f} s  {_reached(frame)}")
     except (KeyboardInterrupt, RuntimeError) as error:
         left = f"the image of {_reached(frame)} was written" if frame else "no image was written"
         _add_message_to_interrupt(error, left)
@@ -194,16 +202,11 @@ def _terminated_like_interrupted():
 
 
 @contextmanager
-def progress_bar(integrator: mi.Integrator):
-    """Show the progress of the cache on a terminal if it takes longer than a second."""
-    with tqdm(unit="sample", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
-
-        def advance(stage: str, done: int, total: int) -> None:
-            bar.total = total
-            bar.set_description(stage, refresh=False)
-            bar.update(done - bar.n)
-
-        integrator.progress = advance
+def progress_bar(integrator: mi.Integrator, display: StageDisplay | None = None):
+    """Show the progress of the cache, from the compilation of its kernels on."""
+    display = display or StageDisplay()
+    with display.stage("cache: preparing the scene, compiling kernels"):
+        integrator.progress = display.advance
         try:
             yield
         finally:
@@ -215,6 +218,24 @@ def _stopwatch(seconds: dict[str, float], name: str):
     started = time.perf_counter()
     yield
     seconds[name] = time.perf_counter() - started
+
+
+@contextmanager
+def _kernel_stopwatch(seconds: dict[str, float], name: str):
+    """Measure a stage without the compilation of its kernels, which is a stage of its own."""
+    before = dr.flag(dr.JitFlag.KernelHistory)
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    dr.kernel_history_clear()
+    try:
+        with _stopwatch(seconds, name):
+            yield
+        missed = (k for k in dr.kernel_history() if not k.get("cache_hit", True))
+        compiling = sum(k["codegen_time"] + k["backend_time"] for k in missed) / 1000
+        if compiling:
+            seconds[name] -= compiling
+            seconds["compilation"] = seconds.get("compilation", 0.0) + compiling
+    finally:
+        dr.set_flag(dr.JitFlag.KernelHistory, before)
 
 
 def _check_targets(args: argparse.Namespace) -> None:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterable
 
 import mitsuba as mi
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, suggestion
 
 #: Maximum number of characters of a value that an error message shows.
 MAX_SHOWN_LENGTH = 60
@@ -21,12 +22,12 @@ class RecordedProperties:
     """Wrapper of ``mi.Properties`` that records each property read and its value or default."""
 
     def __init__(self, props: mi.Properties) -> None:
-        self._props = props
+        self.wrapped = props
         #: value, or default, of every property read so far, by name
         self.values: dict[str, object] = {}
 
     def get(self, name: str, default: object) -> object:
-        self.values[name] = value = self._props.get(name, default)
+        self.values[name] = value = self.wrapped.get(name, default)
         return value
 
 
@@ -74,7 +75,8 @@ def choice(props: mi.Properties, name: str, default: str, choices: tuple[str, ..
     """Read a string that must be one of ``choices``."""
     value = props.get(name, default)
     if not isinstance(value, str) or value not in choices:
-        raise _refusal(name, value, f"one of: {', '.join(choices)}")
+        wanted = f"one of: {', '.join(choices)}"
+        raise _refusal(name, value, wanted, suggestion(str(value), choices))
     return value
 
 
@@ -102,7 +104,18 @@ def file_name(props: mi.Properties, name: str) -> str:
     return value
 
 
-def _refusal(name: str, value: object, wanted: str) -> IrrcacheError:
+def refuse_misspelt(props: mi.Properties, known: Iterable[str]) -> None:
+    """Raise IrrcacheError for a property that is similar to a known one, but was never read.
+
+    Mitsuba refuses others after the constructor, as unreferenced; derived classes may read them.
+    """
+    for name in props.unqueried():
+        meant = suggestion(name, known)
+        if meant:
+            raise IrrcacheError(f'irrcache: there is no property "{name}"{meant}.')
+
+
+def _refusal(name: str, value: object, wanted: str, meant: str = "") -> IrrcacheError:
     shown = " ".join(repr(value).split())
     shown = shown if len(shown) <= MAX_SHOWN_LENGTH else f"{shown[:MAX_SHOWN_LENGTH]}..."
-    return IrrcacheError(f"irrcache: {name} is {shown}; it must be {wanted}.")
+    return IrrcacheError(f"irrcache: {name} is {shown}; it must be {wanted}{meant}.")

@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
 import mitsuba as mi
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.io.scene_xml import scene_element
 
 #: Properties common to all volumetric path integrators, with the same meaning in irrcache.
@@ -35,12 +36,45 @@ def load_scene(
     """
     path = Path(path)
     config, state = _parse(path, parameters)
-    with _search_path(path.parent):
+    with _explained(path), _search_path(path.parent):
         mi.parser.transform_all(config, state)
         if integrator is not None:
             _replace_integrator(state, integrator, path)
         scene = mi.parser.instantiate(config, state)
     return scene[0] if isinstance(scene, list) else scene
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Add the most similar name to Mitsuba's errors about names that it does not know."""
+    try:
+        yield
+    except RuntimeError as error:
+        meant = _meant(str(error), path)
+        if not meant:
+            raise
+        raise RuntimeError(f"{str(error).rstrip()}{meant}") from None
+
+
+def _meant(message: str, path: Path) -> str:
+    """Return a suggestion for the unknown plugin, property or parameter of an error message."""
+    plugin = re.search(r'Plugin "(\w+)" not found', message)
+    if plugin is not None:
+        return suggestion(plugin[1], _plugin_names())
+    unused = re.search(r"unused parameters:\s*- \$(\w+)=", message)
+    if unused is not None:
+        declared = re.findall(r'\$\{?(\w+)|<default\s+name="(\w+)"', path.read_text("utf-8"))
+        return suggestion(unused[1], filter(None, sum(declared, ())))
+    unreferenced = re.search(r'unreferenced propert.*of type "\w+":\s*- \w+ "(\w+)"', message)
+    if unreferenced is not None and "integrator plugin" in message:
+        return suggestion(unreferenced[1], SHARED_PROPERTIES)
+    return ""
+
+
+def _plugin_names() -> list[str]:
+    """Return the names of Mitsuba's plugins, which are files of its package, and ours."""
+    folder = Path(mi.__file__).parent / "plugins"
+    return ["irrcache", *(file.stem for file in folder.glob("*.*"))]
 
 
 def check_scene_file(path: str | Path) -> Path:
@@ -183,7 +217,8 @@ def _parse(
 ) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
     check_scene_file(path)
     config = mi.parser.ParserConfig(mi.variant())
-    return config, mi.parser.parse_file(config, str(path), **(parameters or {}))
+    with _explained(path):
+        return config, mi.parser.parse_file(config, str(path), **(parameters or {}))
 
 
 def _literal(text: str) -> object:

@@ -23,7 +23,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine import llvm as runtime
 from mitsuba_irrcache.machine import versions
 from mitsuba_irrcache.machine.extras import remedy
-from mitsuba_irrcache.machine.memory import available_memory
+from mitsuba_irrcache.machine.memory import available_memory, total_memory
 from mitsuba_irrcache.machine.variants import SUPPORTED, require_variant
 
 DEFAULT_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
@@ -115,7 +115,7 @@ def examine_system() -> dict[str, Any]:
         "processor": _processor(),
         "vector_extensions": _vector_extensions(),
         "cores": _cores(),
-        "memory": _total_memory(),
+        "memory": total_memory(),
         "free_memory": available_memory(),
     }
 
@@ -285,13 +285,6 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-def _total_memory() -> int | None:
-    """Memory of the machine in bytes, or None if the system does not report it."""
-    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
-        return None
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
 def _optix_library() -> str | None:
     """Path of the OptiX library: the one selected by the user, else the driver's (Linux only)."""
     named = os.environ.get("DRJIT_LIBOPTIX_PATH")
@@ -332,8 +325,8 @@ def _system_lines(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def _gib(size: int | None) -> str:
-    return "unknown" if size is None else f"{size / 2**30:.1f} GiB"
+def _gib(size: int) -> str:
+    return f"{size / 2**30:.1f} GiB"
 
 
 def _package_lines(packages: list[dict[str, Any]]) -> list[str]:

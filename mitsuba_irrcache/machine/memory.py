@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import platform
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +12,10 @@ import drjit as dr
 
 from mitsuba_irrcache.errors import IrrcacheError
 
+#: Where Linux keeps its control groups, and those of this process.
+CONTROL_GROUPS, PROCESS_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+#: Stands for no limit, in bytes.
+UNLIMITED = 2**63
 #: Arrays of at least this many bytes are returned to the system when freed: glibc's initial
 #: threshold.
 MMAP_THRESHOLD = 1 << 17
@@ -22,14 +26,73 @@ _M_MMAP_THRESHOLD = -3
 
 
 def available_memory() -> int:
-    """Bytes that can be allocated without swapping; 2^63 if the system does not report it."""
+    """Bytes that can be allocated without swapping, within the limit of a container, if any."""
+    # Imported here because importing the package takes longer with it.
+    import psutil
+
+    return max(0, min(psutil.virtual_memory().available, _left_in_container()))
+
+
+def total_memory() -> int:
+    """Bytes of memory of the machine, or of the container if it is limited."""
+    import psutil
+
+    limits = (_bytes(folder / limit) for folder, limit, *_ in _control_groups())
+    return min(psutil.virtual_memory().total, *limits, UNLIMITED)
+
+
+def _left_in_container() -> int:
+    """Bytes that the control groups of this process permit to allocate, `UNLIMITED` if any."""
+    left = UNLIMITED
+    for folder, limit, usage, cache in _control_groups():
+        allowed = _bytes(folder / limit)
+        if allowed < UNLIMITED:
+            # Cached files count as used, but are dropped when memory is needed.
+            used = _bytes(folder / usage) - _statistic(folder / "memory.stat", cache)
+            left = min(left, allowed - used)
+    return left
+
+
+def _control_groups() -> Iterator[tuple[Path, str, str, str]]:
+    """Yield folders of Linux' control groups of this process, from its own up to the root.
+
+    Each comes with the names of its limit, its usage, and its statistic of cached files. In a
+    container the own group may be at the root, whatever its path on the host.
+    """
+    groups = {"": Path("/")}
+    with suppress(OSError):
+        for line in PROCESS_GROUPS.read_text().splitlines():
+            _, controllers, path = line.split(":", 2)
+            groups |= {controller: Path(path) for controller in controllers.split(",")}
+    for controller, mount, names in (
+        ("", CONTROL_GROUPS, ("memory.max", "memory.current", "inactive_file")),
+        (
+            "memory",
+            CONTROL_GROUPS / "memory",
+            ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+        ),
+    ):
+        own = groups.get(controller, Path("/"))
+        for path in (own, *own.parents):
+            folder = mount / path.relative_to("/")
+            if (folder / names[0]).is_file():
+                yield folder, *names
+
+
+def _bytes(file: Path) -> int:
+    """Return the number in a file of a control group; `UNLIMITED` if it is none."""
+    try:
+        return min(int(file.read_text()), UNLIMITED)
+    except (OSError, ValueError):  # "max"
+        return UNLIMITED
+
+
+def _statistic(file: Path, name: str) -> int:
     with suppress(OSError, ValueError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    with suppress(AttributeError, ValueError, OSError):
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return 2**63
+        for line in file.read_text().splitlines():
+            if line.split()[0] == name:
+                return int(line.split()[1])
+    return 0
 
 
 def require_memory(needed: int, what: str, remedy: str) -> None:

@@ -19,7 +19,6 @@ from mitsuba_irrcache.machine.extras import require
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.memory import free_at_once
 from mitsuba_irrcache.volumes import importer
-from mitsuba_irrcache.volumes.scene import SceneSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -109,9 +108,7 @@ def _document(args: argparse.Namespace) -> tuple:
         return Document.load(path, parameters, integrator), None
     volume, mapping = importer.read(args)
     appearance = Appearance(volume, mapping)
-    settings = SceneSettings(
-        integrator="irrcache", max_depth=args.max_depth, up=importer.up_axis(args)
-    )
+    settings = importer.scene_settings(args, "irrcache")
     return appearance.document(settings, parameters, args.integrator), appearance
 
 

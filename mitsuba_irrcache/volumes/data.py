@@ -19,6 +19,7 @@ class VolumeData:
         origin: world position of the centre of voxel ``(0, 0, 0)``.
         direction: 3x3, columns are the world directions of the grid's x, y and z axes.
         unit: the unit of the values, e.g. ``"HU"``; empty if it is unknown.
+        length_unit: the unit of ``spacing`` and ``origin``, e.g. ``"mm"``; empty if it is unknown.
         source: description of the origin of the values, for summaries and messages.
 
     Raises:
@@ -30,6 +31,7 @@ class VolumeData:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     direction: np.ndarray = field(default_factory=lambda: np.eye(3))
     unit: str = ""
+    length_unit: str = ""
     source: str = ""
 
     def __post_init__(self) -> None:

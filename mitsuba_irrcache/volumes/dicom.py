@@ -57,6 +57,7 @@ def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> V
         origin=tuple(positions[0]),
         direction=np.stack([row, column, stack / np.linalg.norm(stack)], axis=1),
         unit="HU" if modality == "CT" else "",
+        length_unit="mm",
         source=f"{folder} ({len(files)} DICOM slices)",
     )
 

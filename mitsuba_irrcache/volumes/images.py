@@ -1,9 +1,8 @@
-"""Image files with a header - NRRD, NIfTI, MetaImage, single DICOM - through SimpleITK."""
+"""Image files with a header - NRRD, NIfTI, Analyze, MetaImage, DICOM - through SimpleITK."""
 
 from __future__ import annotations
 
 import gzip
-import os
 import re
 import zlib
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.detached import data_files
 from mitsuba_irrcache.volumes.dicom_lengths import check_lengths
+from mitsuba_irrcache.volumes.options import ReadOptions, picked
 
 _READERS = {
     ".nrrd": "NrrdImageIO",
@@ -24,9 +24,10 @@ _READERS = {
     ".nii.gz": "NiftiImageIO",
     ".mha": "MetaImageIO",
     ".mhd": "MetaImageIO",
+    ".hdr": "NiftiImageIO",  # it reads the Analyze format, too, from which NIfTI stems
+    ".img": "NiftiImageIO",
     ".dcm": "GDCMImageIO",
 }
-EXTENSIONS = tuple(_READERS)
 # Maximum compression ratio of deflate (zlib.net/zlib_tech.html).
 _BEST_DEFLATE_RATIO = 1032
 _COMPRESSED = re.compile(
@@ -48,38 +49,29 @@ _COMPONENT_BYTES = {
 }
 
 
-def read_image(
-    path: str | os.PathLike, data_folders: Sequence[str | os.PathLike] = ()
-) -> VolumeData:
+def read(path: Path, options: ReadOptions) -> VolumeData:
     """Read one image file with its spacing, origin and direction (LPS, mm).
 
-    Args:
-        path: the image file.
-        data_folders: folders, besides that of the header, for voxels in other files.
-
     Raises:
-        IrrcacheError: missing or truncated file, a header that declares more than the file can
-            hold (found before memory is allocated), one that names a data file in another folder,
-            or an image that is no scalar volume.
+        IrrcacheError: a truncated file, a header that declares more than the file can hold (found
+            before memory is allocated), one that names a data file in another folder, or an image
+            that is no scalar volume.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise IrrcacheError(f"volume file {path} does not exist")
-    if not path.stat().st_size:
-        raise IrrcacheError(f"volume file {path} is empty; copy or export it again")
     if path.suffix == ".dcm":
         check_lengths(path)
     if path.suffix.lower() in (".mha", ".mhd"):
         _check_dimensions(path)
-    formats = (".nrrd", ".nhdr", ".mha", ".mhd")
-    data = data_files(path, data_folders) if path.suffix.lower() in formats else [path]
     reader = SimpleITK.ImageFileReader()
     # The reader is fixed: one selected by the contents could read unchecked data files.
     reader.SetImageIO(_reader_of(path))
     reader.SetFileName(str(path))
     try:
+        data = _data_files(path, options)
         reader.ReadImageInformation()
-        _check_scalar_volume(path, reader)
+        _check_volume(path, reader)
+        channel = picked(str(path), "channel", reader.GetNumberOfComponents(), options.channel)
+        frames = int(np.prod(reader.GetSize()[3:], dtype=object))
+        frame = picked(str(path), "frame", frames, options.frame)
         _check_file_holds(path, data, _image_bytes(path, reader))
         image = reader.Execute()
     except RuntimeError as error:
@@ -88,14 +80,32 @@ def read_image(
             f"cannot read {path}: {reason} (is it truncated, or of another format?)"
         ) from error
     if image.GetDimension() == 4:
-        image = image[..., 0]
+        image = image[..., frame]
+    values = SimpleITK.GetArrayFromImage(image)
     return VolumeData(
-        values=SimpleITK.GetArrayFromImage(image),
+        values=values if values.ndim == 3 else values[..., channel],
         spacing=image.GetSpacing(),
         origin=image.GetOrigin(),
         direction=np.array(image.GetDirection()).reshape(3, 3),
+        length_unit="mm",
         source=str(path),
     )
+
+
+def _data_files(path: Path, options: ReadOptions) -> list[Path]:
+    """Return the files with the voxels, after checking those that a header names."""
+    suffix = path.suffix.lower()
+    if suffix in (".nrrd", ".nhdr", ".mha", ".mhd"):
+        return data_files(path, options.data_folders)
+    if suffix not in (".hdr", ".img"):
+        return [path]
+    image = path.with_suffix(".img" if suffix == ".hdr" else path.suffix)
+    header = path.with_suffix(".hdr") if suffix == ".img" else path
+    packed = path.with_suffix(".img.gz")
+    for file, what in ((header, "header"), (packed if packed.exists() else image, "voxels")):
+        if not file.is_file():
+            raise IrrcacheError(f"{path} has its {what} in {file}, which does not exist; add it")
+    return [packed if packed.exists() else image]
 
 
 def _check_dimensions(path: Path) -> None:
@@ -108,18 +118,14 @@ def _check_dimensions(path: Path) -> None:
         )
 
 
-def _check_scalar_volume(path: Path, reader: SimpleITK.ImageFileReader) -> None:
+def _check_volume(path: Path, reader: SimpleITK.ImageFileReader) -> None:
     size = reader.GetSize()
     if len(size) < 3 or (len(size) == 3 and size[2] == 1):
         raise IrrcacheError(
             f"{path} is one slice of size {size}; give the folder of the series, or a 3-D file"
         )
-    if len(size) > 3 and any(n != 1 for n in size[3:]):
+    if len(size) > 4 and any(n != 1 for n in size[4:]):
         raise IrrcacheError(f"{path} has size {size}; extract one 3-D frame of it first")
-    if reader.GetNumberOfComponents() != 1:
-        raise IrrcacheError(
-            f"{path} has {reader.GetNumberOfComponents()} values per voxel; extract one of them"
-        )
 
 
 def _image_bytes(path: Path, reader: SimpleITK.ImageFileReader) -> int:
@@ -127,7 +133,7 @@ def _image_bytes(path: Path, reader: SimpleITK.ImageFileReader) -> int:
 
     SimpleITK reports the type after rescaling.
     """
-    count = int(np.prod(reader.GetSize(), dtype=object))
+    count = int(np.prod(reader.GetSize(), dtype=object)) * reader.GetNumberOfComponents()
     if reader.HasMetaDataKey("bitpix"):
         return count * int(reader.GetMetaData("bitpix")) // 8
     return count * _COMPONENT_BYTES.get(reader.GetPixelID(), 1)
@@ -152,6 +158,10 @@ def _check_file_holds(path: Path, data: Sequence[Path], image_bytes: int) -> Non
     with path.open("rb") as stream:
         header = stream.read(64 * 1024)
     stored = sum(file.stat().st_size for file in data)
+    if data[0].suffix == ".gz":
+        _check_ratio(data[0], stored, image_bytes)
+        _check_gzip(data[0], image_bytes)
+        return
     if _COMPRESSED.search(header):
         _check_ratio(data[0], stored, image_bytes)
     elif stored < image_bytes:

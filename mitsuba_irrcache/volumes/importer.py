@@ -5,15 +5,20 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mitsuba_irrcache.core.argument_types import argument, finite, finite_number, whole
-from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.volumes import processing
+from mitsuba_irrcache.core.stage_display import StageDisplay
+from mitsuba_irrcache.errors import IrrcacheError, suggestion
+from mitsuba_irrcache.volumes import processing, transfer_files
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.detached import OPTION
+from mitsuba_irrcache.volumes.formats import format_of, suffixes
+from mitsuba_irrcache.volumes.options import CloudVariables, ReadOptions
 from mitsuba_irrcache.volumes.raw import RawLayout
 from mitsuba_irrcache.volumes.readers import read_volume
 from mitsuba_irrcache.volumes.scene import SceneSettings, write_scene
@@ -21,10 +26,13 @@ from mitsuba_irrcache.volumes.transfer import (
     DensityMapping,
     TransferFunction,
     load_preset,
-    load_transfer_function,
     preset_names,
 )
 
+#: Mean cosine of scattering by the droplets of a water cloud in visible light.
+CLOUD_ASYMMETRY = 0.85
+#: Radiance of the sky and irradiance of the sun in scenes of clouds, in arbitrary units.
+CLOUD_SKY, CLOUD_SUN = 0.1, 4.0
 _PHANTOMS = ("thorax", "cloud")
 # Air is -1000 HU; data in Hounsfield units without air are rare.
 _AIR_LIKE = -200
@@ -46,7 +54,7 @@ def add_input(parser: argparse.ArgumentParser, besides: str = "") -> None:
         "input",
         nargs="+",
         metavar="INPUT",
-        help=f"{besides}NRRD, NIfTI, MetaImage or .vol file, DICOM folder, raw file(s) in one or "
+        help=f"{besides}a volume file ({suffixes()}), a DICOM folder, raw file(s) in one or "
         "in slices, or one made here: phantom:thorax (a chest), phantom:cloud (needs --density), "
         "each with :X,Y,Z after it for another size",
     )
@@ -60,6 +68,7 @@ def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
     needed = "one is needed" if required else "for volumes: one is needed"
     _add_appearance(parser.add_argument_group(f"appearance ({needed})"), required)
     _add_processing(parser.add_argument_group("processing, in this order"))
+    _add_selection(parser.add_argument_group("files with several volumes, or without a spacing"))
     _add_raw(parser.add_argument_group("raw files"))
     parser.add_argument(
         OPTION,
@@ -76,10 +85,15 @@ def add_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
         help="replace NaN and infinite values by VALUE",
     )
     parser.add_argument(
-        "--max-depth", type=whole(-1), default=2, help="default of the scene (2: single scattering)"
+        "--max-depth",
+        type=whole(-1),
+        help="default of the scene (2: single scattering, the default; -1, all orders, with "
+        "--asymmetry or --cloud)",
     )
     parser.add_argument(
-        "--up", choices=("z", "y"), help="axis up in the picture (default: z; y for .vol)"
+        "--up",
+        choices=("z", "y"),
+        help="axis up in the picture (default: that of the format, mostly z)",
     )
 
 
@@ -89,14 +103,18 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         IrrcacheError: invalid input; no files are written then.
     """
-    volume, mapping = _volume(args)
-    resampled, sigma_t, albedo = processing.bake(
-        volume, mapping, _target_size(volume, args), args.supersample
-    )
-    settings = SceneSettings(max_depth=args.max_depth, up=up_axis(args))
-    written = write_scene(
-        args.output, resampled, mapping, sigma_t, albedo, settings, overwrite=args.overwrite
-    )
+    display = StageDisplay(is_updated=False)  # large volumes have progress bars
+    with display.stage(f"reading {args.input[0]}"):
+        volume, mapping = _volume(args)
+    with display.stage("computing extinction and albedo"):
+        resampled, sigma_t, albedo = processing.bake(
+            volume, mapping, _target_size(volume, args), args.supersample
+        )
+    settings = scene_settings(args)
+    with display.stage(f"writing {args.output}"):
+        written = write_scene(
+            args.output, resampled, mapping, sigma_t, albedo, settings, overwrite=args.overwrite
+        )
     print(_summary(resampled, sigma_t, albedo, written, args.output))
     return 0
 
@@ -110,22 +128,44 @@ def read(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | Densi
 
 def _volume(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | DensityMapping]:
     if not has_appearance(args):
-        raise IrrcacheError(f"{args.input[0]}: give --preset, --transfer-function or --density.")
+        raise IrrcacheError(
+            f"{args.input[0]}: give --preset, --transfer-function, --density or --cloud."
+        )
     mapping = _mapping(args)
     volume = _process(_read(args), args)
     _warn_about_unit(volume, mapping)
     return volume, mapping
 
 
+def scene_settings(args: argparse.Namespace, integrator: str = "volpath") -> SceneSettings:
+    """Return the defaults of the scene's parameters for ``args``."""
+    asymmetry = args.asymmetry
+    if asymmetry is None:
+        asymmetry = CLOUD_ASYMMETRY if args.cloud else 0.0
+    max_depth = args.max_depth
+    if max_depth is None:
+        max_depth = -1 if asymmetry else 2
+    settings = SceneSettings(
+        integrator=integrator, max_depth=max_depth, asymmetry=asymmetry, up=up_axis(args)
+    )
+    # A cloud that absorbs nothing is invisible before a uniform environment: add a sun.
+    return replace(settings, radiance=CLOUD_SKY, sun=CLOUD_SUN) if args.cloud else settings
+
+
 def has_appearance(args: argparse.Namespace) -> bool:
     """Return whether ``args`` specify the appearance of a volume."""
-    return any(v is not None for v in (args.preset, args.transfer_function, args.density))
+    given = (args.preset, args.transfer_function, args.density)
+    return args.cloud or any(v is not None for v in given)
 
 
 def _add_appearance(group: argparse._ArgumentGroup, required: bool) -> None:
     choice = group.add_mutually_exclusive_group(required=required)
     choice.add_argument("--preset", metavar="NAME", help=", ".join(preset_names()))
-    choice.add_argument("--transfer-function", metavar="FILE", help="a JSON file")
+    choice.add_argument(
+        "--transfer-function",
+        metavar="FILE",
+        help="a JSON file, of VPT, too, or 3D Slicer's volume property: .vp, or presets.xml:NAME",
+    )
     choice.add_argument(
         "--density",
         type=finite,
@@ -134,11 +174,37 @@ def _add_appearance(group: argparse._ArgumentGroup, required: bool) -> None:
         metavar="SCALE",
         help="the values are densities: sigma_t = SCALE * value (default: 1)",
     )
+    choice.add_argument(
+        "--cloud",
+        action="store_true",
+        help="NetCDF or Zarr with liquid water content and effective radius: "
+        "sigma_t = 3 LWC / (2 rho_water r_eff), asymmetry 0.85",
+    )
     group.add_argument(
         "--albedo",
         type=_numbers,
         metavar="A | R,G,B",
-        help="with --density: the albedo (default: 1)",
+        help="with --density or --cloud: the albedo (default: 1)",
+    )
+    group.add_argument(
+        "--asymmetry",
+        type=_asymmetry,
+        metavar="G",
+        help="mean cosine of the Henyey-Greenstein phase function (default: 0, isotropic)",
+    )
+    group.add_argument(
+        "--liquid-water", metavar="NAME", help="with --cloud: its variable, if not found by name"
+    )
+    group.add_argument(
+        "--effective-radius",
+        metavar="NAME | UM",
+        help="with --cloud: its variable, or one radius in micrometres",
+    )
+    group.add_argument(
+        "--air-density",
+        type=finite,
+        metavar="KG_PER_M3",
+        help="with --cloud: for mixing ratios, if the file has no density of air",
     )
 
 
@@ -179,6 +245,20 @@ def _add_processing(group: argparse._ArgumentGroup) -> None:
     )
 
 
+def _add_selection(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--field", metavar="NAME", help="the array, variable, grid or data set")
+    group.add_argument(
+        "--channel", type=whole(0), metavar="N", help="which value of each voxel, counted from 0"
+    )
+    group.add_argument("--frame", type=whole(0), metavar="N", help="which time step, from 0")
+    group.add_argument(
+        "--spacing",
+        type=_numbers,
+        metavar="X,Y,Z",
+        help="distance between voxel centres, in place of that of the file",
+    )
+
+
 def _add_raw(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--raw-shape", type=_counts, metavar="X,Y,Z", help="voxels; marks raw input")
     group.add_argument("--raw-type", default="uint8", help="e.g. uint16, float32 (default: uint8)")
@@ -188,14 +268,17 @@ def _add_raw(group: argparse._ArgumentGroup) -> None:
 
 
 def _mapping(args: argparse.Namespace) -> TransferFunction | DensityMapping:
-    if args.density is None and args.albedo is not None:
-        raise IrrcacheError("--albedo needs --density; a transfer function has its own colours")
+    if args.density is None and not args.cloud and args.albedo is not None:
+        raise IrrcacheError(
+            "--albedo needs --density or --cloud; a transfer function has its own colours"
+        )
     if args.preset is not None:
         return load_preset(args.preset)
     if args.transfer_function is not None:
-        return load_transfer_function(args.transfer_function)
+        return transfer_files.load(args.transfer_function)
     albedo = args.albedo or (1.0,)
-    return DensityMapping(args.density, albedo * 3 if len(albedo) == 1 else albedo)
+    scale = 1.0 if args.cloud else args.density
+    return DensityMapping(scale, albedo * 3 if len(albedo) == 1 else albedo)
 
 
 def _read(args: argparse.Namespace) -> VolumeData:
@@ -212,8 +295,28 @@ def _read(args: argparse.Namespace) -> VolumeData:
         raw=raw,
         series=args.series,
         replace_nan=args.replace_nan,
-        data_folders=args.data_folder,
+        options=ReadOptions(args.field, args.channel, args.frame, args.spacing, args.data_folder),
+        cloud=_cloud(args),
     )
+
+
+def _cloud(args: argparse.Namespace) -> CloudVariables | None:
+    """Return the variables of a cloud, None without --cloud."""
+    given = (args.liquid_water, args.effective_radius, args.air_density)
+    if not args.cloud and any(value is not None for value in given):
+        raise IrrcacheError(
+            "--liquid-water, --effective-radius and --air-density need --cloud; add it"
+        )
+    if not args.cloud:
+        return None
+    radius = args.effective_radius
+    with suppress(TypeError, ValueError):  # None, or the name of a variable
+        radius = float(radius)
+    if isinstance(radius, float) and not 0 < radius < math.inf:
+        raise IrrcacheError(f"--effective-radius is {radius:g}; give micrometres above 0")
+    if args.air_density is not None and args.air_density <= 0:
+        raise IrrcacheError(f"--air-density is {args.air_density:g}; give kg/m^3 above 0")
+    return CloudVariables(args.liquid_water, radius, args.air_density)
 
 
 def _phantom(source: str) -> VolumeData:
@@ -224,7 +327,7 @@ def _phantom(source: str) -> VolumeData:
     name, _, size = source.removeprefix("phantom:").partition(":")
     if name not in _PHANTOMS:
         known = " and ".join(f"phantom:{known}" for known in _PHANTOMS)
-        raise IrrcacheError(f"no phantom {name!r}; there are {known}")
+        raise IrrcacheError(f"no phantom {name!r}{suggestion(name, _PHANTOMS)}; there are {known}")
     make = getattr(phantom, name)
     if not size:
         return make()
@@ -263,7 +366,8 @@ def up_axis(args: argparse.Namespace) -> str:
     """Return the up axis: y for graphics volumes, z (to the patient's head) for medical ones."""
     if args.up is not None:
         return args.up
-    return "y" if Path(args.input[0]).suffix == ".vol" else "z"
+    known = format_of(Path(args.input[0]))
+    return known.up if known is not None else "z"
 
 
 def _warn_about_unit(volume: VolumeData, mapping: TransferFunction | DensityMapping) -> None:
@@ -292,9 +396,10 @@ def _summary(
     empty = 1.0 - np.count_nonzero(sigma_t) / sigma_t.size
     values = np.asarray(volume.values)
     unit = f" {volume.unit}" if volume.unit else ""
+    length = f" ({volume.length_unit})" if volume.length_unit else ""
     lines = [
         f"source         {volume.source}",
-        f"size           {size} voxels of {spacing}, {extent} in all",
+        f"size           {size} voxels of {spacing}, {extent} in all{length}",
         f"values         {values.min():.6g} .. {values.max():.6g}{unit}",
         f"sigma_t        0 .. {sigma_t.max():.4g} per unit length, {empty:.1%} of voxels empty",
         f"albedo         {albedo.min():.3g} .. {albedo.max():.3g}",
@@ -307,6 +412,14 @@ def _summary(
 @argument("numbers separated by commas, for example 0.9 or 0.9,0.5,0.4")
 def _numbers(text: str) -> tuple[float, ...]:
     return tuple(finite_number(part) for part in text.split(","))
+
+
+@argument("a mean cosine between -1 and 1, for example 0.85")
+def _asymmetry(text: str) -> float:
+    value = finite_number(text)
+    if not -1 < value < 1:
+        raise ValueError
+    return value
 
 
 @argument("three whole numbers of voxels X,Y,Z, each at least 1, for example 40,32,24")

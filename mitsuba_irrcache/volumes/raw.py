@@ -77,9 +77,9 @@ def read_raw_slices(paths: Sequence[str | os.PathLike], layout: RawLayout) -> Vo
         IrrcacheError: the number of files is not the shape's z, a number is missing from the
             sequence of names, or a file's size is wrong.
     """
-    ordered = sorted((Path(path) for path in paths), key=lambda path: _natural_key(path.name))
+    ordered = natural_order(paths)
     x, y, z = layout.shape
-    _check_numbering(ordered)
+    check_numbering(ordered)
     if len(ordered) != z:
         raise IrrcacheError(
             f"{len(ordered)} slice files from {ordered[0]} on, but raw shape {layout.shape} "
@@ -110,13 +110,18 @@ def _check_bytes(path: Path, layout: RawLayout, shape: tuple[int, ...]) -> None:
         )
 
 
+def natural_order(paths: Sequence[str | os.PathLike]) -> list[Path]:
+    """Sort files by the numbers in their names: ``head.2`` before ``head.10``."""
+    return sorted((Path(path) for path in paths), key=lambda path: _natural_key(path.name))
+
+
 def _natural_key(name: str) -> list[tuple[int, int, str]]:
     """Return a sort key that compares digits as numbers, without leading zeros, too."""
     parts = re.split(r"(\d+)", name)
     return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
 
 
-def _check_numbering(ordered: Sequence[Path]) -> None:
+def check_numbering(ordered: Sequence[Path]) -> None:
     """Refuse numbered names with a gap: after a missing slice, all others would be shifted.
 
     Names whose only difference is one number count as numbered; other lists are used as given.

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.io.mitsuba_vol import read_vol
+from mitsuba_irrcache.machine.extras import require
 from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.formats import NETCDF, TIFF, ZARR, ZARR_MARKS, format_of, suffixes
+from mitsuba_irrcache.volumes.options import CloudVariables, ReadOptions
 from mitsuba_irrcache.volumes.raw import RawLayout, read_raw, read_raw_slices
 
 PathLike = str | os.PathLike
@@ -24,23 +26,30 @@ def read_volume(
     raw: RawLayout | None = None,
     series: str | None = None,
     replace_nan: float | None = None,
-    data_folders: Sequence[PathLike] = (),
+    options: ReadOptions | None = None,
+    cloud: CloudVariables | None = None,
 ) -> VolumeData:
     """Read a scalar volume with its placement.
 
     Args:
-        path: NRRD, NIfTI, MetaImage or Mitsuba ``.vol`` file; a folder with a DICOM series; with
-            ``raw``, a raw file, or a list or glob pattern of raw slice files.
+        path: a file of one of `formats.FORMATS`; a folder with a DICOM series; with ``raw``, a raw
+            file, or a list or glob pattern of raw slice files.
         raw: the layout of raw files.
         series: SeriesInstanceUID, for DICOM folders with several.
         replace_nan: value that replaces NaN and infinite values.
-        data_folders: folders, besides that of a header (NRRD, MetaImage), for voxels that it keeps
-            in other files.
+        options: which of several volumes to read, and from where.
+        cloud: read the extinction of a cloud of liquid water, from these variables.
 
     Raises:
         IrrcacheError: anything that cannot be read as a finite scalar volume.
     """
-    volume = _read(path, raw, series, data_folders)
+    options = options or ReadOptions()
+    if cloud is not None:
+        volume = _read_cloud(path, options, cloud)
+    else:
+        volume = _read(path, raw, series, options)
+    if options.spacing is not None:
+        volume = replace(volume, spacing=options.spacing)
     return replace(volume, values=_finite(volume, replace_nan))
 
 
@@ -48,32 +57,29 @@ def _read(
     path: PathLike | Sequence[PathLike],
     raw: RawLayout | None,
     series: str | None,
-    data_folders: Sequence[PathLike],
+    options: ReadOptions,
 ) -> VolumeData:
     paths = _expand(path)
     if raw is not None:
         return read_raw(paths[0], raw) if len(paths) == 1 else read_raw_slices(paths, raw)
     if len(paths) > 1:
+        if all(path.name.lower().endswith(TIFF.suffixes) for path in paths):
+            return _read_tiff_slices(paths, options)
         raise IrrcacheError(
-            f"{len(paths)} files from {paths[0]} on: several files are read as raw slices only; "
-            "give their --raw-shape X,Y,Z and --raw-type"
+            f"{len(paths)} files from {paths[0]} on: several files are read as TIFF or raw slices "
+            "only; for raw slices give their --raw-shape X,Y,Z and --raw-type"
         )
     single = paths[0]
-    if single.is_dir():
-        return _read_folder(single, series)
     if not single.exists():
         raise IrrcacheError(f"volume file {single} does not exist")
-    name = single.name.lower()
-    if name.endswith(".vol"):
-        return _read_mitsuba(single)
-    # Imported here because only these formats need SimpleITK.
-    from mitsuba_irrcache.volumes import images
-
-    if name.endswith(images.EXTENSIONS):
-        return images.read_image(single, data_folders)
+    known = format_of(single)
+    if known is not None:
+        return known.read(single, options)
+    if single.is_dir():
+        return _read_folder(single, series, options)
     raise IrrcacheError(
-        f"{single} has an extension that is not supported; give .vol, "
-        f"{', '.join(images.EXTENSIONS)}, a DICOM folder, or --raw-shape X,Y,Z for a raw file"
+        f"{single} has an extension that is not supported; give {suffixes()}, a DICOM folder, or "
+        "--raw-shape X,Y,Z for a raw file"
     )
 
 
@@ -91,25 +97,40 @@ def _expand(path: PathLike | Sequence[PathLike]) -> list[Path]:
     return [Path(path)]
 
 
-def _read_folder(folder: Path, series: str | None) -> VolumeData:
-    if not any(folder.iterdir()):
+def _read_folder(folder: Path, series: str | None, options: ReadOptions) -> VolumeData:
+    names = {path.name for path in folder.iterdir()}
+    if not names:
         raise IrrcacheError(f"folder {folder} is empty; give a folder with a DICOM series")
+    if names & set(ZARR_MARKS):
+        return ZARR.read(folder, options)
+    if all(name.lower().endswith(TIFF.suffixes) for name in names):
+        return _read_tiff_slices([folder / name for name in names], options)
+    require("SimpleITK", "volumes", f"reading {folder}")
     # Imported here because only these formats need SimpleITK.
     from mitsuba_irrcache.volumes.dicom import read_dicom_series
 
     return read_dicom_series(folder, series)
 
 
-def _read_mitsuba(path: Path) -> VolumeData:
-    """Read a one-channel ``.vol``, placed by the bounding box in its header."""
-    values, (low, high) = read_vol(path)
-    if values.shape[3] != 1:
+def _read_cloud(
+    path: PathLike | Sequence[PathLike], options: ReadOptions, cloud: CloudVariables
+) -> VolumeData:
+    paths = _expand(path)
+    known = format_of(paths[0])
+    if len(paths) > 1 or known not in (NETCDF, ZARR):
         raise IrrcacheError(
-            f"{path} has {values.shape[3]} channels; only volumes of one value are imported, "
-            "use it in a scene as it is"
+            f"{paths[0]}: --cloud reads one NetCDF file or Zarr folder with the liquid water "
+            "content and the effective radius; for other files give --density"
         )
-    spacing = (high - low) / values.shape[2::-1]
-    return VolumeData(values[..., 0], tuple(spacing), tuple(low + 0.5 * spacing), source=str(path))
+    return NETCDF.call(paths[0], "clouds", "read_cloud", options, cloud)
+
+
+def _read_tiff_slices(paths: list[Path], options: ReadOptions) -> VolumeData:
+    require("tifffile", TIFF.extra, f"reading {paths[0]}")
+    # Imported here because only this format needs tifffile.
+    from mitsuba_irrcache.volumes.tiff_files import read_slices
+
+    return read_slices(paths, options)
 
 
 def _finite(volume: VolumeData, replacement: float | None) -> np.ndarray:

@@ -26,11 +26,17 @@ VIEWS = {
 }
 
 
+# The direction of the rays of a sun to the right of the camera, 40 degrees high.
+_SUN = {"z": np.array([-0.7, 0.3, -0.64]), "y": np.array([-0.7, -0.64, -0.3])}
+
+
 @dataclass(frozen=True)
 class SceneSettings:
     """The parameters of ``scene.xml`` (``-D name=value``) with their defaults, and its view.
 
     Attributes:
+        asymmetry: mean cosine of scattering; 0: isotropic, otherwise Henyey-Greenstein.
+        sun: irradiance of a sun beside the uniform environment; 0: there is none.
         up: the world axis that points up in the picture, ``"z"`` (medical) or ``"y"``.
     """
 
@@ -42,6 +48,8 @@ class SceneSettings:
     scale: float = 1.0
     radiance: float = 1.0
     hide_emitters: bool = False
+    asymmetry: float = 0.0
+    sun: float = 0.0
     up: str = "z"
 
 
@@ -111,7 +119,10 @@ def camera(volume: VolumeData, sigma_t: np.ndarray, up: str = "z") -> tuple[np.n
     relative = occupied - target
     along = relative @ towards
     aside = np.maximum(np.abs(relative @ right), np.abs(relative @ np.cross(towards, right)))
-    distance = (along + _MARGIN * aside / np.tan(np.radians(_FIELD_OF_VIEW / 2))).max()
+    slope = np.tan(np.radians(_FIELD_OF_VIEW / 2))
+    # A single voxel has no extent between its ends.
+    voxel = float(np.linalg.norm(volume.spacing)) / slope
+    distance = max((along + _MARGIN * aside / slope).max(), voxel)
     return target + distance * towards, target, up_vector
 
 
@@ -130,6 +141,19 @@ def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: Scen
         "scale": f"{settings.scale:.9g}",
         "radiance": f"{settings.radiance:.9g}",
     }
+    phase = '<phase type="isotropic"/>'
+    if settings.asymmetry:
+        defaults["g"] = f"{settings.asymmetry:.9g}"
+        phase = '<phase type="hg"><float name="g" value="$g"/></phase>'
+    sun = ""
+    if settings.sun:
+        defaults["sun"] = f"{settings.sun:.9g}"
+        sun = f"""
+    <emitter type="directional">
+        <vector name="direction" value="{_text(_SUN[settings.up])}"/>
+        <rgb name="irradiance" value="$sun, $sun, $sun"/>
+    </emitter>
+"""
     return f"""<scene version="3.0.0">
 {_default_lines(defaults)}
 
@@ -161,7 +185,7 @@ def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: Scen
     <emitter type="constant">
         <rgb name="radiance" value="$radiance, $radiance, $radiance"/>
     </emitter>
-
+{sun}
     <!-- Lengths are in the units of the data (mm for medical volumes), extinction in 1/length. -->
     <medium type="heterogeneous" id="volume">
         <volume name="sigma_t" type="gridvolume">
@@ -173,7 +197,7 @@ def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: Scen
             <transform name="to_world"><matrix value="{grid}"/></transform>
         </volume>
         <float name="scale" value="$scale"/>
-        <phase type="isotropic"/>
+        {phase}
     </medium>
 
     <shape type="cube">

@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.io.files import atomic_write
 
 FORMAT = "irrcache transfer function"
@@ -294,7 +294,10 @@ def load_preset(name: str) -> TransferFunction:
         IrrcacheError: no preset of that name; the names are listed.
     """
     if name not in preset_names():
-        raise IrrcacheError(f"no preset {name!r}; choose one of {', '.join(preset_names())}")
+        raise IrrcacheError(
+            f"no preset {name!r}{suggestion(name, preset_names())}; choose one of "
+            f"{', '.join(preset_names())}"
+        )
     return parse_transfer_function((_PRESETS / f"{name}.json").read_text(encoding="utf-8"))
 
 
@@ -303,7 +306,10 @@ def _check_keys(document: object) -> None:
         raise IrrcacheError(f"the document is a {type(document).__name__}; give an object {{...}}")
     unknown = sorted(set(document) - _KEYS)
     if unknown:
-        raise IrrcacheError(f'unknown key "{unknown[0]}"; known are {", ".join(sorted(_KEYS))}')
+        raise IrrcacheError(
+            f'unknown key "{unknown[0]}"{suggestion(unknown[0], _KEYS)}; known are '
+            f"{', '.join(sorted(_KEYS))}"
+        )
     missing = sorted(_REQUIRED - set(document))
     if missing:
         raise IrrcacheError(f'the key "{missing[0]}" is missing; add it')

@@ -63,6 +63,62 @@ def _write_image(path: Path) -> None:
     SimpleITK.WriteImage(SimpleITK.GetImageFromArray(values), str(path))
 
 
+def _values() -> np.ndarray:
+    return np.linspace(0, 1, 60, dtype=np.float32).reshape(3, 4, 5)
+
+
+def _write_npy(path: Path) -> None:
+    np.save(path, _values())
+
+
+def _write_npz(path: Path) -> None:
+    np.savez(path, volume=_values(), spacing=(1.0, 2.0, 3.0))
+
+
+def _write_vtk(path: Path) -> None:
+    header = "# vtk DataFile Version 3.0\n\nBINARY\nDATASET STRUCTURED_POINTS\nDIMENSIONS 5 4 3\n"
+    placement = (
+        "SPACING 1 2 3\nORIGIN 0 0 0\nPOINT_DATA 60\nSCALARS a float\nLOOKUP_TABLE default\n"
+    )
+    path.write_bytes(f"{header}{placement}".encode() + _values().astype(">f4").tobytes())
+
+
+def _write_vti(path: Path) -> None:
+    grid = 'WholeExtent="0 4 0 3 0 2" Origin="0 0 0" Spacing="1 2 3"'
+    values = _values().tobytes()
+    path.write_bytes(
+        f"""<VTKFile type="ImageData" byte_order="LittleEndian" header_type="UInt32">
+<ImageData {grid}><Piece Extent="0 4 0 3 0 2"><PointData><DataArray type="Float32" Name="a"
+format="appended" offset="0"/></PointData></Piece></ImageData>
+<AppendedData encoding="raw">_""".encode()
+        + np.uint32(len(values)).tobytes()
+        + values
+        + b"</AppendedData></VTKFile>"
+    )
+
+
+def _write_tiff(path: Path) -> None:
+    import tifffile
+
+    tifffile.imwrite(path, _values(), imagej=True, metadata={"axes": "ZYX", "spacing": 2.0})
+
+
+def _write_hdf5(path: Path) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        file.create_dataset("a", data=_values(), chunks=True, compression="gzip")
+
+
+def _write_netcdf(path: Path) -> None:
+    import xarray
+
+    variables = {"a": (("z", "y", "x"), _values())}
+    coordinates = {axis: np.arange(n) for axis, n in zip("zyx", (3, 4, 5), strict=True)}
+    engine = "scipy" if path.suffix == ".cdf" else "h5netcdf"
+    xarray.Dataset(variables, coordinates).to_netcdf(path, engine=engine)
+
+
 def _write_vol(path: Path) -> None:
     write_vol(path, np.linspace(0, 1, 60).reshape(3, 4, 5))
 
@@ -103,6 +159,14 @@ FORMATS = (
     Format("a.nii.gz", _write_image, read_volume, mutated_gzip),
     Format("a.mha", _write_image, read_volume),
     Format("a.vol", _write_vol, read_volume),
+    Format("a.npy", _write_npy, read_volume),
+    Format("a.npz", _write_npz, read_volume),
+    Format("a.vtk", _write_vtk, read_volume),
+    Format("a.vti", _write_vti, read_volume),
+    Format("a.tif", _write_tiff, read_volume),
+    Format("a.h5", _write_hdf5, read_volume),
+    Format("a.nc", _write_netcdf, read_volume),
+    Format("a.cdf", _write_netcdf, read_volume),
     Format("slice.dcm", _write_dicom, read_series),
     Format("transfer.json", _write_transfer_function, load_transfer_function),
     Format(

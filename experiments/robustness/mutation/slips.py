@@ -21,6 +21,7 @@ LAYERS = "tests/system/test_aovs_and_filter.py"
 GRID = "tests/unit/grids/test_grid.py"
 MACROCELLS = "tests/unit/grids/test_majorants.py"
 VOLUME_FILES = "tests/unit/volumes/test_readers.py"
+VOLUME_FORMATS = "tests/unit/volumes/test_formats.py"
 PROCESSING = "tests/unit/volumes/test_processing.py"
 TRANSFER = "tests/unit/volumes/test_transfer.py"
 METRICS_OF_RUNS = "tests/unit/compare/test_metrics_common_error.py"
@@ -378,10 +379,31 @@ SLIPS = (
     ),
     Mutant(
         "spacing of a grid file with its axes exchanged (readers)",
-        "volumes/readers.py",
+        "volumes/mitsuba_files.py",
         "values.shape[2::-1]",
         "values.shape[:3]",
         (VOLUME_FILES,),
+    ),
+    Mutant(
+        "the origin of VTK image data taken for its first voxel (readers)",
+        "volumes/vti_files.py",
+        "grid.direction @ (grid.spacing * extent[:, 0])",
+        "grid.direction @ (0 * grid.spacing)",
+        (VOLUME_FORMATS,),
+    ),
+    Mutant(
+        "values of decreasing coordinates not reversed (readers)",
+        "volumes/netcdf_files.py",
+        "if placed[axis].is_reversed:",
+        "if False:",
+        (VOLUME_FORMATS,),
+    ),
+    Mutant(
+        "extinction of a cloud from half the cross section of its droplets (clouds)",
+        "volumes/clouds.py",
+        "1.5 * content",
+        "0.75 * content",
+        ("tests/unit/volumes/test_clouds.py",),
     ),
     Mutant(
         "two runs compared with the same half of a reference (metrics)",

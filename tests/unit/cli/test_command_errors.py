@@ -205,7 +205,7 @@ def test_invalid_volume_and_output_files_are_refused(tmp_path, capsys, monkeypat
 
     for name in ("e.nrrd", "e.mhd", "e.nii", "e.dcm"):
         assert f"{name} is empty" in importing(name, "--density", "-o", "out")
-    assert "e.vol is truncated" in importing("e.vol", "--density", "-o", "out")
+    assert "e.vol is empty" in importing("e.vol", "--density", "-o", "out")
     assert "folder is empty" in importing("folder", "--density", "-o", "out")
     error = importing("folder", "--density", "--raw-shape", "4,4,4", "-o", "out")
     assert "is a folder" in error

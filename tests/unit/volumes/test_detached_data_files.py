@@ -12,6 +12,7 @@ import SimpleITK
 
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.volumes.options import ReadOptions
 from mitsuba_irrcache.volumes.readers import read_volume
 
 LONG = "x" * 3000000
@@ -105,7 +106,7 @@ def test_one_data_file(folders, case):
         with pytest.raises(IrrcacheError, match=r"outside of its own folder.*--data-folder"):
             read_volume(path)
         if not name.startswith("~"):
-            found = read_volume(path, data_folders=[other])
+            found = read_volume(path, options=ReadOptions(data_folders=[other]))
             np.testing.assert_array_equal(found.values, VALUES)
     with pytest.raises(IrrcacheError, match="does not exist"):
         read_volume(written(own, case, ["absent.raw"]))
@@ -122,7 +123,9 @@ def test_data_files_of_slices(folders, case):
         path = written(own, case, names, SLICES)
         with pytest.raises(IrrcacheError, match="outside of its own folder"):
             read_volume(path)
-        np.testing.assert_array_equal(read_volume(path, data_folders=[other]).values, VALUES)
+        np.testing.assert_array_equal(
+            read_volume(path, options=ReadOptions(data_folders=[other])).values, VALUES
+        )
     with pytest.raises(IrrcacheError, match="outside of its own folder"):
         read_volume(written(own, case, ["alias0.raw", "alias1.raw"], SLICES))
     if "list" in case:

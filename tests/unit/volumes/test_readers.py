@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import locale
 import os
 import re
 import struct
@@ -54,6 +55,7 @@ def write_dicom(folder: Path, positions, uid="1.2.826.0.1.9", tag="a", shear=0.0
     File names do not follow the positions.
     """
     folder.mkdir(exist_ok=True)
+    before = locale.setlocale(locale.LC_ALL)  # the writer sets it to C, in which text is ASCII
     writer = SimpleITK.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
     for index, position in enumerate(positions):
@@ -74,6 +76,7 @@ def write_dicom(folder: Path, positions, uid="1.2.826.0.1.9", tag="a", shear=0.0
             image.SetMetaData(key, value)
         writer.SetFileName(str(folder / f"{tag}{(7 * index) % 97:02d}.dcm"))
         writer.Execute(image)
+    locale.setlocale(locale.LC_ALL, before)
 
 
 # Placement
