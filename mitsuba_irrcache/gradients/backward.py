@@ -21,7 +21,7 @@ from mitsuba_irrcache.gradients.parameters import (
     shaped_like,
 )
 from mitsuba_irrcache.gradients.points import add_ways
-from mitsuba_irrcache.gradients.replay import CameraSplats, LitMedium
+from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
@@ -156,7 +156,7 @@ class MediumAdjoint:
         self._medium, self._emitters = part.medium, emitters
         self._transport: AdjointTransport | None = None
         self._collided: list[mi.Float] = []
-        field, falloff, lights = None, None, []
+        field, falloff, lights, colour = None, None, [], None
         if part.cache is not None:
             self.grid = part.cache.grid
             self._check_memory()
@@ -170,21 +170,19 @@ class MediumAdjoint:
                 (part.settings.seed, film.seed),
                 pairs,
                 part.settings.max_depth == 2,
+                wanted,
                 self._medium.channels == max(wanted.values(), default=3) == 1
                 and not emitters
                 and EMISSION not in wanted,
             )
-            self._transport.wants_extinction = SIGMA_T in wanted
-            self._transport.wants_emission = EMISSION in wanted
             field, falloff, lights = self._irradiance()
             self._quadrature = VoxelQuadrature(self._medium, self.grid)
             self._extinction = list(self._quadrature.extinction())
             dr.eval(self._extinction)
-        self._lit = LitMedium(self._medium, field, falloff, lights, step)
-        if self._transport is not None and self._transport.channels == 1:
-            self._lit.colour = mi.Spectrum(
-                [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
-            )
+            if self._transport.channels == 1:
+                factors = [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
+                colour = mi.Spectrum(factors)
+        self._march = CameraReplay(self._medium, field, falloff, lights, colour, step)
 
     def _check_memory(self) -> None:
         """Refuse an adjoint solve that cannot be held."""
@@ -256,13 +254,13 @@ class MediumAdjoint:
         for each in self._film.passes():
             span, behind, hit, offset = self._rays(each)
             march = each.ray, span, each.radiance
-            ahead, passed = self._lit.radiance(*march, behind, offset, hit)
+            ahead, passed = self._march.radiance(*march, behind, offset, hit)
             dr.eval(ahead, passed)
             if self._camera_rays.background(self._scene, each.ray, mi.Bool(True))[0]:
                 self._emitters.add_background(each.ray, passed * each.radiance)
             if splats is None:
                 splats = self._camera_splats(ahead)
-            self._lit.replay(*march, ahead, offset, hit, splats)
+            self._march.replay(*march, ahead, offset, hit, splats)
             dr.eval()
         for role in self._wanted:
             sums[role].append(getattr(splats, role).values())
@@ -289,7 +287,7 @@ class MediumAdjoint:
         diagonal, rays = float(np.linalg.norm(lengths)), film.samples * MARGIN
         largest = film.largest * film.pixels * MARGIN
         brightest = max(float(dr.max(dr.max(dr.abs(ahead)))[0]) * rays, 1e-30)
-        irradiance = self._lit.irradiance
+        irradiance = self._march.irradiance
         mean = irradiance.maximum / (4 * np.pi) if irradiance is not None else 0.0
         needs = self._transport is not None
         return CameraSplats(
@@ -357,7 +355,7 @@ class MediumAdjoint:
         diagonal = float(np.linalg.norm(grid.side_lengths))
         bound = float(dr.max(dr.max(dr.abs(removed)))[0]) * grid.voxel_count * diagonal * 3
         splat = self._splat(SIGMA_T, bound * MARGIN)
-        add_ways(self._medium, emitter, self._transport.positions, removed, self._lit.step, splat)
+        add_ways(self._medium, emitter, self._transport.positions, removed, self._march.step, splat)
         return splat.values()
 
 
