@@ -37,8 +37,9 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
 
-#: Pairs of ordinates, and those under environments that vary, whose spots they have to find.
-PAIRS, MOST_PAIRS = 32, 128
+#: Pairs of ordinates for the default directions of the cache, with others in proportion; those
+#: under environments that vary, whose spots they have to find; and the fewest.
+PAIRS, MOST_PAIRS, FEWEST_PAIRS = 32, 128, 8
 UNEVEN = (EmitterKind.ENVIRONMENT_MAP,)
 #: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
 MARGIN = 256.0
@@ -186,15 +187,12 @@ class MediumAdjoint:
         if part.cache is not None:
             self.grid = part.cache.grid
             self._check_memory()
-            environment = scene.environment()
-            uneven = environment is not None and kind_of(environment) in UNEVEN
-            pairs = MOST_PAIRS if uneven else PAIRS
             self._transport = AdjointTransport(
                 scene,
                 self._medium,
                 self.grid,
                 (part.settings.seed, seed),
-                pairs,
+                self._pairs,
                 part.settings.max_depth == 2,
                 wanted,
                 self._medium.channels == max(wanted.values(), default=3) == 1
@@ -209,6 +207,17 @@ class MediumAdjoint:
                 factors = [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
                 colour = mi.Spectrum(factors)
         self._march = CameraReplay(self._medium, field, falloff, lights, colour, step)
+
+    @property
+    def _pairs(self) -> int:
+        """Pairs of ordinates, in proportion to the directions of the cache."""
+        part, environment = self._part, self._scene.environment()
+        uneven = environment is not None and kind_of(environment) in UNEVEN
+        usual = part.solver.default_samples(
+            self._medium, part.settings.max_depth, part.cache.active_count
+        )
+        share = (part.cache.samples or usual) / usual
+        return max(FEWEST_PAIRS, round((MOST_PAIRS if uneven else PAIRS) * share))
 
     def _check_memory(self) -> None:
         """Refuse an adjoint solve that cannot be held."""

@@ -20,8 +20,6 @@ from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
 
-#: Steps, relative to those of the image, whose quadrature rule is of higher order.
-STEP = 0.5
 #: Transmittance below which nothing ahead matters.
 OPAQUE = 1e-6
 
@@ -66,7 +64,7 @@ class CameraReplay:
         fields = medium.sigma_t, medium.albedo, irradiance
         edges = [f.grid.voxel_size.min() for f in fields if f is not None and f.grid is not None]
         length = min(edges, default=float(max(abs(medium.frame[:3, :3]).max(), 1e-30) / 64))
-        self.step = dr.opaque(mi.Float, float(length) * step * STEP)
+        self.step = dr.opaque(mi.Float, float(length) * step)
 
     def sigma_t(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
         return mi.Spectrum(self.medium.sigma_t.at_world(p, active))
