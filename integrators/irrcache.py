@@ -176,7 +176,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     box or sphere under distant and point emitters, without surfaces, with the solver ``sweep``,
     ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. Emissive media have gradients by
     ``emission`` only. All other gradients, and forward mode, are refused with an error that names
-    the parameter. While parameters carry gradients, the grid of the cache is kept.
+    the parameter. While parameters carry gradients, the grid of the cache is kept. Images of the
+    same state of the scene in one loss share one adjoint solve; ``cache_spp`` also sets its
+    directions.
 
     .. tabs::
         .. code-tab:: xml

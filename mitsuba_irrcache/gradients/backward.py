@@ -39,7 +39,7 @@ from mitsuba_irrcache.scene.compile import media_of
 
 #: Pairs of ordinates for the default directions of the cache, with others in proportion; those
 #: under environments that vary, whose spots they have to find; and the fewest.
-PAIRS, MOST_PAIRS, FEWEST_PAIRS = 32, 128, 8
+PAIRS, MOST_PAIRS, FEWEST_PAIRS = 24, 128, 8
 UNEVEN = (EmitterKind.ENVIRONMENT_MAP,)
 #: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
 MARGIN = 256.0
