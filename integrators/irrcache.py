@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator
+from contextlib import contextmanager
 from time import perf_counter
+from weakref import ref
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +19,8 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core import properties
 from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients.backward import check, parameter_gradients
-from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients import operations
+from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check
 from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
@@ -175,7 +177,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     box or sphere under distant and point emitters, without surfaces, with the solver ``sweep``,
     ``max_depth`` 1, 2 or -1, no filter and no ``aovs``. Emissive media have gradients by
     ``emission`` only. All other gradients, and forward mode, are refused with an error that names
-    the parameter. While parameters carry gradients, the grid of the cache is kept.
+    the parameter. While parameters carry gradients, the grid of the cache is kept. Images of the
+    same state of the scene in one loss share one adjoint solve; ``cache_spp`` also sets its
+    directions.
 
     .. tabs::
         .. code-tab:: xml
@@ -239,6 +243,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._chosen = "volpath"
         #: duration [s] of those stages of the last image that are measured
         self.seconds: dict[str, float] = {}
+        # Held by the images that share it: they hold the integrator.
+        self._shared: ref[operations.SharedIrradiance] | None = None
         #: called with (stage, done, total) while the cache is built; exceptions end the build
         self.progress = None
 
@@ -466,18 +472,56 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        keys = enabled(params)
-        if not keys:
-            return
-        with dr.suspend_grad(), self._builder.lock:
-            camera_rays = self._prepared(scene)
-            check(self._builder.parts, keys, self._layered)
-            film = FilmAdjoint(sensor, grad_in, seed, spp)
-            (part,) = self._builder.parts
-            image = camera_rays, self._step, self._emission
-            found = parameter_gradients(scene, params, keys, part, image, film)
-        for key, grad in found.items():
-            dr.accum_grad(params[key], grad)
+        if enabled(params):
+            # Without a graph: the irradiance is not shared with other images.
+            operations.SceneState(self, scene, params, alone=True).add_image(
+                grad_in, sensor, seed, spp
+            )
+
+    def render_shared(
+        self,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        seed_grad: int = 0,
+        spp: int = 0,
+        spp_grad: int = 0,
+    ) -> mi.TensorXf:
+        """`mi.render` for ``params`` that carry gradients: images of the same state of the scene
+        share one adjoint solve in ``dr.backward``.
+        """
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        seeds = seed, seed_grad or mi.sample_tea_32(seed, 1)[0]
+        shared = self._shared() if self._shared is not None else None
+        image, shared = operations.image(
+            self, shared, scene, params, sensor, seeds, (spp, spp_grad or spp)
+        )
+        self._shared = ref(shared)
+        return image
+
+    @contextmanager
+    def exclusively(self) -> Iterator[None]:
+        """Exclude other threads from the cache."""
+        with self._builder.lock:
+            yield
+
+    def revision(self, scene: mi.Scene) -> int:
+        """Bring the cache up to date, and return the number of its state."""
+        with self._builder.lock:
+            self._prepared(scene)
+            return self._builder.revision
+
+    def adjoint(
+        self, scene: mi.Scene, params: mi.SceneParameters, keys: list[str], seed: int
+    ) -> ParameterAdjoint:
+        """Return the derivatives of images of ``scene`` by the parameters ``keys``."""
+        camera_rays = self._prepared(scene)
+        check(self._builder.parts, keys, self._layered)
+        (part,) = self._builder.parts
+        image = camera_rays, self._step, self._emission
+        return ParameterAdjoint(scene, params, keys, part, image, seed)
 
     def _render(
         self,

@@ -8,10 +8,12 @@ each variant. Mitsuba 3.10 imports and reloads this module through the entry poi
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 from collections.abc import Callable
 from functools import wraps
 
+import drjit as dr
 import mitsuba as mi
 import mitsuba.python.util
 
@@ -35,17 +37,20 @@ def _variant_changed(old: str | None, new: str) -> None:
     register()
 
 
-def _with_causes(render: Callable) -> Callable:
-    """Wrap ``mi.render`` so that its exceptions state the original cause.
+def _wrapped(render: Callable) -> Callable:
+    """Wrap ``mi.render`` so that its exceptions state the original cause, and images that receive
+    gradients share what they can.
 
     ``mi.render`` calls integrators through ``dr.custom``, which replaces the message of any
     exception by "error while performing a custom differentiable operation (see above)".
     """
+    signature = inspect.signature(render)
 
     @wraps(render)
     def render_with_cause(*args: object, **kwargs: object) -> object:
         try:
-            return render(*args, **kwargs)
+            shared = _shared(signature.bind(*args, **kwargs).arguments)
+            return render(*args, **kwargs) if shared is None else shared()
         except RuntimeError as error:
             add_cause(error)
             raise
@@ -53,10 +58,26 @@ def _with_causes(render: Callable) -> Callable:
     return render_with_cause
 
 
+def _shared(arguments: dict) -> Callable | None:
+    """Return a function that renders with ``render_shared`` of our integrator; None if these
+    ``arguments`` of ``mi.render`` are not for it, or no parameter carries gradients.
+    """
+    params = arguments.get("params")
+    if not isinstance(params, mi.SceneParameters):
+        return None
+    integrator = arguments.pop("integrator", None) or arguments["scene"].integrator()
+    seeds = arguments.get("seed", 0), arguments.get("seed_grad", 0)
+    if not hasattr(integrator, "render_shared") or (seeds[1] and seeds[0] == seeds[1]):
+        return None
+    if not any(map(dr.grad_enabled, dict(params).values())):
+        return None
+    return lambda: integrator.render_shared(**arguments)
+
+
 register()
 if (
     "_listening" not in globals()
 ):  # reloading a module keeps its globals: register the callback only once
     mi.detail.add_variant_callback(_variant_changed)
-    mi.render = mitsuba.python.util.render = _with_causes(mitsuba.python.util.render)
+    mi.render = mitsuba.python.util.render = _wrapped(mitsuba.python.util.render)
     _listening = True

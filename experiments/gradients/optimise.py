@@ -4,7 +4,8 @@
 
 Adam fits the extinction of a cube under a sky and a sun, from a start without structure. Prints the
 error of two views that the optimisation does not see, relative to their mean, against CPU time;
-``prbvolpath`` with several numbers of samples and step sizes, of which the best counts.
+``prbvolpath`` with several numbers of samples and step sizes, of which the best counts. The same by
+``fit`` with L-BFGS and with Adam, and then the error of the extinction, relative to its mean.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ import numpy as np
 from experiments.gradients.cases import SKY, SUN, Case
 from experiments.gradients.differences import key_of
 from experiments.support.options import begin
+from mitsuba_irrcache.gradients.fit import Result, Settings, View
+from mitsuba_irrcache.gradients.fit import fit as run_fit
 
 VIEWS, UNSEEN = 8, 2
 SIZE = 64
@@ -27,19 +30,21 @@ SIZE = 64
 
 @dataclass(frozen=True)
 class Method:
-    """An integrator, camera samples of each pixel, and the step size of Adam relative to the
-    largest extinction.
+    """An integrator, camera samples of each pixel, the step size of Adam relative to the largest
+    extinction, and the directions of the cache (0: the default).
     """
 
     integrator: str
     spp: int
     rate: float
+    directions: int = 0
 
 
 METHODS = (
     Method("irrcache", 4, 0.02),
     Method("irrcache", 4, 0.05),
     Method("irrcache", 4, 0.1),
+    Method("irrcache", 4, 0.1, 32),
     Method("prbvolpath", 4, 0.005),
     Method("prbvolpath", 4, 0.02),
     Method("prbvolpath", 16, 0.02),
@@ -71,7 +76,13 @@ def main() -> None:
     for method in METHODS:
         marks = fit(case, method, truth, options.seconds)
         text = ", ".join(f"{error:.3f} after {time:.0f} s" for time, error in marks)
-        print(f"{method.integrator:10} spp {method.spp:2} rate {method.rate:5}: {text}", flush=True)
+        name = f"{method.integrator}{{cache_spp={method.directions}}}"
+        print(f"{name:24} spp {method.spp:2} rate {method.rate:5}: {text}", flush=True)
+    for settings in (Settings(40), Settings(40, "adam", rate=0.4)):
+        marks, density = by_fit(case, settings, truth)
+        text = ", ".join(f"{error:.4f} after {time:.0f} s" for time, error in marks)
+        error = np.sqrt(np.mean(np.square(density - case.sigma_t()))) / case.sigma_t().mean()
+        print(f"fit, {settings.method}: {text}; extinction {error:.2f}", flush=True)
 
 
 def sensor(number: int) -> dict:
@@ -105,7 +116,7 @@ def fit(case: Case, method: Method, truth: list, seconds: float) -> list[tuple[f
     """Times and errors of unseen views."""
     own = {"type": method.integrator, "max_depth": -1}
     if method.integrator == "irrcache":  # all views at once; else one of them for each step
-        own |= {"solver": "sweep", "resolution": case.cache}
+        own |= {"solver": "sweep", "resolution": case.cache, "cache_spp": method.directions}
         sensors = [together()]
         targets = [mi.TensorXf(np.concatenate(truth[:VIEWS], axis=1))]
     else:
@@ -132,6 +143,28 @@ def fit(case: Case, method: Method, truth: list, seconds: float) -> list[tuple[f
             marks.append((spent, unseen_error(case, params[key], truth)))
             following += seconds / 4
     return marks
+
+
+def by_fit(
+    case: Case, settings: Settings, truth: list
+) -> tuple[list[tuple[float, float]], np.ndarray]:
+    """Times and errors of unseen views, and the extinction that `fit` ends with."""
+    scene, marks, spent = case.load(), [], [0.0, process_time()]
+    params, peak = mi.traverse(scene), float(case.sigma_t().max())
+    key = key_of(params, "sigma_t")
+    params[key] = dr.full(mi.TensorXf, 0.1 * peak, params[key].shape)
+    params.update()
+
+    def report(result: Result) -> None:
+        spent[0] += process_time() - spent[1]
+        if result.step % (settings.steps // 4) == 0:
+            density = mi.TensorXf(result.values["sigma_t"])
+            marks.append((spent[0], unseen_error(case, density, truth)))
+        spent[1] = process_time()
+
+    seen = [View(view, image) for view, image in zip(views()[:VIEWS], truth, strict=False)]
+    result = run_fit(scene, seen, ["sigma_t"], settings, report=report)
+    return marks, result.values["sigma_t"]
 
 
 def unseen_error(case: Case, density: mi.TensorXf, truth: list) -> float:

@@ -1,4 +1,4 @@
-"""The command ``irrcache``: render, view, compare, import, doctor."""
+"""The command ``irrcache``: render, view, compare, fit, import, doctor."""
 
 from __future__ import annotations
 
@@ -63,6 +63,7 @@ COMMANDS = (
     ("render", "cli.render", "render a scene with irrcache", ""),
     ("view", "view.command", "display a scene or a volume in the browser", "view"),
     ("compare", "compare.command", "compare integrators: error against time", "compare"),
+    ("fit", "cli.fit", "fit a volume to images of it", "volumes"),
     ("import", "volumes.importer", "convert a CT, MR or other volume to a scene", "volumes"),
     ("doctor", "machine.doctor", "check this machine and say what to install", ""),
 )

@@ -75,3 +75,18 @@ def unravelled(index: mi.UInt32, sides: Sequence[Divisor]) -> tuple[mi.UInt32, .
         index, place = side.split(index)
         places.append(place)
     return (*places, index)
+
+
+def graph_variables(value: object) -> list[int]:
+    """Numbers of the variables of Dr.Jit's derivative graph that an array, or the matrix of a
+    transform, consists of, also while derivatives are suspended.
+    """
+    if not dr.is_array_v(value):
+        # Points accept any attribute name as a swizzle.
+        return graph_variables(value.matrix) if hasattr(value, "matrix") else []
+    if dr.is_tensor_v(value):
+        return graph_variables(value.array)
+    if dr.depth_v(value) > 1:
+        return [number for part in value for number in graph_variables(part)]
+    number = getattr(value, "index_ad", 0)
+    return [number] if number else []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -21,7 +23,7 @@ from mitsuba_irrcache.gradients.parameters import (
     shaped_like,
 )
 from mitsuba_irrcache.gradients.points import add_ways
-from mitsuba_irrcache.gradients.replay import CameraSplats, LitMedium
+from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
@@ -35,8 +37,9 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
 
-#: Pairs of ordinates, and those under environments that vary, whose spots they have to find.
-PAIRS, MOST_PAIRS = 32, 128
+#: Pairs of ordinates for the default directions of the cache, with others in proportion; those
+#: under environments that vary, whose spots they have to find; and the fewest.
+PAIRS, MOST_PAIRS, FEWEST_PAIRS = 24, 128, 8
 UNEVEN = (EmitterKind.ENVIRONMENT_MAP,)
 #: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
 MARGIN = 256.0
@@ -77,40 +80,64 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
         refuse_all(keys, f"max_depth is {depth}", "Set max_depth to 1, 2 or -1")
 
 
-def parameter_gradients(
-    scene: mi.Scene,
-    params: mi.SceneParameters,
-    keys: list[str],
-    part: CachedMedium,
-    image: tuple[ClosedFormCameraRays, float, object],
-    film: FilmAdjoint,
-) -> dict[str, object]:
-    """The derivatives by the parameters ``keys`` of the objective whose derivatives by the pixels
-    ``film`` has, in the types of these parameters.
+class ParameterAdjoint:
+    """Derivatives by the parameters ``keys`` of ``scene`` of objectives of its images, in the types
+    of these parameters: what camera rays depend on straight, view by view, and what the irradiance
+    depends on, for all views at once.
 
     ``part`` is the scene's only medium, with its cache; ``image`` are its camera rays and the
-    integrator's properties ``step`` and ``emission``.
+    integrator's properties ``step`` and ``emission``; the ordinates depend on ``seed``.
     """
-    camera_rays, step, emission = image
-    (medium,) = media_of(scene)
-    roles, wanted = roles_of(params, keys, medium, scene, emission), {}
-    emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
-    of_medium = {key: role for key, role in roles.items() if not isinstance(role, mi.Emitter)}
-    _check_emission(part, of_medium)
-    for key, role in of_medium.items():
-        field = field_of(part.medium, role)
-        own = field.channels if field.grid is not None else channels_of(params[key])
-        wanted[role] = max(wanted.get(role, 1), own)
-    if film.largest == 0:
-        return {key: dr.zeros(type(params[key]), dr.shape(params[key])) for key in keys}
-    emitted = EmitterAdjoint(scene, emitters)
-    adjoint = MediumAdjoint(scene, part, (camera_rays, step), wanted, emitted, film)
-    found = adjoint.gradients()
-    result = {}
-    for key, role in of_medium.items():
-        grad = by_parameter(params[key], field_of(part.medium, role), found[role])
-        result[key] = shaped_like(params[key], grad)
-    return result
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        keys: list[str],
+        part: CachedMedium,
+        image: tuple[ClosedFormCameraRays, float, object],
+        seed: int,
+    ) -> None:
+        self._scene, self._params, self._part, self._seed = scene, params, part, seed
+        self._camera_rays, self._step, emission = image
+        (medium,) = media_of(scene)
+        roles = roles_of(params, keys, medium, scene, emission)
+        self._of_medium = {k: role for k, role in roles.items() if not isinstance(role, mi.Emitter)}
+        _check_emission(part, self._of_medium)
+        emitters = [role for role in roles.values() if isinstance(role, mi.Emitter)]
+        self._emitters = EmitterAdjoint(scene, emitters)
+
+    def view(self, film: FilmAdjoint) -> tuple[dict[str, object], list[mi.Float] | None]:
+        """Derivatives of the objective whose derivatives by the pixels ``film`` has, at a given
+        irradiance; and the adjoint fluence that its camera rays leave, None without a cache.
+        """
+        if film.largest == 0:
+            return {}, None
+        found, fluence = self._adjoint.replayed(film)
+        return self._by_parameters(found), fluence
+
+    def transport(self, fluence: list[mi.Float]) -> dict[str, object]:
+        """Derivatives of the objective by way of the irradiance, given the sum of the adjoint
+        ``fluence`` of all views.
+        """
+        return self._by_parameters(self._adjoint.transported(fluence))
+
+    @cached_property
+    def _adjoint(self) -> MediumAdjoint:
+        wanted: dict[str, int] = {}
+        for key, role in self._of_medium.items():
+            field = field_of(self._part.medium, role)
+            own = field.channels if field.grid is not None else channels_of(self._params[key])
+            wanted[role] = max(wanted.get(role, 1), own)
+        march = self._camera_rays, self._step
+        return MediumAdjoint(self._scene, self._part, march, wanted, self._emitters, self._seed)
+
+    def _by_parameters(self, found: dict[str, mi.Float]) -> dict[str, object]:
+        result = {}
+        for key, role in self._of_medium.items():
+            value, field = self._params[key], field_of(self._part.medium, role)
+            result[key] = shaped_like(value, by_parameter(value, field, found[role]))
+        return result
 
 
 def field_of(medium: MediumGrid, role: str) -> Field:
@@ -135,11 +162,11 @@ def _check_emission(part: CachedMedium, of_medium: dict[str, str]) -> None:
 
 
 class MediumAdjoint:
-    """Derivatives by the medium of ``part`` in ``scene`` of the objective whose derivatives by the
-    pixels ``film`` has; ``image`` are the camera rays and the integrator's property ``step``.
+    """Derivatives by the medium of ``part`` in ``scene``; ``image`` are the camera rays and the
+    integrator's property ``step``.
 
     ``wanted`` maps what is wanted, `SIGMA_T`, `ALBEDO` or `EMISSION`, to its channels; the
-    derivatives by ``emitters`` are added to their parameters.
+    derivatives by ``emitters`` are added to their parameters. The ordinates depend on ``seed``.
     """
 
     def __init__(
@@ -149,42 +176,48 @@ class MediumAdjoint:
         image: tuple[ClosedFormCameraRays, float],
         wanted: dict[str, int],
         emitters: EmitterAdjoint,
-        film: FilmAdjoint,
+        seed: int,
     ) -> None:
-        self._scene, self._part, self._wanted, self._film = scene, part, wanted, film
+        self._scene, self._part, self._wanted = scene, part, wanted
         self._camera_rays, step = image
         self._medium, self._emitters = part.medium, emitters
         self._transport: AdjointTransport | None = None
         self._collided: list[mi.Float] = []
-        field, falloff, lights = None, None, []
+        field, falloff, lights, colour = None, None, [], None
         if part.cache is not None:
             self.grid = part.cache.grid
             self._check_memory()
-            environment = scene.environment()
-            uneven = environment is not None and kind_of(environment) in UNEVEN
-            pairs = MOST_PAIRS if uneven else PAIRS
             self._transport = AdjointTransport(
                 scene,
                 self._medium,
                 self.grid,
-                (part.settings.seed, film.seed),
-                pairs,
+                (part.settings.seed, seed),
+                self._pairs,
                 part.settings.max_depth == 2,
+                wanted,
                 self._medium.channels == max(wanted.values(), default=3) == 1
                 and not emitters
                 and EMISSION not in wanted,
             )
-            self._transport.wants_extinction = SIGMA_T in wanted
-            self._transport.wants_emission = EMISSION in wanted
             field, falloff, lights = self._irradiance()
             self._quadrature = VoxelQuadrature(self._medium, self.grid)
             self._extinction = list(self._quadrature.extinction())
             dr.eval(self._extinction)
-        self._lit = LitMedium(self._medium, field, falloff, lights, step)
-        if self._transport is not None and self._transport.channels == 1:
-            self._lit.colour = mi.Spectrum(
-                [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
-            )
+            if self._transport.channels == 1:
+                factors = [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
+                colour = mi.Spectrum(factors)
+        self._march = CameraReplay(self._medium, field, falloff, lights, colour, step)
+
+    @property
+    def _pairs(self) -> int:
+        """Pairs of ordinates, in proportion to the directions of the cache."""
+        part, environment = self._part, self._scene.environment()
+        uneven = environment is not None and kind_of(environment) in UNEVEN
+        usual = part.solver.default_samples(
+            self._medium, part.settings.max_depth, part.cache.active_count
+        )
+        share = (part.cache.samples or usual) / usual
+        return max(FEWEST_PAIRS, round((MOST_PAIRS if uneven else PAIRS) * share))
 
     def _check_memory(self) -> None:
         """Refuse an adjoint solve that cannot be held."""
@@ -240,56 +273,49 @@ class MediumAdjoint:
 
     # The camera
 
-    def gradients(self) -> dict[str, mi.Float]:
-        """Derivatives by what is wanted, at the data's voxels."""
-        sums: dict[str, list] = {role: [] for role in self._wanted}
-        fluence = self._replayed(sums)
-        if self._transport is not None and fluence is not None:
-            self._add_transport(fluence, sums)
-        return {role: _total(parts) for role, parts in sums.items()}
-
-    def _replayed(self, sums: dict[str, list]) -> list[mi.Float] | None:
-        """Add what camera rays depend on straight to ``sums``; return the adjoint fluence that they
-        leave in the voxels.
+    def replayed(self, film: FilmAdjoint) -> tuple[dict[str, mi.Float], list[mi.Float] | None]:
+        """Derivatives by what is wanted, at the data's voxels, of what the camera rays of ``film``
+        depend on straight; and the adjoint fluence that they leave in the voxels.
         """
         splats = None
-        for each in self._film.passes():
-            span, behind, hit, offset = self._rays(each)
+        for each in film.passes():
+            span, behind, hit, offset = self._rays(each, film.medium)
             march = each.ray, span, each.radiance
-            ahead, passed = self._lit.radiance(*march, behind, offset, hit)
+            ahead, passed = self._march.radiance(*march, behind, offset, hit)
             dr.eval(ahead, passed)
             if self._camera_rays.background(self._scene, each.ray, mi.Bool(True))[0]:
                 self._emitters.add_background(each.ray, passed * each.radiance)
             if splats is None:
-                splats = self._camera_splats(ahead)
-            self._lit.replay(*march, ahead, offset, hit, splats)
+                splats = self._camera_splats(ahead, film)
+            self._march.replay(*march, ahead, offset, hit, splats)
             dr.eval()
-        for role in self._wanted:
-            sums[role].append(getattr(splats, role).values())
-        return self._fluence(splats.collisions) if splats.collisions is not None else None
+        found = {role: getattr(splats, role).values() for role in self._wanted}
+        if splats.collisions is None:
+            return found, None
+        return found, self._fluence(splats.collisions)
 
-    def _rays(self, each: CameraPass) -> tuple:
+    def _rays(self, each: CameraPass, medium: mi.Medium | None) -> tuple:
         """For camera rays the distances between which they are in the medium, the weighted radiance
-        behind it, whether there is any such, and the first step.
+        behind it, whether there is any such, and the first step. ``medium`` is around the sensor.
         """
         ray, camera_rays = each.ray, self._camera_rays
         visible, background = camera_rays.background(self._scene, ray, mi.Bool(True))
         behind = each.radiance * background if visible else mi.Spectrum(0)
         if each.alpha is not None and not visible:
             behind = behind - each.alpha / dr.size_v(mi.Spectrum)
-        hit, near, far = camera_rays.span(ray, self._film.medium)
+        hit, near, far = camera_rays.span(ray, medium)
         offset = 1 - each.sampler.next_1d()
         span = mi.Float(near), mi.Float(far)
         dr.eval(ray, span, behind, hit, offset, each.radiance)
         return span, behind, hit, offset
 
-    def _camera_splats(self, ahead: mi.Spectrum) -> CameraSplats:
+    def _camera_splats(self, ahead: mi.Spectrum, film: FilmAdjoint) -> CameraSplats:
         """Empty sums for the derivatives that are wanted."""
-        film, lengths = self._film, np.linalg.norm(self._medium.frame[:3, :3], axis=0)
+        lengths = np.linalg.norm(self._medium.frame[:3, :3], axis=0)
         diagonal, rays = float(np.linalg.norm(lengths)), film.samples * MARGIN
         largest = film.largest * film.pixels * MARGIN
         brightest = max(float(dr.max(dr.max(dr.abs(ahead)))[0]) * rays, 1e-30)
-        irradiance = self._lit.irradiance
+        irradiance = self._march.irradiance
         mean = irradiance.maximum / (4 * np.pi) if irradiance is not None else 0.0
         needs = self._transport is not None
         return CameraSplats(
@@ -322,13 +348,16 @@ class MediumAdjoint:
         dr.eval(found)
         return found
 
-    def _add_transport(self, fluence: list[mi.Float], sums: dict[str, list]) -> None:
-        """Add to ``sums`` what depends on the radiance that reaches the voxels."""
+    def transported(self, fluence: list[mi.Float]) -> dict[str, mi.Float]:
+        """Derivatives by what is wanted, at the data's voxels, of the radiance that reaches the
+        voxels, given the adjoint ``fluence`` of camera rays.
+        """
         transport = self._transport
-        found = transport.derivatives(self._collided, fluence, self._extinction)
+        camera = fluence[: transport.channels]
+        found = transport.derivatives(self._collided, camera, self._extinction)
         self._emitters.add_transport(transport, found)
         if not self._wanted:
-            return
+            return {}
         volume = 3 * MARGIN * abs(np.linalg.det(self._medium.frame[:3, :3]))
         collided = _largest(found.collided)
         splats = {
@@ -338,13 +367,12 @@ class MediumAdjoint:
         }
         of_medium = splats[SIGMA_T], splats[ALBEDO], found, transport.albedo
         self._quadrature.add(*of_medium, splats[EMISSION])
-        for role in self._wanted:
-            sums[role].append(splats[role].values())
+        result = {role: splats[role].values() for role in self._wanted}
         if SIGMA_T in self._wanted:
-            for emitter, irradiance in zip(
-                transport.point_lights, transport.from_points, strict=True
-            ):
-                sums[SIGMA_T].append(self._along_ways(emitter, irradiance, found))
+            lights = zip(transport.point_lights, transport.from_points, strict=True)
+            for emitter, irradiance in lights:
+                result[SIGMA_T] = result[SIGMA_T] + self._along_ways(emitter, irradiance, found)
+        return result
 
     def _along_ways(
         self, emitter: mi.Emitter, irradiance: mi.Spectrum, found: Derivatives
@@ -357,21 +385,13 @@ class MediumAdjoint:
         diagonal = float(np.linalg.norm(grid.side_lengths))
         bound = float(dr.max(dr.max(dr.abs(removed)))[0]) * grid.voxel_count * diagonal * 3
         splat = self._splat(SIGMA_T, bound * MARGIN)
-        add_ways(self._medium, emitter, self._transport.positions, removed, self._lit.step, splat)
+        add_ways(self._medium, emitter, self._transport.positions, removed, self._march.step, splat)
         return splat.values()
 
 
 def _largest(channels: list[mi.Float]) -> float:
     """The largest magnitude; 0 without any channels."""
     return max((float(dr.max(dr.abs(values))[0]) for values in channels), default=0.0)
-
-
-def _total(parts: list[mi.Float]) -> mi.Float:
-    result = parts[0]
-    for part in parts[1:]:
-        result = result + part
-    dr.eval(result)
-    return result
 
 
 def by_parameter(value: object, field: Field, grad: mi.Float) -> mi.Float:

@@ -9,10 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.jit import Divisor
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.render.film import PixelPositions, camera_ray
-from mitsuba_irrcache.render.pixel_filter import pixel_of, reconstructed
+from mitsuba_irrcache.render.film import PixelPositions, SampledFilm, camera_ray
+from mitsuba_irrcache.render.pixel_filter import reconstructed
 
 #: Camera samples of one launch, at most.
 LANES = 1 << 20
@@ -40,18 +39,15 @@ class FilmAdjoint:
     def __init__(self, sensor: mi.Sensor, grad: mi.TensorXf, seed: int, spp: int) -> None:
         self._sensor, self._film = sensor, sensor.film()
         self._seed, self._spp = seed, spp or sensor.sampler().sample_count()
-        film = self._film
-        self._border = film.rfilter().border_size() if film.sample_border() else 0
-        self._size = mi.ScalarVector2u(film.crop_size()) + 2 * self._border
-        pixels = int(self._size.x) * int(self._size.y)
-        self._per_pass = _divisor(self._spp, max(1, LANES // pixels))
-        self.colour, self.alpha = _planes(film, grad)
+        self._frame = SampledFilm(self._film, self._spp, LANES)
+        self.colour, self.alpha = _planes(self._film, grad)
         #: the seed as a number: wrapping functions pass it as an array
         self.seed = int(np.array(seed).ravel()[0])
         #: medium around the sensor
         self.medium = sensor.get_medium()
         #: numbers of pixels, with those beside the image, and of camera samples
-        self.pixels, self.samples = pixels, pixels * self._spp
+        self.pixels = self._frame.pixels
+        self.samples = self.pixels * self._spp
 
     @property
     def largest(self) -> float:
@@ -66,7 +62,8 @@ class FilmAdjoint:
         if not self._film.rfilter().is_box_filter():
             norm = mi.Float(0)
             for position, *_ in self._drawn():
-                (weights,) = reconstructed(self._film, self._border, self._per_pass, position, [])
+                frame = self._frame
+                (weights,) = reconstructed(self._film, frame.border, frame.per_pass, position, [])
                 norm = norm + weights
                 dr.eval(norm)
         for position, index, sampler, ray, weight in self._drawn():
@@ -80,18 +77,14 @@ class FilmAdjoint:
 
     def _drawn(self) -> Iterator[tuple]:
         """Positions on the film, pixels, and rays of the camera samples of each launch."""
-        sampler = self._sensor.sampler().clone()
+        sampler, frame = self._sensor.sampler().clone(), self._frame
         sampler.set_sample_count(self._spp)
-        sampler.set_samples_per_wavefront(self._per_pass)
-        lanes = int(self._size.x) * int(self._size.y) * self._per_pass
-        sampler.seed(self._seed, lanes)
+        sampler.set_samples_per_wavefront(frame.per_pass)
+        sampler.seed(self._seed, frame.lanes)
         spread = PixelPositions(sampler, self._seed, self._spp)
-        for done in range(0, self._spp, self._per_pass):
+        for done in range(0, self._spp, frame.per_pass):
             spread.first = dr.opaque(mi.UInt32, done)
-            index, sample = Divisor(self._per_pass).split(dr.arange(mi.UInt32, lanes))
-            pixel = mi.Vector2f(pixel_of(index, int(self._size.x)) - self._border)
-            pixel += mi.Vector2f(self._film.crop_offset())
-            position = pixel + spread.next(index, sample)
+            position, index, _ = frame.positions(spread)
             ray, weight = camera_ray(self._sensor, sampler, position)
             yield position, index, sampler, ray, weight
             sampler.advance()
@@ -173,8 +166,3 @@ def _check_finite(values: mi.Float, shape: tuple[int, ...]) -> None:
         f"({column}, {row}), channel {channel}; check the loss (a logarithm, root or quotient of a "
         "pixel that is 0?)."
     )
-
-
-def _divisor(n: int, limit: int) -> int:
-    """The largest divisor of ``n`` that is at most ``limit``."""
-    return next(d for d in range(min(n, limit), 0, -1) if n % d == 0)

@@ -20,8 +20,6 @@ from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
 
-#: Steps, relative to those of the image, whose quadrature rule is of higher order.
-STEP = 0.5
 #: Transmittance below which nothing ahead matters.
 OPAQUE = 1e-6
 
@@ -44,10 +42,12 @@ class CameraSplats:
         self.collisions = collisions
 
 
-class LitMedium:
-    """A medium and its irradiance in single precision, as camera rays see them.
+class CameraReplay:
+    """The march of camera rays through ``medium``, whose ``irradiance`` is in single precision, or
+    None where nothing is scattered.
 
-    ``irradiance`` is None where nothing is scattered.
+    All channels of the irradiance are one, times the factors ``colour``, unless that is None.
+    ``step`` is the integrator's property.
     """
 
     def __init__(
@@ -56,16 +56,15 @@ class LitMedium:
         irradiance: GridField | None,
         falloff: InverseSquareFactor | None,
         direct_lights: list[DirectLightAlongRays],
+        colour: mi.Spectrum | None,
         step: float,
     ) -> None:
         self.medium, self.irradiance = medium, irradiance
-        self._falloff, self._direct_lights = falloff, direct_lights
-        #: factors of the irradiance of all channels; None where each has its own
-        self.colour: mi.Spectrum | None = None
+        self._falloff, self._direct_lights, self.colour = falloff, direct_lights, colour
         fields = medium.sigma_t, medium.albedo, irradiance
         edges = [f.grid.voxel_size.min() for f in fields if f is not None and f.grid is not None]
         length = min(edges, default=float(max(abs(medium.frame[:3, :3]).max(), 1e-30) / 64))
-        self.step = dr.opaque(mi.Float, float(length) * step * STEP)
+        self.step = dr.opaque(mi.Float, float(length) * step)
 
     def sigma_t(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
         return mi.Spectrum(self.medium.sigma_t.at_world(p, active))

@@ -10,13 +10,14 @@ the radiance L, times the adjoint radiance W that arrives against it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.gradients.parameters import EMISSION, SIGMA_T
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor, VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -54,7 +55,8 @@ class Derivatives:
 class AdjointTransport:
     """The transport equation in all voxels of ``grid``, and its adjoint.
 
-    ``pairs`` of opposite ordinates are used. With ``single``, radiance is scattered once only. If
+    ``pairs`` of opposite ordinates are used. With ``single``, radiance is scattered once only.
+    ``wanted`` are the derivatives to be found, `SIGMA_T` and `EMISSION` if they are among them. If
     the medium and what is wanted are ``grey``, and all emitters have one colour, a single channel
     stands for all: ``colour`` holds the factors of the radiance of each.
     """
@@ -67,11 +69,10 @@ class AdjointTransport:
         seed: tuple[int, int],
         pairs: int,
         single: bool,
+        wanted: Container[str],
         grey: bool = False,
     ) -> None:
-        self.grid, self._medium, self.single = grid, medium, single
-        #: whether derivatives by the extinction, and by emission, are wanted
-        self.wants_extinction, self.wants_emission = True, False
+        self.grid, self._medium, self.single, self._wanted = grid, medium, single, wanted
         colours = 1 if mi.is_monochromatic else 3
         rng = np.random.default_rng((*seed, 0x67726164))
         illumination = DistantIllumination(scene)
@@ -190,7 +191,7 @@ class AdjointTransport:
             if self.single:
                 totals += self._apart(source, own)
                 travelled += [dr.zeros(mi.Float, self._count) for _ in own]
-                if self.wants_emission:
+                if EMISSION in self._wanted:
                     centres += self._apart(level.sweep(source, table)[0], own)
                 continue
             _, first = level.sweep(source, level.tracks.table(*self._solving))
@@ -217,7 +218,7 @@ class AdjointTransport:
             for c in own:
                 scale = self.albedo[c] * dr.inv_four_pi
                 source = mi.Float(0) if self.single else scale * phi[c]
-                if self.wants_extinction:
+                if SIGMA_T in self._wanted:
                     sigma_t.append(self._products(level.tracks, c, source, scale * total[c]))
                 collided.append(phi[c] * travelled[c] * dr.inv_four_pi)
                 direct.append(extinction[c] * scale * total[c])

@@ -79,17 +79,15 @@ def render_film(
     if spp:
         sampler.set_sample_count(spp)
     spp = sampler.sample_count()
-    border = film.rfilter().border_size() if film.sample_border() else 0
-    size = mi.ScalarVector2u(film.crop_size()) + 2 * border
-    pixels = int(size.x) * int(size.y)
     film.prepare(list(channels))
-    per_pass = _divisor(spp, max(1, LANES // pixels))
+    frame = SampledFilm(film, spp, LANES)
+    border, per_pass = frame.border, frame.per_pass
     sampler.set_samples_per_wavefront(per_pass)
-    sampler.seed(seed, pixels * per_pass)
+    sampler.seed(seed, frame.lanes)
     spread, sums = PixelPositions(sampler, seed, spp), None
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
-        samples = _sampled(sensor, sampler, spread, size, border, per_pass, spp, radiance)
+        samples = _sampled(sensor, sampler, spread, frame, spp, radiance)
         if refine and per_pass >= FEWEST_SAMPLES:
             samples = _refined(sensor, sampler, seed, per_pass, radiance, *samples)
         found = reconstructed(film, border, per_pass, *samples)
@@ -178,9 +176,33 @@ def check_film(film: mi.Film, spp: int, channels: int, at_once: bool = False) ->
         raise IrrcacheError(f"{what} needs {lanes} samples at once, 2^32 or more; {remedy}.")
 
 
-def _divisor(n: int, limit: int) -> int:
+def largest_divisor(n: int, limit: int) -> int:
     """Return the largest divisor of ``n`` that is at most ``limit``."""
     return next(d for d in range(min(n, limit), 0, -1) if n % d == 0)
+
+
+class SampledFilm:
+    """The pixels of a ``film`` that are sampled, with those beside the image that its filter needs,
+    and how many of the ``spp`` samples of each are taken in one launch of at most ``most``.
+    """
+
+    def __init__(self, film: mi.Film, spp: int, most: int) -> None:
+        self.film = film
+        self.border = film.rfilter().border_size() if film.sample_border() else 0
+        size = mi.ScalarVector2u(film.crop_size()) + 2 * self.border
+        self.width, self.pixels = int(size.x), int(size.x) * int(size.y)
+        self.per_pass = largest_divisor(spp, max(1, most // self.pixels))
+        #: samples of a launch
+        self.lanes = self.pixels * self.per_pass
+
+    def positions(self, spread: PixelPositions) -> tuple[mi.Point2f, mi.UInt32, mi.UInt32]:
+        """Positions on the film of the samples of a launch; their pixels, and their numbers within
+        these.
+        """
+        index, sample = Divisor(self.per_pass).split(dr.arange(mi.UInt32, self.lanes))
+        pixel = mi.Vector2f(pixel_of(index, self.width) - self.border)
+        pixel += mi.Vector2f(self.film.crop_offset())
+        return pixel + spread.next(index, sample), index, sample
 
 
 class PixelPositions:
@@ -277,18 +299,12 @@ def _sampled(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
     spread: PixelPositions,
-    size: mi.ScalarVector2u,
-    border: int,
-    per_pass: int,
+    frame: SampledFilm,
     spp: int,
     radiance: RadianceFunction,
 ) -> tuple[mi.Point2f, list[mi.Float]]:
     """Trace the samples of a pass; return their film positions and the values of all channels."""
-    lane = dr.arange(mi.UInt32, int(size.x) * int(size.y) * per_pass)
-    index, sample = Divisor(per_pass).split(lane)
-    pixel = mi.Vector2f(pixel_of(index, int(size.x)) - border)
-    pixel += mi.Vector2f(sensor.film().crop_offset())
-    position = pixel + spread.next(index, sample)
+    position, index, sample = frame.positions(spread)
 
     def on_emitter() -> mi.Point2f:
         return spread.emitter_sample(index, sample)

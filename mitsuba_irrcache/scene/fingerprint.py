@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.jit import graph_variables
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import Media
@@ -69,7 +70,7 @@ class Snapshot:
             entries |= {f"emission.{key}": entry for key, entry in own.items()}
         values = {key: _value(entry) for key, entry in entries.items()}
         #: whether a parameter carries gradients
-        self.carries_gradients = any(map(_carries_gradients, values.values()))
+        self.carries_gradients = any(map(graph_variables, values.values()))
         shared = {} if previous is None else previous._values
         budget = _Budget(SMALL_IN_ALL)
         self._values = {k: _kept(v, shared.get(k), budget) for k, v in values.items()}
@@ -89,17 +90,6 @@ def _value(entry: tuple) -> Any:
     """Return the value of a traversed parameter; None if the plugin has none."""
     value, kind, node, _ = entry
     return value if kind is None else mi.get_property(value, kind, node)
-
-
-def _carries_gradients(value: Any) -> bool:
-    """Whether an array is attached to others by derivatives, also while these are suspended."""
-    if not dr.is_array_v(value):
-        return _is_transform(value) and _carries_gradients(value.matrix)
-    if dr.is_tensor_v(value):
-        return _carries_gradients(value.array)
-    if dr.depth_v(value) > 1:
-        return any(map(_carries_gradients, value))
-    return bool(getattr(value, "index_ad", 0))
 
 
 def _is_transform(value: Any) -> bool:

@@ -158,6 +158,96 @@ def test_views_add_up(rgb):
     np.testing.assert_allclose(both, one + two, rtol=1e-4, atol=1e-6 * np.abs(both).max())
 
 
+@pytest.fixture
+def adjoint_solves(monkeypatch) -> list:
+    """A list that grows with every adjoint solve."""
+    from mitsuba_irrcache.gradients.transport import AdjointTransport
+
+    calls, adjoint = [], AdjointTransport.adjoint
+    monkeypatch.setattr(
+        AdjointTransport, "adjoint", lambda *args: calls.append(args) or adjoint(*args)
+    )
+    return calls
+
+
+def loss_of(image: mi.TensorXf):
+    return dr.mean(dr.square(image - 0.3))
+
+
+def attached(params: mi.SceneParameters, key: str) -> None:
+    params[key] = mi.TensorXf(dr.detach(params[key]))
+    dr.enable_grad(params[key])
+    params.update()
+
+
+def test_images_of_one_state_share_the_adjoint_solve(rgb, adjoint_solves):
+    scene, params, key = small()
+    attached(params, key)
+    images = [mi.render(scene, params, spp=4, seed=seed) for seed in (1, 2)]
+    dr.backward(sum(map(loss_of, images)))
+    assert len(adjoint_solves) == 1
+    # The next image is of another state, also if no value has changed.
+    attached(params, key)
+    dr.backward(loss_of(mi.render(scene, params, spp=4)))
+    assert len(adjoint_solves) == 2
+
+
+def test_images_of_one_state_may_be_differentiated_one_after_the_other(rgb, adjoint_solves):
+    """The first traversal of Dr.Jit's graph forgets the edges that they share."""
+    scene, params, key = small()
+    one, two = (gradient_of(scene, params, key, seed=seed) for seed in (1, 2))
+    attached(params, key)
+    images = [mi.render(scene, params, spp=4, seed=seed) for seed in (1, 2)]
+    for image, expected in zip(images, (one, one + two), strict=True):
+        dr.backward(loss_of(image))
+        found = np.array(dr.grad(params[key]))
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * np.abs(found).max())
+    # And so may a third, made only then.
+    dr.backward(loss_of(mi.render(scene, params, spp=4, seed=1)))
+    found = np.array(dr.grad(params[key]))
+    np.testing.assert_allclose(found, 2 * one + two, rtol=1e-4, atol=1e-6 * np.abs(found).max())
+    assert len(adjoint_solves) == 2 + 3
+
+
+def test_an_image_without_weight_does_not_hide_others(rgb):
+    scene, params, key = small()
+    expected = gradient_of(scene, params, key, seed=1)
+    attached(params, key)
+    images = [mi.render(scene, params, spp=4, seed=seed) for seed in (2, 1)]
+    dr.backward(dr.sum(images[0] * mi.TensorXf(np.zeros(images[0].shape, np.float32))))
+    dr.backward(loss_of(images[1]))
+    assert np.array(dr.grad(params[key])).tobytes() == expected.tobytes()
+
+
+def test_a_scene_edited_before_the_backward_pass_is_differentiated_as_it_is(rgb):
+    """As by Mitsuba's integrators; nothing of the earlier state is used."""
+    scene, params, key = small()
+    data = mi.TensorXf(dr.detach(params[key]))
+    params[key] = 0.5 * data
+    params.update()
+    expected = gradient_of(scene, params, key, seed=1, spp=64)
+    params[key] = data
+    attached(params, key)
+    image = mi.render(scene, params, spp=64, seed=1)
+    params[key] = mi.TensorXf(0.5 * data)
+    attached(params, key)
+    later = dr.detach(mi.render(scene, params, spp=64, seed=1))
+    # The derivative of the loss by the pixels at the later image.
+    dr.backward(dr.sum(image * (2 / np.prod(later.shape)) * (later - 0.3)))
+    found = np.array(dr.grad(params[key]))
+    np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-3 * np.abs(found).max())
+
+
+def test_images_with_gradients_do_not_keep_the_scene(rgb):
+    scene, params, key = small()
+    attached(params, key)
+    image = mi.render(scene, params, spp=1)
+    shared = scene.integrator()._shared
+    assert shared() is not None
+    del image
+    assert shared() is None
+
+
 def test_a_batch_sensor_is_all_of_its_views(rgb):
     """They share one adjoint solve; its ordinates and samples are others."""
     scene, params, key = small()

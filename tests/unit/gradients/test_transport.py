@@ -28,7 +28,7 @@ def test_a_sweep_is_its_own_transpose():
     case = Case(data=20, cache=20)
     scene, medium = medium_of(case)
     transport = AdjointTransport(
-        scene, medium, Grid.near_cubic(medium.frame, 20), (0, 1), 64, False
+        scene, medium, Grid.near_cubic(medium.frame, 20), (0, 1), 64, False, ()
     )
     ((level, own),) = transport._levels
     table = level.tracks.table(*transport.ordinates.scattering().without_incoming())

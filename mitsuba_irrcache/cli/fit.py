@@ -1,0 +1,211 @@
+"""``irrcache fit``: fit a volume to images of it, one for each sensor of the scene."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from pathlib import Path
+from time import perf_counter
+
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.cli.render import REPLACED, add_scene_options
+from mitsuba_irrcache.core.argument_types import whole
+from mitsuba_irrcache.errors import IrrcacheError, origin
+from mitsuba_irrcache.gradients.fit import LOSSES, METHODS, Result, Settings, View, fit
+from mitsuba_irrcache.io.mitsuba_vol import write_vol
+from mitsuba_irrcache.io.scene_files import (
+    check_scene_file,
+    integrator_of,
+    load_scene,
+    parse_parameters,
+)
+from mitsuba_irrcache.machine.llvm import require_llvm
+
+#: The integrator in place of a path tracer; only this solver has gradients.
+INTEGRATOR = "irrcache{solver=sweep}"
+#: Seconds between checkpoints, at least.
+CHECKPOINT_SECONDS = 30.0
+CHECKPOINT = "fit.npz"
+IMAGES = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of ``irrcache fit``."""
+    own = Settings()
+    parser.add_argument("scene", help="scene XML with the start volume and a sensor for each image")
+    parser.add_argument(
+        "--images", nargs="+", required=True, metavar="FILE",
+        help="images in the order of the sensors, or a folder of them, by name; those with 8 bits "
+        "are taken to be sRGB",
+    )  # fmt: skip
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="FOLDER",
+        help=f"folder for a .vol of each parameter and the checkpoint {CHECKPOINT}",
+    )  # fmt: skip
+    parser.add_argument(
+        "-p", "--parameter", action="append", metavar="NAME",
+        help="sigma_t, albedo, emission, the id of an emitter, or a key of mi.traverse(scene); "
+        "repeatable (default: sigma_t)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--held-out", type=whole(0), default=0, metavar="N",
+        help="how many of the last images are not fitted, but tell the error (default: 0)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--method", choices=METHODS, default=own.method, help="optimiser (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--loss", choices=[*LOSSES], default=own.loss,
+        help="squared errors, absolute ones, or squared relative to the image "
+        "(default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--steps", type=whole(1), default=own.steps, help="steps (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--rate", type=float, default=own.rate,
+        help="first step size of adam, relative to the scale (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--scale", type=float, default=own.scale,
+        help="extinction or emission to expect (default: the start's)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--smoothness", type=float, default=own.smoothness,
+        help="weight of squared differences between neighbours (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--spp", type=whole(1), default=own.spp, help="samples per pixel (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--views", type=whole(0), default=own.views,
+        help="images of each step of adam, in turn (default: 0, all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--seed", type=whole(0), default=own.seed, help="seed of the samples (default: 0)"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help=f"continue from {CHECKPOINT} in the output folder"
+    )
+    parser.add_argument(
+        "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
+        help=f"integrator and its properties (default: {INTEGRATOR} in place of a path tracer)",
+    )  # fmt: skip
+    add_scene_options(parser)
+    parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, print the progress, and write the volumes."""
+    source, names = check_scene_file(args.scene), args.parameter or ["sigma_t"]
+    files = _image_files(args.images)
+    shared = {name: getattr(args, name) for name in Settings.__dataclass_fields__}
+    settings, output = Settings(**shared), Path(args.output)
+    if args.mode.startswith("llvm"):
+        require_llvm()
+    mi.set_variant(args.mode)
+    mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
+    parameters = parse_parameters(args.define)
+    integrator = args.integrator
+    if integrator is None and integrator_of(source, parameters) in REPLACED:
+        integrator = INTEGRATOR
+    scene = load_scene(source, parameters, integrator)
+    sensors = scene.sensors()
+    if len(files) != len(sensors):
+        raise IrrcacheError(
+            f"--images names {len(files)} image(s), but the scene has {len(sensors)} sensor(s); "
+            "give one for each, in the same order."
+        )
+    views = [View(sensor, _pixels(file)) for sensor, file in zip(sensors, files, strict=True)]
+    fitted = len(views) - args.held_out
+    if fitted < 1:
+        raise IrrcacheError(
+            f"--held-out is {args.held_out} of {len(views)} image(s); leave at least one to fit."
+        )
+    _make_folder(output)
+    checkpoint = output / CHECKPOINT
+    start = Result.load(checkpoint, settings) if args.resume else None
+    report = _Report(checkpoint, settings)
+    try:
+        result = fit(scene, views[:fitted], names, settings, views[fitted:], start, report)
+    except (KeyboardInterrupt, RuntimeError) as error:
+        if isinstance(origin(error), KeyboardInterrupt) and report.result is not None:
+            _write(output, report.result, settings)
+            raise KeyboardInterrupt(
+                f"step {report.result.step} was written; continue with --resume"
+            ) from None
+        raise
+    _write(output, result, settings)
+    return 0
+
+
+class _Report:
+    """Prints the progress, and writes a checkpoint now and then."""
+
+    def __init__(self, checkpoint: Path, settings: Settings) -> None:
+        self._checkpoint, self._settings = checkpoint, settings
+        self._begun = self._saved = perf_counter()
+        #: the last state
+        self.result: Result | None = None
+
+    def __call__(self, result: Result) -> None:
+        self.result, now = result, perf_counter()
+        step, loss, error = result.history[-1]
+        held_out = "" if math.isnan(error) else f"  held out {error:.2%}"
+        if held_out or step % 10 == 0 or step in (1, self._settings.steps):
+            count = f"{step}/{self._settings.steps}"
+            print(
+                f"{now - self._begun:8.1f} s  step {count}  loss {loss:.3e}{held_out}", flush=True
+            )
+        if now - self._saved >= CHECKPOINT_SECONDS:
+            result.save(self._checkpoint, self._settings)
+            self._saved = perf_counter()
+
+
+def _image_files(given: list[str]) -> list[Path]:
+    """The image files; those of a folder by their names."""
+    paths = [Path(name) for name in given]
+    if len(paths) == 1 and paths[0].is_dir():
+        folder = paths[0]
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGES)
+        if not paths:
+            raise IrrcacheError(f'the folder "{folder}" has no images ({", ".join(IMAGES)}).')
+    missing = [path for path in paths if not path.is_file()]
+    if missing:
+        raise IrrcacheError(f'there is no image "{missing[0]}".')
+    return paths
+
+
+def _pixels(file: Path) -> np.ndarray:
+    """Linear radiance (height, width, 3), or 1 channel in a monochromatic variant."""
+    form = mi.Bitmap.PixelFormat.Y if mi.is_monochromatic else mi.Bitmap.PixelFormat.RGB
+    try:
+        bitmap = mi.Bitmap(str(file)).convert(form, mi.Struct.Type.Float32, srgb_gamma=False)
+    except RuntimeError as error:
+        raise IrrcacheError(f'cannot read the image "{file}": {error}') from error
+    image = np.array(bitmap)
+    return image if image.ndim == 3 else image[..., None]
+
+
+def _make_folder(output: Path) -> None:
+    try:
+        output.mkdir(exist_ok=True)
+    except OSError as error:
+        raise IrrcacheError(f'cannot make the folder "{output}": {error.strerror}.') from error
+
+
+def _write(output: Path, result: Result, settings: Settings) -> None:
+    """Write the checkpoint, and each parameter: grids as .vol, others as text."""
+    result.save(output / CHECKPOINT, settings)
+    for name, value in result.values.items():
+        name = re.sub(r"[^\w.-]", "_", name)  # a name in a scene is no path
+        if value.ndim == 4:
+            file = output / f"{name}.vol"
+            write_vol(file, value)
+        else:
+            file = output / f"{name}.txt"
+            np.savetxt(file, value.reshape(1, -1))
+        print(f"wrote {file}")

@@ -1,0 +1,450 @@
+"""Fit parameters of a scene to images of it, by Adam or L-BFGS.
+
+    views = [View(sensor, image) for sensor, image in zip(scene.sensors(), images)]
+    result = fit(scene, views[:-1], ["sigma_t"], held_out=views[-1:])
+    result.values["sigma_t"]  # (z, y, x, channel)
+
+D. P. Kingma and J. Ba, *Adam: A Method for Stochastic Optimization*, ICLR 2015; R. H. Byrd, P. Lu,
+J. Nocedal and C. Zhu, *A Limited Memory Algorithm for Bound Constrained Optimization*, SIAM Journal
+on Scientific Computing 16, 1995 (SciPy's L-BFGS-B).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.files import atomic_write
+from mitsuba_irrcache.machine.extras import require
+
+#: Directions of the cache, if the integrator does not set ``cache_spp``: from these shares of all
+#: steps on. Early steps do not need exact gradients.
+DIRECTIONS = ((0.0, 32), (0.6, 64), (0.85, 128))
+#: Those of L-BFGS, whose objective has to stay the same.
+LBFGS_DIRECTIONS = 64
+#: Decay rates and least denominator of Adam, and the share of its step size that the last has.
+DECAY, EPSILON, LAST_RATE = (0.9, 0.99), 1e-8, 0.1
+#: Optical depth of the scene's diagonal by which the extinction is scaled if the start is thinner.
+DEPTH = 4.0
+#: Radiance below which errors of the loss ``relative`` are absolute.
+DARK = 0.1
+
+LOSSES: dict[str, Callable] = {
+    "l2": lambda image, target: dr.square(image - target),
+    "l1": lambda image, target: dr.abs(image - target),
+    "relative": lambda image, target: (
+        dr.square(image - target) / (dr.square(dr.detach(image)) + DARK**2)
+    ),
+}
+METHODS = ("adam", "lbfgs")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An image (height, width, channel) of linear radiance, and the sensor that took it."""
+
+    sensor: mi.Sensor
+    image: np.ndarray
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to fit.
+
+    Attributes:
+        steps: of Adam, or iterations of L-BFGS at most.
+        method: "lbfgs", which needs fewer steps, or "adam", which may take some views at a time.
+        loss: "l2", "l1" or "relative" (squared errors relative to the image).
+        rate: first step size of Adam, relative to the scale of a parameter.
+        scale: of extinction and emission; 0: the largest value of the start, at least that of a
+            medium of some optical depth.
+        smoothness: weight in the loss of the mean squared difference between neighbouring voxels,
+            for images of mean square 1 and a scale of 1. Views leave the finest structure of a
+            volume undetermined.
+        spp: camera samples of each pixel.
+        views: of each step of Adam, in turn; 0: all.
+        seed: of camera samples and of the choice of views.
+    """
+
+    steps: int = 100
+    method: str = "lbfgs"
+    loss: str = "l2"
+    rate: float = 0.1
+    scale: float = 0.0
+    smoothness: float = 1e-4
+    spp: int = 4
+    views: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value, known in (("method", self.method, METHODS), ("loss", self.loss, LOSSES)):
+            if value not in known:
+                raise IrrcacheError(f'fit: {name} is "{value}"; it must be one of {[*known]}.')
+        if self.steps < 1 or self.spp < 1 or self.views < 0:
+            raise IrrcacheError(
+                f"fit: steps is {self.steps}, spp {self.spp} and views {self.views}; steps and spp "
+                "must be at least 1, views at least 0."
+            )
+        if self.views and self.method != "adam":
+            raise IrrcacheError(f"fit: {self.method} takes all views; set views to 0, or use adam.")
+        numbers = {"rate": self.rate, "scale": self.scale, "smoothness": self.smoothness}
+        if not (self.rate > 0 and all(0 <= x < math.inf for x in numbers.values())):
+            raise IrrcacheError(
+                f"fit: {numbers} given; the rate must be above 0, the others not negative."
+            )
+
+
+@dataclass(eq=False)
+class Result:
+    """The state of a fit after ``step`` steps.
+
+    Attributes:
+        values: of the parameters, by their names.
+        history: step, loss of the views of that step, and error of the views held out, relative to
+            their mean (NaN without any, and where it was not computed).
+        moments: first and second moments of Adam, by the names of the parameters.
+    """
+
+    step: int
+    values: dict[str, np.ndarray]
+    history: list[tuple[int, float, float]] = field(default_factory=list)
+    moments: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+
+    def save(self, path: str | Path, settings: Settings) -> None:
+        """Write a checkpoint from which `load` continues."""
+        arrays = {f"value {name}": value for name, value in self.values.items()}
+        for name, (first, second) in self.moments.items():
+            arrays |= {f"first {name}": first, f"second {name}": second}
+        about = json.dumps({"step": self.step, "settings": asdict(settings)})
+        history = np.array(self.history, dtype=np.float64).reshape(-1, 3)
+        with atomic_write(path) as stream:
+            np.savez(stream, about=np.array(about), history=history, **arrays)
+
+    @classmethod
+    def load(cls, path: str | Path, settings: Settings) -> Result:
+        """Read a checkpoint. Raises IrrcacheError if it is none, or one of other ``settings``."""
+        try:
+            with np.load(path) as stored:
+                arrays = dict(stored)
+            about = json.loads(str(arrays.pop("about")))
+            history = [(int(s), a, b) for s, a, b in arrays.pop("history").tolist()]
+        except (OSError, ValueError, KeyError) as error:
+            raise IrrcacheError(f'"{path}" is no checkpoint of a fit: {error}.') from error
+        others = {k: v for k, v in about["settings"].items() if asdict(settings)[k] != v}
+        if others:
+            raise IrrcacheError(
+                f'the checkpoint "{path}" was made with {others}; continue with the same, or '
+                "delete it."
+            )
+
+        def named(prefix: str) -> dict[str, np.ndarray]:
+            return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+        first, second = named("first "), named("second ")
+        moments = {name: (first[name], second[name]) for name in first}
+        return cls(about["step"], named("value "), history, moments)
+
+
+def fit(
+    scene: mi.Scene,
+    views: Sequence[View],
+    names: Sequence[str],
+    settings: Settings | None = None,
+    held_out: Sequence[View] = (),
+    start: Result | None = None,
+    report: Callable[[Result], None] | None = None,
+    every: int = 10,
+) -> Result:
+    """Fit the parameters of ``scene`` that ``names`` stand for (see `key_of`) to ``views``.
+
+    The parameters start from the values that they have, or from those of ``start``, a result of
+    fewer steps with the same settings; the scene has the last values afterwards. ``report`` is
+    called after each step; the error of the views ``held_out`` is computed ``every`` so many. An
+    exception of ``report`` ends the fit. The same settings give the same bits, also with a
+    ``start``, unless the method is L-BFGS, whose memory starts anew.
+
+    Raises IrrcacheError if a parameter or an image does not fit the scene, or has no gradients.
+    """
+    run = _Fit(scene, views, names, settings or Settings(), held_out, start, report, every)
+    return run.with_adam() if run.settings.method == "adam" else run.with_lbfgs()
+
+
+def key_of(params: mi.SceneParameters, name: str) -> str:
+    """The key of the parameter that ``name`` stands for: a key itself, or a part of one between
+    dots that is found in a single key of an array, such as ``sigma_t``, ``albedo``, ``emission`` or
+    the id of an emitter.
+
+    Raises IrrcacheError if there is none, or several.
+    """
+    arrays = [k for k in params.keys() if k.endswith((".data", ".value")) and name in k.split(".")]
+    if name in params.keys():
+        return name
+    if len(arrays) != 1:
+        found = ", ".join(f'"{key}"' for key in arrays) or "none"
+        raise IrrcacheError(
+            f'fit: "{name}" must be a key of mi.traverse(scene), or stand in exactly one that ends '
+            f'in "data" or "value"; found: {found}.'
+        )
+    return arrays[0]
+
+
+class _Fit:
+    """A fit in progress; the arguments are those of `fit`."""
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        views: Sequence[View],
+        names: Sequence[str],
+        settings: Settings,
+        held_out: Sequence[View],
+        start: Result | None,
+        report: Callable[[Result], None] | None,
+        every: int,
+    ) -> None:
+        self.scene, self.settings = scene, settings
+        self._report, self._every = report or (lambda result: None), every
+        self._params = mi.traverse(scene)
+        self._keys = {name: key_of(self._params, name) for name in names}
+        self._kinds = {name: type(self._params[key]) for name, key in self._keys.items()}
+        if not views or not names:
+            raise IrrcacheError("fit: give at least one view and one parameter.")
+        integrator = scene.integrator()
+        if not hasattr(integrator, "cache_spp"):
+            raise IrrcacheError(
+                f"fit: the scene's integrator is {integrator.class_name()}; use irrcache."
+            )
+        self._chooses_directions = integrator.cache_spp == 0
+        first = {n: np.array(self._params[k], dtype=np.float32) for n, k in self._keys.items()}
+        self._bounds = {n: 1.0 if "albedo" in k.split(".") else np.inf for n, k in self._named()}
+        self._scales = {name: self._scale(name, value) for name, value in first.items()}
+        self.result = start or Result(0, first)
+        if start is not None:
+            self._check_start(start, first)
+            # The grid of the cache follows from the first values, and stays.
+            integrator.prepare(scene)
+        self._views = [self._target(view) for view in views]
+        self._held_out = [self._target(view) for view in held_out]
+        # Losses have the units of these.
+        units = {"l2": np.square, "l1": np.abs, "relative": np.ones_like}[settings.loss]
+        level = np.mean([units(np.asarray(view.image, np.float64)).mean() for view in views])
+        self._smoothness = settings.smoothness * float(level)
+
+    def _named(self) -> list[tuple[str, str]]:
+        return list(self._keys.items())
+
+    def _scale(self, name: str, value: np.ndarray) -> float:
+        if np.isfinite(self._bounds[name]):
+            return self._bounds[name]
+        if self.settings.scale:
+            return self.settings.scale
+        largest = float(np.abs(value).max())
+        if "sigma_t" not in self._keys[name].split("."):
+            return largest or 1.0
+        box = self.scene.bbox()
+        return max(largest, DEPTH / float(dr.norm(box.max - box.min)))
+
+    def _check_start(self, start: Result, first: dict[str, np.ndarray]) -> None:
+        shapes = {name: value.shape for name, value in first.items()}
+        found = {name: value.shape for name, value in start.values.items()}
+        if shapes != found:
+            raise IrrcacheError(f"fit: the start has parameters {found}, the scene has {shapes}.")
+
+    def _target(self, view: View) -> tuple[mi.Sensor, mi.TensorXf]:
+        size = view.sensor.film().crop_size()
+        image = np.asarray(view.image, dtype=np.float32)
+        if image.ndim != 3 or image.shape[:2] != (int(size.y), int(size.x)):
+            raise IrrcacheError(
+                f"fit: an image has shape {image.shape}, but the film of its sensor is "
+                f"{int(size.x)} x {int(size.y)} pixels; scale one of them."
+            )
+        if not np.isfinite(image).all():
+            raise IrrcacheError("fit: an image has pixels that are NaN or infinite; clean it.")
+        return view.sensor, mi.TensorXf(image)
+
+    # Images
+
+    def _set(self, values: dict[str, np.ndarray], attached: bool) -> dict[str, object]:
+        """Give the parameters these values; return them."""
+        for name, key in self._named():
+            value = values[name].astype(np.float32)
+            # Not from NumPy's memory, which would be borrowed.
+            self._params[key] = dr.copy(self._kinds[name](value))
+            if attached:
+                dr.enable_grad(self._params[key])
+        self._params.update()
+        return {name: self._params[key] for name, key in self._named()}
+
+    def _objective(
+        self, values: dict[str, np.ndarray], views: list[tuple], seed: int
+    ) -> tuple[float, dict[str, np.ndarray]]:
+        """The loss and its gradient. All images share one cache and one adjoint solve."""
+        leaves, settings = self._set(values, attached=True), self.settings
+        function, total = LOSSES[settings.loss], 0.0
+        for number, (sensor, target) in enumerate(views):
+            own = (seed * len(views) + number) & 0x7FFFFFFF
+            image = mi.render(self.scene, self._params, sensor=sensor, spp=settings.spp, seed=own)
+            total += dr.mean(function(_colours(image, target), target)) / len(views)
+        dr.backward(total)
+        loss, gradient = float(np.array(total).item()), {}
+        for name, leaf in leaves.items():
+            gradient[name] = np.array(dr.grad(leaf), dtype=np.float64).reshape(values[name].shape)
+            roughness, change = _roughness(values[name] / self._scales[name])
+            loss += self._smoothness * roughness
+            gradient[name] += self._smoothness / self._scales[name] * change
+        return loss, gradient
+
+    def _held_out_error(self) -> float:
+        """Root mean square error of the views held out, relative to their mean."""
+        if not self._held_out:
+            return math.nan
+        square = mean = 0.0
+        for sensor, target in self._held_out:
+            image = mi.render(self.scene, sensor=sensor, spp=self.settings.spp)
+            target = np.array(target, dtype=np.float64)
+            square += np.mean(np.square(np.array(_colours(image, target)) - target))
+            mean += np.mean(target)
+        count = len(self._held_out)
+        return float(np.sqrt(square / count) / max(mean / count, 1e-30))
+
+    def _step_done(self, loss: float) -> None:
+        result, settings = self.result, self.settings
+        result.step += 1
+        last = result.step == settings.steps
+        error = math.nan
+        if last or result.step % self._every == 0:
+            self._set(result.values, attached=not last)
+            error = self._held_out_error()
+        result.history.append((result.step, loss, error))
+        self._report(result)
+
+    # Methods
+
+    def with_adam(self) -> Result:
+        settings, result = self.settings, self.result
+        while result.step < settings.steps:
+            done = result.step / settings.steps
+            if self._chooses_directions:
+                self.scene.integrator().cache_spp = max(n for s, n in DIRECTIONS if s <= done)
+            loss, gradient = self._objective(result.values, self._chosen(result.step), result.step)
+            _check_finite(loss, gradient, result.step)
+            rate = settings.rate * (
+                LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))
+            )
+            for name, value in result.values.items():
+                step = self._adam_step(name, gradient[name] * self._scales[name])
+                changed = value - rate * self._scales[name] * step
+                result.values[name] = self._within_bounds(name, changed).astype(np.float32)
+            self._step_done(loss)
+        return result
+
+    def _adam_step(self, name: str, gradient: np.ndarray) -> np.ndarray:
+        zero = np.zeros_like(gradient)
+        first, second = self.result.moments.get(name, (zero, zero))
+        (a, b), count = DECAY, self.result.step + 1
+        first, second = a * first + (1 - a) * gradient, b * second + (1 - b) * gradient**2
+        self.result.moments[name] = first, second
+        scale = np.sqrt(second / (1 - b**count)) + EPSILON
+        return first / (1 - a**count) / scale
+
+    def _chosen(self, step: int) -> list[tuple]:
+        """The views of a step: all in turn, in an order that changes."""
+        count = self.settings.views
+        if not 0 < count < len(self._views):
+            return self._views
+        numbers = range(step * count, (step + 1) * count)
+        orders = {}
+        for number in numbers:
+            turn = number // len(self._views)
+            if turn not in orders:
+                rng = np.random.default_rng((self.settings.seed, turn))
+                orders[turn] = rng.permutation(len(self._views))
+        return [self._views[orders[n // len(self._views)][n % len(self._views)]] for n in numbers]
+
+    def _within_bounds(self, name: str, value: np.ndarray) -> np.ndarray:
+        return np.clip(value, 0, self._bounds[name])
+
+    def with_lbfgs(self) -> Result:
+        require("scipy", "volumes", "the method lbfgs")
+        from scipy.optimize import minimize
+
+        settings, result = self.settings, self.result
+        if self._chooses_directions:
+            self.scene.integrator().cache_spp = LBFGS_DIRECTIONS
+        shapes = {name: value.shape for name, value in result.values.items()}
+        ends = np.cumsum([0, *(value.size for value in result.values.values())])
+        scale = np.concatenate([np.full(v.size, self._scales[n]) for n, v in result.values.items()])
+
+        def apart(x: np.ndarray) -> dict[str, np.ndarray]:
+            parts = (x[a:b] for a, b in pairwise(ends))
+            return {
+                name: self._within_bounds(name, part.reshape(shape)).astype(np.float32)
+                for (name, shape), part in zip(shapes.items(), parts, strict=True)
+            }
+
+        first: list[float] = []
+
+        def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+            loss, gradient = self._objective(apart(x * scale), self._views, settings.seed)
+            _check_finite(loss, gradient, result.step)
+            first.append(loss or 1.0)
+            flat = np.concatenate([g.ravel() for g in gradient.values()]) * scale
+            return loss / first[0], flat / first[0]  # tolerances are for values around 1
+
+        def iterated(intermediate_result) -> None:
+            result.values = apart(intermediate_result.x * scale)
+            self._step_done(float(intermediate_result.fun) * first[0])
+
+        left = settings.steps - result.step
+        if left > 0:
+            x = np.concatenate([v.ravel() for v in result.values.values()]) / scale
+            upper = np.concatenate(
+                [
+                    np.full(v.size, self._bounds[n] / self._scales[n])
+                    for n, v in result.values.items()
+                ]
+            )
+            bounds = list(zip(np.zeros(len(x)), upper, strict=True))
+            # The loss is smooth to single precision.
+            options = {"maxiter": left, "maxfun": 4 * left + 20, "gtol": 0, "ftol": 1e-7}
+            minimize(
+                objective, x, jac=True, method="L-BFGS-B", bounds=bounds,
+                callback=iterated, options=options,
+            )  # fmt: skip
+        self._set(result.values, attached=False)
+        return result
+
+
+def _roughness(values: np.ndarray) -> tuple[float, np.ndarray]:
+    """The mean squared difference between neighbouring voxels (z, y, x, channel), and its gradient;
+    0 if the values are no grid.
+    """
+    total, gradient = 0.0, np.zeros(values.shape)
+    for axis in range(3 if values.ndim == 4 else 0):
+        difference = np.diff(values.astype(np.float64), axis=axis) / values.size
+        total += float(np.square(difference).sum()) * values.size
+        ends = [[(0, 0)] * 4, [(0, 0)] * 4]
+        ends[0][axis], ends[1][axis] = (1, 0), (0, 1)
+        gradient += 2 * (np.pad(difference, ends[0]) - np.pad(difference, ends[1]))
+    return total, gradient
+
+
+def _colours(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+    """The channels of an image that the target has: without alpha."""
+    return image if image.shape[2] == target.shape[2] else image[:, :, : target.shape[2]]
+
+
+def _check_finite(loss: float, gradient: dict[str, np.ndarray], step: int) -> None:
+    bad = [name for name, values in gradient.items() if not np.isfinite(values).all()]
+    if bad or not math.isfinite(loss):
+        what = f'the gradient of "{bad[0]}"' if bad else f"the loss {loss}"
+        raise IrrcacheError(f"fit: {what} is not finite at step {step + 1}; lower the rate.")

@@ -1,0 +1,201 @@
+"""Images as operations of Dr.Jit's graph, such that several of them share one adjoint solve.
+
+The irradiance is a variable of the graph: it depends on the parameters, and images depend on it and
+on the parameters straight. The derivatives of an objective by the irradiance are the adjoint
+fluence of camera rays, which Dr.Jit adds up over all images. It visits the irradiance once, after
+all images, and only then the adjoint equation is solved.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.core.jit import graph_variables
+from mitsuba_irrcache.gradients.backward import ParameterAdjoint
+from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients.parameters import enabled
+
+
+class DifferentiableIntegrator(Protocol):
+    """What these operations need of the integrator."""
+
+    caches: dict[str, IrradianceCache | None]
+
+    def render(
+        self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, develop: bool, evaluate: bool
+    ) -> mi.TensorXf:
+        """The method of Mitsuba's integrators."""
+
+    def render_forward(
+        self,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        sensor: mi.Sensor,
+        seed: int,
+        spp: int,
+    ) -> mi.TensorXf:
+        """The method of Mitsuba's integrators."""
+
+    def exclusively(self) -> AbstractContextManager:
+        """A context in which no other thread changes the cache."""
+
+    def adjoint(
+        self, scene: mi.Scene, params: mi.SceneParameters, keys: list[str], seed: int
+    ) -> ParameterAdjoint:
+        """The derivatives of images of ``scene`` by the parameters ``keys``."""
+
+    def revision(self, scene: mi.Scene) -> int:
+        """The number of the present state of the cache, which is brought up to date."""
+
+
+class SceneState:
+    """A state of ``scene`` and of ``params``, which carry gradients, and the adjoint that images of
+    this state share. With ``alone`` there is one image, which solves at once.
+    """
+
+    def __init__(
+        self,
+        integrator: DifferentiableIntegrator,
+        scene: mi.Scene,
+        params: mi.SceneParameters,
+        alone: bool = False,
+    ) -> None:
+        self.integrator, self.scene, self.params = integrator, scene, params
+        self._identity, self._revision = _variables(params), integrator.revision(scene)
+        cache = next(iter(integrator.caches.values()), None)
+        #: values of the irradiance in each channel
+        self.voxels = cache.grid.voxel_count if cache is not None else 1
+        self._adjoint: ParameterAdjoint | None = None
+        # Dr.Jit forgets edges of its graph once it has followed them.
+        self._is_solved = alone
+
+    def is_state_of(self, scene: mi.Scene, params: mi.SceneParameters) -> bool:
+        """Whether another image of these may share the adjoint solve."""
+        if self._is_solved or self._adjoint is not None:
+            return False
+        if self.scene is not scene or self.params is not params:
+            return False
+        return self._identity == _variables(params) and self._is_current
+
+    @property
+    def _is_current(self) -> bool:
+        return self._revision == self.integrator.revision(self.scene)
+
+    def add_image(
+        self, grad: mi.TensorXf, sensor: mi.Sensor, seed: int, spp: int
+    ) -> mi.Spectrum | None:
+        """Add to the parameters their derivatives at a given irradiance, from those by the pixels,
+        ``grad``. Return those by the irradiance while its adjoint solve is still to come; otherwise
+        solve.
+        """
+        with dr.suspend_grad(), self.integrator.exclusively():
+            film = FilmAdjoint(sensor, grad, seed, spp)
+            shared = not self._is_solved and self._is_current
+            adjoint = self._adjoint if shared else None
+            if adjoint is None:
+                adjoint = self.integrator.adjoint(
+                    self.scene, self.params, list(self._identity), film.seed
+                )
+            found, fluence = adjoint.view(film)
+            rest = {}
+            if not shared and fluence is not None:
+                rest = adjoint.transport(fluence)
+        self._accumulate(found)
+        self._accumulate(rest)
+        if not shared or fluence is None:
+            return None
+        self._adjoint = adjoint
+        return mi.Spectrum(*fluence)
+
+    def solve(self, fluence: mi.Spectrum) -> None:
+        """Add to the parameters their derivatives by way of the irradiance, from those by it."""
+        adjoint, self._adjoint, self._is_solved = self._adjoint, None, True
+        if adjoint is None:
+            return  # no image depends on the irradiance
+        with dr.suspend_grad(), self.integrator.exclusively():
+            found = adjoint.transport(list(fluence))
+        self._accumulate(found)
+
+    def _accumulate(self, found: dict[str, object]) -> None:
+        # Gradients must not be suspended, or nothing is added.
+        for key, grad in found.items():
+            dr.accum_grad(self.params[key], grad)
+
+
+class Irradiance(dr.CustomOp):
+    """The irradiance of a `SceneState`; its value does not matter."""
+
+    def eval(self, state: SceneState, parameters: dict) -> mi.Spectrum:
+        self._state = state
+        return dr.zeros(mi.Spectrum, state.voxels)
+
+    def backward(self) -> None:
+        self._state.solve(self.grad_out())
+
+
+class SharedIrradiance:
+    """The variable of the irradiance of a state of the scene, for all images of it."""
+
+    def __init__(self, state: SceneState) -> None:
+        self.state = state
+        self.variable = dr.custom(Irradiance, state, dict(state.params))
+
+
+class Image(dr.CustomOp):
+    """An image that depends on the ``irradiance`` and on parameters; ``seed`` and ``spp`` are those
+    of the image and of its gradients.
+    """
+
+    def eval(
+        self,
+        shared: SharedIrradiance,
+        irradiance: mi.Spectrum,
+        parameters: dict,
+        sensor: mi.Sensor,
+        seed: tuple[int, int],
+        spp: tuple[int, int],
+    ) -> mi.TensorXf:
+        self._shared, self._sensor, self._seed, self._spp = shared, sensor, seed[1], spp[1]
+        state = shared.state
+        with dr.suspend_grad():
+            return state.integrator.render(state.scene, sensor, seed[0], spp[0], True, False)
+
+    def forward(self) -> None:
+        state = self._shared.state
+        state.integrator.render_forward(
+            state.scene, state.params, self._sensor, self._seed, self._spp
+        )
+
+    def backward(self) -> None:
+        found = self._shared.state.add_image(self.grad_out(), self._sensor, self._seed, self._spp)
+        # Dr.Jit visits only what has a gradient, and forgets that it was asked for.
+        self.set_grad_in("irradiance", mi.Spectrum(0) if found is None else found)
+
+
+def image(
+    integrator: DifferentiableIntegrator,
+    shared: SharedIrradiance | None,
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    sensor: mi.Sensor,
+    seed: tuple[int, int],
+    spp: tuple[int, int],
+) -> tuple[mi.TensorXf, SharedIrradiance]:
+    """An `Image` of which ``params`` receive gradients, and the irradiance that it shares with
+    others: the ``shared`` one if that is of the same state of the scene.
+    """
+    with integrator.exclusively():
+        if shared is None or not shared.state.is_state_of(scene, params):
+            shared = SharedIrradiance(SceneState(integrator, scene, params))
+    rest = dict(params), sensor, seed, spp
+    return dr.custom(Image, shared, shared.variable, *rest), shared
+
+
+def _variables(params: mi.SceneParameters) -> dict[str, list[int]]:
+    """The variables of Dr.Jit's graph of all parameters that carry gradients."""
+    return {key: graph_variables(params[key]) for key in enabled(params)}
