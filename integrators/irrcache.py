@@ -161,8 +161,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     boundaries around all of them, are rendered by ``volpath`` or, if the extinction differs
     strongly between the channels, ``volpathmis``.
 
-    Phase functions may be ``isotropic``, ``hg`` with :math:`|g|` up to 0.58, ``rayleigh``, or others
-    that depend only on the scattering angle and are as broad. For anisotropic phase functions, the cache
+    Phase functions may be ``isotropic``, ``hg`` with :math:`|g|` up to 0.58, ``rayleigh``, or
+    others that depend only on the scattering angle and are as broad. For anisotropic ones, the cache
     also stores spherical harmonics of the radiance up to degree 4, or 6 with delta-M (below), and,
     separately, the irradiance from suns, point lights and lamps, whose direction is known. With the
     solver ``sweep``, ``hg`` may have g up to 0.85 if ``max_depth`` is -1. Scattering into such a

@@ -57,7 +57,7 @@ def noise(size: int, seed: int) -> np.ndarray:
 
 
 def cumulus() -> dict:
-    """A cloud under a sun, all orders of scattering, forward scattering by delta-M."""
+    """A cloud under a sun, all orders of scattering, forward scattering."""
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 64)] * 3, indexing="ij")
     ball = 0.75 - np.sqrt(x**2 + y**2 + np.where(z < -0.3, 3, 1) * (z + 0.1) ** 2)
     density = 60 * np.clip(5 * (ball + 0.13 * noise(64, 3)), 0, 1)
@@ -70,7 +70,7 @@ def cumulus() -> dict:
             "direction": [-0.8, 0.5, -0.7],
             "irradiance": rgb(3, 3, 2.5),
         },
-        "cloud": medium(density, 0.999, phase={"type": "hg", "g": 0.8}),
+        "cloud": medium(density, 0.999, phase={"type": "hg", "g": 0.5}),
     }
 
 
@@ -96,28 +96,20 @@ def coloured_lights() -> dict:
     }
 
 
-def subsurface() -> dict:
-    """Marble, milk and jade: chromatic albedo and extinction, several media at once."""
-    materials = {
-        -1.15: ((18, 20, 24), (0.996, 0.99, 0.975)),
-        0.0: ((9, 6, 8), (0.93, 0.99, 0.955)),
-        1.15: ((10, 14, 22), (0.995, 0.96, 0.86)),
+def jade() -> dict:
+    """Extinction and albedo of their own in each channel, in closed form where it is opaque."""
+    interior = {
+        "type": "homogeneous",
+        "sigma_t": rgb(0.9, 0.6, 0.8),
+        "scale": 12,
+        "albedo": rgb(0.93, 0.99, 0.955),
     }
-    balls = {
-        f"ball{k}": {
-            "type": "sphere",
-            "center": [x, 0, 0],
-            "radius": 0.55,
-            "bsdf": {"type": "null"},
-            "interior": {"type": "homogeneous", "sigma_t": rgb(*sigma_t), "albedo": rgb(*albedo)},
-        }
-        for k, (x, (sigma_t, albedo)) in enumerate(materials.items())
-    }
-    return balls | {
-        "integrator": {"type": "irrcache", "max_depth": -1},
-        "sensor": camera([0, -5, 1.4], [0, 0, 0]),
+    return {
+        "integrator": {"type": "irrcache"},
+        "sensor": camera([0, -4.4, 1.4], [0, 0, 0]),
         "sky": {"type": "constant", "radiance": rgb(0.12, 0.15, 0.2)},
-        "sun": {"type": "directional", "direction": [1, 0.9, -0.8], "irradiance": rgb(4, 3.7, 3.2)},
+        "sun": {"type": "directional", "direction": [1, 0.6, -0.8], "irradiance": rgb(4, 3.7, 3.2)},
+        "ball": {"type": "sphere", "bsdf": {"type": "null"}, "interior": interior},
     }
 
 
@@ -201,7 +193,7 @@ def sky_gaps() -> dict:
 
 
 SCENES: tuple[Callable[[], dict], ...] = (
-    cumulus, coloured_lights, subsurface, fire, nebula, room, sky_gaps,
+    cumulus, coloured_lights, jade, fire, nebula, room, sky_gaps,
 )  # fmt: skip
 
 
