@@ -92,8 +92,12 @@ def _link_equations(app, name: str, source: list[str]) -> None:
     def links(found: re.Match) -> str:
         return re.sub(r"\((\d)\.(\d+)\)", link, found[0])
 
-    # Code, in blocks and in lines, stays as it is.
-    parts = re.split(r"(^```.*?^```|`[^`\n]+`)", source[0], flags=re.DOTALL | re.MULTILINE)
+    # Code and formulas, in blocks and in lines, stay as they are.
+    parts = re.split(
+        r"(^```.*?^```|^\$\$.*?^\$\$|`[^`\n]+`|\$[^$]+\$)",
+        source[0],
+        flags=re.DOTALL | re.MULTILINE,
+    )
     source[0] = "".join(p if i % 2 else _EQUATIONS.sub(links, p) for i, p in enumerate(parts))
 
 
