@@ -164,10 +164,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     Phase functions may be ``isotropic``, ``hg`` with :math:`|g|` up to 0.58, ``rayleigh``, or
     others that depend only on the scattering angle and are as broad. For anisotropic ones, the
     cache also stores spherical harmonics of the radiance up to degree 4, or 6 with delta-M (below),
-    and, separately, the irradiance from suns, point lights and lamps, whose direction is known. With the
-    solver ``sweep``, ``hg`` may have g up to 0.85 if ``max_depth`` is -1. Scattering into such a
-    sharp forward peak is then treated as unscattered (delta-M), also in ``transmittance`` and
-    alpha.
+    and, separately, the irradiance from suns, point lights and lamps, whose direction is known.
+    With the solver ``sweep``, ``hg`` may have g up to 0.85 if ``max_depth`` is -1. Scattering into
+    such a sharp forward peak is then treated as unscattered (delta-M), also in ``transmittance``
+    and alpha.
 
     Gradients (``dr.backward``) are computed by ``sigma_t`` and ``albedo`` of a medium and by the
     radiance of emitters, by solving the adjoint transport equation: for one isotropic medium in a

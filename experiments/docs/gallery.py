@@ -107,7 +107,7 @@ def jade() -> dict:
     return {
         "integrator": {"type": "irrcache"},
         "sensor": camera([0, -4.4, 1.4], [0, 0, 0]),
-        "sky": {"type": "constant", "radiance": rgb(0.12, 0.15, 0.2)},
+        "sky": {"type": "constant", "radiance": rgb(0.03, 0.035, 0.05)},
         "sun": {"type": "directional", "direction": [1, 0.6, -0.8], "irradiance": rgb(4, 3.7, 3.2)},
         "ball": {"type": "sphere", "bsdf": {"type": "null"}, "interior": interior},
     }
@@ -138,13 +138,13 @@ def nebula() -> dict:
     field = noise(64, 11)
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 64)] * 3, indexing="ij")
     radius = np.sqrt(x**2 + y**2 + z**2)
-    dust = np.exp(1.3 * field) * np.clip(8 * (0.95 - radius), 0, 1) * np.clip(3 * radius, 0, 1)
+    dust = np.exp(1.5 * field) * np.clip(8 * (0.95 - radius), 0, 1) * np.clip(3 * radius, 0, 1)
     albedo = np.stack([0.93 - 0.1 * np.tanh(field), 0.75 + 0.1 * field, 0.85 - 0 * field], axis=-1)
     return {
         "integrator": {"type": "irrcache"},
         "sensor": camera([2.4, -3.2, 1.2], [0, 0, 0], 36),
-        "star": {"type": "point", "position": [0.12, -0.1, 0.1], "intensity": rgb(9, 8, 10)},
-        "dust": medium(2.2 * dust, grid(np.clip(albedo, 0.1, 0.98))),
+        "star": {"type": "point", "position": [0.12, -0.1, 0.1], "intensity": rgb(1.0, 0.9, 1.15)},
+        "dust": medium(1.8 * dust, grid(np.clip(albedo, 0.1, 0.98))),
     }
 
 
