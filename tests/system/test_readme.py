@@ -111,3 +111,11 @@ def test_every_command_is_one():
                     _parser(words[1:]).parse_args(words[1:])
                 except SystemExit:
                     pytest.fail(f"{page}: {line}")
+
+
+def test_the_reference_has_every_command():
+    from mitsuba_irrcache.cli.main import COMMANDS
+
+    page = (ROOT / "docs/api/command-line.md").read_text()
+    for name, *_ in COMMANDS:
+        assert f"```{{command-output}} irrcache {name} --help\n" in page
