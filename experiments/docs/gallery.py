@@ -178,23 +178,7 @@ def room() -> dict:
     }
 
 
-def sky_gaps() -> dict:
-    """Single scattering in haze beneath gaps of a cloud layer, Rayleigh phase function."""
-    z = np.linspace(-1, 1, 72)[:, None, None]
-    layer = np.clip(14 * (gaussian_filter(noise(72, 21).mean(axis=0), 2) * 3.0 - 0.15), 0, 1)
-    density = 0.35 + 70 * layer[None] * np.exp(-(((z - 0.75) / 0.1) ** 2))
-    return {
-        "integrator": {"type": "irrcache", "max_depth": 2, "resolution": 144},
-        "sensor": camera([-1.2, -4.2, -0.7], [0, 0, -0.1], 36),
-        "sky": {"type": "constant", "radiance": rgb(0.03, 0.045, 0.08)},
-        "sun": {"type": "directional", "direction": [0.35, 0.1, -1], "irradiance": rgb(9, 8, 6.5)},
-        "haze": medium(density, 0.95, phase={"type": "rayleigh"}),
-    }
-
-
-SCENES: tuple[Callable[[], dict], ...] = (
-    cumulus, coloured_lights, jade, fire, nebula, room, sky_gaps,
-)  # fmt: skip
+SCENES: tuple[Callable[[], dict], ...] = (cumulus, coloured_lights, jade, fire, nebula, room)
 
 
 def main() -> None:
