@@ -34,7 +34,8 @@ mi.set_variant("llvm_ad_rgb")
 scene = mi.load_file(scene_path("cloud"), size=16)
 image = mi.TensorXf(mi.render(scene, spp=4))
 assert image.shape == (16, 16, 3) and 0.1 < float(mi.Float(image.array)[384]) < 10, image
-print(scene_path("cloud"), mitsuba_irrcache.__file__, sep="\n")
+print(scene_path("cloud"))
+print(mitsuba_irrcache.__file__)
 """
 
 
