@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-FOLDER = Path(__file__).parent
+from mitsuba_irrcache.errors import IrrcacheError
+
+_FOLDER = Path(__file__).parent
 
 
 def scene_path(name: str) -> str:
@@ -14,10 +16,10 @@ def scene_path(name: str) -> str:
         name: ``"cloud"``, a ball of fog under a white sky and a sun.
 
     Raises:
-        FileNotFoundError: the package has no scene of this name; the message lists those it has.
+        IrrcacheError: the package has no scene of this name; the message lists those it has.
     """
-    path = FOLDER / f"{name}.xml"
-    if path.name not in (there := {p.name for p in FOLDER.glob("*.xml")}):
-        names = ", ".join(sorted(f'"{n.removesuffix(".xml")}"' for n in there))
-        raise FileNotFoundError(f'there is no scene "{name}"; the package has {names}.')
-    return str(path)
+    known = {path.stem: str(path) for path in _FOLDER.glob("*.xml")}
+    if name not in known:
+        names = ", ".join(f'"{there}"' for there in sorted(known))
+        raise IrrcacheError(f'scene_path: there is no scene "{name}"; the package has {names}.')
+    return known[name]
