@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from mitsuba_irrcache.scenes import scene_path
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.scenes import scene_path
 
 FOLDER = Path(__file__).parents[2] / "scenes"
 
