@@ -2,10 +2,11 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+DOCS_READY := .venv/.ready-docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo paper test stress lint clean
+.PHONY: help setup demo paper test stress lint docs links gallery dist clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,6 +32,20 @@ lint: setup ## check style and format
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 
+# Warnings are errors. Executed notebooks are kept in build/.jupyter_cache and run again when edited.
+docs: $(DOCS_READY) ## build the documentation site into build/docs; QUICK=1: without running the notebooks
+	$(BIN)/python -m sphinx -W --keep-going -q $(if $(QUICK),-D nb_execution_mode=off) docs build/docs
+	@echo "open build/docs/index.html"
+
+links: $(DOCS_READY) ## check the addresses that the documentation links to; needs access to them
+	$(BIN)/python -m sphinx -b linkcheck -q -D nb_execution_mode=off docs build/links
+
+gallery: setup ## render the images of the gallery, 3 minutes
+	$(BIN)/python -m experiments.docs.gallery
+
+dist: setup ## build the sdist and the wheel into dist
+	$(BIN)/python -m build
+
 clean: ## remove .venv and everything that was built
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -47,4 +62,8 @@ $(READY): pyproject.toml | $(BIN)/pip
 	@echo "Installing the package and what it needs into .venv; this takes a minute or two"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[test]"
 	$(BIN)/python -m mitsuba_irrcache.machine.install_llvm
+	@touch $@
+
+$(DOCS_READY): $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
 	@touch $@

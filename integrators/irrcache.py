@@ -164,13 +164,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     boundaries around all of them, are rendered by ``volpath`` or, if the extinction differs
     strongly between the channels, ``volpathmis``.
 
-    Phase functions may be ``isotropic``, ``hg`` with |g| up to 0.58, ``rayleigh``, or others that
-    depend only on the scattering angle and are as broad. For anisotropic phase functions, the cache
-    also stores spherical harmonics of the radiance up to degree 4, or 6 with delta-M (below), and,
-    separately, the irradiance from suns, point lights and lamps, whose direction is known. With the
-    solver ``sweep``, ``hg`` may have g up to 0.85 if ``max_depth`` is -1. Scattering into such a
-    sharp forward peak is then treated as unscattered (delta-M), also in ``transmittance`` and
-    alpha.
+    Phase functions may be ``isotropic``, ``hg`` with :math:`|g|` up to 0.58, ``rayleigh``, or
+    others that depend only on the scattering angle and are as broad. For anisotropic ones, the
+    cache also stores spherical harmonics of the radiance up to degree 4, or 6 with delta-M (below),
+    and, separately, the irradiance from suns, point lights and lamps, whose direction is known.
+    With the solver ``sweep``, ``hg`` may have g up to 0.85 if ``max_depth`` is -1. Scattering into
+    such a sharp forward peak is then treated as unscattered (delta-M), also in ``transmittance``
+    and alpha.
 
     Gradients (``dr.backward``) are computed by ``sigma_t`` and ``albedo`` of a medium and by the
     radiance of emitters, by solving the adjoint transport equation: for one isotropic medium in a
@@ -271,7 +271,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     @property
     def cache_spp(self) -> int:
-        """Target number of samples per cache voxel; 0: chosen automatically.
+        """Target number of samples per cache voxel, or 0 to have it chosen.
 
         After an increase the next rendering refines the cache: it continues the random stream and
         reuses all existing samples.

@@ -16,7 +16,7 @@ from mitsuba_irrcache.pipeline.progressive import render_progressive  # noqa: E4
 from . import _register  # noqa: E402,F401
 from .errors import CacheFileError, IrrcacheError, UnsupportedSceneError  # noqa: E402
 
-__version__ = "0.1.0"
+__version__ = "0.1.0"  # pyproject.toml reads it
 
 __all__ = [
     "CacheFileError",

@@ -357,14 +357,15 @@ class IrradianceCache:
                 f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
             )
         attributes = ("max_depth", "channels", "batch", "correlated", "moments")
-        if self.grid.shape != other.grid.shape or any(
-            getattr(self, name) != getattr(other, name) for name in attributes
-        ):
-            raise IrrcacheError(
-                f"IrradianceCache.merge: shape {self.grid.shape} with max_depth {self.max_depth} "
-                "does not fit "
-                f"shape {other.grid.shape} with max_depth {other.max_depth}."
+        mine = {"shape": self.grid.shape} | {name: getattr(self, name) for name in attributes}
+        its = {"shape": other.grid.shape} | {name: getattr(other, name) for name in attributes}
+        if mine != its:
+            differences = ", ".join(
+                f"{name} {mine[name]} does not fit {name} {its[name]}"
+                for name in mine
+                if mine[name] != its[name]
             )
+            raise IrrcacheError(f"IrradianceCache.merge: {differences}.")
         common = sorted(self.streams.keys() & other.streams.keys())
         if common:
             raise IrrcacheError(

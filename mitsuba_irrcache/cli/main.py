@@ -10,6 +10,7 @@ from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
+from mitsuba_irrcache import __version__
 from mitsuba_irrcache.errors import IrrcacheError, origin, original_message
 from mitsuba_irrcache.machine.extras import missing_package
 
@@ -84,6 +85,7 @@ def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="irrcache", description="Irradiance caching for participating media in Mitsuba 3."
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for name, path, text, _ in COMMANDS:
         command = commands.add_parser(name, help=text)

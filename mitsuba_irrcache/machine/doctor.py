@@ -27,6 +27,7 @@ from mitsuba_irrcache.machine.memory import available_memory, total_memory
 from mitsuba_irrcache.machine.variants import SUPPORTED, require_variant
 
 DEFAULT_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+DEVELOPMENT = ("test", "docs")  # extras that users have no need for
 
 _EXTENSIONS = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512vl", "asimd", "sve")
 _OPTIX_FILES = (
@@ -121,7 +122,7 @@ def examine_system() -> dict[str, Any]:
 
 
 def examine_packages() -> list[dict[str, Any]]:
-    """Every required or optional package with its version and whether it is sufficient."""
+    """Every package that users need or may want, its version and whether it is sufficient."""
     return [
         {
             "name": requirement.name,
@@ -131,6 +132,7 @@ def examine_packages() -> list[dict[str, Any]]:
             "needed_by": extra,
         }
         for extra in ("", *versions.extras())
+        if extra not in DEVELOPMENT
         for requirement in versions.requirements(extra)
     ]
 

@@ -113,13 +113,15 @@ def working(monkeypatch):
     monkeypatch.setattr(doctor, "_probe", lambda variant, environment: "")
 
 
-def test_the_doctor_lists_all_extras(working, capsys):
+def test_the_doctor_lists_all_extras_for_users(working, capsys):
     assert main(["doctor", "-m", "llvm_ad_rgb"]) == 0
     printed = capsys.readouterr().out
     assert printed.rstrip().endswith("All is well.")
+    assert set(doctor.DEVELOPMENT) < set(versions.extras())
     for extra in versions.extras():
+        assert (f"[{extra}]" in printed) == (extra not in doctor.DEVELOPMENT)
         for requirement in versions.requirements(extra):
-            assert requirement.name in printed and f"[{extra}]" in printed
+            assert requirement.name in printed or extra in doctor.DEVELOPMENT
     assert "viser" in printed
 
 

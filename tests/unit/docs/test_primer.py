@@ -99,6 +99,12 @@ def test_links_and_images_lead_to_files(page):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
+@pytest.mark.parametrize("page", MARKDOWN, ids=lambda page: str(page.relative_to(ROOT)))
+def test_no_line_is_taken_for_a_comment(page):
+    """MyST leaves out lines that begin with a per cent sign."""
+    assert not re.findall(r"^%.*", page.read_text(), re.MULTILINE)
+
+
 CONSTANTS = [
     ("2-representation", r"\\frac\{\((\d+) h\)\^2\}", (falloff.REACH,)),
     ("4-sweep", r"4\\pi \\cdot ([\d.]+)\) < 1", (multigrid.THIN,)),
