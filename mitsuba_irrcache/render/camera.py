@@ -26,7 +26,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.film import CameraSampler, scattered_rays
 from mitsuba_irrcache.render.raymarch import Projection
-from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance, has_surfaces
+from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance
 from mitsuba_irrcache.render.surface_paths import SampledEmitters, SurfacePaths
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
@@ -218,7 +218,8 @@ class TracedCameraRays:
         #: what irradiance on surfaces is computed with. An object that outlives the scene must not
         #: hold its emitters: Dr.Jit would call them without their shapes.
         self._emitters: SampledEmitters | None = None
-        if max_depth < 0 and len(projections) == len(description.media.grids):
+        all_visible = len(projections) == len(description.media.grids)
+        if max_depth < 0 and all_visible and description.has_surfaces:
             self._emitters = SampledEmitters(description.emitters)
         self._surfaces: SurfaceIrradiance | None = None
         #: whether the current image uses irradiance on surfaces
@@ -241,7 +242,7 @@ class TracedCameraRays:
         width, height = (int(n) for n in sensor.film().crop_size())
         samples = width * height * (spp or sensor.sampler().sample_count())
         self.caches_surfaces = False
-        if self._emitters is None or samples < FEWEST_SAMPLES or not has_surfaces(scene):
+        if self._emitters is None or samples < FEWEST_SAMPLES:
             return
         if self._surfaces is None:
             self._surfaces = SurfaceIrradiance(self._paths(), seed)

@@ -34,6 +34,8 @@ MOST_NODES = 1 << 18
 GENERATIONS = 4
 #: Gather rays of a launch, at most.
 LANES = 1 << 21
+#: Smallest cosine between the normal of a node's surface and the axis along which it was found.
+MIN_SLOPE = 0.3
 #: Relative change of the irradiances at which the iteration ends, and the most iterations.
 CONVERGED, MOST_ITERATIONS = 1e-4, 500
 
@@ -41,20 +43,22 @@ CONVERGED, MOST_ITERATIONS = 1e-4, 500
 class SurfaceIrradiance:
     """The cached irradiance on the surfaces of a scene."""
 
-    def __init__(self, paths: SurfacePaths, seed: int) -> None:
+    def __init__(
+        self, paths: SurfacePaths, seed: int, groups: Sequence[tuple[int, int, int]] = ()
+    ) -> None:
+        """``groups`` are those of the nodes that ``paths`` have already: the first of consecutive
+        nodes, the end, and the number of rays that gather radiance.
+        """
         self.paths, self.nodes, self.seed = paths, paths.nodes, seed
         self._seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self._channels = range(dr.size_v(mi.Spectrum))
-        #: the first of consecutive nodes, the end, and the number of rays that gather radiance
-        self._groups: list[tuple[int, int, int]] = []
+        self._groups = list(groups)
         self._exchange: list[Exchange] = []
         self._gathered = 0  # groups
 
     def renewed(self, paths: SurfacePaths) -> SurfaceIrradiance:
         """The same nodes, with irradiance that is gathered anew along ``paths``."""
-        new = SurfaceIrradiance(paths, self.seed)
-        new._groups = list(self._groups)
-        return new
+        return SurfaceIrradiance(paths, self.seed, self._groups)
 
     def prepare(self, scene: mi.Scene, ray: mi.Ray3f, pointer: mi.MediumPtr) -> None:
         """Create the nodes that camera rays like these need, and compute their irradiance."""
@@ -220,14 +224,6 @@ def _joined(parts: Sequence) -> object:
     return dr.concat(list(parts))
 
 
-def has_surfaces(scene: mi.Scene) -> bool:
-    """Whether any shape is more than the boundary of a medium."""
-    return any(
-        shape.bsdf() is not None and not is_null(int(shape.bsdf().flags()))
-        for shape in scene.shapes()
-    )
-
-
 @symbolic
 def _first_surface(scene: mi.Scene, ray: mi.Ray3f, length: mi.Float):
     """Find the first surface along ``ray`` that is not null and reflects diffusely.
@@ -254,7 +250,3 @@ def _first_surface(scene: mi.Scene, ray: mi.Ray3f, length: mi.Float):
         crossings += 1
         active &= crossings < MOST_CROSSINGS
     return position, (geometric, shading), found
-
-
-#: Smallest cosine between the normal of a node's surface and the axis along which it was found.
-MIN_SLOPE = 0.3

@@ -81,7 +81,15 @@ def compile_scene(scene: mi.Scene, emission: Emission | None = None) -> SceneDes
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
-    return SceneDescription(Media(grids), visible, emitters, brightest)
+    return SceneDescription(Media(grids), visible, emitters, brightest, _has_surfaces(scene))
+
+
+def _has_surfaces(scene: mi.Scene) -> bool:
+    """Whether any shape is more than the boundary of a medium."""
+    return any(
+        shape.bsdf() is not None and not is_null(int(shape.bsdf().flags()))
+        for shape in scene.shapes()
+    )
 
 
 def _check_general(scene: mi.Scene, media: dict[mi.Medium, list[mi.Shape]]) -> None:

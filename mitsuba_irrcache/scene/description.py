@@ -21,12 +21,14 @@ class SceneDescription:
         emitters: the emitters by their kind.
         brightest: radiance that no emitter exceeds; None where no rays are traced, see
             `MediumGrid.is_traced`.
+        has_surfaces: whether any shape is more than the boundary of a medium.
     """
 
     media: Media
     visible: tuple[MediumGrid, ...]
     emitters: EmittersByKind
     brightest: mi.Float | None = None
+    has_surfaces: bool = False
 
     @property
     def emits(self) -> bool:
