@@ -65,7 +65,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - |string|
        - How the cache is computed: ``sweep`` (discrete ordinates along long characteristics that
          all voxels share), ``path`` (Monte Carlo path tracing from every voxel), or ``auto``:
-         ``sweep`` unless surfaces or other media are among the voxels. The log states the choice
+         ``sweep`` wherever it supports the scene (see below). The log states the choice
          and its reason. Whatever the solver, an opaque homogeneous medium without a ``resolution``
          has no cache but is treated as a half-space. (Default: ``auto``)
 
@@ -157,8 +157,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     direct light and follows mirrors, glass and glossy surfaces by one path. With other depths,
     surfaces are path traced. What they reflect is part of the ``background``. A scene with a single
     medium in a box or sphere, and only distant and point emitters, requires no ray tracing. The
-    solver ``sweep`` supports media in boxes or spheres without surfaces and other media among their
-    voxels; with surfaces elsewhere, it requires ``max_depth`` 2 or -1.
+    solver ``sweep`` supports media in boxes or spheres without other media among their voxels; with
+    surfaces, it requires ``max_depth`` 2 or -1, and where these reach into a medium, isotropic
+    scattering without emission.
     Unbounded media and sharp phase functions are rejected with an error that names them, and so are
     boundaries that overlap or contradict each other. Scenes without media, or with dielectric
     boundaries around all of them, are rendered by ``volpath`` or, if the extinction differs

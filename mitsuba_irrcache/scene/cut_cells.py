@@ -1,8 +1,9 @@
 """Lookups between voxels that lie on different sides of a surface.
 
 Interpolation in a cell, the box between eight voxel centres, would mix the irradiance of both sides
-of a surface that cuts it. Each cut cell has a plane that approximates the surface; a lookup weights
-only those voxels that lie on its own side of the plane.
+of a surface that cuts it. Each cut cell has a plane that approximates the surface, and a second one
+where surfaces meet at an edge; a lookup weights only those voxels that lie on its own side of both
+planes.
 """
 
 from __future__ import annotations
@@ -26,17 +27,21 @@ SEGMENTS = [
     if sum(x != y for x, y in zip(CORNERS[a], CORNERS[b], strict=True)) in (1, 3)
 ]
 
+#: Cosine between the normals of two surfaces below which a cell has a plane for each of them.
+EDGE = 0.9
+
 
 class CutCells:
-    """The cells of a cache over ``grid`` that surfaces intersect, and a plane for each of them."""
+    """The cells of a cache over ``grid`` that surfaces intersect, and their planes, one or two."""
 
     def __init__(self, scene: mi.Scene, grid: Grid) -> None:
         self.grid = Extension(grid).grid  #: the grid that lookups interpolate on
         self.cells = tuple(n - 1 for n in self.grid.sides)
         count = int((self.grid.resolution - 1).prod())
         cell = dr.arange(mi.UInt32, count)
-        cut, *plane = self._cut(scene, cell)
-        dr.eval(cut, plane)
+        nearest, plane, normal = self._plane(scene, cell, mi.Normal3f(0))
+        cut = nearest < dr.inf
+        dr.eval(cut, plane, normal)
         found = dr.compress(cut)
         #: number of cut cells; without any, no lookups are corrected
         self.count = dr.width(found)
@@ -45,15 +50,22 @@ class CutCells:
         number = dr.arange(mi.UInt32, self.count) + 1
         self._number = dr.zeros(mi.UInt32, count)
         dr.scatter(self._number, number, found)
-        self._planes = dr.zeros(mi.Float, 4 * (self.count + 1))
-        kept = mi.Vector4f([dr.gather(mi.Float, v, found) for v in plane])
-        dr.scatter(self._planes, kept, number)
-        dr.eval(self._number, self._planes)
+        nearest, other, _ = self._plane(scene, found, dr.gather(mi.Normal3f, normal, found))
+        # A plane that all positions are in front of, where there is no edge.
+        everywhere = mi.Vector4f(0, 0, 0, 1)
+        other = dr.select(nearest < dr.inf, other, everywhere)
+        planes = dr.gather(mi.Vector4f, plane, found), other
+        self._planes, self._others = (dr.zeros(mi.Float, 4 * (self.count + 1)) for _ in range(2))
+        for data, values in zip((self._planes, self._others), planes, strict=True):
+            dr.scatter(data, values, number)
+        dr.eval(self._number, self._planes, self._others)
 
     @symbolic
-    def _cut(self, scene: mi.Scene, cell: mi.UInt32):
-        """Whether surfaces cut the cells, and the planes g s + c = 0 tangent to the surfaces at the
-        points nearest to the cells' centres; s is in voxels, 0 at the centre of the first one.
+    def _plane(self, scene: mi.Scene, cell: mi.UInt32, known: mi.Normal3f):
+        """The planes g s + c = 0 tangent to the surfaces at the points nearest to the cells'
+        centres, among those whose normals are not about parallel to the ``known`` ones (0: all); s
+        is in voxels, 0 at the centre of the first one. Also returns the distances of these points,
+        infinite where there is none, and the normals.
         """
         sides = [Divisor(int(n) - 1) for n in self.grid.resolution[:2]]
         first = mi.Point3f(*unravelled(cell, sides)) + 0.5
@@ -69,6 +81,7 @@ class CutCells:
             ray.maxt = length
             si = scene.ray_intersect(ray)
             solid = ~is_null(si.bsdf().flags()) | (si.shape.emitter() != None)  # noqa: E711
+            solid &= dr.abs(dr.dot(si.n, known)) < EDGE
             distance = dr.norm(si.p - middle)
             nearer = si.is_valid() & solid & (distance < nearest)
             nearest = dr.select(nearer, distance, nearest)
@@ -82,7 +95,7 @@ class CutCells:
             dr.dot(normal, self.grid.world.vector(mi.Vector3f(0, 0, 1))),
         )
         offset = dr.dot(normal, middle - hit) - dr.dot(steps, first)
-        return nearest < dr.inf, steps.x, steps.y, steps.z, offset
+        return nearest, mi.Vector4f(steps.x, steps.y, steps.z, offset), normal
 
     @symbolic
     def corrected(
@@ -90,7 +103,7 @@ class CutCells:
     ):
         """Correct ``phi``, the value of ``field`` at the world position ``p``, in cut cells.
 
-        There it becomes the mean of the voxels on the same side of the plane as ``p``.
+        There it becomes the mean of the voxels on the same side of the planes as ``p``.
         """
         s = self._clamped(p)
         cell = self._cell(s)
@@ -98,8 +111,11 @@ class CutCells:
         index = mi.UInt32((lower.z * self.cells[1] + lower.y) * self.cells[0] + lower.x)
         number = dr.gather(mi.UInt32, self._number, index, active)
         if active & (number > 0):
-            plane = dr.gather(mi.Vector4f, self._planes, number)
-            phi = self._one_sided(field, plane, s, lower, phi)
+            planes = (
+                dr.gather(mi.Vector4f, self._planes, number),
+                dr.gather(mi.Vector4f, self._others, number),
+            )
+            phi = self._one_sided(field, planes, s, lower, phi)
         return phi
 
     def _clamped(self, p: mi.Point3f) -> mi.Point3f:
@@ -115,29 +131,37 @@ class CutCells:
     def _one_sided(
         self,
         field: RootField | ExtendedField,
-        plane: mi.Vector4f,
+        planes: tuple[mi.Vector4f, mi.Vector4f],
         s: mi.Point3f,
         lower: mi.Vector3i,
         phi: mi.Float | mi.Color3f,
     ) -> mi.Float | mi.Color3f:
-        """Return the mean of the voxels on the side of ``s`` with trilinear weights.
-
-        ``phi`` if there are none.
+        """Return the mean of the voxels on the side of ``s`` with trilinear weights: with respect
+        to both planes, to the first one if there are none, ``phi`` if there are none then.
         """
-        gradient = mi.Vector3f(plane.x, plane.y, plane.z)
-        ahead = dr.dot(gradient, s) + plane.w > 0
+        ahead = [_is_ahead(plane, s) for plane in planes]
         fraction = s - mi.Point3f(lower)
         nx, ny, _ = self.grid.sides
-        total, weights = dr.zeros(type(phi)), mi.Float(0)
+        totals, sums = [dr.zeros(type(phi)) for _ in planes], [mi.Float(0) for _ in planes]
         for corner in CORNERS:
             place = [n + c for n, c in zip(lower, corner, strict=True)]
-            side = dr.dot(gradient, mi.Point3f(*place)) + plane.w > 0
             parts = [f if c else 1 - f for f, c in zip(fraction, corner, strict=True)]
-            weight = dr.select(side == ahead, parts[0] * parts[1] * parts[2], 0)
-            total += weight * _roots(field, mi.UInt32((place[2] * ny + place[1]) * nx + place[0]))
-            weights += weight
-        known = weights > 1e-6
-        return dr.select(known, field.decoded(total / dr.select(known, weights, 1)), phi)
+            weight = parts[0] * parts[1] * parts[2]
+            value = _roots(field, mi.UInt32((place[2] * ny + place[1]) * nx + place[0]))
+            for i, plane in enumerate(planes):
+                same = _is_ahead(plane, mi.Point3f(*place)) == ahead[i]
+                weight = dr.select(same, weight, 0)
+                totals[i] += weight * value
+                sums[i] += weight
+        for total, weights in zip(totals, sums, strict=True):
+            known = weights > 1e-6
+            phi = dr.select(known, field.decoded(total / dr.select(known, weights, 1)), phi)
+        return phi
+
+
+def _is_ahead(plane: mi.Vector4f, s: mi.Point3f) -> mi.Bool:
+    """Whether voxel coordinates lie on the side of the ``plane`` to which its normal points."""
+    return dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), s) + plane.w > 0
 
 
 def _corner(index: mi.UInt32) -> mi.Vector3f:
