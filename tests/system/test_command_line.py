@@ -15,6 +15,7 @@ import pytest
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.cli.main import main
+from tests.support.scene_xml import FOG_IN_A_BOX
 
 SCENE = """<scene version="3.0.0">
     <default name="density" value="density.vol"/>
@@ -37,22 +38,11 @@ SCENE = """<scene version="3.0.0">
             <integer name="width" value="6"/> <integer name="height" value="6"/>
         </film>
     </sensor>
-    <shape type="cube" id="box">
-        <bsdf type="null"/>
-        <medium name="interior" type="heterogeneous" id="fog">
-            <volume name="sigma_t" type="gridvolume">
-                <string name="filename" value="$density"/>
-                <transform name="to_world">
-                    <translate value="-.5, -.5, -.5"/> <scale value="2"/>
-                </transform>
-            </volume>
-            <float name="albedo" value="0.8"/>
-        </medium>
-    </shape>
+    FOG
     <emitter type="constant"/>
     EXTRA
 </scene>
-"""
+""".replace("FOG", FOG_IN_A_BOX)
 
 
 @pytest.fixture(autouse=True)

@@ -13,6 +13,7 @@ from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.fit import Result, Settings, View, _roughness, fit
 from mitsuba_irrcache.io.mitsuba_vol import read_vol, write_vol
+from tests.support.scene_xml import FOG_IN_A_BOX
 
 CASE = Case(data=8, cache=8, depth=0.5)
 ORIGINS = ([5.0, 1.0, 0.0], [0.0, 2.0, 5.0], [-4.0, 1.0, -3.0], [1.0, -4.0, 3.0])
@@ -165,21 +166,10 @@ XML = """<scene version="3.0.0">
     <default name="density" value="start.vol"/>
     <integrator type="volpath"/>
     {sensors}
-    <shape type="cube">
-        <bsdf type="null"/>
-        <medium name="interior" type="heterogeneous">
-            <volume name="sigma_t" type="gridvolume">
-                <string name="filename" value="$density"/>
-                <transform name="to_world">
-                    <translate value="-.5, -.5, -.5"/> <scale value="2"/>
-                </transform>
-            </volume>
-            <float name="albedo" value="0.8"/>
-        </medium>
-    </shape>
+    FOG
     <emitter type="constant"/>
 </scene>
-"""
+""".replace("FOG", FOG_IN_A_BOX)
 SENSOR = """<sensor type="perspective">
     <transform name="to_world"> <lookat origin="{}, {}, {}" target="0,0,0" up="0,1,0"/> </transform>
     <film type="hdrfilm"> <integer name="width" value="12"/> <integer name="height" value="12"/>

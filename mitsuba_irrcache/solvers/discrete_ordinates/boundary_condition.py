@@ -126,9 +126,6 @@ class IncomingRadiance:
         self.crossings = boundary.crossings(tracks, ordinates)
         parameters = self._parameters(directions, parts, weights)
         found = _trace_cells(boundary, self, *parameters, paths, seed)
-        if self.crossings is not None and self.crossings.count:
-            of_crossings = _trace_crossings(boundary, self, *parameters, paths, seed)
-            found = _joined(found, of_crossings)
         #: for each channel: straight from emitters, in the parts of `has_emitters`; all that does
         #: not depend on phi; factors of phi. And the voxels of phi, and the directions in which
         #: radiance leaves these (None for isotropic scattering).
@@ -375,22 +372,27 @@ def _trace_cells(
     paths: bool,
     seed: tuple[int, int, int],
 ) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
-    """What enters along the tracks of all cells, both ways in turn; see `IncomingRadiance`."""
+    """What enters along the tracks of all cells and then of all crossings, both ways in turn; see
+    `IncomingRadiance`.
+    """
     way, weight, hit, ray, rng = incoming.sample_rays(parameters, seed)
     pointer = probe(boundary.scene, ray.o, ray.d)
-    return _trace(boundary, incoming, (way, weight, hit, ray, rng, pointer), distant, paths)
+    rays = way, weight, hit, ray, rng, pointer
+    found = _trace(boundary, incoming, rays, distant, paths)
+    if incoming.crossings is not None and incoming.crossings.count:
+        rays = _crossing_rays(boundary, incoming.crossings, parameters, seed)
+        found = _joined(found, _trace(boundary, incoming, rays, distant, paths))
+    return found
 
 
-def _trace_crossings(
+def _crossing_rays(
     boundary: SurfaceBoundary,
-    incoming: IncomingRadiance,
+    crossings: SurfaceCrossings,
     parameters: tuple[mi.UInt32, mi.Float],
-    distant: list[mi.Float],
-    paths: bool,
     seed: tuple[int, int, int],
-) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
-    """The same where tracks leave surfaces among the voxels."""
-    way, hit, ray = incoming.crossings.rays()
+) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Ray3f, mi.PCG32, mi.MediumPtr]:
+    """What `_trace` needs where tracks leave surfaces among the voxels."""
+    way, hit, ray = crossings.rays()
     weight = dr.gather(mi.Float, parameters[1], (way >> 1) * len(_REALS) + _REALS.index("weight"))
     *batch, use = seed
     stream = hashed_seed(batch)[0] + dr.opaque(mi.UInt32, use + CROSSING_STREAM)
@@ -398,7 +400,7 @@ def _trace_crossings(
     rng = random_stream(mi.sample_tea_32(lanes, stream))
     pointer = dr.zeros(mi.MediumPtr, dr.width(way))
     pointer = dr.select(True, boundary.pointer, pointer)
-    return _trace(boundary, incoming, (way, weight, hit, ray, rng, pointer), distant, paths)
+    return way, weight, hit, ray, rng, pointer
 
 
 def _joined(first: tuple, second: tuple) -> tuple:
