@@ -28,7 +28,6 @@ from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
 from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.occluders import obstacle
 from mitsuba_irrcache.solvers.base import Progress
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merged
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
@@ -106,7 +105,7 @@ class Sweep:
         self._medium = medium
         # The tracks come first: `occupied_box` evaluates the coordinates of all voxels, which the
         # sample points would otherwise share and store.
-        self._surfaces = _surfaces_among(scene, medium, cache)
+        self._surfaces = _surfaces_among(scene, cache)
         self._prepare_tracks(pause)
         self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
         #: mean of 1/r^2 over a voxel, over its value at the sample point, in multiple scattering:
@@ -164,6 +163,12 @@ class Sweep:
                 extinction = resampled(medium, medium.sigma_t, grid)
             self._sigma_t = self._at_active(extinction)
             self._albedo = collision_albedo(medium, grid, cache.active)
+            if self._surfaces is not None:
+                # Without it, corrections from coarser grids would leave traces of irradiance within
+                # objects, which lookups next to them take for that of their neighbours.
+                enclosed = dr.gather(mi.Bool, cache.voxel_classes.enclosed, cache.active)
+                self._albedo = [dr.select(enclosed, 0, albedo) for albedo in self._albedo]
+                dr.eval(self._albedo)
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Adds ``samples`` ordinates per voxel, a multiple of the cache's batch.
@@ -462,16 +467,11 @@ class Sweep:
         return [place + c for c in range(len(channels))]
 
 
-def _surfaces_among(
-    scene: mi.Scene, medium: MediumGrid, cache: IrradianceCache
-) -> SurfaceVoxels | None:
+def _surfaces_among(scene: mi.Scene, cache: IrradianceCache) -> SurfaceVoxels | None:
     """The voxels near surfaces, None where there are none in the box of the active voxels."""
-    if medium.is_isolated:
+    if cache.voxel_classes is None:
         return None
-    box = occupied_box(cache.grid, cache.active)
-    if obstacle(scene, cache.grid, *box) is None:
-        return None
-    surfaces = SurfaceVoxels(scene, cache.grid, *box)
+    surfaces = SurfaceVoxels(scene, cache.grid, *occupied_box(cache.grid, cache.active))
     return surfaces if surfaces.count else None
 
 
