@@ -41,8 +41,6 @@ class FilmAdjoint:
         self._seed, self._spp = seed, spp or sensor.sampler().sample_count()
         self._frame = SampledFilm(self._film, self._spp, LANES)
         self.colour, self.alpha = _planes(self._film, grad)
-        #: the seed as a number: wrapping functions pass it as an array
-        self.seed = int(np.array(seed).ravel()[0])
         #: medium around the sensor
         self.medium = sensor.get_medium()
         #: numbers of pixels, with those beside the image, and of camera samples

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import graph_variables
@@ -31,14 +32,7 @@ class DifferentiableIntegrator(Protocol):
     ) -> mi.TensorXf:
         """The method of Mitsuba's integrators."""
 
-    def render_forward(
-        self,
-        scene: mi.Scene,
-        params: mi.SceneParameters,
-        sensor: mi.Sensor,
-        seed: int,
-        spp: int,
-    ) -> mi.TensorXf:
+    def render_forward(self, scene: mi.Scene, params: mi.SceneParameters) -> mi.TensorXf:
         """The method of Mitsuba's integrators."""
 
     def exclusively(self) -> AbstractContextManager:
@@ -94,14 +88,14 @@ class SceneState:
         solve.
         """
         with dr.suspend_grad(), self.integrator.exclusively():
-            film = FilmAdjoint(sensor, grad, seed, spp)
             shared = not self._is_solved and self._is_current
             adjoint = self._adjoint if shared else None
             if adjoint is None:
-                adjoint = self.integrator.adjoint(
-                    self.scene, self.params, list(self._identity), film.seed
-                )
-            found, fluence = adjoint.view(film)
+                # Wrapping functions pass the seed as an array.
+                number = int(np.array(seed).ravel()[0])
+                keys = list(self._identity)
+                adjoint = self.integrator.adjoint(self.scene, self.params, keys, number)
+            found, fluence = adjoint.view(FilmAdjoint(sensor, grad, seed, spp))
             rest = {}
             if not shared and fluence is not None:
                 rest = adjoint.transport(fluence)
@@ -121,6 +115,10 @@ class SceneState:
             found = adjoint.transport(list(fluence))
         self._accumulate(found)
 
+    def refuse_forward(self) -> None:
+        """Raise the error of the integrator for derivatives in forward mode."""
+        self.integrator.render_forward(self.scene, self.params)
+
     def _accumulate(self, found: dict[str, object]) -> None:
         # Gradients must not be suspended, or nothing is added.
         for key, grad in found.items():
@@ -133,6 +131,9 @@ class Irradiance(dr.CustomOp):
     def eval(self, state: SceneState, parameters: dict) -> mi.Spectrum:
         self._state = state
         return dr.zeros(mi.Spectrum, state.voxels)
+
+    def forward(self) -> None:
+        self._state.refuse_forward()
 
     def backward(self) -> None:
         self._state.solve(self.grad_out())
@@ -166,10 +167,7 @@ class Image(dr.CustomOp):
             return state.integrator.render(state.scene, sensor, seed[0], spp[0], True, False)
 
     def forward(self) -> None:
-        state = self._shared.state
-        state.integrator.render_forward(
-            state.scene, state.params, self._sensor, self._seed, self._spp
-        )
+        self._shared.state.refuse_forward()
 
     def backward(self) -> None:
         found = self._shared.state.add_image(self.grad_out(), self._sensor, self._seed, self._spp)

@@ -323,7 +323,7 @@ MUTANTS = (
     Mutant(
         "interpolated roots do not keep the light",
         "cache/volume.py",
-        "values = conserving(self.grid, values, known, channels, share)",
+        "values = conserving(self.grid, values, known, channels, share, separated)",
         "values = values + 0",
         ("tests/system/test_point_lights.py",),
     ),
