@@ -148,12 +148,12 @@ def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
 @symbolic
 def first_surface(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: mi.Bool):
     """Find the distance from ``start`` to the first surface before ``stop`` that is not a null
-    boundary (0 without one), and whether there is one.
+    boundary (0 without one), its normal, and whether there is one.
     """
     length = dr.norm(stop - start)
     ray = mi.Ray3f(start, (stop - start) / dr.maximum(length, 1e-30))
     ray.maxt = mi.Float(length)
-    distance, found = mi.Float(0), mi.Bool(False)
+    distance, normal, found = mi.Float(0), mi.Normal3f(0), mi.Bool(False)
     crossed, crossings, active = mi.Float(0), mi.UInt32(0), mi.Bool(active) & (length > 0)
     while dr.hint(active, label="first surface"):
         si = scene.ray_intersect(ray, active)
@@ -161,12 +161,13 @@ def first_surface(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: 
         solid = active & (~is_null(si.bsdf().flags()) | (si.shape.emitter() != None))  # noqa: E711
         crossed = dr.norm(si.p - start)
         distance = dr.select(solid, crossed, distance)
+        normal = dr.select(solid, si.n, normal)
         found |= solid
         ray = si.spawn_ray(ray.d)
         ray.maxt = dr.maximum(length - crossed, 0)
         crossings += 1
         active &= ~solid & (crossings < MOST_CROSSINGS)
-    return distance, found
+    return distance, normal, found
 
 
 def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:

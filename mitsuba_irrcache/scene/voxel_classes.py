@@ -143,7 +143,7 @@ def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
     exists = at[axis] + 1 < mi.UInt32(grid.sides[axis])
     at[axis] = at[axis] + 1
     stop = grid.world.point(mi.Point3f(*at) + 0.5)
-    _, found = first_surface(scene, start, stop, exists)
+    *_, found = first_surface(scene, start, stop, exists)
     dr.eval(found)
     return found
 

@@ -79,7 +79,7 @@ class SurfaceVoxels:
         while dr.hint(active & (k < 27), label="nearest voxel"):
             at, there = _neighbour(self.grid, u, k)
             distance = dr.squared_norm(at - u)
-            _, hidden = first_surface(
+            *_, hidden = first_surface(
                 self.scene, p, self.grid.world.point(at), active & (distance < best)
             )
             nearer = ~hidden & (distance < best)
@@ -101,7 +101,8 @@ class SurfaceCrossings:
     ``records`` has four values for each: the positions ``first`` and ``last`` along the dominant
     axis, in slices from the middle of the segment, and whether the parts before and behind them
     see the centre of the voxel. ``first`` > ``last`` where the segment is on the far side of a
-    surface but does not cross it.
+    surface but does not cross it. ``sources`` has two values for each, the voxels whose source
+    applies to the parts.
     """
 
     def __init__(self, surfaces: SurfaceVoxels, lower: np.ndarray, geometry: TrackGeometry) -> None:
@@ -110,16 +111,16 @@ class SurfaceCrossings:
         self._parameters = _parameters(geometry)
         count = surfaces.count
         self.slots = dr.zeros(mi.UInt32, ordinates * count)
-        records, found_at, total = [], [], 0
+        records, sources, found_at, total = [], [], [], 0
         most = max(1, LANES // max(count, 1))
         #: number of the first crossing of each ordinate, and of all
         self.starts = np.zeros(ordinates + 1, np.int64)
         for begin in range(0, ordinates, most):
             number, place = layer_and_index(count, min(most, ordinates - begin))
             number += dr.opaque(mi.UInt32, begin)
-            first, last, before, behind = _intersect(self, number, place)
+            first, last, before, behind, *voxels = _intersect(self, number, place)
             wanted = (first <= last) | (before < 1)
-            dr.eval(wanted, first, last, before, behind)
+            dr.eval(wanted, first, last, before, behind, voxels)
             index = dr.compress(wanted)
             width = dr.width(index)
             if not width:
@@ -130,21 +131,24 @@ class SurfaceCrossings:
             slot = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, total)
             dr.scatter(self.slots, slot + 1, lane)
             dr.eval(values, lane, self.slots)
+            sources.append(dr.ravel(mi.Vector2u(*(dr.gather(mi.UInt32, x, index) for x in voxels))))
+            dr.eval(sources)
             records.append(values)
             found_at.append(lane)
             total += width
         self.count = total
         self._lanes = concatenated(found_at) if found_at else mi.UInt32()
         self.records = concatenated(records) if records else mi.Float([0, 0, 0, 0])
+        self.sources = concatenated(sources) if sources else mi.UInt32([0, 0])
         if total:
             ordinate = np.array(self._lanes) // count
             self.starts[1:] = np.cumsum(np.bincount(ordinate, minlength=ordinates))
 
     def of_table(self, numbers: np.ndarray) -> TrackCrossings:
         """For a table of the same tracks, with these ``numbers`` of the ordinates."""
-        return TrackCrossings(
-            self.surfaces.number, numbers * self.surfaces.count, self.slots, self.records
-        )
+        first = numbers * self.surfaces.count
+        data = self.slots, self.records, self.sources
+        return TrackCrossings(self.surfaces.number, first, *data)
 
     def rays(self) -> tuple[mi.UInt32, mi.Bool, mi.Ray3f]:
         """For each crossing, both ways in turn: the number of the way (two for each ordinate),
@@ -229,8 +233,8 @@ def _intersect(crossings: SurfaceCrossings, number: mi.UInt32, place: mi.UInt32)
     """Intersect segments with surfaces; see `SurfaceCrossings`."""
     segment, scene = _Segment(crossings, number, place), crossings.surfaces.scene
     slice_length = dr.norm(segment.step)
-    near, hit = first_surface(scene, segment.start, segment.end, mi.Bool(True))
-    far, _ = first_surface(scene, segment.end, segment.start, hit)
+    near, _, hit = first_surface(scene, segment.start, segment.end, mi.Bool(True))
+    far, *_ = first_surface(scene, segment.end, segment.start, hit)
     first = dr.select(hit, near / slice_length - segment.back, BEYOND)
     last = dr.select(hit, segment.ahead - far / slice_length, -BEYOND)
     last = dr.select(hit, dr.maximum(first, last), last)
@@ -238,11 +242,25 @@ def _intersect(crossings: SurfaceCrossings, number: mi.UInt32, place: mi.UInt32)
     middle_before = dr.select(hit, 0.5 * (first - segment.back), 0)
     middle_behind = 0.5 * (last + segment.ahead)
     is_cut = dr.gather(mi.Bool, crossings.surfaces.is_cut, segment.voxel)
-    _, hidden = first_surface(scene, segment.centre, segment.at(middle_before), is_cut | hit)
-    before = dr.select(hidden, mi.Float(0), 1)
-    _, hidden = first_surface(scene, segment.centre, segment.at(middle_behind), hit)
-    behind = dr.select(hidden, mi.Float(0), 1)
-    return first, last, before, behind
+    before, source_before = _side(crossings, segment, middle_before, is_cut | hit)
+    behind, source_behind = _side(crossings, segment, middle_behind, hit)
+    return first, last, before, behind, source_before, source_behind
+
+
+def _side(
+    crossings: SurfaceCrossings, segment: _Segment, position: mi.Float, active: mi.Bool
+) -> tuple[mi.Float, mi.UInt32]:
+    """Whether a position on a segment is on the same side of surfaces as the centre of its voxel,
+    and the voxel whose source applies there: else a neighbour on the far side, a voxel away from
+    the surface.
+    """
+    surfaces, p = crossings.surfaces, segment.at(position)
+    _, normal, hidden = first_surface(surfaces.scene, segment.centre, p, active)
+    normal = dr.select(dr.dot(normal, p - segment.centre) > 0, normal, -normal)
+    step = surfaces.grid.coordinates.vector(mi.Vector3f(normal))
+    step /= dr.maximum(dr.max(dr.abs(step)), 1e-30)
+    away = voxel_at(surfaces.grid, p + surfaces.grid.world.vector(step))
+    return dr.select(hidden, mi.Float(0), 1), dr.select(hidden, away, segment.voxel)
 
 
 def _parameters(geometry: TrackGeometry) -> tuple[mi.Int32, mi.Float]:

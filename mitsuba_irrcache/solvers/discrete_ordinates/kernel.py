@@ -501,13 +501,14 @@ class _PairSweep:
             )
         ]
         if self.crossings is not None:
+            whole = source if self._source_elsewhere else values
             crossed = [
                 _collide_at_surface(
-                    self, way, state, light, sent, halves, *result,
-                    self._slot(way, state, visit.active),
+                    self, way, state, light, halves, *result,
+                    self._slot(way, state, visit.active), whole,
                 )
-                for way, state, light, sent, halves, result, visit in zip(
-                    self.ways, states, radiance, sources, extinction, crossed, visits, strict=True
+                for way, state, light, halves, result, visit in zip(
+                    self.ways, states, radiance, extinction, crossed, visits, strict=True
                 )
             ]  # fmt: skip
         radiance, tallies = ([way[i] for way in crossed] for i in range(2))
@@ -593,9 +594,9 @@ class _PairSweep:
         way: _Way,
         state: _TrackState,
         radiance: list,
-        source: list,
         extinction: tuple,
         slot: mi.UInt32,
+        source: mi.Float,
     ) -> tuple[list, list]:
         """See `_collide_at_surface`."""
         # docs/primer, eq. (4.14)
@@ -604,23 +605,43 @@ class _PairSweep:
         lower, upper = (half * self.scale for half in extinction)
         begin = -dr.select(state.since_entry < 1, state.since_entry, 0.5)
         end, restart = (clipped(x, begin, 0.5) for x in (first, last))
-        # Parts on the far side of a surface attenuate nothing: their source is not the voxel's.
-        ahead = before * _depth(begin, end, lower, upper)
-        beyond = dr.select(crosses, behind, 0) * _depth(restart, mi.Float(0.5), lower, upper)
+        ahead = _depth(begin, end, lower, upper)
+        beyond = dr.select(crosses, _depth(restart, mi.Float(0.5), lower, upper), 0)
         shares = [absorbed(tau, decay(tau)) for tau in (ahead, beyond)]
         to_centre, from_surface = decay(-begin * lower), decay(maximum(-last, 0.0) * lower)
-        depth = self.solid_angle * (ahead + beyond) * self.area
+        # Parts on the far side of a surface are those of another voxel: they count for none, whose
+        # mean does not need them.
+        depth = self.solid_angle * (before * ahead + behind * beyond) * self.area
+        sources = self._part_sources(way, slot, source)
         carried, tallies = [], []
-        for x, sent, y in zip(radiance, source, left, strict=True):
-            lost = [(value - sent) * share for value, share in zip((x, y), shares, strict=True)]
+        for x, y, s, t in zip(radiance, left, *sources, strict=True):
+            lost = (x - s) * shares[0], (y - t) * shares[1]
             centre = dr.select(
                 ~crosses | (first > 0),
-                before * dr.fma(x - sent, to_centre, sent),
-                dr.select(last < 0, behind * dr.fma(y - sent, from_surface, sent), 0),
+                before * dr.fma(x - s, to_centre, s),
+                dr.select(last < 0, behind * dr.fma(y - t, from_surface, t), 0),
             )
             carried.append(dr.select(crosses, y - lost[1], x - lost[0]))
-            tallies.append(mi.Vector4f(0, centre, (lost[0] + lost[1]) * self.area, depth))
+            total = (before * lost[0] + behind * lost[1]) * self.area
+            tallies.append(mi.Vector4f(0, centre, total, depth))
         return carried, tallies
+
+    def _part_sources(self, way: _Way, slot: mi.UInt32, source: mi.Float) -> list[list[mi.Float]]:
+        """The sources in all channels that apply to the parts before and behind a surface."""
+        voxels, channels = self.crossings.source_voxels(slot, slot > 0), self.volume.channels
+        found = [
+            [
+                dr.gather(mi.Float, source, (voxel * channels + c) * 4, slot > 0) * self.weight
+                for c in range(channels)
+            ]
+            for voxel in (voxels.x, voxels.y)
+        ]
+        if way.number:
+            # Without a crossing there is only the part before.
+            record = self.crossings.record(slot, slot > 0)
+            crosses = record.x <= record.y
+            found = [_select(crosses, found[1], found[0]), found[0]]
+        return found
 
 
 @symbolic
@@ -643,17 +664,18 @@ def _collide_at_surface(
     way: _Way,
     state: _TrackState,
     radiance: list,
-    source: list,
     extinction: tuple,
     carried: list,
     tallies: list,
     slot: mi.UInt32,
+    source: mi.Float,
 ):
     """``carried`` and ``tallies``, the results of `_PairSweep._cross_voxel`, where no surface is
-    near; else the same for the parts of the track that belong to the voxel.
+    near; else the same for the parts of the track that belong to the voxel. ``source`` is a volume
+    with that of all voxels.
     """
     if slot > 0:
-        carried, tallies = sweep._cross_parts(way, state, radiance, source, extinction, slot)
+        carried, tallies = sweep._cross_parts(way, state, radiance, extinction, slot, source)
     return carried, tallies
 
 

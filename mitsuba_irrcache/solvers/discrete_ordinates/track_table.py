@@ -100,13 +100,20 @@ class TrackCrossings:
     """Crossings of the tracks of a table with surfaces among the voxels, see `SurfaceCrossings`."""
 
     def __init__(
-        self, number: mi.UInt32, first: np.ndarray, slots: mi.UInt32, records: mi.Float
+        self,
+        number: mi.UInt32,
+        first: np.ndarray,
+        slots: mi.UInt32,
+        records: mi.Float,
+        sources: mi.UInt32,
     ) -> None:
         """``number`` is 1 + the place of each voxel of the grid among those near surfaces, 0 for
         others; ``first`` (n) the index in ``slots`` of the first of these voxels for each pair.
-        ``slots`` has 1 + the index of the crossing in ``records``, 0 where there is none.
+        ``slots`` has 1 + the index of the crossing in ``records`` and ``sources``, 0 where there is
+        none.
         """
-        self._number, self._slots, self._records = number, slots, records
+        self._number, self._slots = number, slots
+        self._records, self._sources = records, sources
         # One more, since kernels that read an array of a single value are different ones.
         self._first = mi.UInt32([*first.tolist(), 0, 0])
 
@@ -122,6 +129,10 @@ class TrackCrossings:
     def record(self, slot: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """The record of the crossing with this `slot`."""
         return dr.gather(mi.Vector4f, self._records, slot - 1, active)
+
+    def source_voxels(self, slot: mi.UInt32, active: mi.Bool) -> mi.Vector2u:
+        """The voxels of the grid whose source applies to the parts of the crossing."""
+        return dr.gather(mi.Vector2u, self._sources, slot - 1, active)
 
 
 class BoundarySource:
