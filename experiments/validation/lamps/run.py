@@ -15,6 +15,7 @@ Rows and references are saved in output/lamps; ``--force`` discards the rows. No
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from time import process_time
@@ -98,31 +99,37 @@ def cells(name: str, settings: str, row: dict) -> list[str]:
     ]  # fmt: skip
 
 
-def main() -> None:
-    """Compute missing rows and print the table."""
-    parser = parser_of(__doc__)
+def tabulate(
+    description: str,
+    name: str,
+    cases: Iterable[str],
+    build: Callable[[str], tuple[dict, int]],
+    settings: dict[str, dict],
+) -> None:
+    """Compute missing rows of an experiment of this ``name`` and print the table."""
+    parser = parser_of(description)
     add_document(parser)
     parser.add_argument("--only", default="", help="cases whose name contains this")
     parser.add_argument("--seconds", type=float, default=40.0, help="of volpath for each case")
     args = parser.parse_args()
     begin()
     options = Options(output=args.output, force=args.force)
-    folder = options.folder("lamps")
+    folder = options.folder(name)
     store, rows = Store(folder / "results.json", options.force), []
-    for name in CASES:
-        if args.only not in name:
+    for case in cases:
+        if args.only not in case:
             continue
-        objects, depth = build(name)
-        file = folder / f"{re.sub('[^0-9a-z]+', '-', name)}.npy"
-        for title, settings in SETTINGS.items():
-            arguments = objects, depth, settings, args.seconds, file
-            row = store.row(f"{name}: {title}", partial(measure, *arguments))
-            rows.append(cells(name, title, row))
+        objects, depth = build(case)
+        file = folder / f"{re.sub('[^0-9a-z]+', '-', case)}.npy"
+        for title, chosen in settings.items():
+            arguments = objects, depth, chosen, args.seconds, file
+            row = store.row(f"{case}: {title}", partial(measure, *arguments))
+            rows.append(cells(case, title, row))
             print(" | ".join(rows[-1]), flush=True)
     if args.document:
         short = [[r[0], *r[2:]] for r in rows if r[1] == "defaults"]
-        replace_tables(args.document, {"lamps": Table("", [HEAD[0], *HEAD[2:]], short)})
+        replace_tables(args.document, {name: Table("", [HEAD[0], *HEAD[2:]], short)})
 
 
 if __name__ == "__main__":
-    main()
+    tabulate(__doc__, "lamps", CASES, build, SETTINGS)
