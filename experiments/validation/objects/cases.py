@@ -60,17 +60,16 @@ def two_sided(value: float) -> dict:
     return {"type": "twosided", "bsdf": grey(value)}
 
 
-def room() -> dict:
-    """Return white walls within the fog, with a lamp below the ceiling and a box."""
+def corner() -> dict:
+    """Return three walls in the fog, a lamp above them, and a box."""
     walls = {
-        "type": "cube",
-        "flip_normals": True,
-        "to_world": mi.ScalarTransform4f().scale(0.97),
-        "bsdf": grey(0.7),
+        "floor": box((0, -0.9, 0), (0.9, 0.03, 0.9), grey(0.7)),
+        "left": box((-0.9, 0, 0), (0.03, 0.9, 0.9), grey(0.6)),
+        "back": box((0, 0, -0.9), (0.9, 0.9, 0.03), grey(0.5)),
     }
     emitter = {"type": "area", "radiance": 10.0}
-    light = sheet((0, 0.9, 0), (0, -1, 0.001), 0.3, grey(0)) | {"emitter": emitter}
-    return {"walls": walls, "light": light, "box": box((0.3, -0.6, 0), (0.3, 0.36, 0.3), grey(0.7))}
+    light = sheet((0, 0.8, 0), (0, -1, 0.001), 0.3, grey(0)) | {"emitter": emitter}
+    return walls | {"light": light, "box": box((0.3, -0.5, 0), (0.3, 0.36, 0.3), grey(0.4))}
 
 
 #: Surfaces with emitters, the medium, and ``max_depth``.
@@ -104,7 +103,7 @@ CASES: dict[str, Callable[[], tuple[dict, dict, int]]] = {
         {"a": ball((0.2, 0.1, 0), 0.25, grey(0.5), emitter={"type": "area", "radiance": 3.0})},
         fog(2.0), -1,
     ),
-    "room filled with fog": lambda: (room(), fog(0.5), -1),
+    "corner of a room, fog, lamp": lambda: (corner(), fog(0.5), -1),
 }  # fmt: skip
 
 
