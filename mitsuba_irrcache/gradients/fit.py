@@ -29,7 +29,7 @@ from mitsuba_irrcache.machine.extras import require
 #: Directions of the cache, if the integrator does not set ``cache_spp``: from these shares of all
 #: steps on. Early steps do not need exact gradients.
 DIRECTIONS = ((0.0, 32), (0.6, 64), (0.85, 128))
-#: Those of L-BFGS, whose objective has to stay the same.
+#: Directions of the cache with L-BFGS, whose objective must be one function.
 LBFGS_DIRECTIONS = 64
 #: Decay rates and least denominator of Adam, and the share of its step size that the last has.
 DECAY, EPSILON, LAST_RATE = (0.9, 0.99), 1e-8, 0.1
