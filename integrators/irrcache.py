@@ -20,7 +20,7 @@ from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients import operations
 from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check
-from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
+from mitsuba_irrcache.gradients.parameters import enabled
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
 from mitsuba_irrcache.machine.versions import check_versions
@@ -454,7 +454,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         spp: int = 0,
     ) -> mi.TensorXf:
         """Refuse: gradients are computed in reverse mode only."""
-        refuse_all(enabled(params), "dr.forward was called", "Call dr.backward on a loss")
+        operations.refuse_forward(params)
 
     def render_backward(
         self,

@@ -41,8 +41,6 @@ class FilmAdjoint:
         self._seed, self._spp = seed, spp or sensor.sampler().sample_count()
         self._frame = SampledFilm(self._film, self._spp, LANES)
         self.colour, self.alpha = _planes(self._film, grad)
-        #: the seed as a number: wrapping functions pass it as an array
-        self.seed = int(np.array(seed).ravel()[0])
         #: medium around the sensor
         self.medium = sensor.get_medium()
         #: numbers of pixels, with those beside the image, and of camera samples
@@ -127,6 +125,11 @@ class FilmAdjoint:
                 for i, plane in enumerate(planes):
                     sums[i] = dr.fma(dr.gather(mi.Float, plane, place, inside), weight, sums[i])
         return sums
+
+
+def number_of(seed: object) -> int:
+    """The seed as a number; wrapping functions pass it as an array."""
+    return int(np.array(seed).ravel()[0])
 
 
 def _planes(film: mi.Film, grad: mi.TensorXf) -> tuple[list[mi.Float], mi.Float | None]:

@@ -17,8 +17,8 @@ import mitsuba as mi
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import graph_variables
 from mitsuba_irrcache.gradients.backward import ParameterAdjoint
-from mitsuba_irrcache.gradients.film import FilmAdjoint
-from mitsuba_irrcache.gradients.parameters import enabled
+from mitsuba_irrcache.gradients.film import FilmAdjoint, number_of
+from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
 
 
 class DifferentiableIntegrator(Protocol):
@@ -28,16 +28,6 @@ class DifferentiableIntegrator(Protocol):
 
     def render(
         self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, develop: bool, evaluate: bool
-    ) -> mi.TensorXf:
-        """The method of Mitsuba's integrators."""
-
-    def render_forward(
-        self,
-        scene: mi.Scene,
-        params: mi.SceneParameters,
-        sensor: mi.Sensor,
-        seed: int,
-        spp: int,
     ) -> mi.TensorXf:
         """The method of Mitsuba's integrators."""
 
@@ -94,14 +84,13 @@ class SceneState:
         solve.
         """
         with dr.suspend_grad(), self.integrator.exclusively():
-            film = FilmAdjoint(sensor, grad, seed, spp)
             shared = not self._is_solved and self._is_current
             adjoint = self._adjoint if shared else None
             if adjoint is None:
                 adjoint = self.integrator.adjoint(
-                    self.scene, self.params, list(self._identity), film.seed
+                    self.scene, self.params, list(self._identity), number_of(seed)
                 )
-            found, fluence = adjoint.view(film)
+            found, fluence = adjoint.view(FilmAdjoint(sensor, grad, seed, spp))
             rest = {}
             if not shared and fluence is not None:
                 rest = adjoint.transport(fluence)
@@ -133,6 +122,9 @@ class Irradiance(dr.CustomOp):
     def eval(self, state: SceneState, parameters: dict) -> mi.Spectrum:
         self._state = state
         return dr.zeros(mi.Spectrum, state.voxels)
+
+    def forward(self) -> None:
+        refuse_forward(self._state.params)
 
     def backward(self) -> None:
         self._state.solve(self.grad_out())
@@ -166,10 +158,7 @@ class Image(dr.CustomOp):
             return state.integrator.render(state.scene, sensor, seed[0], spp[0], True, False)
 
     def forward(self) -> None:
-        state = self._shared.state
-        state.integrator.render_forward(
-            state.scene, state.params, self._sensor, self._seed, self._spp
-        )
+        refuse_forward(self._shared.state.params)
 
     def backward(self) -> None:
         found = self._shared.state.add_image(self.grad_out(), self._sensor, self._seed, self._spp)
@@ -194,6 +183,11 @@ def image(
             shared = SharedIrradiance(SceneState(integrator, scene, params))
     rest = dict(params), sensor, seed, spp
     return dr.custom(Image, shared, shared.variable, *rest), shared
+
+
+def refuse_forward(params: mi.SceneParameters) -> None:
+    """Raise the error for derivatives in forward mode."""
+    refuse_all(enabled(params), "dr.forward was called", "Call dr.backward on a loss")
 
 
 def _variables(params: mi.SceneParameters) -> dict[str, list[int]]:
