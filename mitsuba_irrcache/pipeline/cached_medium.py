@@ -184,7 +184,7 @@ class CachedMedium:
         self._check_memory(grid, moments)
         warn_of_dense_border(medium, grid)
         active = active_voxels(medium, grid)
-        classes = solver.voxel_classes(scene, media, medium, grid)
+        classes = solver.voxel_classes(scene, media, medium, grid, active)
         if classes is not None:
             active = dr.compress(classes.readable & marked(grid, active))
         if medium.albedo.maximum == 0 or not self._is_lit:

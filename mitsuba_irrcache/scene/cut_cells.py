@@ -16,7 +16,7 @@ import mitsuba as mi
 from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import ExtendedField, Extension, RootField
-from mitsuba_irrcache.transport.path import is_null
+from mitsuba_irrcache.transport.path import is_solid
 
 CORNERS = list(itertools.product((0, 1), repeat=3))
 #: Segments in a cell that are intersected with surfaces, as pairs of `CORNERS`: its edges and
@@ -80,8 +80,7 @@ class CutCells:
             ray = mi.Ray3f(a, (b - a) / length)
             ray.maxt = length
             si = scene.ray_intersect(ray)
-            solid = ~is_null(si.bsdf().flags()) | (si.shape.emitter() != None)  # noqa: E711
-            solid &= dr.abs(dr.dot(si.n, known)) < EDGE
+            solid = is_solid(si) & (dr.abs(dr.dot(si.n, known)) < EDGE)
             distance = dr.norm(si.p - middle)
             nearer = si.is_valid() & solid & (distance < nearest)
             nearest = dr.select(nearer, distance, nearest)

@@ -13,7 +13,7 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.consistency import described
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, is_solid
 
 #: Offsets of the rays along each axis that detect surfaces: through the corners and the centre of
 #: each voxel's face.
@@ -135,7 +135,7 @@ def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
     while dr.hint(active, label="obstacles"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        solid = active & (~is_null(si.bsdf().flags()) | (si.shape.emitter() != None))  # noqa: E711
+        solid = active & is_solid(si)
         shape = dr.select(si.instance != None, si.instance, si.shape)  # noqa: E711
         found = dr.select(solid, shape, found)
         ray = si.spawn_ray(direction)
@@ -158,7 +158,7 @@ def first_surface(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: 
     while dr.hint(active, label="first surface"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        solid = active & (~is_null(si.bsdf().flags()) | (si.shape.emitter() != None))  # noqa: E711
+        solid = active & is_solid(si)
         crossed = dr.norm(si.p - start)
         distance = dr.select(solid, crossed, distance)
         normal = dr.select(solid, si.n, normal)

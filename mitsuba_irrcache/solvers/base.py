@@ -123,9 +123,11 @@ class Solver(ABC):
 
     @classmethod
     def voxel_classes(
-        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid
+        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> VoxelClasses | None:
-        """Classify the voxels of ``grid``; None if there cannot be surfaces among them."""
+        """Classify the voxels of ``grid``, of which lookups in the medium read the ``active`` ones;
+        None if there cannot be surfaces among them.
+        """
         return None
 
     @classmethod

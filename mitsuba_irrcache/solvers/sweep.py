@@ -125,12 +125,11 @@ class SweepSolver(Solver):
 
     @classmethod
     def voxel_classes(
-        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid
+        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> VoxelClasses | None:
-        if medium.is_isolated:
+        if medium.is_isolated or not dr.width(active):
             return None
-        active = active_voxels(medium, grid)
-        if not dr.width(active) or obstacle(scene, grid, *occupied_box(grid, active)) is None:
+        if obstacle(scene, grid, *occupied_box(grid, active)) is None:
             return None
         return VoxelClasses(scene, media, medium, grid)
 

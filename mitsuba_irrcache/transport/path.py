@@ -130,6 +130,11 @@ def is_null(flags: mi.UInt32) -> mi.Bool:
     return (flags & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
 
 
+def is_solid(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether a surface is more than the boundary of a medium: it scatters or emits."""
+    return ~is_null(si.bsdf().flags()) | (si.shape.emitter() != None)  # noqa: E711
+
+
 def medium_after(si: mi.SurfaceInteraction3f, direction: mi.Vector3f, pointer: mi.MediumPtr):
     """Return the medium behind a surface for a ray that is in the medium ``pointer`` before it."""
     return dr.select(si.is_medium_transition(), si.target_medium(direction), pointer)

@@ -22,7 +22,7 @@ from mitsuba_irrcache.scene.occluders import first_surface
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated, layer_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackCrossings, TrackGeometry
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_solid
 
 #: Rays along each edge of a voxel's face that detect surfaces in it.
 RAYS_PER_EDGE = 6
@@ -306,7 +306,7 @@ def _mark_hits(
     while dr.hint(active, label="surface voxels"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        solid = active & (~is_null(si.bsdf().flags()) | (si.shape.emitter() != None))  # noqa: E711
+        solid = active & is_solid(si)
         dr.scatter(marks, mi.UInt32(1), voxel_at(grid, si.p), solid)
         ray = si.spawn_ray(direction)
         ray.maxt = dr.maximum(length - dr.norm(si.p - start), 0)

@@ -561,23 +561,28 @@ class _PairSweep:
 
     def _crossing(self, way: _Way, slot: mi.UInt32, active: mi.Bool) -> tuple:
         """Where this way crosses surfaces, first and last, in slices from the middle, whether the
-        parts before and behind them belong to the voxel, and the radiance behind.
+        parts before and behind them belong to the voxel, the radiance behind, and the voxels whose
+        source applies to the parts.
         """
         first, last, before, behind = self.crossings.record(slot, active)
+        voxels = tuple(self.crossings.source_voxels(slot, active))
         if way.number:
             first, last, before, behind = -last, -first, behind, before
+            voxels = voxels[1], voxels[0]
             # Without a crossing there is only the part before.
-            before = dr.select(first > last, behind, before)
+            alone = first > last
+            before = dr.select(alone, behind, before)
+            voxels = dr.select(alone, voxels[1], voxels[0]), voxels[1]
         left = [mi.Float(0)] * self.volume.channels
         if self.boundary_source is not None:
             left = self.boundary_source.from_surface(slot, self._offsets, way.number, active)
-        return first, last, before, behind, left
+        return first, last, before, behind, left, voxels
 
     def _attenuated_parts(
         self, way: _Way, radiance: list, extinction: mi.Float, slot: mi.UInt32
     ) -> tuple[list, list, mi.Float]:
         """See `_attenuate_at_surface`."""
-        first, last, before, behind, left = self._crossing(way, slot, slot > 0)
+        first, last, before, behind, left, _ = self._crossing(way, slot, slot > 0)
         crosses = first <= last
         reaches, leaves = ~crosses | (first > 0), crosses & (last <= 0)
         to_middle = decay(maximum(-last, 0.0) * extinction * self.scale)
@@ -600,7 +605,7 @@ class _PairSweep:
     ) -> tuple[list, list]:
         """See `_collide_at_surface`."""
         # docs/primer, eq. (4.14)
-        first, last, before, behind, left = self._crossing(way, slot, slot > 0)
+        first, last, before, behind, left, voxels = self._crossing(way, slot, slot > 0)
         crosses = first <= last
         lower, upper = (half * self.scale for half in extinction)
         begin = -dr.select(state.since_entry < 1, state.since_entry, 0.5)
@@ -612,7 +617,11 @@ class _PairSweep:
         # Parts on the far side of a surface are those of another voxel: they count for none, whose
         # mean does not need them.
         depth = self.solid_angle * (before * ahead + behind * beyond) * self.area
-        sources = self._part_sources(way, slot, source)
+        channels = range(self.volume.channels)
+        sources = [
+            [self._source(source, voxel * len(channels) + c, slot > 0) for c in channels]
+            for voxel in voxels
+        ]
         carried, tallies = [], []
         for x, y, s, t in zip(radiance, left, *sources, strict=True):
             lost = (x - s) * shares[0], (y - t) * shares[1]
@@ -626,22 +635,9 @@ class _PairSweep:
             tallies.append(mi.Vector4f(0, centre, total, depth))
         return carried, tallies
 
-    def _part_sources(self, way: _Way, slot: mi.UInt32, source: mi.Float) -> list[list[mi.Float]]:
-        """The sources in all channels that apply to the parts before and behind a surface."""
-        voxels, channels = self.crossings.source_voxels(slot, slot > 0), self.volume.channels
-        found = [
-            [
-                dr.gather(mi.Float, source, (voxel * channels + c) * 4, slot > 0) * self.weight
-                for c in range(channels)
-            ]
-            for voxel in (voxels.x, voxels.y)
-        ]
-        if way.number:
-            # Without a crossing there is only the part before.
-            record = self.crossings.record(slot, slot > 0)
-            crosses = record.x <= record.y
-            found = [_select(crosses, found[1], found[0]), found[0]]
-        return found
+    def _source(self, volume: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """The source at an index of voxels and channels, times the solid angle."""
+        return dr.gather(mi.Float, volume, index * 4, active) * self.weight
 
 
 @symbolic

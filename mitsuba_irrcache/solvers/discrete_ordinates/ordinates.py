@@ -217,7 +217,8 @@ def boundary_ordinate_sets(
     reflected, crossings = None, [None] * passes
     if several:
         reflected = IncomingRadiance(boundary, tracks, scattering[0], several, (*seed, 1))
-        crossings = [boundary.crossings(tracks, each) for each in scattering]
+        rest = (boundary.crossings(tracks, each) for each in scattering[1:])
+        crossings = [reflected.crossings, *rest]
     starts = np.cumsum([0] + [len(each.directions) for each in sets])
     spectra = [*incoming.spectra, *(reflected.spectra if several else ())]
 

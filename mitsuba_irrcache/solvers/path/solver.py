@@ -94,7 +94,7 @@ class PathSolver(Solver):
 
     @classmethod
     def voxel_classes(
-        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid
+        cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> VoxelClasses | None:
         return VoxelClasses(scene, media, medium, grid) if medium.is_traced else None
 
