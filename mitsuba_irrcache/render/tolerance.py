@@ -48,8 +48,8 @@ COARSEST, LARGEST_RATIO, SMALLEST_RATIO = 16, 2.0, 1.4
 ASSUMED_ORDER, ORDERS = 1.3, (0.8, 2.0)
 #: The next resolution is larger by this factor than predicted.
 MARGIN = 1.2
-#: Most resolutions that are tried.
-MOST_LEVELS = 8
+#: Finest resolution that is tried, unless the data have more voxels along their longest side.
+FINEST = 256
 #: Seeds by which the scatter of a coarse cache is measured.
 SEEDS = 4
 #: Most directions or samples per voxel that are chosen; the order of the error in their number by
@@ -296,6 +296,7 @@ class ToleranceSearch:
         self, scene: mi.Scene, rays: Rays, mean: float, progress: Progress | None
     ) -> float:
         """Return the standard error of an image due to the directions, from other seeds."""
+        # docs/primer, eq. (7.4)
         first = self._levels[0]
         images = [first.radiance]
         for seed in range(1, SEEDS):
@@ -319,10 +320,10 @@ class ToleranceSearch:
             if len(self._levels) > 2 and error > self._error(self._levels[:-1], mean):
                 self._notes.append("the error does not decrease with the resolution")
                 return error
-            if len(self._levels) == MOST_LEVELS:
-                self._notes.append(f"more than {MOST_LEVELS} resolutions were not tried")
-                return error
             resolution = self._next_resolution(error / wanted)
+            if resolution > self._finest:
+                self._notes.append(f"resolutions above {self._finest} were not tried")
+                return error
             try:
                 level = self._built(scene, resolution, 0, progress)
             except Stopped:
@@ -334,6 +335,12 @@ class ToleranceSearch:
             level.radiance = self._probe(scene, level, rays)
             self._levels.append(level)
 
+    @property
+    def _finest(self) -> int:
+        """Finest resolution that is tried."""
+        grids = (part.medium.sigma_t.grid for part in self._levels[0].builder.parts)
+        return max([FINEST, *(max(grid.shape) for grid in grids if grid is not None)])
+
     def _next_resolution(self, excess: float) -> int:
         """Return the resolution at which the error is predicted to be smaller by ``excess``."""
         last = self._levels[-1].resolution
@@ -344,6 +351,7 @@ class ToleranceSearch:
 
     def _order(self, levels: list[Level]) -> float:
         """Estimate the order of the error in the voxel edge from the last three levels."""
+        # docs/primer, eq. (7.3)
         if len(levels) < 3:
             return ASSUMED_ORDER
         a, b, c = levels[-3:]

@@ -4,10 +4,10 @@
         [--budget 280] [--force] [-o output] [--document FILE]
 
 Single scattering in coarse grids of high contrast, every emitter and phase function of
-experiments/validation/limits, whose reference is a quadrature without noise. Every image has 16 x 16
-pixels and is rendered with ``tolerance`` alone. The table has the true RMSE, the estimate, both in %
-of the mean; the largest part of the estimate; what was chosen; and the time of the cold image over
-that of default settings, both with kernels that are compiled.
+experiments/validation/limits, whose reference is a quadrature without noise. Every image has 16 x
+16 pixels and is rendered with ``tolerance`` alone. The table has the true RMSE and the estimate, in
+% of the mean; the largest part of the estimate; resolution, cache_spp, step and spp that were
+chosen; and the time of the cold image, also over that of default settings, with compiled kernels.
 
 Rows are saved in output/tolerance/results.json; no case is started after ``--budget`` seconds.
 """
