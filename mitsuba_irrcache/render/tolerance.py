@@ -57,11 +57,11 @@ SEEDS = 4
 #: of its ratio to the one before.
 MOST_SAMPLES, SAMPLE_ORDER, SAMPLE_RATIOS = 1 << 12, 0.7, (1.5, 4.0)
 #: Steps that are tried, from the longest on.
-STEPS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
+STEPS = (4.0, 2.0, 1.0, 0.5, 0.25)
 #: Order of the error in the step.
 STEP_ORDER = 2
 #: Samples per pixel that are tried.
-MOST_PIXEL_SAMPLES = 1 << 12
+MOST_PIXEL_SAMPLES = 1 << 10
 
 CameraRays = ClosedFormCameraRays | TracedCameraRays
 MakeCameraRays = Callable[[CacheBuilder, float], CameraRays]
