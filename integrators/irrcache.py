@@ -454,6 +454,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         The mask is a random rounding of alpha.
         """
+        self._refuse_tolerance("another integrator calls this one, without the sensor")
         camera_rays = self._prepared(scene)
         if camera_rays is None:
             radiance, valid, _ = self._fallback().sample(scene, sampler, ray, medium, active)

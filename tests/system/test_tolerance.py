@@ -117,6 +117,11 @@ def test_what_needs_a_fixed_resolution_refuses_a_tolerance(rgb):
     scene = Case("constant").scene(tolerance=TOLERANCE)
     with pytest.raises(IrrcacheError, match="progressive run has targets of its own"):
         next(render_progressive(scene))
+    wrapper = mi.load_dict(
+        {"type": "aov", "aovs": "d:depth", "n": {"type": "irrcache", "tolerance": TOLERANCE}}
+    )
+    with pytest.raises(RuntimeError, match="another integrator calls this one"):
+        mi.render(scene, integrator=wrapper)
     params = mi.traverse(scene)
     key = "body.interior_medium.sigma_t.data"
     dr.enable_grad(params[key])
