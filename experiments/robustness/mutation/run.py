@@ -22,6 +22,7 @@ from pathlib import Path
 from experiments.robustness.mutation.mutants import MUTANTS, Mutant
 from experiments.robustness.mutation.outside import OUTSIDE
 from experiments.robustness.mutation.slips import SLIPS
+from experiments.robustness.mutation.surfaces import SURFACES
 from experiments.support.options import parser_of
 from experiments.support.store import Store
 from mitsuba_irrcache.compare.tables import Table
@@ -31,7 +32,7 @@ PARTS = ("mitsuba_irrcache", "integrators", "scenes", "tests", "experiments", "p
 #: Packages that an installation maps into another one: in a copy they are links.
 MAPPED = ("integrators", "scenes")
 SURVIVED = "survived"
-ALL = (*MUTANTS, *OUTSIDE, *SLIPS)
+ALL = (*MUTANTS, *OUTSIDE, *SLIPS, *SURFACES)
 
 
 def main() -> int:

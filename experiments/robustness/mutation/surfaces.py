@@ -1,0 +1,127 @@
+"""Mutants of surfaces among the voxels, irradiance on surfaces, gradients and the tolerance."""
+
+from __future__ import annotations
+
+from experiments.robustness.mutation.mutants import Mutant
+
+AMONG = "tests/system/test_surfaces_among_voxels.py"
+CROSSINGS = "tests/unit/solvers/discrete_ordinates/test_crossings.py"
+NODES = "tests/unit/cache/test_surface.py"
+IMAGES = "tests/system/test_surface_irradiance.py"
+GRADIENTS = "tests/system/test_gradients.py"
+TOLERANCE = "tests/system/test_tolerance.py"
+
+SURFACES = (
+    Mutant(
+        "parts of tracks are not exchanged for the way back",
+        "solvers/discrete_ordinates/kernel.py",
+        "first, last, before, behind = -last, -first, behind, before",
+        "first, last, before, behind = -last, -first, before, behind",
+        (CROSSINGS, AMONG),
+    ),
+    Mutant(
+        "both parts of a track use the source of the same voxel",
+        "solvers/discrete_ordinates/kernel.py",
+        "            voxels = voxels[1], voxels[0]\n",
+        "            voxels = voxels[1], voxels[1]\n",
+        (CROSSINGS, AMONG),
+    ),
+    Mutant(
+        "radiance behind a surface is attenuated before it begins",
+        "solvers/discrete_ordinates/kernel.py",
+        "carried.append(dr.select(crosses, y - lost[1], x - lost[0]))",
+        "carried.append(dr.select(crosses, y - lost[1] - lost[0], x - lost[0]))",
+        (CROSSINGS, AMONG),
+    ),
+    Mutant(
+        "parts on the far side of a surface count for the voxel",
+        "solvers/discrete_ordinates/crossings.py",
+        "return dr.select(hidden, mi.Float(0), 1), dr.select(hidden, away, segment.voxel)",
+        "return mi.Float(1), dr.select(hidden, away, segment.voxel)",
+        (CROSSINGS, AMONG),
+    ),
+    Mutant(
+        "crossings end at the first surface",
+        "solvers/discrete_ordinates/crossings.py",
+        "last = dr.select(hit, segment.ahead - far / slice_length, -BEYOND)",
+        "last = dr.select(hit, first, -BEYOND)",
+        (CROSSINGS, AMONG),
+    ),
+    Mutant(
+        "the coarsest nodes are used wherever there are some",
+        "cache/surface.py",
+        "finer |= divided | (total == 0)",
+        "finer &= False",
+        (NODES, IMAGES),
+    ),
+    Mutant(
+        "nodes of surfaces that face elsewhere apply",
+        "cache/surface.py",
+        "                applies &= cosine > SAME_SIDE\n",
+        "",
+        (NODES, IMAGES),
+    ),
+    Mutant(
+        "nodes receive only direct light",
+        "render/surface_irradiance.py",
+        "        for _ in range(MOST_ITERATIONS):\n",
+        "        for _ in range(0):\n",
+        (IMAGES,),
+    ),
+    Mutant(
+        "nodes do not know the medium before them",
+        "render/surface_irradiance.py",
+        "dr.gather(mi.UInt32, medium, lane))\n            active = dr.gather(mi.Float",
+        "mi.UInt32(0) * lane)\n            active = dr.gather(mi.Float",
+        (IMAGES,),
+    ),
+    Mutant(
+        "refined pixels have half the radiance",
+        "render/film.py",
+        "dr.block_sum(value, further) / mi.Float(each)",
+        "dr.block_sum(value, further) * 0.5 / mi.Float(each)",
+        (IMAGES,),
+    ),
+    Mutant(
+        "the number of refined samples is a constant of the kernel",
+        "render/film.py",
+        "    spp = mi.Float(each * per_pass)\n",
+        "    spp = mi.Float(further * per_pass)\n",
+        (IMAGES,),
+    ),
+    Mutant(
+        "the adjoint lacks what camera rays leave in the voxel itself",
+        "gradients/transport.py",
+        "phi = source + level.solve(first, self._solving)",
+        "phi = level.solve(first, self._solving)",
+        (GRADIENTS,),
+    ),
+    Mutant(
+        "the error of the voxels is the difference of two resolutions",
+        "render/tolerance.py",
+        "return difference / (ratio ** self._order(levels) - 1)",
+        "return difference / 8",
+        (TOLERANCE,),
+    ),
+    Mutant(
+        "the directions have no error",
+        "render/tolerance.py",
+        "            self._direction_error = error\n",
+        "            self._direction_error = error = 0.0\n",
+        (TOLERANCE,),
+    ),
+    Mutant(
+        "an edit keeps the caches of a tolerance",
+        "render/tolerance.py",
+        "            del self._levels[1:]\n",
+        "            pass\n",
+        (TOLERANCE,),
+    ),
+    Mutant(
+        "the error of a tolerance has one part only",
+        "render/tolerance.py",
+        "sum(part**2 for part in self.parts.values())",
+        "max(part**2 for part in list(self.parts.values())[-1:])",
+        (TOLERANCE,),
+    ),
+)
