@@ -85,8 +85,8 @@ SURFACES = (
     Mutant(
         "the number of refined samples is a constant of the kernel",
         "render/film.py",
-        "    spp = mi.Float(each * per_pass)\n",
-        "    spp = mi.Float(further * per_pass)\n",
+        "kronecker(sample * each + k, 2, shift)",
+        "kronecker(sample * further + k, 2, shift)",
         (IMAGES,),
     ),
     Mutant(

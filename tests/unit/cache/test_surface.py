@@ -104,6 +104,18 @@ def test_close_surfaces_make_interpolation_uncertain():
     assert CLEARANCE > 1  # nodes on either side of a wall are within a cell of it
 
 
+def test_nodes_whose_normals_point_elsewhere_do_not_apply():
+    """Lookups with another shading normal find nothing, however fine the levels are."""
+    plane = unit(PLANES["floor"])
+    nodes = SurfaceNodes(LOWER, UPPER)
+    p, (geometric, _), _ = cover(nodes, plane, points(*plane, count=20), 9.0, 9.0)
+    for tilt, expected in ((0.5, 1.0), (0.8, 0.0)):  # cosines of 0.88 and 0.7
+        tilted = mi.Normal3f(np.sin(tilt), np.cos(tilt), 0) + dr.zeros(mi.Float, dr.width(p))
+        normals = geometric, tilted
+        _, weights, *_ = nodes.find(p, normals, mi.UInt32(0), mi.Bool(True))
+        np.testing.assert_allclose(np.array(sum(weights)), expected, atol=1e-5)
+
+
 def test_nodes_do_not_depend_on_the_order_of_points():
     plane = unit(PLANES["slope"])
     p = points(*plane)
