@@ -36,8 +36,7 @@ def test_windows_that_are_resized_and_closed(tmp_path):
         for width, height in ((420, 300), (430, 310), (640, 280)):
             window.page.set_viewport_size({"width": width, "height": height})
             window.wait_for(f"^(at rest|final): {width} x {height}", 60)
-            shown = window.shown()[-1]
-            assert (shown["width"], shown["height"]) == (width, height)
+            window.wait_until_shown((width, height), 60)
         for _ in range(3):
             other = browser.open(address, (300, 200))
             other.wait_for("per pixel$", 60)

@@ -114,6 +114,14 @@ class Window:
             timeout=1000 * seconds,
         )
 
+    def wait_until_shown(self, size: tuple[int, int], seconds: float = 60.0) -> None:
+        """Wait until the image on display, which may follow the text about it, has this size."""
+        self.page.wait_for_function(
+            "([w, h]) => { const e = __shown.at(-1); return e && e.width == w && e.height == h; }",
+            arg=list(size),
+            timeout=1000 * seconds,
+        )
+
     def field(self, label: str) -> Locator:
         """Return the input of the control with this label."""
         row = "ancestor::div[contains(@class, 'mantine-Flex-root')][1]"
