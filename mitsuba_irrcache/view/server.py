@@ -13,55 +13,86 @@ from pathlib import Path
 
 import viser
 import viser._messages as messages
+from websockets.http11 import Request, Response
 
 from mitsuba_irrcache.view.access import Access, check_host, guarded, is_own_page, is_wildcard
 from mitsuba_irrcache.view.appearance import Appearance
+from mitsuba_irrcache.view.channel import PATH, Channel
 from mitsuba_irrcache.view.panel import LightPanel
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.transfer_panel import TransferPanel
 from mitsuba_irrcache.view.visitor import Visitor
+from mitsuba_irrcache.view.web_page import page
 
 LOG = logging.getLogger(__name__)
 
 
 class Server:
-    """Display a started ``session`` on ``host`` and ``port``, or on the next free port."""
+    """Serve the page on ``host`` and ``port``, or on the next free port.
+
+    The page tells what it waits for (`say`) until `show` gives it something to display. Files that
+    visitors save go to ``folder``, or to their browsers if it is None.
+    """
 
     def __init__(
         self,
-        session: Session,
         host: str = "127.0.0.1",
         port: int = 8080,
         folder: Path | None = None,
-        appearance: Appearance | None = None,
+        title: str = "irrcache",
     ) -> None:
-        self.session, self.host = session, host
+        self.host, self._folder = host, folder
         check_host(host)
         ignore_closed_connections()
         self._access = Access(host)
+        self.channel = Channel(self._access)
+        self.session: Session | None = None
+        self._visitors: dict[int, Visitor] = {}
+        self._lock = threading.Lock()
+
+        def pages(request: Request) -> Response | None:
+            is_page = request.path.partition("?")[0] == "/"
+            is_socket = request.headers.get("Upgrade", "").lower() == "websocket"
+            return page(title, request.headers) if is_page and not is_socket else None
+
         # Viser prints a greeting of its own; `command` prints ours.
-        with contextlib.redirect_stdout(io.StringIO()), guarded(self._access):
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            guarded(self._access, pages, {PATH: self.channel.serve}),
+        ):
             self._server = viser.ViserServer(host, port, label="irrcache", verbose=False)
         self.port = self._server.get_port()
         self._keep_to_ourselves()
-        self._visitors: dict[int, Visitor] = {}
-        self._lock = threading.Lock()
-        self._folder = folder
         server = self._server
         server.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, control_width="medium"
         )
+        server.gui.main_panel.dock_right()  # beside the image, which it never covers
         # The browser's own 3-D scene is empty and needs no lights.
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
-        self._set_first_camera()
-        self.panel = LightPanel(server, session)
+
+    def say(self, text: str) -> None:
+        """Display what the page waits for in all windows without an image."""
+        self.channel.send("wait", text)
+
+    def show(self, session: Session, appearance: Appearance | None = None) -> None:
+        """Display a started ``session`` in all windows, also in those that are open already."""
+        self.session = session
+        self.say("computing the first image ...")
+        self._set_first_camera(session)
+        self.panel = LightPanel(self._server, session, self.channel)
         if appearance is not None and appearance.is_editable:
-            TransferPanel(server, session, appearance, self.panel.editing)
+            transfer = TransferPanel(
+                self._server, session, appearance, self.panel.editing, self.channel
+            )
+            transfer.add_files(self._server.gui)
+        anatomical = appearance is not None and appearance.volume.unit == "HU"
+        self.channel.send("axes", ["L", "P", "S"] if anatomical else ["x", "y", "z"])
         session.on_status = self.panel.show
         self.panel.show(session.status)
-        server.on_client_connect(self._connected)
-        server.on_client_disconnect(self._gone)
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._gone)
 
     @property
     def address(self) -> str:
@@ -81,21 +112,22 @@ class Server:
 
     def stop(self) -> None:
         """Close all windows and the server."""
-        self.session.on_status = lambda status: None
+        if self.session is not None:
+            self.session.on_status = lambda status: None
         for client in list(self._visitors):
             self._forget(client)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def _set_first_camera(self) -> None:
-        camera = next(iter(self.session.cameras.values()))
-        place, first = self.session.placement.to_browser, self._server.initial_camera
+    def _set_first_camera(self, session: Session) -> None:
+        camera = next(iter(session.cameras.values()))
+        place, first = session.placement.to_browser, self._server.initial_camera
         self._server.scene.set_up_direction(camera.up)
         first.position, first.look_at = place(camera.position), place(camera.target)
         first.up, first.fov = camera.up, math.radians(camera.fov)
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        visitor = Visitor(client, self.session, self._folder)
+        visitor = Visitor(client, self.session, self._folder, self.channel)
         with self._lock:
             self._visitors[client.client_id] = visitor
 

@@ -15,9 +15,13 @@ from time import monotonic
 
 import numpy as np
 import viser
+from PIL import Image
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
+from mitsuba_irrcache.view.channel import Channel
+from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
+from mitsuba_irrcache.view.comparison import Compared, described
 from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.keep import checked_name, keep
 from mitsuba_irrcache.view.picture import KINDS, TONES, Look
@@ -36,8 +40,15 @@ class Visitor:
     Files are saved in ``folder``, or downloaded by the browser if it is None.
     """
 
-    def __init__(self, client: viser.ClientHandle, session: Session, folder: Path | None) -> None:
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        session: Session,
+        folder: Path | None,
+        channel: Channel,
+    ) -> None:
         self.client, self.session, self.folder = client, session, folder
+        self._channel, self._key = channel, channel.open()
         self._encoder = ThreadPoolExecutor(1)
         self._lock = threading.Lock()
         self._waiting: Picture | None = None
@@ -53,6 +64,7 @@ class Visitor:
     def close(self) -> None:
         """Release the window after the browser has disconnected."""
         self._gone = True
+        self._channel.close(self._key)
         self.session.close(self.window)
         self._encoder.shutdown(wait=False, cancel_futures=True)
 
@@ -60,26 +72,29 @@ class Visitor:
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("View", order=1):
-            self._note = gui.add_markdown("")
             self._refusal = gui.add_markdown("", visible=False)
             self.editing = Editing(self._refuse)
             cameras = list(self.session.cameras)
             self._sensor = gui.add_dropdown("camera", cameras, initial_value=cameras[0])
             self._reset = gui.add_button("reset camera")
+            self._kind = gui.add_dropdown("show", KINDS)
+            self._exposure = gui.add_slider("exposure, EV", -8.0, 8.0, 0.1, 0.0)
+            self._compare = gui.add_dropdown(
+                "volpath", COMPARISONS,
+                hint="compare with volpath, which is refined while no camera moves: swipe with the "
+                "divider, or the error in false colours",
+            )  # fmt: skip
+            gui.add_html(f'<irrcache-window key="{self._key}"></irrcache-window>')
+        with gui.add_folder("Camera and tone", order=5, expand_by_default=False):
             fov = math.degrees(self.client.camera.fov)
             self._fov = gui.add_slider(
-                "field of view", NARROWEST, WIDEST, 0.5, min(max(round(fov, 1), 1.0), 150.0)
+                "field of view, °", NARROWEST, WIDEST, 0.5, min(max(round(fov, 1), 1.0), 150.0)
             )
-            self._kind = gui.add_dropdown("show", KINDS)
-            self._exposure = gui.add_slider("exposure", -8.0, 8.0, 0.1, 0.0, hint="stops")
             self._tone = gui.add_dropdown("tone mapping", tuple(TONES))
             self._filter = gui.add_checkbox(
                 "filter", False, hint="of the illumination; weaker as the caches converge"
             )
-            self._compare = gui.add_checkbox(
-                "compare with volpath", False, hint="side by side, refined while no camera moves"
-            )
-        with gui.add_folder("Save", order=5, expand_by_default=False):
+        with gui.add_folder("Save", order=6, expand_by_default=False):
             self._name = gui.add_text("name", "view")
             self._cache = gui.add_checkbox("with the cache", False)
             self._save = gui.add_button(
@@ -98,6 +113,8 @@ class Visitor:
         kind, tone, exposure = self._kind.value, self._tone.value, self._exposure.value
         if kind not in KINDS or tone not in TONES or not -64 <= exposure <= 64:
             raise IrrcacheError(f"{kind!r}, {tone!r}, exposure {exposure!r}: nothing to be shown.")
+        if self._compare.value not in COMPARISONS:
+            raise IrrcacheError(f"{self._compare.value!r} is no comparison.")
         self._look = Look(kind, float(exposure), tone, bool(self._filter.value))
         self._look_again()
 
@@ -145,7 +162,8 @@ class Visitor:
         if not np.isfinite(numbers).all() or seen.distance == 0 or not any(seen.up):
             return  # the browser sent values that are no camera
         size = camera.image_width, camera.image_height
-        self._view = View(seen, size, self._look, bool(self._compare.value))
+        self._channel.send("camera", seen.axes.round(4).tolist(), self._key)
+        self._view = View(seen, size, self._look, self._compare.value)
         self.session.look(self.window, self._view)
 
     def _show(self, picture: Picture) -> None:
@@ -167,13 +185,28 @@ class Visitor:
         self.client.scene.set_background_image(picture.pixels, kind, jpeg_quality=quality)
         if not picture.moving or monotonic() - self._noted > NOTE_SECONDS:
             self._noted = monotonic()
-            height, width, _ = picture.pixels.shape
-            state = "moving" if picture.moving else "final" if picture.final else "at rest"
-            samples = "1 sample" if picture.samples == 1 else f"{picture.samples} samples"
-            self._note.content = f"{state}: {width} x {height}, {samples} per pixel"
-            if picture.comparison:
-                self._note.content += f"; on the right {picture.comparison}"
+            self._tell(picture)
         self.client.flush()
+
+    def _tell(self, picture: Picture) -> None:
+        """Send what lies over the image: a note about it, and the comparison."""
+        height, width, _ = picture.pixels.shape
+        state = "moving" if picture.moving else "final" if picture.final else "at rest"
+        samples = "1 sample" if picture.samples == 1 else f"{picture.samples} samples"
+        send, key = self._channel.send, self._key
+        send("wait", "", key)
+        send("note", f"{state}: {width} x {height}, {samples} per pixel", key)
+        found = picture.compared
+        if found is None and picture.view.compared == "off":
+            send("comparison", {"mode": "off"}, key)
+            return
+        if found is None:
+            found = Compared(picture.view.compared, "volpath waits for the camera to rest")
+        send("comparison", described(found), key)
+        if found.reference is not None:
+            pixels = io.BytesIO()
+            Image.fromarray(found.reference).save(pixels, "JPEG", quality=RESTING_QUALITY)
+            send("reference", pixels.getvalue(), key)
 
     # ------------------------------------------------------------------ saving
 
@@ -181,7 +214,7 @@ class Visitor:
         name = checked_name(self._name.value)
         if self._view is None:
             return
-        view = replace(self._view, look=self._look, compared=False)
+        view = replace(self._view, look=self._look, compared="off")
         self._saved.content = "saving ..."
         try:
             if self.folder is not None:
