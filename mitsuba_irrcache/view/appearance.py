@@ -16,6 +16,9 @@ from mitsuba_irrcache.volumes.scene import (
 )
 from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 
+#: A part of a volume: from which share of each side to which, along x, y and z.
+Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+WHOLE: Box = ((0.0, 1.0),) * 3
 #: Number of bins of the histogram.
 BINS = 128
 
@@ -30,6 +33,8 @@ class Appearance:
         self, volume: VolumeData, mapping: TransferFunction | DensityMapping, preset: str = ""
     ) -> None:
         self.volume, self.preset = volume, preset
+        #: what lies outside is transparent
+        self.box = WHOLE
         self.mapping = mapping.fitted_to(volume.values)
         sample = volume.values[:: max(1, volume.values.size // 4_000_000)]
         counts, self.edges = np.histogram(sample, BINS)
@@ -44,8 +49,11 @@ class Appearance:
     def grids(self, mapping: TransferFunction | DensityMapping) -> dict[str, np.ndarray]:
         """Return extinction (z, y, x) and albedo (z, y, x, 3), keyed by their file names."""
         sigma_t, albedo = mapping.apply(self.volume.values)
+        sigma_t = cropped(sigma_t, self.box)
         if not sigma_t.any():
-            raise IrrcacheError("all of the volume would be transparent; raise an opacity.")
+            raise IrrcacheError(
+                "all of the volume would be transparent; raise an opacity, or enlarge the crop box."
+            )
         return {SIGMA_T_FILE: sigma_t, ALBEDO_FILE: np.ascontiguousarray(albedo)}
 
     def document(
@@ -63,3 +71,16 @@ class Appearance:
         view = camera(self.volume, grids[SIGMA_T_FILE], settings.up)
         text = scene_xml(self.volume.to_world, view, settings)
         return Document.of_text(text, grids, parameters, integrator or "irrcache")
+
+
+def cropped(sigma_t: np.ndarray, box: Box) -> np.ndarray:
+    """Return extinctions (z, y, x) that are 0 outside of a box; whole voxels are kept."""
+    if box == WHOLE:
+        return sigma_t
+    inside = tuple(
+        slice(int(np.floor(low * n)), int(np.ceil(high * n)))
+        for n, (low, high) in zip(sigma_t.shape, reversed(box), strict=True)
+    )
+    result = np.zeros_like(sigma_t)
+    result[inside] = sigma_t[inside]
+    return result

@@ -25,7 +25,7 @@ LOG = logging.getLogger(__name__)
 #: Path of the websocket.
 PATH = "/irrcache"
 #: Largest accepted message in bytes.
-LARGEST_MESSAGE = 1 << 16
+LARGEST_MESSAGE = 1 << 19
 
 #: Called with the value of a message.
 Receiver = Callable[[object], None]
@@ -107,11 +107,11 @@ class Channel:
         """Pass a message on; what is no message of a component is ignored."""
         try:
             message = json.loads(text[:LARGEST_MESSAGE])
-            kind, value = message["kind"], message.get("value")
+            kind, value = str(message["kind"]), message.get("value")
         except (ValueError, TypeError, KeyError, RecursionError):
             return
         if kind == "window":
-            link.key = value if value in self._own else ""
+            link.key = value if isinstance(value, str) and value in self._own else ""
             for known, newest in list(self._private.get(link.key, {}).items()):
                 link.queue(known, newest)
             return

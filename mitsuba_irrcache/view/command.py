@@ -7,6 +7,7 @@ import gc
 import signal
 import threading
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -124,6 +125,8 @@ def _document(args: argparse.Namespace) -> tuple:
     volume, mapping = importer.read(args)
     appearance = Appearance(volume, mapping, args.preset or "")
     settings = importer.scene_settings(args, "irrcache")
+    if appearance.is_editable:  # CT, MR and the like: before a dark background
+        settings = replace(settings, hide_emitters=True)
     return appearance.document(settings, parameters, args.integrator), appearance
 
 

@@ -57,6 +57,10 @@ class Comparison:
         return (self.light, self.camera, self.size) == (light, camera, size)
 
     @property
+    def has_sample(self) -> bool:
+        return self._reference.samples > 0
+
+    @property
     def is_done(self) -> bool:
         return self._reference.is_done
 
@@ -71,8 +75,11 @@ class Comparison:
                 self._reference = Reference(self.light, self.camera, self.size, finest)
         return complete or not known.samples
 
-    def state(self, kind: str, image: np.ndarray, look: Look) -> Compared:
-        """Compare an ``image``, float (height, width, 3), that is displayed like ``look``."""
+    def state(self, kind: str, image: np.ndarray, look: Look, backdrop: np.ndarray) -> Compared:
+        """Compare an ``image``, float (height, width, 3), that is displayed like ``look``.
+
+        ``backdrop`` is what lies behind it.
+        """
         known = self._reference
         text = known.comparison(image)
         if not known.samples:
@@ -82,7 +89,7 @@ class Comparison:
             limit = rounded(float(np.quantile(np.abs(error), 0.98)))
             colours = np.kron(false_colours(error / limit), np.ones((known.coarseness,) * 2 + (1,)))
             return Compared(kind, text, None, colours.astype(np.uint8), limit)
-        return Compared(kind, text, displayed(known.radiance(), look))
+        return Compared(kind, text, displayed(known.radiance(), look, known.reduced(backdrop)))
 
 
 def described(found: Compared) -> dict:

@@ -15,6 +15,10 @@ from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.light import Status
 from mitsuba_irrcache.view.session import Session
 
+HINTS = {
+    "environment": "factor of the radiance that the scene gives its environment",
+    "sun": "irradiance on a surface that faces it, in the units of the scene; 0: no sun",
+}
 #: Irradiance of a sun that is switched on by dragging it.
 SUN = 3.0
 
@@ -31,7 +35,6 @@ class LightPanel:
             self.editing = Editing(self.refuse)
             if session.document.has_environment:
                 self._light("environment", lighting.environment, 0.0, 10.0, gui)
-                self._light("rotation", lighting.rotation, -180.0, 180.0, gui, slider=True)
             self._sun = self._light("sun", lighting.sun, 0.0, 1000.0, gui)
             gui.add_html("<irrcache-light></irrcache-light>")
         with gui.add_folder("Details", order=4, expand_by_default=False):
@@ -56,6 +59,8 @@ class LightPanel:
         self.editing.bind(density, self._set_density)
         self.editing.bind(depth, self._set_depth)
         self.editing.bind(target, self._set_target)
+        if document.has_environment:
+            self._light("rotation", lighting.rotation, -180.0, 180.0, gui, slider=True)
         self._azimuth = self._light("azimuth", lighting.azimuth, -180.0, 180.0, gui, slider=True)
         self._elevation = self._light(
             "elevation", lighting.elevation, -90.0, 90.0, gui, slider=True
@@ -63,12 +68,10 @@ class LightPanel:
 
     def show(self, status: Status) -> None:
         """Display the progress of the cache refinement; called in the session's thread."""
-        error = "" if math.isnan(status.error) else f", standard error {status.error:.2%}"
+        error = "" if math.isnan(status.error) else f"error {status.error:.2%}, "
         state = "improving" if status.improving else "done"
-        self._status.content = (
-            f"{state}: {status.samples} samples per voxel{error}, {status.seconds:.1f} s"
-            + (f" ({status.solver})" if status.solver else "")
-        )
+        samples = f"{status.samples} samples, {status.seconds:.1f} s"
+        self._status.content = f"{state}: {error}{samples}"
         target = self._session.target_error
         above = status.improving and status.error > target
         shown = f"error of the illumination {100 * status.error:.2g} %, target {100 * target:.2g} %"
@@ -84,14 +87,12 @@ class LightPanel:
     def _light(
         self, name: str, value: float, low: float, high: float, gui: viser.GuiApi, slider=False
     ) -> viser.GuiInputHandle:
-        add = gui.add_slider if slider else gui.add_number
+        """Add a control for a field of `Lighting`: a slider for angles, otherwise a number."""
         value = min(max(round(value, 3), low), high)
-        step = 1.0 if slider else 0.01
-        handle = (
-            add(name, low, high, step, value)
-            if slider
-            else add(name, value, min=low, max=high, step=step)
-        )
+        if slider:
+            handle = gui.add_slider(f"{name}, °", low, high, 1.0, value)
+        else:
+            handle = gui.add_number(name, value, min=low, max=high, step=0.01, hint=HINTS[name])
 
         def apply(number: float) -> None:
             self._edit_light(name, _number(name, number, low, high))

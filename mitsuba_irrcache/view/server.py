@@ -13,11 +13,13 @@ from pathlib import Path
 
 import viser
 import viser._messages as messages
+from PIL import Image
 from websockets.http11 import Request, Response
 
 from mitsuba_irrcache.view.access import Access, check_host, guarded, is_own_page, is_wildcard
 from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.view.channel import PATH, Channel
+from mitsuba_irrcache.view.crop_panel import CropPanel
 from mitsuba_irrcache.view.panel import LightPanel
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.transfer_panel import TransferPanel
@@ -25,6 +27,10 @@ from mitsuba_irrcache.view.visitor import Visitor
 from mitsuba_irrcache.view.web_page import page
 
 LOG = logging.getLogger(__name__)
+
+
+#: (width, height) of the image that is displayed until the page has started.
+PREVIEW = (480, 240)
 
 
 class Server:
@@ -76,17 +82,27 @@ class Server:
         """Display what the page waits for in all windows without an image."""
         self.channel.send("wait", text)
 
+    def _send_preview(self, session: Session) -> None:
+        """Send an image that the page displays until viser's client has started and asks for one.
+
+        It is wider than most windows; they crop it.
+        """
+        picture = session.call(lambda: session.preview(PREVIEW))
+        encoded = io.BytesIO()
+        Image.fromarray(picture).save(encoded, "JPEG", quality=90)
+        self.channel.send("preview", encoded.getvalue())
+
     def show(self, session: Session, appearance: Appearance | None = None) -> None:
         """Display a started ``session`` in all windows, also in those that are open already."""
         self.session = session
-        self.say("computing the first image ...")
+        self._send_preview(session)
+        self.say("loading the controls ...")
         self._set_first_camera(session)
         self.panel = LightPanel(self._server, session, self.channel)
         if appearance is not None and appearance.is_editable:
-            transfer = TransferPanel(
-                self._server, session, appearance, self.panel.editing, self.channel
-            )
-            transfer.add_files(self._server.gui)
+            TransferPanel(self._server, session, appearance, self.panel.editing, self.channel)
+        if appearance is not None:
+            CropPanel(self._server, session, appearance, self.panel.editing, self.channel)
         anatomical = appearance is not None and appearance.volume.unit == "HU"
         self.channel.send("axes", ["L", "P", "S"] if anatomical else ["x", "y", "z"])
         session.on_status = self.panel.show
@@ -127,6 +143,7 @@ class Server:
         first.up, first.fov = camera.up, math.radians(camera.fov)
 
     def _connected(self, client: viser.ClientHandle) -> None:
+        self.channel.send("preview", b"")  # windows that open later would show an old state
         visitor = Visitor(client, self.session, self._folder, self.channel)
         with self._lock:
             self._visitors[client.client_id] = visitor

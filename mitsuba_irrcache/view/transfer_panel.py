@@ -19,8 +19,6 @@ from mitsuba_irrcache.volumes.transfer import (
     preset_names,
 )
 
-#: Maximum size of uploaded files in bytes.
-LARGEST_FILE = 1 << 20
 #: Maximum number of points of a curve that a browser sends.
 MOST_POINTS = 256
 #: Number of steps that can be undone.
@@ -42,6 +40,7 @@ class TransferPanel:
         self._session, self._appearance, self._editing = session, appearance, editing
         self._channel = channel
         self._history = History(appearance.mapping, appearance.preset or _OWN)
+        self._steps = 0  # to travel in the history, as queued
         self._is_step = False  # whether a queued edit ends a step of the history
         gui = server.gui
         with gui.add_folder("Transfer function", order=2):
@@ -51,16 +50,10 @@ class TransferPanel:
             gui.add_html("<irrcache-transfer></irrcache-transfer>")
         editing.bind(self._preset, self._take_preset)
         channel.receive("transfer", self._edited)
-        channel.receive("undo", lambda _: editing.submit("undo", lambda: self._travel(-1)))
-        channel.receive("redo", lambda _: editing.submit("redo", lambda: self._travel(1)))
+        channel.receive("load", self._load)
+        channel.receive("undo", lambda _: self._travel(-1))
+        channel.receive("redo", lambda _: self._travel(1))
         self._tell()
-
-    def add_files(self, gui: viser.GuiApi) -> None:
-        """Add the buttons that exchange the function with JSON files."""
-        load = gui.add_upload_button("load transfer function", mime_type="application/json")
-        save = gui.add_button("save transfer function", hint="JSON, for irrcache import")
-        load.on_upload(lambda _: self._editing.submit("load", lambda: self._upload(load.value)))
-        save.on_click(self._save)
 
     def _tell(self) -> None:
         """Send the function to the editors of all windows."""
@@ -74,6 +67,7 @@ class TransferPanel:
             "unit": mapping.unit or appearance.volume.unit,
             "undo": self._history.can(-1),
             "redo": self._history.can(1),
+            "json": mapping.to_json(),
         }
         self._channel.send("transfer", state)
 
@@ -88,25 +82,35 @@ class TransferPanel:
 
         self._editing.submit("transfer", change)
 
-    def _travel(self, steps: int) -> None:
-        if self._history.can(steps):
+    def _travel(self, step: int) -> None:
+        """Queue a step of the history; steps that wait already are added up."""
+        self._steps += step
+
+        def change() -> None:
+            steps, self._steps = self._history.bounded(self._steps), 0
             function, preset = self._history.at(steps)
             self._apply(function, preset, done=False)
             self._history.travel(steps)
             self._tell()
 
+        self._editing.submit("travel", change)
+
     def _take_preset(self, name: str) -> None:
         if name != _OWN:
             self._apply(load_preset(name).fitted_to(self._appearance.volume.values), name)
 
-    def _upload(self, file: viser.UploadedFile) -> None:
-        if len(file.content) > LARGEST_FILE:
-            raise IrrcacheError(f"{file.name!r} is no transfer function: it is too large.")
-        try:
-            function = parse_transfer_function(file.content.decode("utf-8"))
-        except UnicodeDecodeError as error:
-            raise IrrcacheError(f"{file.name!r} is no transfer function: {error}") from error
-        self._apply(function.fitted_to(self._appearance.volume.values), _OWN)
+    def _load(self, value: object) -> None:
+        """Queue a transfer function that a browser has read from a file."""
+        name, text = str(value["name"]), str(value["text"])
+
+        def change() -> None:
+            try:
+                function = parse_transfer_function(text)
+            except IrrcacheError as error:
+                raise IrrcacheError(f"{name!r} is no transfer function: {error}") from error
+            self._apply(function.fitted_to(self._appearance.volume.values), _OWN)
+
+        self._editing.submit("load", change)
 
     def _apply(self, function: TransferFunction, preset: str, done: bool = True) -> None:
         """Apply a transfer function; restore the previous one if it is refused."""
@@ -119,11 +123,6 @@ class TransferPanel:
                 self._history.add(function, preset)
         finally:
             self._tell()
-
-    def _save(self, event: viser.GuiEvent) -> None:
-        if event.client is not None:
-            text = self._appearance.mapping.to_json().encode()
-            event.client.send_file_download("transfer_function.json", text, save_immediately=True)
 
 
 class History:
@@ -144,6 +143,10 @@ class History:
 
     def can(self, steps: int) -> bool:
         return 0 <= self._index + steps < len(self._steps)
+
+    def bounded(self, steps: int) -> int:
+        """Return the nearest number of steps that there are."""
+        return min(max(steps, -self._index), len(self._steps) - 1 - self._index)
 
     def at(self, steps: int) -> tuple[TransferFunction, str]:
         """Return the function so many steps later, or earlier if ``steps`` is negative."""

@@ -24,7 +24,7 @@ from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.comparison import Compared, described
 from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.keep import checked_name, keep
-from mitsuba_irrcache.view.picture import KINDS, TONES, Look
+from mitsuba_irrcache.view.picture import KINDS, MARKED, TONES, Look
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 
@@ -59,6 +59,8 @@ class Visitor:
         self.window = session.open(self._show)
         self._add_controls(client.gui)
         client.camera.on_update(self._camera_moved)
+        if self._aspect < 1:
+            self._go_to(self._sensor.value)  # the first camera was placed for wide windows
         self._look_again()
 
     def close(self) -> None:
@@ -75,8 +77,9 @@ class Visitor:
             self._refusal = gui.add_markdown("", visible=False)
             self.editing = Editing(self._refuse)
             cameras = list(self.session.cameras)
-            self._sensor = gui.add_dropdown("camera", cameras, initial_value=cameras[0])
-            self._reset = gui.add_button("reset camera")
+            self._sensor = gui.add_dropdown(
+                "camera", cameras, initial_value=cameras[0], visible=len(cameras) > 1
+            )
             self._kind = gui.add_dropdown("show", KINDS)
             self._exposure = gui.add_slider("exposure, EV", -8.0, 8.0, 0.1, 0.0)
             self._compare = gui.add_dropdown(
@@ -84,6 +87,7 @@ class Visitor:
                 hint="compare with volpath, which is refined while no camera moves: swipe with the "
                 "divider, or the error in false colours",
             )  # fmt: skip
+            self._reset = gui.add_button("reset camera", color="gray")
             gui.add_html(f'<irrcache-window key="{self._key}"></irrcache-window>')
         with gui.add_folder("Camera and tone", order=5, expand_by_default=False):
             fov = math.degrees(self.client.camera.fov)
@@ -94,15 +98,20 @@ class Visitor:
             self._filter = gui.add_checkbox(
                 "filter", False, hint="of the illumination; weaker as the caches converge"
             )
+            self._background = gui.add_rgb(
+                "background", (0, 0, 0), hint="where emitters are hidden (-D hide_emitters=true)"
+            )
         with gui.add_folder("Save", order=6, expand_by_default=False):
             self._name = gui.add_text("name", "view")
             self._cache = gui.add_checkbox("with the cache", False)
             self._save = gui.add_button(
-                "save" if self.folder is not None else "download",
+                "save view" if self.folder is not None else "download view",
                 hint="PNG, EXR with layers, and a scene for irrcache render",
             )
             self._saved = gui.add_markdown("")
-        for handle in (self._kind, self._exposure, self._tone, self._filter, self._compare):
+        for handle in (
+            self._kind, self._exposure, self._tone, self._filter, self._background, self._compare
+        ):  # fmt: skip
             self.editing.bind(handle, lambda _: self._set_look())
         self.editing.bind(self._sensor, lambda name: self._go_to(name))
         self.editing.bind(self._fov, self._set_fov)
@@ -115,7 +124,8 @@ class Visitor:
             raise IrrcacheError(f"{kind!r}, {tone!r}, exposure {exposure!r}: nothing to be shown.")
         if self._compare.value not in COMPARISONS:
             raise IrrcacheError(f"{self._compare.value!r} is no comparison.")
-        self._look = Look(kind, float(exposure), tone, bool(self._filter.value))
+        colour = tuple(_linear(c) for c in self._background.value)
+        self._look = Look(kind, float(exposure), tone, bool(self._filter.value), colour)
         self._look_again()
 
     def _set_fov(self, degrees: float) -> None:
@@ -126,13 +136,21 @@ class Visitor:
         self.client.camera.fov = math.radians(degrees)
         self._look_again()
 
+    @property
+    def _aspect(self) -> float:
+        """Return width over height of the image."""
+        camera = self.client.camera
+        return max(camera.image_width, 1) / max(camera.image_height, 1)
+
     def _go_to(self, name: str) -> None:
         if name not in self.session.cameras:
             raise IrrcacheError(f"the scene has no camera {name!r}.")
         camera, place = self.session.cameras[name], self.session.placement.to_browser
         with self.client.atomic():
             self.client.camera.up_direction = np.array(camera.up)
-            self.client.camera.position = place(camera.position)
+            target, away = np.array(camera.target), max(1.0, 1 / self._aspect)  # fits high windows
+            position = target + away * (np.array(camera.position) - target)
+            self.client.camera.position = place(position)
             self.client.camera.look_at = place(camera.target)
             self.client.camera.fov = math.radians(camera.fov)
         self._fov.value = camera.fov
@@ -163,7 +181,10 @@ class Visitor:
             return  # the browser sent values that are no camera
         size = camera.image_width, camera.image_height
         self._channel.send("camera", seen.axes.round(4).tolist(), self._key)
-        self._view = View(seen, size, self._look, self._compare.value)
+        look = self._look
+        if look.kind == MARKED:
+            look = replace(look, target=self.session.target_error)
+        self._view = View(seen, size, look, self._compare.value)
         self.session.look(self.window, self._view)
 
     def _show(self, picture: Picture) -> None:
@@ -236,3 +257,9 @@ class Visitor:
                 for file in files:
                     archive.write(file, file.name)
         self.client.send_file_download(f"{name}.zip", packed.getvalue(), save_immediately=True)
+
+
+def _linear(value: int) -> float:
+    """Return the linear value of an 8-bit channel in sRGB."""
+    c = min(max(value, 0), 255) / 255
+    return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4

@@ -17,8 +17,6 @@ from websockets.http11 import Response
 
 FOLDER = Path(__file__).with_name("page")
 SCRIPTS = ("channel.js", "transfer.js", "light.js", "overlay.js")
-#: Displayed until the components can display messages of the viewer.
-_WAIT = '<div id="irrcache-wait">irrcache: loading the page ...</div>'
 
 
 @cache
@@ -35,7 +33,6 @@ def _page(title: str) -> bytes:
     )
     text = re.sub(r'<link\s+rel="icon".*?>', "", text, count=1, flags=re.DOTALL)
     text = re.sub(r"<title>.*?</title>", lambda _: head, text, count=1)
-    text = text.replace('<div id="root">', f'{_WAIT}<div id="root">')
     return gzip.compress(text.encode())
 
 

@@ -86,6 +86,11 @@ class Window:
         self._comparison: Comparison | None = None
 
     @property
+    def has_first_sample(self) -> bool:
+        """Return whether the reference of the comparison covers the image."""
+        return self._comparison is not None and self._comparison.has_sample
+
+    @property
     def is_moving(self) -> bool:
         return monotonic() - self.moved < REST_SECONDS
 
@@ -97,7 +102,7 @@ class Window:
         old, view = self.view, view.bounded()
         if view == old:
             return False
-        if old is not None and not view.shows_place_of(old):
+        if not view.shows_place_of(old):  # the first image of a window is a coarse one, too
             self.moved = monotonic()
         self.view, self.fresh = view, True
         return True
@@ -135,14 +140,13 @@ class Window:
         """Render an image of a moving camera at the level of detail that is fast enough."""
         share, stride = LEVELS[self.level]
         size = tuple(max(round(n * share), 1) for n in view.size)
-        started, look = perf_counter(), view.look
-        # Without error propagation and filter, for which there is no time.
-        seen = light.seen(look.kind != "image", look.kind == "error bar")
+        started, look = perf_counter(), replace(view.look, filtered=False)  # no time for that
+        seen = light.seen(look.layered, look.with_error)
         seen.stride(stride)
         try:
             samples = Samples(seen, view.camera, size)
             samples.add(1)
-            pixels = samples.picture(replace(look, filtered=False), extent)
+            pixels = samples.picture(look, extent)
         finally:
             seen.stride(1.0)
         self.level = _adapted(self.level, perf_counter() - started)
@@ -212,7 +216,8 @@ class Window:
             state = Compared(view.compared, "volpath has not begun")
             return Picture(pixels, view, count, False, False, state)
         image = self.samples.image(view.look.filtered)
-        state = known.state(view.compared, image, replace(view.look, kind="image"))
+        look = replace(view.look, kind="image")
+        state = known.state(view.compared, image, look, self.samples.backdrop(look))
         if state.error is not None:
             pixels = state.error
         return Picture(pixels, view, count, False, final and known.is_done, state)

@@ -2,13 +2,13 @@
 "use strict";
 
 (() => {
-  const RADIUS = 40, SIZE = 2 * RADIUS + 12;
+  const RADIUS = 30, SIZE = 2 * RADIUS + 12;
 
   class Light extends HTMLElement {
     connectedCallback() {
       this.innerHTML = `<canvas role="img" aria-label="direction to the sun, drag to change it"></canvas>
-        <span class="irrcache-quiet">drag the sun over the sphere;<br>
-        behind it: dashed, Shift while dragging</span>`;
+        <span class="irrcache-quiet">drag the sun over the sphere;
+        with Shift: behind it (dashed)</span>`;
       this.canvas = this.querySelector("canvas");
       this.edited = irrcache.throttled("sun");
       this.stops = [

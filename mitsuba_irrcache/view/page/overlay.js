@@ -7,6 +7,7 @@
 
 (() => {
   const CORNER = 34;
+  const PANEL = 324; // width of viser's panel, before it is there
   let root, split = 0.5, comparison = { mode: "off" }, shown = null;
   const find = (name) => root.querySelector(`[data-id="${name}"]`);
   const set = (name, text) => {
@@ -19,6 +20,7 @@
     root = document.createElement("div");
     root.id = "irrcache-overlay";
     root.innerHTML = `
+      <img class="preview" data-id="preview" alt="" hidden>
       <img data-id="reference" alt="image by volpath" hidden>
       <div class="divider" data-id="divider" role="slider" tabindex="0" hidden
         aria-label="divider between irrcache and volpath" aria-valuemin="0" aria-valuemax="100"
@@ -43,13 +45,9 @@
   /** Keep the overlay over viser's canvas, which the panel beside it makes smaller. */
   function follow() {
     const canvas = document.querySelector("#root canvas[data-engine]") || document.querySelector("#root canvas");
-    if (canvas) {
-      const box = canvas.getBoundingClientRect();
-      const style = { left: box.left, top: box.top, width: box.width, height: box.height };
-      for (const [name, value] of Object.entries(style)) root.style[name] = `${value}px`;
-      const wait = document.getElementById("irrcache-wait");
-      if (wait) wait.remove();
-    }
+    const box = canvas ? canvas.getBoundingClientRect()
+      : { left: 0, top: 0, width: window.innerWidth - PANEL, height: window.innerHeight };
+    for (const side of ["left", "top", "width", "height"]) root.style[side] = `${box[side]}px`;
     window.setTimeout(follow, canvas ? 250 : 50);
   }
 
@@ -100,7 +98,8 @@
 
   function hideReference() {
     find("reference").hidden = true;
-    if (shown) URL.revokeObjectURL(shown);
+    const former = shown;
+    if (former) window.setTimeout(() => URL.revokeObjectURL(former), 2000); // it may be loading
     shown = null;
   }
 
@@ -113,6 +112,15 @@
     await image.decode().catch(() => {});
     if (shown === url) image.hidden = false;
     if (former) URL.revokeObjectURL(former);
+  }
+
+  /** Show an image until the first one for this window arrives. */
+  function preview(bytes) {
+    const image = find("preview"), done = !bytes || !bytes.length || !find("note").hidden;
+    image.hidden = done;
+    if (done) return;
+    image.src = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
+    image.onload = image.onerror = () => URL.revokeObjectURL(image.src);
   }
 
   /** Draw the axes of the scene as the camera sees them, those behind first. */
@@ -140,11 +148,27 @@
     irrcache.receive("axes", (value) => { labels = value; if (rows) axes(rows, labels); });
     irrcache.receive("wait", (text) => { waiting = text; message(); });
     irrcache.receive("connection", (text) => { lost = text; message(); });
-    irrcache.receive("note", (text) => set("note", text));
+    irrcache.receive("note", (text) => { set("note", text); preview(null); });
+    irrcache.receive("preview", preview);
     irrcache.receive("hint", (text) => set("hint", text));
     irrcache.receive("comparison", compare);
     irrcache.receive("reference", showReference);
   }
+
+  // A slice of the volume's values, in the panel.
+  customElements.define("irrcache-slice", class extends HTMLElement {
+    connectedCallback() {
+      this.innerHTML = '<img alt="slice of the values">';
+      const image = this.querySelector("img");
+      let url = null;
+      this.stop = irrcache.receive("slice", (bytes) => {
+        const former = url;
+        if (former) window.setTimeout(() => URL.revokeObjectURL(former), 2000); // it may be loading
+        image.src = url = URL.createObjectURL(new Blob([bytes], { type: "image/png" }));
+      });
+    }
+    disconnectedCallback() { this.stop(); }
+  });
 
   if (document.readyState === "loading") document.addEventListener("DOMContentLoaded", start);
   else start();

@@ -32,15 +32,16 @@
           <label><span data-id="unit">value</span><input type="number" step="any" data-id="value"></label>
           <label data-id="opacity-label">opacity<input type="number" min="0" max="0.999" step="0.01" data-id="opacity"></label>
           <label data-id="colour-label">colour<input type="color" data-id="colour"></label>
-          <button data-id="remove" title="remove the selected point (Delete)">remove</button>
         </div>
         <div class="irrcache-row">
+          <button data-id="remove" title="remove the selected point (Delete)">remove</button>
           <button data-id="undo" title="Ctrl+Z">undo</button>
           <button data-id="redo" title="Ctrl+Shift+Z">redo</button>
-          <button data-id="whole" title="show all values (double click on the axis)">whole range</button>
-          <span class="irrcache-quiet" data-id="pointed"></span>
+          <button data-id="whole" title="show all values, or double click on the axis">all</button>
+          <button data-id="load" title="a transfer function as JSON, from a file">load</button>
+          <button data-id="save" title="JSON, for irrcache import">save</button>
         </div>
-        <div class="irrcache-quiet">click: add a point; drag: move it; wheel: zoom</div>`;
+        <div class="irrcache-quiet" data-id="pointed">click: add a point; drag: move it; wheel: zoom</div>`;
       this.canvas = this.querySelector("canvas");
       this.find = (name) => this.querySelector(`[data-id="${name}"]`);
       this.selected = { curve: "opacity", index: 0 };
@@ -205,7 +206,7 @@
       this.fill("value", +value.toPrecision(6));
       if (opacity) this.fill("opacity", +height.toFixed(4));
       else this.fill("colour", hex(height));
-      this.find("remove").disabled = points.length <= (opacity ? 2 : 1);
+      this.find("remove").disabled = points.length <= 2;
       this.find("undo").disabled = !this.state.undo;
       this.find("redo").disabled = !this.state.redo;
       this.draw();
@@ -293,6 +294,24 @@
       this.find("undo").addEventListener("click", () => irrcache.send("undo", null));
       this.find("redo").addEventListener("click", () => irrcache.send("redo", null));
       this.find("whole").addEventListener("click", () => this.whole());
+      this.find("load").addEventListener("click", () => this.load());
+      this.find("save").addEventListener("click", () => this.save());
+    }
+
+    load() {
+      const chooser = Object.assign(document.createElement("input"), { type: "file", accept: ".json" });
+      chooser.addEventListener("change", async () => {
+        const file = chooser.files[0];
+        if (file) irrcache.send("load", { name: file.name, text: (await file.text()).slice(0, 1 << 18) });
+      });
+      chooser.click();
+    }
+
+    save() {
+      const url = URL.createObjectURL(new Blob([this.state.json], { type: "application/json" }));
+      const link = Object.assign(document.createElement("a"), { href: url, download: "transfer_function.json" });
+      link.click();
+      window.setTimeout(() => URL.revokeObjectURL(url), 1000);
     }
 
     whole() {
