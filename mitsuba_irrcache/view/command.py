@@ -21,10 +21,16 @@ from mitsuba_irrcache.machine.extras import require
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.memory import free_at_once
 from mitsuba_irrcache.volumes import importer
+from mitsuba_irrcache.volumes.options import MissingItemError
 
 if TYPE_CHECKING:
     from mitsuba_irrcache.view.server import Server
     from mitsuba_irrcache.view.session import Session
+    from mitsuba_irrcache.view.time_panel import TimeSteps
+    from mitsuba_irrcache.volumes.data import VolumeData
+
+#: A number of a time step that no file has.
+MOST_STEPS = 1 << 30
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -103,8 +109,25 @@ def _fill(server: Server, args: argparse.Namespace, name: str) -> Session:
     session = Session(document)
     gc.freeze()  # collections then scan the objects created below only
     session.start()
-    server.show(session, appearance)
+    server.show(session, appearance, _time_steps(args))
     return session
+
+
+def _time_steps(args: argparse.Namespace) -> TimeSteps | None:
+    """Return the time steps of the file if ``--frame`` names one of several."""
+    from mitsuba_irrcache.view.time_panel import TimeSteps
+
+    if args.frame is None:
+        return None
+
+    def read(frame: int) -> VolumeData:
+        return importer.read(argparse.Namespace(**vars(args) | {"frame": frame}))[0]
+
+    try:
+        read(MOST_STEPS)
+    except MissingItemError as error:
+        return TimeSteps(error.count, args.frame, read) if error.count > 1 else None
+    return None
 
 
 def _document(args: argparse.Namespace) -> tuple:

@@ -22,6 +22,7 @@ from mitsuba_irrcache.view.channel import PATH, Channel
 from mitsuba_irrcache.view.crop_panel import CropPanel
 from mitsuba_irrcache.view.panel import LightPanel
 from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.time_panel import TimePanel, TimeSteps
 from mitsuba_irrcache.view.transfer_panel import TransferPanel
 from mitsuba_irrcache.view.visitor import Visitor
 from mitsuba_irrcache.view.web_page import page
@@ -92,7 +93,12 @@ class Server:
         Image.fromarray(picture).save(encoded, "JPEG", quality=90)
         self.channel.send("preview", encoded.getvalue())
 
-    def show(self, session: Session, appearance: Appearance | None = None) -> None:
+    def show(
+        self,
+        session: Session,
+        appearance: Appearance | None = None,
+        steps: TimeSteps | None = None,
+    ) -> None:
         """Display a started ``session`` in all windows, also in those that are open already."""
         self.session = session
         self._send_preview(session)
@@ -103,6 +109,8 @@ class Server:
             TransferPanel(self._server, session, appearance, self.panel.editing, self.channel)
         if appearance is not None:
             CropPanel(self._server, session, appearance, self.panel.editing, self.channel)
+        if steps is not None:
+            TimePanel(self._server, session, appearance, self.panel.editing, steps)
         anatomical = appearance is not None and appearance.volume.unit == "HU"
         self.channel.send("axes", ["L", "P", "S"] if anatomical else ["x", "y", "z"])
         session.on_status = self.panel.show

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-import tempfile
 import threading
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -23,7 +21,7 @@ from mitsuba_irrcache.view.channel import Channel
 from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.comparison import Compared, described
 from mitsuba_irrcache.view.editing import Editing, plain
-from mitsuba_irrcache.view.keep import checked_name, keep
+from mitsuba_irrcache.view.export_panel import ExportPanel
 from mitsuba_irrcache.view.picture import KINDS, MARKED, TONES, Look
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
@@ -66,6 +64,7 @@ class Visitor:
     def close(self) -> None:
         """Release the window after the browser has disconnected."""
         self._gone = True
+        self._export.close()
         self._channel.close(self._key)
         self.session.close(self.window)
         self._encoder.shutdown(wait=False, cancel_futures=True)
@@ -101,14 +100,6 @@ class Visitor:
             self._background = gui.add_rgb(
                 "background", (0, 0, 0), hint="where emitters are hidden (-D hide_emitters=true)"
             )
-        with gui.add_folder("Save", order=6, expand_by_default=False):
-            self._name = gui.add_text("name", "view")
-            self._cache = gui.add_checkbox("with the cache", False)
-            self._save = gui.add_button(
-                "save view" if self.folder is not None else "download view",
-                hint="PNG, EXR with layers, and a scene for irrcache render",
-            )
-            self._saved = gui.add_markdown("")
         for handle in (
             self._kind, self._exposure, self._tone, self._filter, self._background, self._compare
         ):  # fmt: skip
@@ -116,7 +107,7 @@ class Visitor:
         self.editing.bind(self._sensor, lambda name: self._go_to(name))
         self.editing.bind(self._fov, self._set_fov)
         self._reset.on_click(lambda _: self._go_to(self._sensor.value))
-        self._save.on_click(lambda _: self.editing.submit("save", self._keep))
+        self._export = ExportPanel(self.client, self.session, self.folder, self.editing, self._seen)
 
     def _set_look(self) -> None:
         kind, tone, exposure = self._kind.value, self._tone.value, self._exposure.value
@@ -155,6 +146,10 @@ class Visitor:
             self.client.camera.fov = math.radians(camera.fov)
         self._fov.value = camera.fov
         self._look_again()
+
+    def _seen(self) -> View | None:
+        """Return the view without its comparison, None if there is none yet."""
+        return self._view and replace(self._view, compared="off")
 
     def _refuse(self, reason: str) -> None:
         self._refusal.content = f"**Refused:** {plain(reason)}" if reason else ""
@@ -228,35 +223,6 @@ class Visitor:
             pixels = io.BytesIO()
             Image.fromarray(found.reference).save(pixels, "JPEG", quality=RESTING_QUALITY)
             send("reference", pixels.getvalue(), key)
-
-    # ------------------------------------------------------------------ saving
-
-    def _keep(self) -> None:
-        name = checked_name(self._name.value)
-        if self._view is None:
-            return
-        view = replace(self._view, look=self._look, compared="off")
-        self._saved.content = "saving ..."
-        try:
-            if self.folder is not None:
-                self.folder.mkdir(exist_ok=True)
-                files = keep(self.session, view, self.folder, name, self._cache.value)
-                self._saved.content = "saved " + ", ".join(f.name for f in files)
-            else:
-                self._download(view, name)
-                self._saved.content = f"downloaded {name}.zip"
-        except Exception:
-            self._saved.content = ""
-            raise
-
-    def _download(self, view: View, name: str) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            files = keep(self.session, view, Path(folder), name, self._cache.value)
-            packed = io.BytesIO()
-            with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-                for file in files:
-                    archive.write(file, file.name)
-        self.client.send_file_download(f"{name}.zip", packed.getvalue(), save_immediately=True)
 
 
 def _linear(value: int) -> float:
