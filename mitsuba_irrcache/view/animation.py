@@ -105,7 +105,7 @@ def _frames(session: Session, view: View, cameras: Sequence[Camera]) -> Iterator
 
             samples = session.call(begin)
             while samples.count < SAMPLES:
-                session.call(lambda samples=samples: samples.add(SAMPLES))
+                session.call(lambda samples=samples: samples.advance(SAMPLES))
             yield session.call(lambda s=samples, c=camera: s.picture(look, session.extent(c)))
 
 

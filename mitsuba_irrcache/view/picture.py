@@ -106,6 +106,14 @@ class Samples:
         self.count += 1
         dr.eval(self._sums)
 
+    def advance(self, total: int) -> None:
+        """Add one sample per pixel like `add`, and wait for it.
+
+        The kernels that `add` launches are asynchronous: many of them would delay what follows.
+        """
+        self.add(total)
+        dr.sync_thread()
+
     @property
     def layers(self) -> Layers:
         """Return the layers as means over the samples; without layers, all is background."""

@@ -7,7 +7,7 @@
 "use strict";
 
 (() => {
-  const TOP = 6, PLOT = 132, BAND = 16, AXIS = 16, SIDE = 8;
+  const TOP = 6, PLOT = 108, BAND = 16, AXIS = 16, SIDE = 8;
   const HEIGHT = TOP + PLOT + BAND + 12 + AXIS, HIGHEST = 0.999;
   const clamp = (v, low, high) => Math.min(Math.max(v, low), high);
   const hex = (c) => `#${c.map((v) => Math.round(255 * v).toString(16).padStart(2, "0")).join("")}`;
