@@ -66,7 +66,7 @@ def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
         raise
     finally:
         process.terminate()
-        process.wait(20)
+        process.wait(60)
 
 
 class Window:
