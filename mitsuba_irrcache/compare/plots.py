@@ -32,7 +32,7 @@ Points = dict[str, list[str]]
 def error_over_time(path: Path, curves: list[Curve], noise: float) -> Points:
     """Plot RMSE against seconds, both logarithmic, with the slope of Monte Carlo noise."""
     points: Points = {}
-    with style.figure(path, figsize=(6.6, 4.0)) as (_, axes):
+    with style.figure(path, figsize=(8.4, 4.0)) as (_, axes):
         ax = axes[0, 0]
         for index, curve in enumerate(curves):
             look = style.line(index)
@@ -63,7 +63,7 @@ def error_over_time(path: Path, curves: list[Curve], noise: float) -> Points:
         _logarithmic(ax)
         ax.set_xlabel("seconds, kernels compiled beforehand")
         ax.set_ylabel("RMSE, % of the mean radiance")
-        ax.legend()
+        ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1))
     return points
 
 

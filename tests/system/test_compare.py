@@ -233,7 +233,13 @@ def test_the_report_in_a_browser(report):
         place = marker.bounding_box()
         page.mouse.move(place["x"] + place["width"] / 2, place["y"] + place["height"] / 2)
         tip = page.locator(".tip:visible").inner_text()
-        assert "volpath" in tip and "RMSE" in tip
+        last = next(m for m in read(report)["measurements"] if m["integrator"] == "volpath")
+        shown = last["snapshots"][-1]
+        seconds, error = re.fullmatch(r"volpath\n(\S+) s, RMSE (\S+) %( or less)?", tip).groups()[
+            :2
+        ]
+        assert float(seconds) == pytest.approx(sum(shown["seconds"].values()), rel=0.01)
+        assert float(error) >= 100 * shown["errors"]["rmse"] * 0.99
         assert window.errors == [] and requests == []
 
 

@@ -77,7 +77,9 @@
 
     /** Return [image, clip from, clip to, left edge, width] of the panes, in CSS pixels. */
     panes() {
-      const layout = this.option("layout"), width = this.width;
+      const width = this.width;
+      const trivial = this.b === this.reference && this.option("quantity") !== "radiance";
+      const layout = trivial ? "one" : this.option("layout"); // the reference has no error
       if (layout === "swipe") {
         const at = this.split * width;
         return [[this.a, 0, at, 0, width], [this.b, at, width, 0, width]];
@@ -195,7 +197,7 @@
       context.scale(ratio, ratio);
       const panes = this.panes();
       panes.forEach((pane, index) => this.drawPane(context, pane, index, panes.length));
-      if (this.option("layout") === "swipe") this.drawDivider(context);
+      if (panes.length === 2 && panes[1][3] === 0) this.drawDivider(context);
       this.drawScale();
       this.markChoices();
     }
@@ -391,7 +393,8 @@
       this.canvas.setPointerCapture(event.pointerId);
       this.canvas.focus({ preventScroll: true });
       const at = this.pixelAt(event)[3];
-      const grabs = this.option("layout") === "swipe" && Math.abs(at - this.split) * this.width < 12;
+      const panes = this.panes(), swipe = panes.length === 2 && panes[1][3] === 0;
+      const grabs = swipe && Math.abs(at - this.split) * this.width < 12;
       this.drag = { divider: grabs, x: event.clientX, y: event.clientY };
     }
 

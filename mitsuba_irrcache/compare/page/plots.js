@@ -8,7 +8,8 @@
   for (const figure of document.querySelectorAll("figure[data-points]")) {
     const marks = [];
     for (const [id, texts] of Object.entries(JSON.parse(figure.dataset.points))) {
-      const shapes = figure.querySelectorAll(`[id="${id}"] use, [id="${id}"] > path`);
+      const markers = figure.querySelectorAll(`[id="${id}"] use`);
+      const shapes = markers.length ? markers : figure.querySelectorAll(`[id="${id}"] > path`);
       texts.forEach((text, index) => shapes[index] && marks.push([shapes[index], text]));
     }
     const tip = figure.appendChild(document.createElement("div"));
