@@ -19,6 +19,8 @@ COARSENESS = (4, 2, 1)
 PASS_SECONDS = 3.0
 #: Passes after which the resolution is chosen.
 PROBE = 2
+#: Largest relative error that has a colour of its own; noise of few samples is larger.
+LARGEST = 1.0
 #: Colours of errors from -1 to 1, blue for too dark and red for too bright.
 _STOPS = np.array(
     [(5, 48, 97), (67, 147, 195), (247, 247, 247), (214, 96, 77), (103, 0, 31)], dtype=float
@@ -86,7 +88,7 @@ class Comparison:
             return Compared(kind, text)
         if kind == "error":
             error = known.signed_error(image)
-            limit = rounded(float(np.quantile(np.abs(error), 0.98)))
+            limit = min(rounded(float(np.quantile(np.abs(error), 0.98))), LARGEST)
             colours = np.kron(false_colours(error / limit), np.ones((known.coarseness,) * 2 + (1,)))
             return Compared(kind, text, None, colours.astype(np.uint8), limit)
         return Compared(kind, text, displayed(known.radiance(), look, known.reduced(backdrop)))

@@ -75,7 +75,8 @@ class LightPanel:
         target = self._session.target_error
         above = status.improving and status.error > target
         shown = f"error of the illumination {100 * status.error:.2g} %, target {100 * target:.2g} %"
-        self._channel.send("hint", shown if above else "")
+        coarse = "coarse illumination, being refined" if status.improving else ""
+        self._channel.send("hint", shown if above else "" if status.samples else coarse)
         if status.message:
             self.refuse(status.message)
 

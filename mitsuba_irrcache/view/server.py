@@ -75,6 +75,8 @@ class Server:
             dark_mode=True, show_logo=False, show_share_button=False, control_width="medium"
         )
         server.gui.main_panel.dock_right()  # beside the image, which it never covers
+        # Without any control viser would show its own settings.
+        self._placeholder = server.gui.add_markdown("The controls follow.")
         # The browser's own 3-D scene is empty and needs no lights.
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
@@ -104,6 +106,7 @@ class Server:
         self._send_preview(session)
         self.say("loading the controls ...")
         self._set_first_camera(session)
+        self._placeholder.remove()
         self.panel = LightPanel(self._server, session, self.channel)
         if appearance is not None and appearance.is_editable:
             TransferPanel(self._server, session, appearance, self.panel.editing, self.channel)

@@ -179,7 +179,10 @@ class Visitor:
         look = self._look
         if look.kind == MARKED:
             look = replace(look, target=self.session.target_error)
-        self._view = View(seen, size, look, self._compare.value)
+        view = View(seen, size, look, self._compare.value)
+        if self._view is not None and view != self._view and view.shows_place_of(self._view):
+            self._channel.send("note", "rendering ...", self._key)  # may take seconds
+        self._view = view
         self.session.look(self.window, self._view)
 
     def _show(self, picture: Picture) -> None:
