@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
@@ -21,6 +23,10 @@ Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 WHOLE: Box = ((0.0, 1.0),) * 3
 #: Number of bins of the histogram.
 BINS = 128
+
+
+#: `Session.edit`: changes the displayed document, or raises IrrcacheError.
+Edit = Callable[[Callable[[Document], None]], None]
 
 
 class Appearance:
@@ -55,6 +61,17 @@ class Appearance:
                 "all of the volume would be transparent; raise an opacity, or enlarge the crop box."
             )
         return {SIGMA_T_FILE: sigma_t, ALBEDO_FILE: np.ascontiguousarray(albedo)}
+
+    def change(self, edit: Edit, **attributes: object) -> None:
+        """Set attributes, and ``edit`` the document that shows them; restore them if refused."""
+        former = {name: getattr(self, name) for name in attributes}
+        try:
+            vars(self).update(attributes)
+            grids = self.grids(self.mapping)
+            edit(lambda document: document.set_volumes(grids))
+        except IrrcacheError:
+            vars(self).update(former)
+            raise
 
     def document(
         self,

@@ -58,14 +58,7 @@ class CropPanel:
 
     def _crop(self, percent: Box) -> None:
         box = checked_box(percent)
-        former = self._appearance.box
-        self._appearance.box = box
-        try:
-            grids = self._appearance.grids(self._appearance.mapping)
-            self._session.edit(lambda document: document.set_volumes(grids))
-        except IrrcacheError:
-            self._appearance.box = former
-            raise
+        self._appearance.change(self._session.edit, box=box)
         self._draw(box)
 
     def _draw(self, box: Box) -> None:

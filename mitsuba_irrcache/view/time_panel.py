@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import viser
 
@@ -13,11 +14,13 @@ from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.volumes.data import VolumeData
 
 
+@dataclass(frozen=True)
 class TimeSteps:
     """The time steps of a file: ``count`` of them, the ``first`` displayed, read by ``read``."""
 
-    def __init__(self, count: int, first: int, read: Callable[[int], VolumeData]) -> None:
-        self.count, self.first, self.read = count, first, read
+    count: int
+    first: int
+    read: Callable[[int], VolumeData]
 
 
 class TimePanel:
@@ -39,13 +42,7 @@ class TimePanel:
     def _show(self, step: int) -> None:
         if not isinstance(step, int) or not 0 <= step < self._steps.count:
             raise IrrcacheError(f"there is no time step {step!r}.")
-        former, volume = self._appearance.volume, self._steps.read(step)
-        if volume.values.shape != former.values.shape:
+        volume = self._steps.read(step)
+        if volume.values.shape != self._appearance.volume.values.shape:
             raise IrrcacheError(f"time step {step} has another size: {volume.size}.")
-        self._appearance.volume = volume
-        try:
-            grids = self._appearance.grids(self._appearance.mapping)
-            self._session.edit(lambda document: document.set_volumes(grids))
-        except IrrcacheError:
-            self._appearance.volume = former
-            raise
+        self._appearance.change(self._session.edit, volume=volume)

@@ -115,9 +115,7 @@ class TransferPanel:
     def _apply(self, function: TransferFunction, preset: str, done: bool = True) -> None:
         """Apply a transfer function; restore the previous one if it is refused."""
         try:
-            grids = self._appearance.grids(function)
-            self._session.edit(lambda document: document.set_volumes(grids))
-            self._appearance.mapping = function
+            self._appearance.change(self._session.edit, mapping=function)
             self._preset.value = preset
             if done:
                 self._history.add(function, preset)
