@@ -112,6 +112,7 @@ class ExportPanel:
             if self._gone:
                 raise IrrcacheError("the window was closed during an export.")
 
+        tell(0)
         rate = float(self._rate.value)
         if self._folder is not None:
             files = write_frames(self._session, view, cameras, self._folder / name, rate, tell)
