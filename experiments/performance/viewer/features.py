@@ -1,8 +1,7 @@
-"""What the viewer offers beside other programs: ``python -m experiments.performance.viewer.features
---document docs/how-to/viewer.md``.
+"""What the viewer offers: ``python -m experiments.performance.viewer.features --document
+docs/how-to/viewer.md``.
 
-Every row is tried in a browser with ``irrcache view``; "no" is printed where that fails. What is
-said of other programs is from their manuals, and was not tried here.
+Every row is tried in a browser with ``irrcache view``; "no" is printed where that fails.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from mitsuba_irrcache.compare.tables import Table
 
 VIEW = ("phantom:thorax:60,38,52", "--preset", "ct-chest")
 SIZES = ((1400, 900), (800, 600), (1920, 1080))
-PROGRAMS = ("`irrcache view`", "3D Slicer", "ParaView", "VPT", "preview of sionna-rt")
 
 
 def curve(window: Window) -> str:
@@ -106,26 +104,18 @@ def video(window: Window) -> str:
     return "turntable, camera path"
 
 
-#: Row: how it is tried, and what other programs have.
-ROWS: dict[str, tuple[Callable[[Window], str] | None, tuple[str, str, str, str]]] = {
-    "multiple scattering in volumes": (
-        None, ("no", "with OSPRay's path tracer", "yes", "no volumes"),
-    ),
-    "image improves while nothing moves; moves at interactive rates on a CPU": (
-        None, ("needs a GPU", "coarser while moving", "needs a GPU", "meshes, in the browser"),
-    ),
-    "opacity edited as points on a plot": (curve, ("yes", "yes", "bumps in 2-D", "-")),
-    "panel beside the image at 1400 x 900, 800 x 600, 1920 x 1080": (
-        layout, ("yes", "yes", "over the image", "in a notebook"),
-    ),
-    "crop box": (crop, ("dragged in 3-D", "dragged in 3-D", "no", "a clip plane")),
-    "slice planes": (slices, ("three, also in 3-D", "any, in 3-D", "no", "no")),
-    "orientation marker": (marker, ("yes", "yes", "no", "no")),
-    "direction of a light": (light, ("no", "numbers", "the environment turns", "no")),
-    "comparison with a reference in the same window": (reference, ("no", "no", "no", "no")),
-    "error bars": (errors, ("no", "no", "no", "no")),
-    "camera path as frames and video": (video, ("yes", "yes", "no", "frames by a script")),
-}  # fmt: skip
+#: Row: how it is tried.
+ROWS: dict[str, Callable[[Window], str]] = {
+    "opacity and colours on a plot over the histogram": curve,
+    "panel at 1400 x 900, 800 x 600, 1920 x 1080": layout,
+    "crop box": crop,
+    "slice planes": slices,
+    "orientation marker": marker,
+    "direction of the sun": light,
+    "comparison with `volpath`": reference,
+    "error bars": errors,
+    "animation, as frames and video": video,
+}
 
 
 def main() -> None:
@@ -140,19 +130,15 @@ def main() -> None:
         window = browser.open(address, SIZES[0])
         window.wait_for("per pixel", 120)
         time.sleep(2)
-        for name, (attempt, others) in ROWS.items():
+        for name, attempt in ROWS.items():
             try:
-                found = attempt(window) if attempt else "yes"
+                found = attempt(window)
             except Exception as error:
                 found = "no"
                 print(f"{name}: {type(error).__name__}: {error}".splitlines()[0])
-            rows.append([name, found, *others])
+            rows.append([name, found])
         assert not window.errors, window.errors
-    note = (
-        "Of the other programs by their manuals (3D Slicer 5.6, ParaView 5.13, VPT 3, sionna-rt "
-        "1.0), not tried here."
-    )
-    table = Table("Features", ["", *PROGRAMS], rows, note)
+    table = Table("Features", ["", "how"], rows)
     print(as_markdown(table))
     if args.document:
         replace_tables(args.document, {"viewer-features": table})
