@@ -49,6 +49,11 @@ class Channel:
         self._own: dict[str, dict[str, Receiver]] = {}
         self._private: dict[str, dict[str, object]] = {}
 
+    @property
+    def has_windows(self) -> bool:
+        """Return whether any window is connected."""
+        return bool(self._links)
+
     def receive(self, kind: str, receiver: Receiver, key: str = "") -> None:
         """Call ``receiver`` in the server's thread, which it must not block, for each message.
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cli.render import REPLACED, add_scene_options
 from mitsuba_irrcache.core.argument_types import whole
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.io.scene_files import integrator_of, parse_parameters
 from mitsuba_irrcache.machine.extras import require
 from mitsuba_irrcache.machine.llvm import require_llvm
@@ -87,7 +87,11 @@ def _show(args: argparse.Namespace) -> None:
             )
         if not args.no_browser:
             webbrowser.open(server.address)
-        session = _fill(server, args, name)
+        try:
+            session = _fill(server, args, name)
+        except Exception as error:
+            server.tell_failure(original_message(error))
+            raise
         _wait()
     finally:
         server.stop()

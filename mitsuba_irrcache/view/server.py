@@ -8,6 +8,7 @@ import logging
 import math
 import socket
 import threading
+import time
 import warnings
 from pathlib import Path
 
@@ -30,6 +31,8 @@ from mitsuba_irrcache.view.web_page import page
 LOG = logging.getLogger(__name__)
 
 
+#: Time in which windows receive a last message.
+FAREWELL_SECONDS = 0.5
 #: (width, height) of the image that is displayed until the page has started.
 PREVIEW = (480, 240)
 
@@ -84,6 +87,12 @@ class Server:
     def say(self, text: str) -> None:
         """Display what the page waits for in all windows without an image."""
         self.channel.send("wait", text)
+
+    def tell_failure(self, text: str) -> None:
+        """Display why nothing will be displayed, before the server stops."""
+        self.say(f"error: {text}")
+        if self.channel.has_windows:
+            time.sleep(FAREWELL_SECONDS)
 
     def _send_preview(self, session: Session) -> None:
         """Send an image that the page displays until viser's client has started and asks for one.

@@ -142,7 +142,7 @@
     follow();
     place(0.5);
     let rows = null, labels = ["x", "y", "z"], waiting = "connecting to the viewer ...", lost = "";
-    const message = () => set("message", lost || waiting);
+    const message = () => set("message", waiting.startsWith("error:") ? waiting : lost || waiting);
     message();
     irrcache.receive("camera", (value) => axes((rows = value), labels));
     irrcache.receive("axes", (value) => { labels = value; if (rows) axes(rows, labels); });

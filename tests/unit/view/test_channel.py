@@ -53,6 +53,16 @@ def test_windows_receive_the_newest_messages_to_them(server):
     channel.send("note", "nobody is there", own)
 
 
+def test_windows_are_told_why_there_is_nothing(server):
+    """Windows that wait for a volume learn why it cannot be read."""
+    server.say("reading ...")
+    with open_channel(server) as connection:
+        assert received(connection)["value"] == "reading ..."
+        server.tell_failure("no such file")
+        assert received(connection) == {"kind": "wait", "value": "error: no such file"}
+    server.say("")
+
+
 def test_messages_of_windows(server):
     """Messages reach the receiver of their kind; what is none, or is refused, does no harm."""
     channel, values, arrived = server.channel, [], threading.Event()
