@@ -13,6 +13,7 @@ from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.io.images import write_image
 
 from . import pictures, plots
+from .embedded import images
 from .metrics import colours
 from .reference import Reference
 from .report import Figure, Section, findings, write_report
@@ -68,36 +69,34 @@ def _sections(
 ) -> list[Section]:
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
-    files = {
-        name: figures / f"{name}.png"
-        for name in ("error", "metrics", "strip", "differences", "blocks", "stages")
-    }
+    curve, bars, multiples = (figures / f"{name}.svg" for name in ("error", "stages", "metrics"))
     measured, truth = comparison.measurements, comparison.reference
-    plots.error_over_time(files["error"], curves(rows), reference_noise(truth))
-    plots.small_multiples(files["metrics"], rows)
-    pictures.strip(files["strip"], measured, truth, folder, comparison.exposure)
-    pictures.differences(files["differences"], measured, truth, folder)
-    pictures.differences(files["blocks"], measured, truth, folder, block=8)
-    plots.stages(files["stages"], measured)
+    # Strips for papers and talks; the page shows the same images interactively.
+    pictures.strip(figures / "strip.png", measured, truth, folder, comparison.exposure)
+    pictures.differences(figures / "differences.png", measured, truth, folder)
+    pictures.differences(figures / "blocks.png", measured, truth, folder, block=8)
     equal_time, equal_error, stages = tables
-    captions = {
-        "error": "Error against time. Hollow: below the resolution of the reference.",
-        "strip": "The tone-mapped images.",
-        "differences": "Signed difference to the reference, including the reference's own noise.",
-        "blocks": "The same, averaged over 8 × 8 pixels: less noise, hence visible blotches, "
-        "bands and bias.",
-        "stages": "Seconds to a first image, by stage.",
-        "metrics": "Other measures of error against seconds.",
-    }
-    figure = {name: Figure(files[name], caption) for name, caption in captions.items()}
+    error = Figure(
+        curve,
+        "Error against time. Hollow: below the resolution of the reference.",
+        plots.error_over_time(curve, curves(rows), reference_noise(truth)),
+    )
+    first = Figure(
+        bars, "Seconds to a first image, by stage.", plots.stages(bars, comparison.measurements)
+    )
+    others = Figure(
+        multiples,
+        "Other measures of error against seconds.",
+        plots.small_multiples(multiples, rows),
+    )
+    shown = images(measured, rows, truth, folder, comparison.exposure)
     return [
-        Section("Error against time", [figure["error"]]),
+        Section("Error against time", [error]),
+        Section("Images and their errors", [shown]),
         Section("Error after equal time", [equal_time]),
         Section("Time to equal error", [equal_error]),
-        Section("Pictures", [figure["strip"]]),
-        Section("Signed errors", [figure["differences"], figure["blocks"]]),
-        Section("Time by stage", [figure["stages"], stages]),
-        Section("All errors", [figure["metrics"], metrics_table(rows)]),
+        Section("Time by stage", [first, stages]),
+        Section("All errors", [others, metrics_table(rows)]),
     ]
 
 

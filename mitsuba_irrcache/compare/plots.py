@@ -1,4 +1,7 @@
-"""Curves and bar charts of a comparison."""
+"""Curves and bar charts of a comparison.
+
+Each function returns the values of its markers as texts, which the report displays on hover.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from . import style
 from .results import Measurement
 from .scores import METRICS
 from .summary import Curve
-from .tables import STAGES
+from .tables import STAGES, percent, seconds
 
 #: Errors other than RMSE that are plotted against time.
 SMALL = ("relative_mse", "display_rmse", "block_rmse", "ciede2000", "flip")
@@ -22,13 +25,29 @@ STAGE_COLOURS = dict(
 )
 
 
-def error_over_time(path: Path, curves: list[Curve], noise: float) -> None:
+#: Texts for the markers of a plot, by the id of their group in the SVG.
+Points = dict[str, list[str]]
+
+
+def error_over_time(path: Path, curves: list[Curve], noise: float) -> Points:
     """Plot RMSE against seconds, both logarithmic, with the slope of Monte Carlo noise."""
-    with style.figure(path, figsize=(6.6, 4.0)) as (_, axes):
+    points: Points = {}
+    with style.figure(path, figsize=(8.4, 4.0)) as (_, axes):
         ax = axes[0, 0]
         for index, curve in enumerate(curves):
             look = style.line(index)
-            ax.plot(curve.seconds, 100 * curve.shown, label=curve.integrator, **look)
+            ax.plot(
+                curve.seconds,
+                100 * curve.shown,
+                label=curve.integrator,
+                gid=f"rmse-{index}",
+                **look,
+            )
+            points[f"rmse-{index}"] = [
+                f"{curve.integrator}\n{seconds(t)} s, RMSE {percent(e)}"
+                + (" or less" if e > measured else "")
+                for t, e, measured in zip(curve.seconds, curve.shown, curve.errors, strict=True)
+            ]
             hidden = curve.errors < curve.resolved
             ax.plot(
                 curve.seconds[hidden], 100 * curve.shown[hidden],
@@ -44,11 +63,13 @@ def error_over_time(path: Path, curves: list[Curve], noise: float) -> None:
         _logarithmic(ax)
         ax.set_xlabel("seconds, kernels compiled beforehand")
         ax.set_ylabel("RMSE, % of the mean radiance")
-        ax.legend()
+        ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1))
+    return points
 
 
-def small_multiples(path: Path, rows: list[dict]) -> None:
+def small_multiples(path: Path, rows: list[dict]) -> Points:
     """Plot the other errors against seconds, one panel each."""
+    points: Points = {}
     names = [n for n in SMALL if any(_drawable(row[n]) for row in rows)]
     integrators = list(dict.fromkeys(row["integrator"] for row in rows))
     columns = 3
@@ -62,8 +83,13 @@ def small_multiples(path: Path, rows: list[dict]) -> None:
                 own.sort(key=lambda r: r["seconds"])
                 ax.plot(
                     [r["seconds"] for r in own], [scale * r[name] for r in own],
-                    **style.line(index), label=integrator,
+                    **style.line(index), label=integrator, gid=f"{name}-{index}",
                 )  # fmt: skip
+                points[f"{name}-{index}"] = [
+                    f"{integrator}\n{seconds(r['seconds'])} s, {label} {scale * r[name]:.3g}"
+                    + (f" {unit}" if unit else "")
+                    for r in own
+                ]
             _logarithmic(ax)
             ax.set_title(f"{label}, %" if unit == "%" else label)
         for ax in axes.flat[len(names) :]:
@@ -73,10 +99,12 @@ def small_multiples(path: Path, rows: list[dict]) -> None:
             axes.flat[-1].legend(handles, labels, loc="center")
         else:
             axes.flat[0].legend(handles, labels)
+    return points
 
 
-def stages(path: Path, measurements: list[Measurement]) -> None:
+def stages(path: Path, measurements: list[Measurement]) -> Points:
     """Plot the seconds to a first image by stage: cold, and with compiled kernels."""
+    points: Points = {}
     bars = [
         (f"{m.integrator}\n{label}", values)
         for m in measurements
@@ -89,13 +117,20 @@ def stages(path: Path, measurements: list[Measurement]) -> None:
         for stage, colour in STAGE_COLOURS.items():
             width = np.array([values.get(stage, 0.0) for _, values in bars])
             if width.any():
-                ax.barh(range(len(bars)), width, left=left, color=colour, label=stage, height=0.7)
+                drawn = ax.barh(
+                    range(len(bars)), width, left=left, color=colour, label=stage, height=0.7
+                )
+                for number, (bar, value) in enumerate(zip(drawn, width, strict=True)):
+                    bar.set_gid(f"{stage}-{number}")
+                    text = bars[number][0].replace("\n", ", ")
+                    points[bar.get_gid()] = [f"{text}\n{stage}: {seconds(value)} s"]
                 left += width
         ax.set_yticks(range(len(bars)), [label for label, _ in bars], fontsize=7.5)
         ax.invert_yaxis()
         ax.grid(False, axis="y")
         ax.set_xlabel("seconds to a first image")
         ax.legend(ncols=len(STAGES), loc="lower left", bbox_to_anchor=(0, 1))
+    return points
 
 
 def _noise_slope(ax: Axes, curves: list[Curve]) -> None:

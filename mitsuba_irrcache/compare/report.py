@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass
+import json
+import re
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 
@@ -11,48 +13,32 @@ import numpy as np
 
 from mitsuba_irrcache.io.files import atomic_write
 
+from . import embedded
+from .embedded import PAGE, Images
 from .results import Measurement
 from .summary import Curve, Reached, equal_time, time_to, uncertainty
 from .tables import Table, percent, seconds, with_uncertainty
 
-CSS = """
-:root { color-scheme: light; }
-body { font: 16px/1.5 system-ui, sans-serif; color: #1c1c1c; margin: 0 auto; max-width: 62rem;
-       padding: 2rem 1.25rem 4rem; }
-h1 { font-size: 1.7rem; margin: 0 0 .25rem; } h2 { font-size: 1.2rem; margin: 2.5rem 0 .5rem; }
-p { margin: .5rem 0; max-width: 46rem; }
-.quiet, figcaption, .note { color: #666; font-size: .88rem; }
-code { font: .92em ui-monospace, monospace; }
-.lead { border-left: 4px solid #0072b2; padding: .1rem 0 .1rem 1rem; margin: 1.25rem 0; }
-.failed { border-left: 4px solid #d55e00; padding: .1rem 0 .1rem 1rem; margin: 1.25rem 0; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .9rem; margin: .5rem 0; }
-th, td { padding: .28rem .8rem .28rem 0; text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-thead th { border-bottom: 1.5px solid #888; font-weight: 600; vertical-align: bottom; }
-tbody tr { border-bottom: 1px solid #e6e6e6; }
-td.best { font-weight: 700; color: #0b5a2b; }
-.wide { font-size: .8rem; }
-figure { margin: 1rem 0; } img { max-width: 100%; height: auto; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; font-size: .9rem; }
-dt { color: #666; } dd { margin: 0; overflow-wrap: anywhere; }
-"""
-
 
 @dataclass
 class Figure:
-    """An image file and its caption."""
+    """An image file (PNG or SVG) and its caption.
+
+    ``points`` are texts for the markers of an SVG, by the id of their group; they are displayed
+    when the pointer is near.
+    """
 
     path: Path
     caption: str
+    points: dict[str, list[str]] = field(default_factory=dict)
 
 
 @dataclass
 class Section:
-    """A heading with figures and tables below it."""
+    """A heading with figures, tables and interactive images below it."""
 
     title: str
-    parts: list[Figure | Table]
+    parts: list[Figure | Table | Images]
 
 
 def write_report(
@@ -63,7 +49,7 @@ def write_report(
     failed: list[Measurement],
     facts: dict[str, str],
 ) -> None:
-    """Write the page atomically, with embedded figures, so that it loads no other file."""
+    """Write the page atomically, with embedded figures and scripts, so that it loads no file."""
     body = [f"<h1>{escape(title)}</h1>", _subtitle(facts), _findings(findings), _failures(failed)]
     body += [_section(section) for section in sections]
     rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in facts.items())
@@ -71,8 +57,9 @@ def write_report(
     page = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{CSS}</style></head><body>"
-        f"{''.join(body)}</body></html>\n"
+        f"<title>{escape(title)}</title><style>{_page('report.css')}</style></head><body>"
+        f"{''.join(body)}<script>{_page('images.js')}</script>"
+        f"<script>{_page('plots.js')}</script></body></html>\n"
     )
     with atomic_write(path) as file:
         file.write(page.encode())
@@ -167,19 +154,39 @@ def _failures(failed: list[Measurement]) -> str:
     )
 
 
+def _page(name: str) -> str:
+    return (PAGE / name).read_text(encoding="utf-8")
+
+
 def _section(section: Section) -> str:
-    return f"<h2>{escape(section.title)}</h2>" + "".join(
-        _table(part) if isinstance(part, Table) else _figure(part) for part in section.parts
-    )
+    return f"<h2>{escape(section.title)}</h2>" + "".join(map(_part, section.parts))
+
+
+def _part(part: Figure | Table | Images) -> str:
+    if isinstance(part, Images):
+        return embedded.html(part)
+    return _table(part) if isinstance(part, Table) else _figure(part)
 
 
 def _figure(figure: Figure) -> str:
-    data = base64.b64encode(figure.path.read_bytes()).decode()
     caption = escape(figure.caption)
+    if figure.path.suffix == ".svg":
+        drawing = _inline(figure.path.read_text(encoding="utf-8"))
+        points = escape(json.dumps(figure.points), quote=True)
+        return (
+            f'<figure data-points="{points}">{drawing}<figcaption>{caption}</figcaption></figure>'
+        )
+    data = base64.b64encode(figure.path.read_bytes()).decode()
     return (
         f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
+
+
+def _inline(svg: str) -> str:
+    """Return an SVG as an element of HTML: without prolog, metadata and names of XML spaces."""
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    return re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg)
 
 
 def _table(table: Table) -> str:

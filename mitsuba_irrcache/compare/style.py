@@ -34,6 +34,8 @@ SETTINGS = {
     "lines.markersize": 5,
     "savefig.dpi": 150,
     "savefig.bbox": "tight",
+    "svg.fonttype": "none",
+    "svg.hashsalt": "irrcache",
     "figure.constrained_layout.use": True,
 }
 

@@ -8,7 +8,7 @@ import http
 import ipaddress
 import secrets
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
@@ -91,21 +91,30 @@ class Access:
         return hmac.compare_digest(given.encode(), self.token.encode())
 
 
+#: Answers a request by a response, or by None to leave it to viser.
+Pages = Callable[[Request], Response | None]
+#: Serves a websocket.
+Handler = Callable[[object], Awaitable[None]]
+
+
 @contextlib.contextmanager
-def guarded(access: Access) -> Iterator[None]:
+def guarded(access: Access, pages: Pages, handlers: Mapping[str, Handler]) -> Iterator[None]:
     """Check every request to viser servers that are created within this context.
 
-    Viser offers no hook for requests, so the function with which it starts its web server is
-    replaced in the meantime.
+    Requests that pass are answered by ``pages``, and websockets are served by the one of the
+    ``handlers`` that belongs to their path; all others are left to viser. Viser offers no hook for
+    requests, so the function with which it starts its web server is replaced in the meantime.
     """
     serve = websockets.asyncio.server.serve
 
-    def guarded_serve(*args: object, process_request: object = None, **kwargs: object) -> object:
+    def guarded_serve(
+        handler: Handler, *args: object, process_request: Callable, **kwargs: object
+    ) -> object:
         def checked(connection: object, request: Request) -> Response | None:
             why = access.refusal(request.path, request.headers)
             if why:
                 return _text(http.HTTPStatus.FORBIDDEN, why)
-            response = process_request(connection, request) if process_request else None
+            response = pages(request) or process_request(connection, request)
             cookie = access.cookie(request.path)
             if response is not None and cookie:
                 response.headers["Set-Cookie"] = cookie
@@ -113,7 +122,11 @@ def guarded(access: Access) -> Iterator[None]:
                 response.headers["Cache-Control"] = "no-store"
             return response
 
-        return serve(*args, process_request=checked, **kwargs)
+        async def chosen(connection: object) -> None:
+            path = urlsplit(connection.request.path).path
+            await handlers.get(path, handler)(connection)
+
+        return serve(chosen, *args, process_request=checked, **kwargs)
 
     websockets.asyncio.server.serve = guarded_serve
     try:

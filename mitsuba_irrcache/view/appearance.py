@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 
 import numpy as np
 
@@ -18,15 +18,29 @@ from mitsuba_irrcache.volumes.scene import (
 )
 from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 
+#: A part of a volume: from which share of each side to which, along x, y and z.
+Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+WHOLE: Box = ((0.0, 1.0),) * 3
 #: Number of bins of the histogram.
 BINS = 128
 
 
-class Appearance:
-    """A ``volume`` and the ``mapping`` from its values to extinction and albedo."""
+#: `Session.edit`: changes the displayed document, or raises IrrcacheError.
+Edit = Callable[[Callable[[Document], None]], None]
 
-    def __init__(self, volume: VolumeData, mapping: TransferFunction | DensityMapping) -> None:
-        self.volume = volume
+
+class Appearance:
+    """A ``volume`` and the ``mapping`` from its values to extinction and albedo.
+
+    ``preset`` is the name of the mapping if it is a preset.
+    """
+
+    def __init__(
+        self, volume: VolumeData, mapping: TransferFunction | DensityMapping, preset: str = ""
+    ) -> None:
+        self.volume, self.preset = volume, preset
+        #: what lies outside is transparent
+        self.box = WHOLE
         self.mapping = mapping.fitted_to(volume.values)
         sample = volume.values[:: max(1, volume.values.size // 4_000_000)]
         counts, self.edges = np.histogram(sample, BINS)
@@ -41,9 +55,23 @@ class Appearance:
     def grids(self, mapping: TransferFunction | DensityMapping) -> dict[str, np.ndarray]:
         """Return extinction (z, y, x) and albedo (z, y, x, 3), keyed by their file names."""
         sigma_t, albedo = mapping.apply(self.volume.values)
+        sigma_t = cropped(sigma_t, self.box)
         if not sigma_t.any():
-            raise IrrcacheError("all of the volume would be transparent; raise an opacity.")
+            raise IrrcacheError(
+                "all of the volume would be transparent; raise an opacity, or enlarge the crop box."
+            )
         return {SIGMA_T_FILE: sigma_t, ALBEDO_FILE: np.ascontiguousarray(albedo)}
+
+    def change(self, edit: Edit, **attributes: object) -> None:
+        """Set attributes, and ``edit`` the document that shows them; restore them if refused."""
+        former = {name: getattr(self, name) for name in attributes}
+        try:
+            vars(self).update(attributes)
+            grids = self.grids(self.mapping)
+            edit(lambda document: document.set_volumes(grids))
+        except IrrcacheError:
+            vars(self).update(former)
+            raise
 
     def document(
         self,
@@ -62,66 +90,14 @@ class Appearance:
         return Document.of_text(text, grids, parameters, integrator or "irrcache")
 
 
-def with_opacity(
-    function: TransferFunction, index: int, value: float, opacity: float
-) -> TransferFunction:
-    """Return a copy in which one opacity point is moved between its neighbours."""
-    values, opacities = function.opacity_values.copy(), function.opacities.copy()
-    values[index], opacities[index] = value, opacity
-    _check_order(values, index)
-    return replace(function, opacity_values=values, opacities=opacities)
-
-
-def with_colour(
-    function: TransferFunction, index: int, value: float, colour: tuple[float, float, float]
-) -> TransferFunction:
-    """Return a copy in which one colour point is moved between its neighbours."""
-    values, colours = function.colour_values.copy(), function.colours.copy()
-    values[index], colours[index] = value, colour
-    _check_order(values, index)
-    return replace(function, colour_values=values, colours=colours)
-
-
-def with_point_after(function: TransferFunction, curve: str, index: int) -> TransferFunction:
-    """Return a copy in which ``curve`` ("opacity" or "colour") has one more point.
-
-    The point lies half-way to the next one, or to the previous one after the last. The shape of the
-    curve does not change.
-    """
-    values, heights = _points(function, curve)
-    left = min(index, len(values) - 2)
-    values = np.insert(values, left + 1, 0.5 * (values[left] + values[left + 1]))
-    heights = np.insert(heights, left + 1, 0.5 * (heights[left] + heights[left + 1]), axis=0)
-    return _with_points(function, curve, values, heights)
-
-
-def without_point(function: TransferFunction, curve: str, index: int) -> TransferFunction:
-    """Return a copy without one point of a curve."""
-    values, heights = _points(function, curve)
-    return _with_points(
-        function, curve, np.delete(values, index), np.delete(heights, index, axis=0)
+def cropped(sigma_t: np.ndarray, box: Box) -> np.ndarray:
+    """Return extinctions (z, y, x) that are 0 outside of a box; whole voxels are kept."""
+    if box == WHOLE:
+        return sigma_t
+    inside = tuple(
+        slice(int(np.floor(low * n)), int(np.ceil(high * n)))
+        for n, (low, high) in zip(sigma_t.shape, reversed(box), strict=True)
     )
-
-
-def _points(function: TransferFunction, curve: str) -> tuple[np.ndarray, np.ndarray]:
-    if curve == "opacity":
-        return function.opacity_values, function.opacities
-    return function.colour_values, function.colours
-
-
-def _with_points(
-    function: TransferFunction, curve: str, values: np.ndarray, heights: np.ndarray
-) -> TransferFunction:
-    if curve == "opacity":
-        return replace(function, opacity_values=values, opacities=heights)
-    return replace(function, colour_values=values, colours=heights)
-
-
-def _check_order(values: np.ndarray, index: int) -> None:
-    low = values[index - 1] if index else -np.inf
-    high = values[index + 1] if index + 1 < len(values) else np.inf
-    if not low < values[index] < high:
-        raise IrrcacheError(
-            f"the value {values[index]:g} is not between those of the points beside it, {low:g} "
-            f"and {high:g}."
-        )
+    result = np.zeros_like(sigma_t)
+    result[inside] = sigma_t[inside]
+    return result

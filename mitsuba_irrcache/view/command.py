@@ -7,18 +7,30 @@ import gc
 import signal
 import threading
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
 from mitsuba_irrcache.cli.render import REPLACED, add_scene_options
 from mitsuba_irrcache.core.argument_types import whole
-from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.io.scene_files import integrator_of, parse_parameters
 from mitsuba_irrcache.machine.extras import require
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.memory import free_at_once
 from mitsuba_irrcache.volumes import importer
+from mitsuba_irrcache.volumes.options import MissingItemError
+
+if TYPE_CHECKING:
+    from mitsuba_irrcache.view.server import Server
+    from mitsuba_irrcache.view.session import Session
+    from mitsuba_irrcache.view.time_panel import TimeSteps
+    from mitsuba_irrcache.volumes.data import VolumeData
+
+#: A number of a time step that no file has.
+MOST_STEPS = 1 << 30
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,25 +67,17 @@ def run(args: argparse.Namespace) -> int:
         require_llvm()
     if args.output is not None and not args.output.absolute().parent.is_dir():
         raise IrrcacheError(f'--output is "{args.output}", whose parent folder is not there.')
-    mi.set_variant(args.mode)
-    mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     _show(args)
     return 0
 
 
 def _show(args: argparse.Namespace) -> None:
-    from mitsuba_irrcache.view.access import check_host, is_local
+    from mitsuba_irrcache.view.access import is_local
     from mitsuba_irrcache.view.server import Server
-    from mitsuba_irrcache.view.session import Session
 
-    check_host(args.host)
-    free_at_once()
-    document, appearance = _document(args)
-    session, server = Session(document), None
-    gc.freeze()  # collections then scan the objects created below only
+    name = Path(args.input[0]).name or args.input[0]
+    server, session = Server(args.host, args.port, args.output, f"{name} - irrcache"), None
     try:
-        session.start()
-        server = Server(session, args.host, args.port, args.output, appearance)
         print(f"irrcache view: {server.address} (Ctrl-C ends it)", flush=True)
         if not is_local(args.host):
             print(
@@ -83,12 +87,51 @@ def _show(args: argparse.Namespace) -> None:
             )
         if not args.no_browser:
             webbrowser.open(server.address)
+        try:
+            session = _fill(server, args, name)
+        except Exception as error:
+            server.tell_failure(original_message(error))
+            raise
         _wait()
     finally:
-        if server is not None:
-            server.stop()
-        session.stop()
+        server.stop()
+        if session is not None:
+            session.stop()
         gc.unfreeze()  # so that the libraries report no leaked objects at exit
+
+
+def _fill(server: Server, args: argparse.Namespace, name: str) -> Session:
+    """Load the input while the page tells so, and display it; return the running session."""
+    from mitsuba_irrcache.view.session import Session
+
+    server.say(f"reading {name} ...")
+    mi.set_variant(args.mode)
+    mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
+    free_at_once()
+    document, appearance = _document(args)
+    server.say("computing the first illumination ...")
+    session = Session(document)
+    gc.freeze()  # collections then scan the objects created below only
+    session.start()
+    server.show(session, appearance, _time_steps(args))
+    return session
+
+
+def _time_steps(args: argparse.Namespace) -> TimeSteps | None:
+    """Return the time steps of the file if ``--frame`` names one of several."""
+    from mitsuba_irrcache.view.time_panel import TimeSteps
+
+    if args.frame is None:
+        return None
+
+    def read(frame: int) -> VolumeData:
+        return importer.read(argparse.Namespace(**vars(args) | {"frame": frame}))[0]
+
+    try:
+        read(MOST_STEPS)
+    except MissingItemError as error:
+        return TimeSteps(error.count, args.frame, read) if error.count > 1 else None
+    return None
 
 
 def _document(args: argparse.Namespace) -> tuple:
@@ -107,8 +150,10 @@ def _document(args: argparse.Namespace) -> tuple:
             integrator = "irrcache"
         return Document.load(path, parameters, integrator), None
     volume, mapping = importer.read(args)
-    appearance = Appearance(volume, mapping)
+    appearance = Appearance(volume, mapping, args.preset or "")
     settings = importer.scene_settings(args, "irrcache")
+    if appearance.is_editable:  # CT, MR and the like: before a dark background
+        settings = replace(settings, hide_emitters=True)
     return appearance.document(settings, parameters, args.integrator), appearance
 
 

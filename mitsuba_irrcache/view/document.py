@@ -162,6 +162,18 @@ class Document:
         self._set_sun(lighting)
         self.lighting = lighting
 
+    @property
+    def towards_sun(self) -> np.ndarray:
+        """Return the unit vector towards the sun."""
+        return _towards(self.lighting.azimuth, self.lighting.elevation, self.up)
+
+    def angles(self, towards: Sequence[float]) -> tuple[float, float]:
+        """Return azimuth and elevation in degrees of the direction ``towards`` the sun."""
+        direction = _unit(towards)
+        x, y = (np.dot(direction, axis) for axis in _horizon(self.up))
+        elevation = np.arcsin(np.clip(np.dot(direction, self.up), -1, 1))
+        return float(np.degrees(np.arctan2(y, x))), float(np.degrees(elevation))
+
     # ------------------------------------------------------------------ saving
 
     def save(
@@ -260,12 +272,8 @@ class Document:
             direction = np.reshape(_numbers(matrix, ()), (4, 4))[:3, 2]
         else:
             direction = (0.0, 0.0, 1.0)  # Mitsuba's default
-        towards = -_unit(direction)
-        x, y = (np.dot(towards, axis) for axis in _horizon(self.up))
-        return {
-            "azimuth": float(np.degrees(np.arctan2(y, x))),
-            "elevation": float(np.degrees(np.arcsin(np.clip(np.dot(towards, self.up), -1, 1)))),
-        }
+        azimuth, elevation = self.angles(-np.asarray(direction))
+        return {"azimuth": azimuth, "elevation": elevation}
 
     def _set_environment(self, lighting: Lighting) -> None:
         node, original = self._environment(self._root), self._environment(self._original)

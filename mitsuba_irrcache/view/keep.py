@@ -75,7 +75,7 @@ def _samples(session: Session, view: View, layered: bool) -> Samples:
 
     samples = session.call(begin)
     while samples.count < SAMPLES:
-        session.call(lambda: samples.add(SAMPLES))
+        session.call(lambda: samples.advance(SAMPLES))
     return samples
 
 

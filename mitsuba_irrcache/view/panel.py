@@ -5,57 +5,78 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import viser
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.view.channel import Channel
 from mitsuba_irrcache.view.document import Document, Lighting
 from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.light import Status
 from mitsuba_irrcache.view.session import Session
 
+HINTS = {
+    "environment": "factor of the radiance that the scene gives its environment",
+    "sun": "irradiance on a surface that faces it, in the units of the scene; 0: no sun",
+}
+#: Irradiance of a sun that is switched on by dragging it.
+SUN = 3.0
+
 
 class LightPanel:
     """Display the progress of the caches of ``session``, and edit its illumination and density."""
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._session = session
-        gui, document = server.gui, session.document
-        lighting = document.lighting
-        with gui.add_folder("Light", order=2):
+    def __init__(self, server: viser.ViserServer, session: Session, channel: Channel) -> None:
+        self._session, self._channel = session, channel
+        gui, lighting = server.gui, session.document.lighting
+        with gui.add_folder("Light", order=3):
             self._status = gui.add_markdown("")
             self._refusal = gui.add_markdown("", visible=False)
             self.editing = Editing(self.refuse)
-            target = gui.add_number(
-                "target error %", 100 * session.target_error, min=0.01, max=100.0, step=0.01,
-                hint="relative standard error of the caches at which refinement stops",
-            )  # fmt: skip
-            depth = gui.add_number(
-                "max_depth", document.settings.max_depth, min=-1, step=1,
-                hint="-1: all orders of scattering; 2: single scattering; 1: none",
-            )  # fmt: skip
-            self.editing.bind(target, self._set_target)
-            self.editing.bind(depth, self._set_depth)
-            if document.has_environment:
+            if session.document.has_environment:
                 self._light("environment", lighting.environment, 0.0, 10.0, gui)
-                self._light("rotation", lighting.rotation, -180.0, 180.0, gui, slider=True)
-            self._light("sun", lighting.sun, 0.0, 1000.0, gui)
-            self._light("azimuth", lighting.azimuth, -180.0, 180.0, gui, slider=True)
-            self._light("elevation", lighting.elevation, -90.0, 90.0, gui, slider=True)
-        with gui.add_folder("Medium", order=3):
-            density = gui.add_number(
-                "density", document.density, min=0.001, max=1000.0, step=0.01,
-                hint="factor of the extinction",
-            )  # fmt: skip
-            self.editing.bind(density, self._set_density)
+            self._sun = self._light("sun", lighting.sun, 0.0, 1000.0, gui)
+            gui.add_html("<irrcache-light></irrcache-light>")
+        with gui.add_folder("Details", order=4, expand_by_default=False):
+            self._add_details(gui, lighting)
+        channel.receive("sun", self._turn_sun)
+        self._tell_light()
+
+    def _add_details(self, gui: viser.GuiApi, lighting: Lighting) -> None:
+        document = self._session.document
+        density = gui.add_number(
+            "density", document.density, min=0.001, max=1000.0, step=0.01,
+            hint="factor of the extinction",
+        )  # fmt: skip
+        depth = gui.add_number(
+            "max_depth", document.settings.max_depth, min=-1, step=1,
+            hint="-1: all orders of scattering; 2: single scattering; 1: none",
+        )  # fmt: skip
+        target = gui.add_number(
+            "target error %", 100 * self._session.target_error, min=0.01, max=100.0, step=0.01,
+            hint="relative standard error of the illumination at which refinement stops",
+        )  # fmt: skip
+        self.editing.bind(density, self._set_density)
+        self.editing.bind(depth, self._set_depth)
+        self.editing.bind(target, self._set_target)
+        if document.has_environment:
+            self._light("rotation", lighting.rotation, -180.0, 180.0, gui, slider=True)
+        self._azimuth = self._light("azimuth", lighting.azimuth, -180.0, 180.0, gui, slider=True)
+        self._elevation = self._light(
+            "elevation", lighting.elevation, -90.0, 90.0, gui, slider=True
+        )
 
     def show(self, status: Status) -> None:
         """Display the progress of the cache refinement; called in the session's thread."""
-        error = "" if math.isnan(status.error) else f", standard error {status.error:.2%}"
+        error = "" if math.isnan(status.error) else f"error {status.error:.2%}, "
         state = "improving" if status.improving else "done"
-        self._status.content = (
-            f"{state}: {status.samples} samples per voxel{error}, {status.seconds:.1f} s"
-            + (f" ({status.solver})" if status.solver else "")
-        )
+        samples = f"{status.samples} samples, {status.seconds:.1f} s"
+        self._status.content = f"{state}: {error}{samples}"
+        target = self._session.target_error
+        above = status.improving and status.error > target
+        shown = f"error of the illumination {100 * status.error:.2g} %, target {100 * target:.2g} %"
+        coarse = "coarse illumination, being refined" if status.improving else ""
+        self._channel.send("hint", shown if above else "" if status.samples else coarse)
         if status.message:
             self.refuse(status.message)
 
@@ -66,20 +87,44 @@ class LightPanel:
 
     def _light(
         self, name: str, value: float, low: float, high: float, gui: viser.GuiApi, slider=False
-    ) -> None:
-        add = gui.add_slider if slider else gui.add_number
+    ) -> viser.GuiInputHandle:
+        """Add a control for a field of `Lighting`: a slider for angles, otherwise a number."""
         value = min(max(round(value, 3), low), high)
-        step = 1.0 if slider else 0.01
-        handle = (
-            add(name, low, high, step, value)
-            if slider
-            else add(name, value, min=low, max=high, step=step)
-        )
+        if slider:
+            handle = gui.add_slider(f"{name}, °", low, high, 1.0, value)
+        else:
+            handle = gui.add_number(name, value, min=low, max=high, step=0.01, hint=HINTS[name])
 
         def apply(number: float) -> None:
             self._edit_light(name, _number(name, number, low, high))
 
         self.editing.bind(handle, apply)
+        return handle
+
+    def _turn_sun(self, towards: object) -> None:
+        """Queue another direction to the sun, which a browser sent; switch it on if needed."""
+        direction = np.array([float(c) for c in towards]).reshape(3)
+        if not np.isfinite(direction).all() or not direction.any():
+            raise ValueError("the direction to the sun is no vector")
+
+        def change() -> None:
+            document = self._session.document
+            azimuth, elevation = document.angles(direction)
+            lighting = document.lighting
+            sun = lighting.sun or SUN
+            turned = replace(lighting, azimuth=azimuth, elevation=elevation, sun=sun)
+            self._session.edit(lambda d: d.set_lighting(turned))
+            self._sun.value = sun
+            self._azimuth.value, self._elevation.value = round(azimuth), round(elevation)
+            self._tell_light()
+
+        self.editing.submit("sun", change)
+
+    def _tell_light(self) -> None:
+        """Send the direction to the sun to the components of all windows."""
+        document = self._session.document
+        towards = document.towards_sun.round(4).tolist()
+        self._channel.send("lighting", {"towards": towards, "sun": document.lighting.sun})
 
     def _edit_light(self, name: str, value: float) -> None:
         def change(document: Document) -> None:
@@ -87,6 +132,7 @@ class LightPanel:
             document.set_lighting(lighting)
 
         self._session.edit(change)
+        self._tell_light()
 
     def _set_target(self, percent: float) -> None:
         target = _number("target error", percent, 0.01, 100.0) / 100

@@ -18,7 +18,20 @@ from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seen
 
 #: Quantities that a window can display.
-KINDS = ("image", "colour", "illumination", "error bar", "transmittance", "depth")
+KINDS = (
+    "image",
+    "image, errors marked",
+    "colour",
+    "illumination",
+    "error bar",
+    "transmittance",
+    "depth",
+)
+#: The kind of image in which pixels with too large an error bar are marked, the colour of the
+#: marks, and the share of the brightest pixels below which an error is not relative any more.
+MARKED, MARK, FLOOR = "image, errors marked", (1.0, 0.0, 0.8), 0.02
+#: Quantities that a window can display.
+KINDS = ("image", MARKED, "colour", "illumination", "error bar", "transmittance", "depth")
 #: Scale factor with which the standard error is displayed.
 ERROR_SCALE = 10.0
 #: Tone curves; all are followed by the sRGB transfer function.
@@ -39,13 +52,16 @@ STREAM = 0x9E3779B9
 class Look:
     """What to display and how: one of `KINDS`, ``exposure`` in stops, and one of `TONES`.
 
-    ``filtered`` says whether the illumination is filtered.
+    ``filtered`` says whether the illumination is filtered; ``background`` is the colour behind the
+    image, linear RGB in [0, 1], where emitters are hidden. The exposure does not change it.
     """
 
     kind: str = "image"
     exposure: float = 0.0
     tone: str = "sRGB"
     filtered: bool = False
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    target: float = 0.0
 
     @property
     def layered(self) -> bool:
@@ -54,7 +70,7 @@ class Look:
 
     @property
     def with_error(self) -> bool:
-        return self.kind == "error bar" or self.filtered
+        return self.kind in ("error bar", MARKED) or self.filtered
 
 
 class Samples:
@@ -90,11 +106,19 @@ class Samples:
         self.count += 1
         dr.eval(self._sums)
 
+    def advance(self, total: int) -> None:
+        """Add one sample per pixel like `add`, and wait for it.
+
+        The kernels that `add` launches are asynchronous: many of them would delay what follows.
+        """
+        self.add(total)
+        dr.sync_thread()
+
     @property
     def layers(self) -> Layers:
         """Return the layers as means over the samples; without layers, all is background."""
         scale = dr.opaque(mi.Float, 1 / self.count)
-        means = [s * scale for s in self._sums]
+        means = [s * scale for s in self._sums[:-1]]
         if not self.seen.layered:
             return Layers.background_only(mi.Spectrum(*means))
         return Layers.of(means)
@@ -112,12 +136,23 @@ class Samples:
         rgb = mi.Color3f(radiance.x) if mi.is_monochromatic else mi.Color3f(radiance)
         return self._array(list(rgb))
 
+    def backdrop(self, look: Look) -> np.ndarray:
+        """Return `behind` as float32 (height, width, 3)."""
+        return self._array(list(self.behind(look)))
+
     def picture(self, look: Look, extent: tuple[float, float]) -> np.ndarray:
         """Return the displayed image, uint8 (height, width, 3).
 
         ``extent`` holds the distances that a depth image shows as black and white.
         """
-        return _display(self._shown(look, extent), look, self.size)
+        return _display(self._shown(look, extent), look, self.size, self.behind(look))
+
+    def behind(self, look: Look) -> mi.Color3f:
+        """Return the background where the image is transparent, as it is added to the display."""
+        if look.kind not in ("image", MARKED):
+            return mi.Color3f(0)
+        share = self._sums[-1] * dr.opaque(mi.Float, 1 / self.count)
+        return share * mi.Color3f(*(dr.opaque(mi.Float, c) for c in look.background))
 
     def channels(self, aovs: tuple[str, ...], filtered: bool = False) -> tuple[np.ndarray, list]:
         """Return image and layers as float32 (height, width, channel), and the channel names."""
@@ -129,7 +164,7 @@ class Samples:
         return np.concatenate([image, self._array(planes)], axis=-1), names
 
     def _trace(self, band: range, total: int) -> list[mi.Float]:
-        """Return the next sample of some pixels: radiance, or all layers."""
+        """Return the next sample of some pixels: radiance, or all layers; and transparency."""
         seen, (width, height) = self.seen, self.size
         sampler = mi.load_dict({"type": "independent"})
         # Each pixel has a random stream of its own, whichever band and pass it is traced in.
@@ -147,6 +182,7 @@ class Samples:
             values = seen.camera_rays.projection.layers(*parts, mi.Spectrum(1)).channels()
         else:
             values = list(view.scattered + view.background)
+        values.append(1 - view.alpha)
         return [value + dr.zeros(mi.Float, len(band)) for value in values]
 
     def _array(self, planes: list[mi.Float]) -> np.ndarray:
@@ -166,6 +202,8 @@ class Samples:
             return mi.Color3f(
                 ERROR_SCALE * dr.sqrt(dr.square(layers.noise) + dr.square(layers.bias))
             )
+        if look.kind == MARKED:
+            return self._marked(look)
         if look.kind == "depth":
             (distance,) = layers.aov("depth")
             near, far = (dr.opaque(mi.Float, value) for value in extent)
@@ -173,19 +211,33 @@ class Samples:
             return mi.Color3f(dr.select(seen, (far - distance) / (far - near), 0))
         return mi.Color3f(*layers.aov(look.kind))
 
+    def _marked(self, look: Look) -> mi.Color3f:
+        """Return the image, coloured where its error bar exceeds the target."""
+        layers, shown = self.layers, mi.Color3f(self.radiance(look.filtered))
+        error = luminance(dr.sqrt(dr.square(layers.noise) + dr.square(layers.bias)))
+        radiance = luminance(shown)
+        allowed = dr.opaque(mi.Float, look.target) * dr.maximum(radiance, FLOOR * dr.max(radiance))
+        share = dr.clip(0.5 * error / dr.maximum(allowed, 1e-12) - 0.5, 0, 0.7)
+        return dr.lerp(shown, mi.Color3f(*MARK) * dr.maximum(radiance, 0.2), share)
 
-def displayed(image: np.ndarray, look: Look) -> np.ndarray:
-    """Tone map radiance for display, as uint8 (height, width, 3)."""
-    planes = (mi.Float(p) for p in image.reshape(-1, 3).T.astype(np.float32))
-    return _display(mi.Color3f(*planes), look, image.shape[1::-1])
+
+def displayed(image: np.ndarray, look: Look, behind: np.ndarray) -> np.ndarray:
+    """Tone map radiance for display, as uint8 (height, width, 3), before what lies ``behind``."""
+    return _display(_colour(image), look, image.shape[1::-1], _colour(behind))
 
 
-def _display(colour: mi.Color3f, look: Look, size: tuple[int, int]) -> np.ndarray:
+def _colour(image: np.ndarray) -> mi.Color3f:
+    return mi.Color3f(*(mi.Float(p) for p in image.reshape(-1, 3).T.astype(np.float32)))
+
+
+def _display(
+    colour: mi.Color3f, look: Look, size: tuple[int, int], behind: mi.Color3f
+) -> np.ndarray:
     """Return pixels in sRGB; transmittance and depth ignore the exposure."""
     if look.kind not in ("transmittance", "depth", "colour"):
         colour = TONES[look.tone](colour * dr.opaque(mi.Float, 2.0**look.exposure))
     width, height = size
-    colour = dr.clip(colour, 0, 1)
+    colour = dr.clip(colour + behind, 0, 1)
     curved = dr.select(colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
     r, g, b = (mi.UInt32(c * 255 + 0.5) for c in curved)
     packed = np.array((r | (g << 8) | (b << 16)) + dr.zeros(mi.UInt32, width * height))

@@ -7,6 +7,8 @@ of ``x`` without the noise of the reference.
 
 from __future__ import annotations
 
+from time import perf_counter
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -24,12 +26,18 @@ MOST_SAMPLES = 4096
 class Reference:
     """Samples by ``volpath`` of the scene of a ``light``, at its maximum depth, from ``camera``.
 
-    ``size`` is (width, height).
+    ``window_size`` is (width, height); each pixel of the reference covers ``coarseness`` x
+    ``coarseness`` pixels of the window, those on the right and at the bottom left out that do not
+    fill one.
     """
 
-    def __init__(self, light: Light, camera: Camera, size: tuple[int, int]) -> None:
-        self.light, self.camera, self.size = light, camera, size
-        self._pixels = size[0] * size[1]
+    def __init__(
+        self, light: Light, camera: Camera, window_size: tuple[int, int], coarseness: int = 1
+    ) -> None:
+        self.light, self.camera, self.window_size = light, camera, window_size
+        self.coarseness = max(min(coarseness, *window_size), 1)
+        self.size = tuple(n // self.coarseness for n in window_size)
+        self._pixels = self.size[0] * self.size[1]
         settings = light.settings
         self._integrator = mi.load_dict(
             {
@@ -45,6 +53,13 @@ class Reference:
         self._bands = Bands()
         self._first = 0  # next pixel to render
         self._passes = 0
+        #: seconds of rendering
+        self.seconds = 0.0
+
+    @property
+    def progress(self) -> float:
+        """Return the share of the image that the current pass has rendered."""
+        return self._first / self._pixels
 
     @property
     def samples(self) -> int:
@@ -59,8 +74,10 @@ class Reference:
         """Add one sample per pixel to a band; return whether all pixels have equally many."""
         band = self._bands.at(self._first, self._pixels)
         half, place = self._passes % 2, slice(band.start, band.stop)
+        started = perf_counter()
         with self._bands.timed(band):
             self._sums[half, place] += self._trace(band)
+        self.seconds += perf_counter() - started
         self._counts[half, place] += 1
         complete = band.stop == self._pixels
         self._first = 0 if complete else band.stop
@@ -71,6 +88,12 @@ class Reference:
         """Return the current estimate (height, width, 3); pixels without samples are black."""
         counts = np.maximum(self._counts.sum(axis=0), 1)
         return (self._sums.sum(axis=0) / counts[:, None]).reshape(*self.size[::-1], 3)
+
+    def reduced(self, image: np.ndarray) -> np.ndarray:
+        """Return means of an ``image`` of the window over the pixels of the reference."""
+        n, (width, height) = self.coarseness, self.size
+        whole = image[: n * height, : n * width]
+        return whole.reshape(height, n, width, n, 3).mean(axis=(1, 3))
 
     def error_of(self, image: np.ndarray) -> tuple[float, float] | None:
         """Return the relative RMSE of ``image`` (height, width, 3) and the smallest detectable one.
@@ -84,7 +107,7 @@ class Reference:
         mean = 0.5 * float((a + b).mean())
         if not mean > 0:
             return None
-        apart = image.reshape(-1, 3)
+        apart = self.reduced(image).reshape(-1, 3)
         square = float(((apart - a) * (apart - b)).mean())
         # The mean of products of independent noise has a standard error of variance / sqrt(n).
         noise = float(((a - b) ** 2).mean()) / 2
@@ -93,24 +116,37 @@ class Reference:
 
     def comparison(self, image: np.ndarray) -> str:
         """Describe the difference of ``image`` (height, width, 3) from the reference in words."""
+        if not self.samples:
+            return f"volpath, first sample: {self.progress:.0%} of the image"
+        samples = "1 sample" if self.samples == 1 else f"{self.samples} samples"
+        told = f"volpath, {samples} per pixel"
+        if self.coarseness > 1:
+            told += f" of {self.coarseness} x {self.coarseness}"
         found = self.error_of(image)
-        told = f"volpath, {self.samples} samples per pixel"
         if found is None:
             return told
         error, resolved = found
         amount = f"{error:.2%}" if error > resolved else f"below {resolved:.2%}"
         return f"{told}; RMSE {amount} of the mean, its noise taken out"
 
+    def signed_error(self, image: np.ndarray) -> np.ndarray:
+        """Return the error of ``image``, mean over the channels, in units of the mean radiance.
+
+        The reference's noise is included. The shape is (height, width) of the reference.
+        """
+        truth = self.radiance()
+        return (self.reduced(image) - truth).mean(axis=-1) / (float(truth.mean()) or 1.0)
+
     def _trace(self, band: range) -> np.ndarray:
         """Render the colours of a band, (pixels, 3)."""
         count = len(band)
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(_seed(self._passes, band.start), count)
-        width, height = self.size
+        width, height = self.window_size
         index = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, band.start)
-        scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in self.size))
-        at = mi.Point2f(pixel_of(index, width)) + sampler.next_2d()
-        ray = mi.RayDifferential3f(self.camera.rays(at * scale, width / height))
+        scale = (dr.opaque(mi.Float, self.coarseness / n) for n in self.window_size)
+        at = mi.Point2f(pixel_of(index, self.size[0])) + sampler.next_2d()
+        ray = mi.RayDifferential3f(self.camera.rays(at * mi.Vector2f(*scale), width / height))
         colour, _, _ = self._integrator.sample(self.light.scene, sampler, ray, self._inside)
         planes = mi.Color3f(colour.x) if mi.is_monochromatic else mi.Color3f(colour)
         return np.stack([np.broadcast_to(np.array(p), count) for p in planes], axis=-1)

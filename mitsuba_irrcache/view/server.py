@@ -8,60 +8,127 @@ import logging
 import math
 import socket
 import threading
+import time
 import warnings
 from pathlib import Path
 
 import viser
 import viser._messages as messages
+from PIL import Image
+from websockets.http11 import Request, Response
 
 from mitsuba_irrcache.view.access import Access, check_host, guarded, is_own_page, is_wildcard
 from mitsuba_irrcache.view.appearance import Appearance
+from mitsuba_irrcache.view.channel import PATH, Channel
+from mitsuba_irrcache.view.crop_panel import CropPanel
 from mitsuba_irrcache.view.panel import LightPanel
 from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.time_panel import TimePanel, TimeSteps
 from mitsuba_irrcache.view.transfer_panel import TransferPanel
 from mitsuba_irrcache.view.visitor import Visitor
+from mitsuba_irrcache.view.web_page import page
 
 LOG = logging.getLogger(__name__)
 
 
+#: Time in which windows receive a last message.
+FAREWELL_SECONDS = 0.5
+#: (width, height) of the image that is displayed until the page has started.
+PREVIEW = (480, 240)
+
+
 class Server:
-    """Display a started ``session`` on ``host`` and ``port``, or on the next free port."""
+    """Serve the page on ``host`` and ``port``, or on the next free port.
+
+    The page tells what it waits for (`say`) until `show` gives it something to display. Files that
+    visitors save go to ``folder``, or to their browsers if it is None.
+    """
 
     def __init__(
         self,
-        session: Session,
         host: str = "127.0.0.1",
         port: int = 8080,
         folder: Path | None = None,
-        appearance: Appearance | None = None,
+        title: str = "irrcache",
     ) -> None:
-        self.session, self.host = session, host
+        self.host, self._folder = host, folder
         check_host(host)
         ignore_closed_connections()
         self._access = Access(host)
+        self.channel = Channel(self._access)
+        self.session: Session | None = None
+        self._visitors: dict[int, Visitor] = {}
+        self._lock = threading.Lock()
+
+        def pages(request: Request) -> Response | None:
+            is_page = request.path.partition("?")[0] == "/"
+            is_socket = request.headers.get("Upgrade", "").lower() == "websocket"
+            return page(title, request.headers) if is_page and not is_socket else None
+
         # Viser prints a greeting of its own; `command` prints ours.
-        with contextlib.redirect_stdout(io.StringIO()), guarded(self._access):
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            guarded(self._access, pages, {PATH: self.channel.serve}),
+        ):
             self._server = viser.ViserServer(host, port, label="irrcache", verbose=False)
         self.port = self._server.get_port()
         self._keep_to_ourselves()
-        self._visitors: dict[int, Visitor] = {}
-        self._lock = threading.Lock()
-        self._folder = folder
         server = self._server
         server.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, control_width="medium"
         )
+        server.gui.main_panel.dock_right()  # beside the image, which it never covers
+        # Without any control viser would show its own settings.
+        self._placeholder = server.gui.add_markdown("The controls follow.")
         # The browser's own 3-D scene is empty and needs no lights.
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
-        self._set_first_camera()
-        self.panel = LightPanel(server, session)
+
+    def say(self, text: str) -> None:
+        """Display what the page waits for in all windows without an image."""
+        self.channel.send("wait", text)
+
+    def tell_failure(self, text: str) -> None:
+        """Display why nothing will be displayed, before the server stops."""
+        self.say(f"error: {text}")
+        if self.channel.has_windows:
+            time.sleep(FAREWELL_SECONDS)
+
+    def _send_preview(self, session: Session) -> None:
+        """Send an image that the page displays until viser's client has started and asks for one.
+
+        It is wider than most windows; they crop it.
+        """
+        picture = session.call(lambda: session.preview(PREVIEW))
+        encoded = io.BytesIO()
+        Image.fromarray(picture).save(encoded, "JPEG", quality=90)
+        self.channel.send("preview", encoded.getvalue())
+
+    def show(
+        self,
+        session: Session,
+        appearance: Appearance | None = None,
+        steps: TimeSteps | None = None,
+    ) -> None:
+        """Display a started ``session`` in all windows, also in those that are open already."""
+        self.session = session
+        self._send_preview(session)
+        self.say("loading the controls ...")
+        self._set_first_camera(session)
+        self._placeholder.remove()
+        self.panel = LightPanel(self._server, session, self.channel)
         if appearance is not None and appearance.is_editable:
-            TransferPanel(server, session, appearance, self.panel.editing)
+            TransferPanel(self._server, session, appearance, self.panel.editing, self.channel)
+        if appearance is not None:
+            CropPanel(self._server, session, appearance, self.panel.editing, self.channel)
+        if steps is not None:
+            TimePanel(self._server, session, appearance, self.panel.editing, steps)
+        anatomical = appearance is not None and appearance.volume.unit == "HU"
+        self.channel.send("axes", ["L", "P", "S"] if anatomical else ["x", "y", "z"])
         session.on_status = self.panel.show
         self.panel.show(session.status)
-        server.on_client_connect(self._connected)
-        server.on_client_disconnect(self._gone)
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._gone)
 
     @property
     def address(self) -> str:
@@ -81,21 +148,23 @@ class Server:
 
     def stop(self) -> None:
         """Close all windows and the server."""
-        self.session.on_status = lambda status: None
+        if self.session is not None:
+            self.session.on_status = lambda status: None
         for client in list(self._visitors):
             self._forget(client)
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def _set_first_camera(self) -> None:
-        camera = next(iter(self.session.cameras.values()))
-        place, first = self.session.placement.to_browser, self._server.initial_camera
+    def _set_first_camera(self, session: Session) -> None:
+        camera = next(iter(session.cameras.values()))
+        place, first = session.placement.to_browser, self._server.initial_camera
         self._server.scene.set_up_direction(camera.up)
         first.position, first.look_at = place(camera.position), place(camera.target)
         first.up, first.fov = camera.up, math.radians(camera.fov)
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        visitor = Visitor(client, self.session, self._folder)
+        self.channel.send("preview", b"")  # windows that open later would show an old state
+        visitor = Visitor(client, self.session, self._folder, self.channel)
         with self._lock:
             self._visitors[client.client_id] = visitor
 

@@ -24,7 +24,7 @@ from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.light import Light, Seen, Status
-from mitsuba_irrcache.view.picture import Samples
+from mitsuba_irrcache.view.picture import Look, Samples
 from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 
 LOG = logging.getLogger(__name__)
@@ -152,6 +152,16 @@ class Session:
     def light(self) -> Light:
         """Return the displayed caches; for the session's thread only."""
         return self._shown
+
+    def preview(self, size: tuple[int, int]) -> np.ndarray:
+        """Return an image by the first camera with one sample per pixel, uint8 (height, width, 3).
+
+        For the session's thread only.
+        """
+        camera, look = next(iter(self.cameras.values())), Look()
+        samples = Samples(self._shown.seen(look.layered, look.with_error), camera, size)
+        samples.add(1)
+        return samples.picture(look, self.extent(camera))
 
     def complete(self, seen: Seen, view: View) -> Samples | None:
         """Return all samples of ``view`` if a window has them; for the session's thread only."""
@@ -387,7 +397,9 @@ class Session:
                 picture = window.compared(light, view, extent, self._wants_light)
                 if picture is not None:
                     window.show(picture)
-                if monotonic() > until or self._is_called or self._is_work_waiting:
+                if self._is_called or self._is_work_waiting:
+                    return True
+                if monotonic() > until and window.has_first_sample:  # the user waits for it
                     return True
 
     def _taken(self, window: Window) -> View:

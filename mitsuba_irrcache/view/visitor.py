@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-import tempfile
 import threading
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -15,12 +13,16 @@ from time import monotonic
 
 import numpy as np
 import viser
+from PIL import Image
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
+from mitsuba_irrcache.view.channel import Channel
+from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
+from mitsuba_irrcache.view.comparison import Compared, described
 from mitsuba_irrcache.view.editing import Editing, plain
-from mitsuba_irrcache.view.keep import checked_name, keep
-from mitsuba_irrcache.view.picture import KINDS, TONES, Look
+from mitsuba_irrcache.view.export_panel import ExportPanel
+from mitsuba_irrcache.view.picture import KINDS, MARKED, TONES, Look
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 
@@ -36,8 +38,15 @@ class Visitor:
     Files are saved in ``folder``, or downloaded by the browser if it is None.
     """
 
-    def __init__(self, client: viser.ClientHandle, session: Session, folder: Path | None) -> None:
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        session: Session,
+        folder: Path | None,
+        channel: Channel,
+    ) -> None:
         self.client, self.session, self.folder = client, session, folder
+        self._channel, self._key = channel, channel.open()
         self._encoder = ThreadPoolExecutor(1)
         self._lock = threading.Lock()
         self._waiting: Picture | None = None
@@ -48,11 +57,15 @@ class Visitor:
         self.window = session.open(self._show)
         self._add_controls(client.gui)
         client.camera.on_update(self._camera_moved)
+        if self._aspect < 1:
+            self._go_to(self._sensor.value)  # the first camera was placed for wide windows
         self._look_again()
 
     def close(self) -> None:
         """Release the window after the browser has disconnected."""
         self._gone = True
+        self._export.close()
+        self._channel.close(self._key)
         self.session.close(self.window)
         self._encoder.shutdown(wait=False, cancel_futures=True)
 
@@ -60,45 +73,50 @@ class Visitor:
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("View", order=1):
-            self._note = gui.add_markdown("")
             self._refusal = gui.add_markdown("", visible=False)
             self.editing = Editing(self._refuse)
             cameras = list(self.session.cameras)
-            self._sensor = gui.add_dropdown("camera", cameras, initial_value=cameras[0])
-            self._reset = gui.add_button("reset camera")
-            fov = math.degrees(self.client.camera.fov)
-            self._fov = gui.add_slider(
-                "field of view", NARROWEST, WIDEST, 0.5, min(max(round(fov, 1), 1.0), 150.0)
+            self._sensor = gui.add_dropdown(
+                "camera", cameras, initial_value=cameras[0], visible=len(cameras) > 1
             )
             self._kind = gui.add_dropdown("show", KINDS)
-            self._exposure = gui.add_slider("exposure", -8.0, 8.0, 0.1, 0.0, hint="stops")
+            self._exposure = gui.add_slider("exposure, EV", -8.0, 8.0, 0.1, 0.0)
+            self._compare = gui.add_dropdown(
+                "volpath", COMPARISONS,
+                hint="compare with volpath, which is refined while no camera moves: swipe with the "
+                "divider, or the error in false colours",
+            )  # fmt: skip
+            self._reset = gui.add_button("reset camera", color="gray")
+            gui.add_html(f'<irrcache-window key="{self._key}"></irrcache-window>')
+        with gui.add_folder("Camera and tone", order=5, expand_by_default=False):
+            fov = math.degrees(self.client.camera.fov)
+            self._fov = gui.add_slider(
+                "field of view, °", NARROWEST, WIDEST, 0.5, min(max(round(fov, 1), 1.0), 150.0)
+            )
             self._tone = gui.add_dropdown("tone mapping", tuple(TONES))
             self._filter = gui.add_checkbox(
                 "filter", False, hint="of the illumination; weaker as the caches converge"
             )
-            self._compare = gui.add_checkbox(
-                "compare with volpath", False, hint="side by side, refined while no camera moves"
+            self._background = gui.add_rgb(
+                "background", (0, 0, 0), hint="where emitters are hidden (-D hide_emitters=true)"
             )
-        with gui.add_folder("Save", order=5, expand_by_default=False):
-            self._name = gui.add_text("name", "view")
-            self._cache = gui.add_checkbox("with the cache", False)
-            self._save = gui.add_button(
-                "save" if self.folder is not None else "download",
-                hint="PNG, EXR with layers, and a scene for irrcache render",
-            )
-            self._saved = gui.add_markdown("")
-        for handle in (self._kind, self._exposure, self._tone, self._filter, self._compare):
+        for handle in (
+            self._kind, self._exposure, self._tone, self._filter, self._background, self._compare
+        ):  # fmt: skip
             self.editing.bind(handle, lambda _: self._set_look())
         self.editing.bind(self._sensor, lambda name: self._go_to(name))
         self.editing.bind(self._fov, self._set_fov)
         self._reset.on_click(lambda _: self._go_to(self._sensor.value))
-        self._save.on_click(lambda _: self.editing.submit("save", self._keep))
+        self._export = ExportPanel(self.client, self.session, self.folder, self.editing, self._seen)
 
     def _set_look(self) -> None:
         kind, tone, exposure = self._kind.value, self._tone.value, self._exposure.value
         if kind not in KINDS or tone not in TONES or not -64 <= exposure <= 64:
             raise IrrcacheError(f"{kind!r}, {tone!r}, exposure {exposure!r}: nothing to be shown.")
-        self._look = Look(kind, float(exposure), tone, bool(self._filter.value))
+        if self._compare.value not in COMPARISONS:
+            raise IrrcacheError(f"{self._compare.value!r} is no comparison.")
+        colour = tuple(_linear(c) for c in self._background.value)
+        self._look = Look(kind, float(exposure), tone, bool(self._filter.value), colour)
         self._look_again()
 
     def _set_fov(self, degrees: float) -> None:
@@ -109,17 +127,29 @@ class Visitor:
         self.client.camera.fov = math.radians(degrees)
         self._look_again()
 
+    @property
+    def _aspect(self) -> float:
+        """Return width over height of the image."""
+        camera = self.client.camera
+        return max(camera.image_width, 1) / max(camera.image_height, 1)
+
     def _go_to(self, name: str) -> None:
         if name not in self.session.cameras:
             raise IrrcacheError(f"the scene has no camera {name!r}.")
         camera, place = self.session.cameras[name], self.session.placement.to_browser
         with self.client.atomic():
             self.client.camera.up_direction = np.array(camera.up)
-            self.client.camera.position = place(camera.position)
+            target, away = np.array(camera.target), max(1.0, 1 / self._aspect)  # fits high windows
+            position = target + away * (np.array(camera.position) - target)
+            self.client.camera.position = place(position)
             self.client.camera.look_at = place(camera.target)
             self.client.camera.fov = math.radians(camera.fov)
         self._fov.value = camera.fov
         self._look_again()
+
+    def _seen(self) -> View | None:
+        """Return the view without its comparison, None if there is none yet."""
+        return self._view and replace(self._view, compared="off")
 
     def _refuse(self, reason: str) -> None:
         self._refusal.content = f"**Refused:** {plain(reason)}" if reason else ""
@@ -145,7 +175,14 @@ class Visitor:
         if not np.isfinite(numbers).all() or seen.distance == 0 or not any(seen.up):
             return  # the browser sent values that are no camera
         size = camera.image_width, camera.image_height
-        self._view = View(seen, size, self._look, bool(self._compare.value))
+        self._channel.send("camera", seen.axes.round(4).tolist(), self._key)
+        look = self._look
+        if look.kind == MARKED:
+            look = replace(look, target=self.session.target_error)
+        view = View(seen, size, look, self._compare.value)
+        if self._view is not None and view != self._view and view.shows_place_of(self._view):
+            self._channel.send("note", "rendering ...", self._key)  # may take seconds
+        self._view = view
         self.session.look(self.window, self._view)
 
     def _show(self, picture: Picture) -> None:
@@ -167,39 +204,31 @@ class Visitor:
         self.client.scene.set_background_image(picture.pixels, kind, jpeg_quality=quality)
         if not picture.moving or monotonic() - self._noted > NOTE_SECONDS:
             self._noted = monotonic()
-            height, width, _ = picture.pixels.shape
-            state = "moving" if picture.moving else "final" if picture.final else "at rest"
-            samples = "1 sample" if picture.samples == 1 else f"{picture.samples} samples"
-            self._note.content = f"{state}: {width} x {height}, {samples} per pixel"
-            if picture.comparison:
-                self._note.content += f"; on the right {picture.comparison}"
+            self._tell(picture)
         self.client.flush()
 
-    # ------------------------------------------------------------------ saving
-
-    def _keep(self) -> None:
-        name = checked_name(self._name.value)
-        if self._view is None:
+    def _tell(self, picture: Picture) -> None:
+        """Send what lies over the image: a note about it, and the comparison."""
+        height, width, _ = picture.pixels.shape
+        state = "moving" if picture.moving else "final" if picture.final else "at rest"
+        samples = "1 sample" if picture.samples == 1 else f"{picture.samples} samples"
+        send, key = self._channel.send, self._key
+        send("wait", "", key)
+        send("note", f"{state}: {width} x {height}, {samples} per pixel", key)
+        found = picture.compared
+        if found is None and picture.view.compared == "off":
+            send("comparison", {"mode": "off"}, key)
             return
-        view = replace(self._view, look=self._look, compared=False)
-        self._saved.content = "saving ..."
-        try:
-            if self.folder is not None:
-                self.folder.mkdir(exist_ok=True)
-                files = keep(self.session, view, self.folder, name, self._cache.value)
-                self._saved.content = "saved " + ", ".join(f.name for f in files)
-            else:
-                self._download(view, name)
-                self._saved.content = f"downloaded {name}.zip"
-        except Exception:
-            self._saved.content = ""
-            raise
+        if found is None:
+            found = Compared(picture.view.compared, "volpath waits for the camera to rest")
+        send("comparison", described(found), key)
+        if found.reference is not None:
+            pixels = io.BytesIO()
+            Image.fromarray(found.reference).save(pixels, "JPEG", quality=RESTING_QUALITY)
+            send("reference", pixels.getvalue(), key)
 
-    def _download(self, view: View, name: str) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            files = keep(self.session, view, Path(folder), name, self._cache.value)
-            packed = io.BytesIO()
-            with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-                for file in files:
-                    archive.write(file, file.name)
-        self.client.send_file_download(f"{name}.zip", packed.getvalue(), save_immediately=True)
+
+def _linear(value: int) -> float:
+    """Return the linear value of an 8-bit channel in sRGB."""
+    c = min(max(value, 0), 255) / 255
+    return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4

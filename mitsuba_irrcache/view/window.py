@@ -9,9 +9,9 @@ from time import monotonic, perf_counter
 import numpy as np
 
 from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.comparison import Compared, Comparison
 from mitsuba_irrcache.view.light import Light, Seen
-from mitsuba_irrcache.view.picture import Look, Samples, displayed
-from mitsuba_irrcache.view.reference import Reference
+from mitsuba_irrcache.view.picture import Look, Samples
 
 #: Seconds without a movement after which a camera counts as resting.
 REST_SECONDS = 0.15
@@ -30,18 +30,13 @@ MOST_PIXELS = 1 << 22
 class View:
     """A requested view: a camera, and the window's ``size`` (width, height) in pixels.
 
-    If ``compared``, half of the window shows the image by ``volpath``.
+    ``compared`` is one of `comparison.KINDS`.
     """
 
     camera: Camera
     size: tuple[int, int]
     look: Look = field(default_factory=Look)
-    compared: bool = False
-
-    @property
-    def part(self) -> tuple[int, int]:
-        """Return the (width, height) of the image by irrcache."""
-        return (max(self.size[0] // 2, 1), self.size[1]) if self.compared else self.size
+    compared: str = "off"
 
     def bounded(self) -> View:
         """Return the view with a size of at least one pixel and at most `MOST_PIXELS`."""
@@ -51,7 +46,7 @@ class View:
 
     def shows_place_of(self, other: View | None) -> bool:
         """Return whether ``other`` has the same camera and the same size."""
-        return other is not None and (self.camera, self.part) == (other.camera, other.part)
+        return other is not None and (self.camera, self.size) == (other.camera, other.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +59,7 @@ class Picture:
         samples: per pixel.
         moving: whether the camera moves.
         final: whether no better image will follow.
-        comparison: how far the image is from the one by ``volpath`` on its right.
+        compared: the comparison with ``volpath``, if one was requested.
     """
 
     pixels: np.ndarray
@@ -72,7 +67,7 @@ class Picture:
     samples: int
     moving: bool
     final: bool
-    comparison: str = ""
+    compared: Compared | None = None
 
 
 class Window:
@@ -88,7 +83,12 @@ class Window:
         self._resting: View | None = None  # the view of `samples`
         self._light: Light | None = None  # the caches of `samples`
         self._revision = -1
-        self._reference: Reference | None = None
+        self._comparison: Comparison | None = None
+
+    @property
+    def has_first_sample(self) -> bool:
+        """Return whether the reference of the comparison covers the image."""
+        return self._comparison is not None and self._comparison.has_sample
 
     @property
     def is_moving(self) -> bool:
@@ -102,7 +102,7 @@ class Window:
         old, view = self.view, view.bounded()
         if view == old:
             return False
-        if old is not None and not view.shows_place_of(old):
+        if not view.shows_place_of(old):  # the first image of a window is a coarse one, too
             self.moved = monotonic()
         self.view, self.fresh = view, True
         return True
@@ -110,14 +110,14 @@ class Window:
     def forget(self) -> None:
         """Reset the window to the state without a view, and release its images."""
         self.view, self.fresh, self._resting = None, False, None
-        self.samples = self._light = self._reference = None
+        self.samples = self._light = self._comparison = None
 
     def let_go(self, light: Light) -> None:
         """Release images of caches other than ``light``."""
         if self._light is not light:
             self.samples = self._light = None
-        if self._reference is not None and self._reference.light is not light:
-            self._reference = None
+        if self._comparison is not None and self._comparison.light is not light:
+            self._comparison = None
 
     def lacks(self, light: Light, revision: int, first: bool) -> bool:
         """Return whether an image at rest lacks samples, or has none at all if ``first``."""
@@ -139,20 +139,17 @@ class Window:
     def quick(self, light: Light, view: View, extent: tuple[float, float]) -> Picture:
         """Render an image of a moving camera at the level of detail that is fast enough."""
         share, stride = LEVELS[self.level]
-        size = tuple(max(round(n * share), 1) for n in view.part)
-        started, look = perf_counter(), view.look
-        # Without error propagation and filter, for which there is no time.
-        seen = light.seen(look.kind != "image", look.kind == "error bar")
+        size = tuple(max(round(n * share), 1) for n in view.size)
+        started, look = perf_counter(), replace(view.look, filtered=False)  # no time for that
+        seen = light.seen(look.layered, look.with_error)
         seen.stride(stride)
         try:
             samples = Samples(seen, view.camera, size)
             samples.add(1)
-            pixels = samples.picture(replace(look, filtered=False), extent)
+            pixels = samples.picture(look, extent)
         finally:
             seen.stride(1.0)
         self.level = _adapted(self.level, perf_counter() - started)
-        if view.compared:
-            pixels = np.concatenate([pixels, np.zeros_like(pixels)], axis=1)
         return Picture(pixels, view, 1, True, False)
 
     def refined(
@@ -174,11 +171,11 @@ class Window:
         samples = self.samples
         known = samples is not None and self._revision == revision
         if not (known and view.shows_place_of(self._resting) and samples.seen is seen):
-            samples = Samples(seen, view.camera, view.part)
+            samples = Samples(seen, view.camera, view.size)
             samples.add(1, pause)
         elif self._resting == view:  # unless only the display of the same samples changes
             if samples.count == 1:  # the centre sample is not random
-                samples = Samples(seen, view.camera, view.part)
+                samples = Samples(seen, view.camera, view.size)
                 samples.add(SAMPLES, pause)
             samples.add(SAMPLES, pause)
         self.samples, self._resting = samples, view
@@ -187,45 +184,43 @@ class Window:
 
     def is_comparing(self, light: Light, revision: int) -> bool:
         """Return whether the image is compared with a reference that is not complete."""
-        if self.view is None or not self.view.compared or self.lacks(light, revision, True):
+        view = self.view
+        if view is None or view.compared == "off" or self.lacks(light, revision, True):
             return False
-        known = self._reference_of(light, self.view)
+        known = self._comparison_of(light, view)
         return known is None or not known.is_done
 
     def compared(
         self, light: Light, view: View, extent: tuple[float, float], improving: bool
     ) -> Picture | None:
-        """Add samples to the reference; return an image if each of its pixels has a new sample."""
-        known = self._reference_of(light, view)
+        """Add samples to the reference; return an image if there is anything new to show."""
+        known = self._comparison_of(light, view)
         if known is None:
-            self._reference = known = Reference(light, view.camera, view.part)
+            self._comparison = known = Comparison(light, view.camera, view.size)
         return self._picture(view, extent, improving) if known.refine() else None
 
-    def _reference_of(self, light: Light, view: View) -> Reference | None:
-        """Return the reference of this scene and view if it exists."""
-        known = self._reference
-        if known is None or (known.light, known.camera, known.size) != (
-            light,
-            view.camera,
-            view.part,
-        ):
-            return None
-        return known
+    def _comparison_of(self, light: Light, view: View) -> Comparison | None:
+        """Return the comparison of this scene and view if it exists."""
+        known = self._comparison
+        return known if known and known.belongs_to(light, view.camera, view.size) else None
 
     def _picture(self, view: View, extent: tuple[float, float], improving: bool) -> Picture:
         """Return the image that `samples` give."""
         count = self.samples.count
         pixels = self.samples.picture(view.look, extent)
         final = count >= SAMPLES and not improving
-        if not view.compared:
+        if view.compared == "off":
             return Picture(pixels, view, count, False, final)
-        known, other, told = self._reference_of(self._light, view), np.zeros_like(pixels), ""
-        if known is not None:
-            other = displayed(known.radiance(), replace(view.look, kind="image"))
-            told = known.comparison(self.samples.image(view.look.filtered))
-            final &= known.is_done
-        beside = np.concatenate([pixels, other], axis=1)
-        return Picture(beside, view, count, False, final and known is not None, told)
+        known = self._comparison_of(self._light, view)
+        if known is None:
+            state = Compared(view.compared, "volpath has not begun")
+            return Picture(pixels, view, count, False, False, state)
+        image = self.samples.image(view.look.filtered)
+        look = replace(view.look, kind="image")
+        state = known.state(view.compared, image, look, self.samples.backdrop(look))
+        if state.error is not None:
+            pixels = state.error
+        return Picture(pixels, view, count, False, final and known.is_done, state)
 
 
 def _adapted(level: int, seconds: float) -> int:

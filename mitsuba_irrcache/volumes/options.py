@@ -79,6 +79,14 @@ def chosen_field(source: str, names: Iterable[str], wanted: str | None, what: st
     )
 
 
+class MissingItemError(IrrcacheError):
+    """A channel or frame that a file does not have; ``count`` is how many it has."""
+
+    def __init__(self, message: str, count: int) -> None:
+        super().__init__(message)
+        self.count = count
+
+
 def picked(source: str, what: str, count: int, wanted: int | None) -> int:
     """Return the index to read of ``count`` items: the one ``wanted``, or 0 if there is one.
 
@@ -94,8 +102,9 @@ def picked(source: str, what: str, count: int, wanted: int | None) -> int:
             f"{source} has {count} {what}s; choose one with --{what} N, from 0 to {count - 1}"
         )
     if not 0 <= wanted < count:
-        raise IrrcacheError(
-            f"{source} has {count} {what}(s), but --{what} is {wanted}; give 0 to {count - 1}"
+        raise MissingItemError(
+            f"{source} has {count} {what}(s), but --{what} is {wanted}; give 0 to {count - 1}",
+            count,
         )
     return wanted
 

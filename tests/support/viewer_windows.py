@@ -11,23 +11,18 @@ from PIL import Image
 
 from experiments.performance.viewer.browser import Window
 
-SIZE = (700, 260)
-
-
-#: Width in pixels, from the left, that the control panel never covers.
-CLEAR = 340
+SIZE = (620, 260)
+#: Hides what lies over the image.
+HIDDEN = "#irrcache-overlay {visibility: hidden}"
 
 
 def settled(window: Window) -> np.ndarray:
-    """Wait for the final image; return the screenshot (height, width, 3) as float.
-
-    The columns that the panel may cover are cropped.
-    """
+    """Wait for the final image; return the screenshot (height, width, 3) as float."""
     count = -1
     while count != len(window.shown()) or not window.note().startswith("final"):
         window.wait_for("^final", 90)
         count = len(window.shown())
-        time.sleep(0.5)
+        time.sleep(0.3)
     return screen(window)
 
 
@@ -35,14 +30,16 @@ def after(window: Window, act: Callable[[], None]) -> np.ndarray:
     """Call ``act`` and return the final screenshot that differs from the previous one."""
     count = len(window.shown())
     act()
-    window.wait_for_picture(count, SIZE[0])
+    window.wait_for_picture(count, round(window.canvas()["width"]))
     return settled(window)
 
 
-def screen(window: Window, width: int = CLEAR) -> np.ndarray:
-    """Return the left columns of a screenshot."""
-    shot = Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")
-    return np.asarray(shot, dtype=float)[:, :width]
+def screen(window: Window) -> np.ndarray:
+    """Return a screenshot of the image, without what lies over it."""
+    style = window.page.add_style_tag(content=HIDDEN)
+    shot = Image.open(io.BytesIO(window.page.screenshot(clip=window.canvas()))).convert("RGB")
+    style.evaluate("style => style.remove()")
+    return np.asarray(shot, dtype=float)
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> float:

@@ -153,18 +153,18 @@ def test_memory_is_the_integrators_own(report):
 
 
 def test_the_report_is_self_contained(report):
-    """The report loads no other file, contains all figures, and its tags are balanced."""
+    """The report loads no other file, contains all plots, and its tags are balanced."""
 
     class Page(HTMLParser):
         def __init__(self):
             super().__init__()
-            self.images, self.links, self.open = 0, [], []
+            self.drawings, self.links, self.open = 0, [], []
 
         def handle_starttag(self, tag, attributes):
-            if tag not in ("meta", "img", "br"):
+            if tag not in ("meta", "br"):
                 self.open.append(tag)
-            self.images += tag == "img"
-            self.links += [v for k, v in attributes if k in ("src", "href")]
+            self.drawings += tag == "svg"
+            self.links += [v for k, v in attributes if k in ("src", "href", "xlink:href")]
 
         def handle_endtag(self, tag):
             assert self.open.pop() == tag
@@ -173,9 +173,74 @@ def test_the_report_is_self_contained(report):
     page = Page()
     page.feed(text)
     assert not page.open
-    assert page.images == len(list((report / "figures").glob("*.png"))) == 6
-    assert all(link.startswith("data:image/png;base64,") for link in page.links)
-    assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+    assert page.drawings == len(list((report / "figures").glob("*.svg"))) == 3
+    assert page.links and all(link.startswith("#") for link in page.links)
+    assert "http" not in re.sub(r"\"data\": \"[^\"]*\"", "", text)
+
+
+def test_the_report_in_a_browser(report):
+    """Opened from disk, the report shows the pixels of the EXR files and the values of its plots.
+
+    Skipped if there is no Chromium.
+    """
+    pytest.importorskip("playwright")
+    from experiments.performance.viewer.browser import Browser, chromium
+
+    if chromium() is None:
+        pytest.skip("there is no Chromium on this machine")
+    snapshots = [s for m in read(report)["measurements"] for s in m["snapshots"]]
+    with Browser() as browser:
+        window = browser.open((report / "report.html").as_uri(), (1200, 900))
+        page, requests = window.page, []
+        page.on("request", lambda request: requests.append(request.url))
+        canvas = page.locator("[data-id=canvas]")
+        page.get_by_text("move the pointer over").wait_for()
+
+        def pointed(x: float, y: float) -> str:
+            """Point at a place of the image; (0, 0) is its upper left corner, in pixels."""
+            canvas.scroll_into_view_if_needed()
+            box = canvas.bounding_box()
+            scale = min(box["width"] / 48, box["height"] / 32)
+            left = box["x"] + box["width"] / 2 + (x - 24) * scale
+            page.mouse.move(left, box["y"] + box["height"] / 2 + (y - 16) * scale)
+            return page.locator("[data-id=values]").inner_text()
+
+        # The first image of the choices is on the left of the divider, the reference on the right.
+        page.locator(".choices button").first.click()
+        said = pointed(20.5, 15.5).splitlines()
+        pixels = oiio.ImageBuf(str(report / snapshots[0]["image"])).get_pixels(oiio.FLOAT)
+        truth = oiio.ImageBuf(str(report / "images" / "reference.exr")).get_pixels(oiio.FLOAT)
+        assert said[0] == "pixel 20, 15"
+        for line, image in ((said[1], pixels), (said[2], truth)):
+            shown = [float(number) for number in line.split()[:3]]
+            assert shown == pytest.approx(image[15, 20].tolist(), rel=2e-3)
+        error = float(re.search(r"error (\S+) % of the mean", said[1])[1])
+        exact = 100 * (pixels[15, 20].mean() - truth[15, 20].mean()) / truth.mean()
+        assert error == pytest.approx(exact, abs=0.3)
+
+        # The wheel zooms about the pointer, and zooms of all images are common.
+        page.mouse.wheel(0, -400)
+        assert page.locator("[data-id=values]").inner_text().startswith("pixel 20, 15")
+        canvas.press("d")
+        canvas.press("r")
+        page.locator("[data-id=high]", has_text="10 % and more").wait_for()
+        canvas.press("r")
+        canvas.press(" ")
+        page.locator(".choices button.a", has_text="reference").wait_for()
+
+        marker = page.locator('[id="rmse-0"] use').last
+        marker.scroll_into_view_if_needed()
+        place = marker.bounding_box()
+        page.mouse.move(place["x"] + place["width"] / 2, place["y"] + place["height"] / 2)
+        tip = page.locator(".tip:visible").inner_text()
+        last = next(m for m in read(report)["measurements"] if m["integrator"] == "volpath")
+        shown = last["snapshots"][-1]
+        seconds, error = re.fullmatch(r"volpath\n(\S+) s, RMSE (\S+) %( or less)?", tip).groups()[
+            :2
+        ]
+        assert float(seconds) == pytest.approx(sum(shown["seconds"].values()), rel=0.01)
+        assert float(error) >= 100 * shown["errors"]["rmse"] * 0.99
+        assert window.errors == [] and requests == []
 
 
 def test_nothing_temporary_is_left(report):

@@ -12,7 +12,7 @@ import pytest
 
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.io.images import read_image
-from tests.support.viewer_windows import CLEAR, SIZE, after, difference, screen, settled
+from tests.support.viewer_windows import SIZE, after, difference, screen, settled
 
 pytest.importorskip("playwright")
 from experiments.performance.viewer.browser import Browser, chromium, viewer
@@ -33,7 +33,7 @@ def browser():
 def started(tmp_path_factory):
     """Start a viewer of a chest with few voxels; return its address and the folder of its files."""
     folder = tmp_path_factory.mktemp("viewer")
-    volume = ("phantom:thorax:40,28,36", "--preset", "ct-chest")
+    volume = ("phantom:thorax:32,22,29", "--preset", "ct-chest")
     arguments = (*volume, "-o", str(folder / "kept"), "--port", "8700")
     with viewer(arguments, folder / "log.txt") as address:
         yield address, folder
@@ -48,53 +48,68 @@ def test_edit_save_reload_and_second_window(browser, started):
     """
     address, folder = started
     window = browser.open(address, SIZE)
-    window.page.add_style_tag(content="[class*=Notification] {display: none !important}")
-    window.enter("target error %", 6)
+    window.unfold("Details")
+    window.enter("target error %", 25)
     first = settled(window)
     assert first.std() > 20
+    assert window.page.title() == "phantom:thorax:32,22,29 - irrcache"
+    assert window.field("preset").input_value() == "ct-chest"
 
     # Dragging rotates the camera, the wheel moves it closer; meanwhile images have low resolution.
     count = len(window.shown())
-    turned = after(window, lambda: window.orbit(12, 8, 0.02))
-    assert difference(turned, first) > 3
-    sizes = [s["width"] for s in window.shown()[count:]]
-    assert min(sizes) < SIZE[0] and sizes[-1] == SIZE[0]
-    window.page.mouse.move(200, 200)
+    window.orbit(12, 8, 0.02)
+    assert min(s["width"] for s in window.shown()[count:]) < first.shape[1]
+    window.page.mouse.move(100, 200)
     closer = after(window, lambda: window.zoom(-3))
-    assert difference(closer, turned) > 3
+    assert window.shown()[-1]["width"] == first.shape[1]
+    assert difference(closer, first) > 3
 
     # A saved scene renders to the displayed image.
     window.page.get_by_text("Save", exact=True).click()
-    window.page.get_by_role("button", name="save", exact=True).click()
+    window.page.get_by_role("button", name="save view", exact=True).click()
     window.page.get_by_text("saved view").wait_for(timeout=20000)
     kept = folder / "kept" / "view.xml"
     assert main(["render", str(kept), "-o", str(folder / "again.exr")]) == 0
-    again = np.rint(255 * read_image(folder / "again.png"))[:, :CLEAR]
+    again = np.rint(255 * read_image(folder / "again.png"))
     assert again.shape == closer.shape
     assert difference(again, closer) < 1.5
-    shown = np.rint(255 * read_image(folder / "kept" / "view.png"))[:, :CLEAR]
+    shown = np.rint(255 * read_image(folder / "kept" / "view.png"))
     assert difference(shown, closer) < 1
 
-    # An edit of the transfer function changes the medium, and is saved.
-    window.choose("point", "4")
-    denser = after(window, lambda: window.enter("opacity", 0.6))
-    assert difference(denser, closer) > 2
+    # A point of the transfer function is dragged, added and removed on the plot, and undone.
+    points = window.curve()
+    window.drag_point(8, 120, 0.6)
+    assert window.curve()[8] == pytest.approx([120, 0.6], abs=4)
+    window.page.mouse.click(*window.place_of(-600, 0.4))
+    window.wait_for_curve(len(points) + 1)
+    window.wait_for_picture(len(window.shown()))
+    denser = screen(window)
+    window.page.keyboard.press("Delete")
+    window.wait_for_curve(len(points))
+    for _ in range(3):
+        window.page.keyboard.press("Control+z")
+    undone = settled(window)
+    assert window.curve() == points
+    assert difference(undone, closer) < 1 and difference(denser, closer) > 2
+
+    # The sun is dragged on its sphere.
+    sphere = window.page.locator("irrcache-light canvas")
+    denser = after(window, lambda: sphere.click(position={"x": 50, "y": 20}))
+    assert difference(denser, undone) > 2 and window.field("sun").input_value() == "3"
 
     # A second window has a camera of its own; invalid input is refused where it was entered.
     other = browser.open(address, SIZE)
-    other.page.add_style_tag(content="[class*=Notification] {display: none !important}")
     elsewhere = settled(other)
     assert difference(elsewhere, denser) > 3
     assert difference(screen(window), denser) < 0.5
     other.page.get_by_text("Save", exact=True).click()
     other.enter("name", "../escaped")
-    other.page.get_by_role("button", name="save", exact=True).click()
+    other.page.get_by_role("button", name="save view", exact=True).click()
     other.page.get_by_text("is no name for a file").first.wait_for()
     assert not list(folder.parent.glob("escaped*")) and not list(folder.glob("escaped*"))
 
     # A reload preserves the shared state.
     other.page.reload()
-    other.page.add_style_tag(content="[class*=Notification] {display: none !important}")
     assert difference(settled(other), elsewhere) < 0.5
     assert window.errors == [] and other.errors == []
 

@@ -66,7 +66,7 @@ def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
         raise
     finally:
         process.terminate()
-        process.wait(20)
+        process.wait(60)
 
 
 class Window:
@@ -96,6 +96,10 @@ class Window:
         entries = self.page.evaluate("window.__shown.filter(e => e.at > 0)")
         return [entry | {"at": entry["at"] / 1000} for entry in entries]
 
+    def canvas(self) -> dict[str, float]:
+        """Return the place of the image in the page: "x", "y", "width" and "height"."""
+        return self.page.locator("#root canvas[data-engine]").bounding_box()
+
     def note(self) -> str:
         """Return the window's text about its image, "" before there is one."""
         found = self.page.get_by_text(re.compile(r"per pixel$")).first
@@ -111,6 +115,14 @@ class Window:
         self.page.wait_for_function(
             "([n, w]) => __shown.slice(n).some(e => e.at > 0 && (w == 0 || e.width == w))",
             arg=[after, width],
+            timeout=1000 * seconds,
+        )
+
+    def wait_until_shown(self, size: tuple[int, int], seconds: float = 60.0) -> None:
+        """Wait until the image on display, which may follow the text about it, has this size."""
+        self.page.wait_for_function(
+            "([w, h]) => { const e = __shown.at(-1); return e && e.width == w && e.height == h; }",
+            arg=list(size),
             timeout=1000 * seconds,
         )
 
@@ -133,6 +145,40 @@ class Window:
         pattern = re.compile(rf"^{re.escape(option)}")
         self.page.get_by_role("option", name=pattern).filter(visible=True).first.click()
 
+    def unfold(self, folder: str) -> None:
+        """Open a folder of the panel."""
+        self.page.get_by_text(folder, exact=True).click()
+
+    def curve(self) -> list[list[float]]:
+        """Return the points [value, opacity] of the transfer function."""
+        return self.page.evaluate("document.querySelector('irrcache-transfer').points.opacity")
+
+    def wait_for_curve(self, points: int, seconds: float = 20.0) -> None:
+        """Wait until the transfer function of the viewer has so many points."""
+        self.page.wait_for_function(
+            "n => document.querySelector('irrcache-transfer').state.opacity.length == n",
+            arg=points,
+            timeout=1000 * seconds,
+        )
+
+    def place_of(self, value: float, opacity: float) -> tuple[float, float]:
+        """Return the place of a point on the plot of the transfer function, in the page."""
+        place = """([value, opacity]) => {
+            const editor = document.querySelector('irrcache-transfer');
+            editor.scrollIntoView();
+            const box = editor.canvas.getBoundingClientRect();
+            return [box.left + editor.x(value), box.top + editor.y(opacity)];
+        }"""
+        return tuple(self.page.evaluate(place, [value, opacity]))
+
+    def drag_point(self, index: int, value: float, opacity: float) -> None:
+        """Drag a point of the transfer function to another place on its plot."""
+        mouse = self.page.mouse
+        mouse.move(*self.place_of(*self.curve()[index]))
+        mouse.down()
+        mouse.move(*self.place_of(value, opacity), steps=4)
+        mouse.up()
+
     def tick(self, label: str) -> None:
         """Set or clear a check box."""
         self.page.get_by_text(label, exact=True).locator(
@@ -140,8 +186,9 @@ class Window:
         ).first.click()
 
     def orbit(self, steps: int, pixels: float, pause: float, first: float = 60.0) -> None:
-        """Drag the mouse from ``first``, in ``steps`` of this many pixels."""
+        """Drag the mouse over the image from ``first``, in ``steps`` of this many pixels."""
         mouse, height = self.page.mouse, self.page.viewport_size["height"]
+        first += self.canvas()["x"]
         mouse.move(first, 0.8 * height)
         mouse.down()
         for step in range(1, steps + 1):

@@ -19,19 +19,21 @@ from experiments.performance.viewer.load import processor_seconds
 
 #: Relative error of the caches, percent, at which refinement is complete before an edit.
 ENOUGH = 50
+#: Width of the panel beside the image in pixels.
+PANEL = 324
 
 
 def main() -> None:
     """Measure and print; unknown options are passed to ``irrcache view``."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", type=int, default=512, help="of the window, pixels")
+    parser.add_argument("--size", type=int, default=512, help="of the image, pixels")
     parser.add_argument("--repeats", type=int, default=5, help="of each measurement")
     parser.add_argument("-o", "--output", type=Path, default=Path("output/viewer"))
     args, view = parser.parse_known_args()
     args.output.mkdir(parents=True, exist_ok=True)
     started = time.time()
     with viewer(view, args.output / "viewer.log") as address, Browser() as browser:
-        window = browser.open(address, (args.size, args.size))
+        window = browser.open(address, (args.size + PANEL, args.size))
         window.wait_for("per pixel")
         results = {"first picture [s]": _first(window) - started}
         results["  of it the browser [s]"] = _first(window) - window.opened
@@ -92,7 +94,7 @@ def latency(window: Window, repeats: int) -> dict[str, float]:
 
 def stopping(window: Window, repeats: int) -> dict[str, float]:
     """Measure from the last mouse event of a drag to an image of full resolution."""
-    found, size = [], window.page.viewport_size["width"]
+    found, size = [], round(window.canvas()["width"])
     for _ in range(repeats):
         window.wait_for("at rest|final", 60)
         window.orbit(20, 4, 0.03)
@@ -120,18 +122,21 @@ def _seen(window: Window, shown: int, since: float, width: int = 0) -> float:
 
 def editing(window: Window, repeats: int) -> dict[str, float]:
     """Measure from an edit of the transfer function, or else the density, to the new image."""
-    found = []
-    label = "opacity" if window.field("opacity").count() else "density"
-    if label == "opacity":
-        window.choose("point", "4")
+    found, has_curve = [], window.page.locator("irrcache-transfer").count() > 0
+    window.unfold("Details")
     window.enter("target error %", ENOUGH)
     for number in range(repeats):
         window.wait_for("^final", 60)  # no other image is displayed from now on
-        shown = len(window.shown())
-        began = time.time()
-        window.enter(label, round(0.2 + 0.05 * number, 2))
+        shown, height = len(window.shown()), round(0.2 + 0.05 * number, 2)
+        if has_curve:
+            window.drag_point(4, window.curve()[4][0], height)
+            began = time.time()
+        else:
+            began = time.time()
+            window.enter("density", height)
         window.wait_for_picture(shown)
         found.append(_seen(window, shown, began) - began)
+    label = "a point dragged" if has_curve else "density"
     return {
         f"picture after an edit ({label}), median [s]": float(np.median(found)),
         "  slowest edit [s]": max(found),

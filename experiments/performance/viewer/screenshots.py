@@ -1,50 +1,97 @@
-"""Screenshots of the viewer for the README: ``python -m
-experiments.performance.viewer.screenshots``.
+"""Screenshots of the viewer: ``python -m experiments.performance.viewer.screenshots``.
 
-The thorax phantom with the panel open, and the same beside volpath after ``--seconds`` of it.
+The thorax phantom at each stage of its use and at three sizes of the window, and ``viewer.jpg`` for
+the documentation.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 from experiments.performance.viewer.browser import Browser, Window, viewer
 
-SIZE = (1100, 620)
-VIEW = (
-    "phantom:thorax:190,120,165", "--preset", "ct-chest", "-D", "hide_emitters=true",
-    "-D", "radiance=2",
-)  # fmt: skip
+SIZES = ((1400, 900), (800, 600), (1920, 1080))
+PICTURE = (1100, 620)
+VIEW = ("phantom:thorax:190,120,165", "--preset", "ct-chest", "-D", "radiance=2")
 #: Relative error of the caches in percent.
-TARGET = 2
+TARGET = 4
+
+
+def edit(window: Window) -> None:
+    """Raise the opacity of bone."""
+    window.drag_point(9, 300, 0.7)
+    window.page.wait_for_timeout(4000)
+
+
+def turn_light(window: Window) -> None:
+    """Light from the upper right."""
+    window.page.locator("irrcache-light canvas").click(position={"x": 55, "y": 20})
+    window.page.wait_for_timeout(4000)
+
+
+def swipe(window: Window) -> None:
+    """Compare with volpath, after its first sample."""
+    window.choose("volpath", "swipe")
+    window.wait_for("volpath, [0-9]+ sample", 240)
+
+
+def error(window: Window) -> None:
+    """Show the error in false colours."""
+    window.choose("volpath", "error")
+    window.page.locator("#irrcache-overlay .scale").wait_for(timeout=240_000)
+
+
+def marks(window: Window) -> None:
+    """Mark the pixels whose error bar exceeds the target."""
+    window.choose("volpath", "off")
+    window.choose("show", "image, errors")
+    window.page.wait_for_timeout(4000)
+
+
+def crop(window: Window) -> None:
+    """Fold out the crop box and the slices."""
+    window.choose("show", "image")
+    window.unfold("Transfer function")
+    window.unfold("Crop and slices")
+    window.page.wait_for_timeout(2000)
+
+
+STAGES: tuple[Callable[[Window], None], ...] = (edit, turn_light, swipe, error, marks, crop)
 
 
 def main() -> None:
     """Take the screenshots."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=Path("output/viewer"))
-    parser.add_argument("--seconds", type=float, default=60.0, help="for volpath")
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
     with viewer(VIEW, args.output / "screenshots.log") as address, Browser() as browser:
-        window = browser.open(address, SIZE)
-        window.wait_for("per pixel", 60)
+        window = browser.open(address, PICTURE)
+        window.page.locator("#irrcache-overlay .message:visible").wait_for(timeout=60_000)
+        take(window, args.output / "waiting.jpg")
+        window.wait_for("per pixel", 240)
+        window.unfold("Details")
         window.enter("target error %", TARGET)
+        window.unfold("Details")
         window.orbit(10, 6, 0.03, first=150)
-        window.wait_for("^final", 120)
+        window.wait_for("^final", 600)
         take(window, args.output / "viewer.jpg")
-        window.tick("compare with volpath")
-        window.wait_for("RMSE", 120)
-        time.sleep(args.seconds)
-        take(window, args.output / "comparison.jpg")
+        window.page.close()
+        for size in SIZES:
+            window = browser.open(address, size)
+            window.wait_for("at rest|final", 240)
+            take(window, args.output / f"start-{size[0]}.jpg")
+            for stage in STAGES:
+                stage(window)
+                take(window, args.output / f"{stage.__name__}-{size[0]}.jpg")
+            print(size, "errors in the console:", window.errors or "none")
+            window.page.close()
 
 
 def take(window: Window, file: Path) -> None:
-    """Take a screenshot without viser's temporary notifications."""
-    window.page.add_style_tag(content="[class*=Notification] {display: none !important}")
-    window.page.mouse.move(150, SIZE[1] - 5)
+    """Take a screenshot."""
     window.page.screenshot(path=str(file), type="jpeg", quality=90)
 
 

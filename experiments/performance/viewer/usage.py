@@ -19,11 +19,12 @@ import numpy as np
 
 from experiments.performance.viewer.browser import Browser, Window, viewer
 from experiments.performance.viewer.load import viewer_memory
+from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.picture import KINDS
 
 #: Maximum number of windows.
 MOST_WINDOWS = 3
-SIZE = (512, 384)
+SIZE = (800, 400)
 #: Timeout in seconds for an expected event, on a machine with other load.
 PATIENCE = 240
 
@@ -60,8 +61,8 @@ class User:
         self.windows[0].wait_for("per pixel", PATIENCE)
         self._actions = {
             self.drag: 8, self.zoom: 4, self.opacity: 4, self.density: 2, self.sun: 2,
-            self.kind: 2, self.compare: 1, self.preset: 1, self.save: 1, self.reload: 1,
-            self.open: 1, self.close: 1,
+            self.undo: 2, self.turn_sun: 2, self.kind: 2, self.compare: 1, self.preset: 1,
+            self.save: 1, self.reload: 1, self.open: 1, self.close: 1,
         }  # fmt: skip
 
     def act(self) -> None:
@@ -75,22 +76,41 @@ class User:
     def drag(self, window: Window) -> None:
         """Drag, and sometimes wait."""
         steps = int(self._rng.integers(3, 20))
-        window.orbit(steps, float(self._rng.uniform(-4, 4)), 0.02, SIZE[0] / 3)
+        window.orbit(steps, float(self._rng.uniform(-4, 4)), 0.02, 200)
         if self._rng.random() < 0.3:
             window.wait_for("at rest|final", PATIENCE)
 
     def zoom(self, window: Window) -> None:
         """Zoom in or out, at most into the medium."""
-        window.page.mouse.move(SIZE[0] / 3, SIZE[1] / 2)
+        window.page.mouse.move(200, SIZE[1] / 2)
         window.zoom(int(self._rng.choice([-4, -2, 2, 4])))
 
     def opacity(self, window: Window) -> None:
-        """Change the transfer function."""
-        window.enter("opacity", round(self._rng.uniform(0.05, 0.95), 2))
+        """Drag a point of the transfer function."""
+        points = window.curve()
+        index = int(self._rng.integers(1, len(points) - 1))
+        low, high = points[index - 1][0], points[index + 1][0]
+        share = float(self._rng.uniform(0.1, 0.9))
+        window.drag_point(index, low + share * (high - low), float(self._rng.uniform(0.0, 0.9)))
+
+    def undo(self, window: Window) -> None:
+        """Undo or redo an edit of the transfer function."""
+        button = window.page.locator(
+            f"irrcache-transfer [data-id={self._rng.choice(['undo', 'redo'])}]"
+        )
+        if button.is_enabled():
+            button.click()
+
+    def turn_sun(self, window: Window) -> None:
+        """Drag the sun on its sphere."""
+        x, y = (int(c) for c in self._rng.integers(15, 57, 2))
+        window.page.locator("irrcache-light canvas").click(position={"x": x, "y": y})
 
     def density(self, window: Window) -> None:
         """Change the density, sometimes to an invalid value."""
-        window.enter("density", self._rng.choice(["0.5", "1", "2", "-3"]))
+        unfolded(window, "Details", "density").enter(
+            "density", self._rng.choice(["0.5", "1", "2", "-3"])
+        )
 
     def sun(self, window: Window) -> None:
         """Switch the sun on and off."""
@@ -102,7 +122,7 @@ class User:
 
     def compare(self, window: Window) -> None:
         """Switch the comparison with volpath."""
-        window.tick("compare with volpath")
+        window.choose("volpath", str(self._rng.choice(COMPARISONS)))
 
     def preset(self, window: Window) -> None:
         """Select a preset of the transfer function."""
@@ -110,10 +130,10 @@ class User:
 
     def save(self, window: Window) -> None:
         """Save all kinds of files."""
-        name = window.page.get_by_role("button", name=re.compile("^(save|download)$"))
-        if not name.is_visible():
-            window.page.get_by_text("Save", exact=True).click()
-        name.click()
+        button = window.page.get_by_role("button", name=re.compile("^(save|download) view$"))
+        if not button.is_visible():
+            window.unfold("Save")
+        button.click()
         window.page.get_by_text(re.compile("^(saved|downloaded) ")).first.wait_for(
             timeout=1000 * PATIENCE
         )
@@ -142,6 +162,13 @@ class User:
         window.page.close()
 
 
+def unfolded(window: Window, folder: str, label: str) -> Window:
+    """Open a folder unless its control is visible, and return the window."""
+    if not window.field(label).is_visible():
+        window.unfold(folder)
+    return window
+
+
 def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path) -> Usage:
     """Use ``irrcache view`` with these arguments for a time; its output goes to ``log``."""
     rng = np.random.default_rng(seed)
@@ -155,7 +182,8 @@ def use(browser: Browser, view: list[str], seconds: float, seed: int, log: Path)
         for window in user.windows:
             user.leave(window)
     said = log.read_text()
-    usage.errors += [line for line in said.splitlines() if re.search("Traceback|[Ee]rror", line)]
+    # Warnings may speak of errors: "errors of about 4 % are expected there".
+    usage.errors += [line for line in said.splitlines() if re.search(r"Traceback|rror:", line)]
     return usage
 
 

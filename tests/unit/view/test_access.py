@@ -21,8 +21,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.view.access import Access, check_host, guarded
+from mitsuba_irrcache.view.access import Access, check_host
 from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.channel import PATH
 from mitsuba_irrcache.view.server import Server, ignore_closed_connections
 from mitsuba_irrcache.view.session import Session, Superseded
 from mitsuba_irrcache.view.window import View
@@ -32,11 +33,10 @@ CAMERA = Camera((0.0, -5.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
 
 @pytest.fixture(params=["127.0.0.1", "0.0.0.0"])
 def served(request):
-    """Return a viser server with access control, and its port."""
-    access = Access(request.param)
-    with guarded(access):
-        server = viser.ViserServer(request.param, 8750, verbose=False)
-    yield access, server.get_port()
+    """Return the access control of a server that displays nothing yet, and its port."""
+    server = Server(request.param, 8750)
+    server.say("reading ...")
+    yield server._access, server.port
     server.stop()
 
 
@@ -51,8 +51,17 @@ def page(port: int, path: str = "/", **headers: str) -> tuple[int, str]:
 
 
 def connects(port: int, path: str = "/", host: str = "", **headers: str) -> bool:
-    """Return whether a window's connection is accepted."""
-    protocol = [f"viser-v{viser.__version__}"]
+    """Return whether a window's connections are accepted: viser's, and that of our components."""
+    own, viewers = PATH + path[1:], [f"viser-v{viser.__version__}"]
+    accepted = {
+        _connects(port, path, viewers, host, headers),
+        _connects(port, own, None, host, headers),
+    }
+    assert len(accepted) == 1, "the two connections differ"
+    return accepted.pop()
+
+
+def _connects(port: int, path: str, protocol: list | None, host: str, headers: dict) -> bool:
     try:
         with connect(
             f"ws://{host or '127.0.0.1'}:{port}{path}",

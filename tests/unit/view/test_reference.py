@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import time
 import weakref
 from collections.abc import Iterator
@@ -102,23 +103,29 @@ def test_reported_error_excludes_the_reference_noise(document):
 
 
 def test_reference_is_displayed_until_something_changes(document):
-    """The reference is displayed beside the image until camera or scene change.
+    """The reference is shown with the image's error until camera or scene change.
 
-    The same image on both sides is reported with its error; while a camera moves there is no
-    reference.
+    It is the same image; while a camera moves there is none.
     """
     session = Session(document)
     session.target_error = 0.02
     session.start()
     try:
-        screen, wide = Screen(), (2 * SIZE[0], SIZE[1])
+        screen = Screen()
         window = session.open(screen.show)
-        view = View(front(session), wide, compared=True)
+        view = View(front(session), SIZE, compared="swipe")
         session.look(window, view)
-        picture = screen.wait(lambda p: "RMSE" in p.comparison and _samples(p) >= 16)
-        left, right = np.split(picture.pixels.astype(float), 2, axis=1)
-        assert left.std() > 20 and np.abs(left.mean() - right.mean()) < 3
-        assert np.corrcoef(left.ravel(), right.ravel())[0, 1] > 0.95
+        picture = screen.wait(lambda p: "RMSE" in _text(p) and _samples(p) >= 16)
+        ours = picture.pixels.astype(float)
+        theirs = picture.compared.reference.astype(float)
+        assert ours.shape == theirs.shape  # the window is small: pixel by pixel
+        assert ours.std() > 20 and np.abs(ours.mean() - theirs.mean()) < 3
+        assert np.corrcoef(ours.ravel(), theirs.ravel())[0, 1] > 0.95
+        session.look(window, replace(view, compared="error"))
+        picture = screen.wait(lambda p: p.compared is not None and p.compared.error is not None)
+        assert _samples(picture) >= 16 and picture.compared.limit < 1
+        assert np.array_equal(picture.pixels, picture.compared.error)
+        session.look(window, view)
         count = len(screen.pictures)
         moving: list[Picture] = []
         for degrees in range(1, 200):  # like a mouse
@@ -127,17 +134,31 @@ def test_reference_is_displayed_until_something_changes(document):
             moving = [p for p in screen.pictures[count:] if p.moving]
             if moving:
                 break
-        screen.wait(lambda p: p.view.camera != view.camera and "RMSE" in p.comparison)
-        assert moving and not np.any(np.split(moving[0].pixels, 2, axis=1)[1])
+        screen.wait(lambda p: p.view.camera != view.camera and "RMSE" in _text(p))
+        assert moving and moving[0].compared is None
         other = [p for p in screen.pictures[count:] if p.view.camera != view.camera]
-        assert _samples(next(p for p in other if p.comparison)) < 8
+        assert _samples(next(p for p in other if _samples(p))) < 8
         count = len(screen.pictures)
         session.edit(lambda document: document.set_density(0.5))
-        screen.wait(lambda p: len(screen.pictures) > count + 3 and "RMSE" in p.comparison)
-        assert min(_samples(p) for p in screen.pictures[count:] if p.comparison) < 8
+        screen.wait(lambda p: len(screen.pictures) > count + 3 and "RMSE" in _text(p))
+        assert min(_samples(p) for p in screen.pictures[count:] if _samples(p)) < 8
     finally:
         session.stop()
         dr.sync_thread()
+
+
+def test_coarse_references_are_means_over_pixels(document):
+    """A coarse reference is the finer one, averaged over the pixels that it covers."""
+    camera = Camera((0.5, -5.0, 1.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
+    light = Light(document.scene(), document.settings, document.seeing)
+    fine, coarse = Reference(light, camera, SIZE), Reference(light, camera, SIZE, 3)
+    for reference, samples in ((fine, 24), (coarse, 96)):
+        while reference.samples < samples:
+            reference.refine()
+    assert coarse.size == (SIZE[0] // 3, SIZE[1] // 3)
+    error, resolved = coarse.error_of(fine.radiance())
+    assert error < max(0.03, 2 * resolved)
+    assert abs(coarse.signed_error(1.1 * fine.radiance()).mean() - 0.1) < 0.02
 
 
 @pytest.mark.parametrize("document", list(SCENES), indirect=True)
@@ -152,8 +173,8 @@ def test_previous_caches_are_freed(document, uncollected):
         screen = Screen()
         window = session.open(screen.show)
         view = View(front(session), SIZE)
-        session.look(window, replace(view, compared=True))
-        screen.wait(lambda p: "RMSE" in p.comparison)
+        session.look(window, replace(view, compared="swipe"))
+        screen.wait(lambda p: "RMSE" in _text(p))
         session.look(window, view)
         screen.wait(lambda p: p.view == view)
         light = session.call(lambda: weakref.ref(session.light))
@@ -176,6 +197,12 @@ def uncollected() -> Iterator[None]:
     gc.enable()
 
 
+def _text(picture: Picture) -> str:
+    """Return what is said about the reference, "" if there is none."""
+    return picture.compared.text if picture.compared else ""
+
+
 def _samples(picture: Picture) -> int:
-    """Return the reported samples of the reference."""
-    return int(picture.comparison.split()[1])
+    """Return the reported samples of the reference, 0 before the first."""
+    found = re.search(r"volpath, (\d+) sample", _text(picture))
+    return int(found[1]) if found else 0

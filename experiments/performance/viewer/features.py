@@ -1,0 +1,148 @@
+"""What the viewer offers: ``python -m experiments.performance.viewer.features --document
+docs/how-to/viewer.md``.
+
+Every row is tried in a browser with ``irrcache view``; "no" is printed where that fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from experiments.performance.viewer.browser import Browser, Window, viewer
+from experiments.support.documents import as_markdown, replace_tables
+from mitsuba_irrcache.compare.tables import Table
+
+VIEW = ("phantom:thorax:60,38,52", "--preset", "ct-chest")
+SIZES = ((1400, 900), (800, 600), (1920, 1080))
+
+
+def curve(window: Window) -> str:
+    """Drag a point, add one and remove it; undo all."""
+    before = window.curve()
+    window.drag_point(8, 120, 0.5)
+    window.page.mouse.click(*window.place_of(-600, 0.4))
+    window.wait_for_curve(len(before) + 1)
+    window.page.keyboard.press("Delete")
+    window.wait_for_curve(len(before))
+    for _ in range(3):
+        window.page.keyboard.press("Control+z")
+    window.page.wait_for_function(
+        "n => JSON.stringify(document.querySelector('irrcache-transfer').points.opacity) == n",
+        arg=re.sub(r"\.0(?=[,\]])", "", str(before)).replace(" ", ""),
+    )
+    return "drag, click, Delete, undo"
+
+
+def layout(window: Window) -> str:
+    """Compare the places of image and panel at three sizes."""
+    for width, height in SIZES:
+        window.page.set_viewport_size({"width": width, "height": height})
+        window.page.wait_for_timeout(1000)
+        place = window.canvas()
+        panel = window.page.locator("irrcache-transfer").bounding_box()
+        assert place["x"] + place["width"] <= panel["x"] and place["height"] == height
+    return "beside the image"
+
+
+def crop(window: Window) -> str:
+    """Fold out the panel of the crop box."""
+    window.unfold("Crop and slices")
+    window.page.get_by_text("y, %", exact=True).wait_for()
+    return "ranges in the panel, edges in the image"
+
+
+def slices(window: Window) -> str:
+    """Wait for a slice."""
+    window.page.locator("irrcache-slice img").wait_for()
+    return "one, in the panel"
+
+
+def marker(window: Window) -> str:
+    """Count the labels of the axes."""
+    assert window.page.locator("#irrcache-overlay svg text").count() == 3
+    return "yes"
+
+
+def light(window: Window) -> str:
+    """Place the sun on its sphere."""
+    shown = len(window.shown())
+    window.page.locator("irrcache-light canvas").click(position={"x": 45, "y": 20})
+    window.wait_for_picture(shown)
+    return "dragged on a sphere"
+
+
+def reference(window: Window) -> str:
+    """Choose both comparisons."""
+    window.choose("volpath", "swipe")
+    window.page.locator("#irrcache-overlay .divider").wait_for()
+    window.wait_for("volpath, [0-9]+ sample", 120)
+    window.choose("volpath", "error")
+    window.page.locator("#irrcache-overlay .scale").wait_for()
+    window.choose("volpath", "off")
+    return "path traced, swipe and false colours"
+
+
+def errors(window: Window) -> str:
+    """Mark pixels."""
+    window.choose("show", "image, errors")
+    window.wait_for("at rest|final", 60)
+    window.choose("show", "image")
+    return "per pixel; marked where above the target"
+
+
+def video(window: Window) -> str:
+    """Export a turntable of few and small frames."""
+    window.page.set_viewport_size({"width": 800, "height": 400})
+    window.unfold("Animation")
+    window.enter("frames", 2)
+    with window.page.expect_download(timeout=120_000):
+        window.page.get_by_role("button", name="export turntable").click()
+    return "turntable, camera path"
+
+
+#: Row: how it is tried.
+ROWS: dict[str, Callable[[Window], str]] = {
+    "opacity and colours on a plot over the histogram": curve,
+    "panel at 1400 x 900, 800 x 600, 1920 x 1080": layout,
+    "crop box": crop,
+    "slice planes": slices,
+    "orientation marker": marker,
+    "direction of the sun": light,
+    "comparison with `volpath`": reference,
+    "error bars": errors,
+    "animation, as frames and video": video,
+}
+
+
+def main() -> None:
+    """Try every row, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--output", type=Path, default=Path("output/viewer"))
+    parser.add_argument("--document", type=Path, help="page to write the table into")
+    args = parser.parse_args()
+    args.output.mkdir(parents=True, exist_ok=True)
+    rows = []
+    with viewer(VIEW, args.output / "features.log") as address, Browser() as browser:
+        window = browser.open(address, SIZES[0])
+        window.wait_for("per pixel", 120)
+        time.sleep(2)
+        for name, attempt in ROWS.items():
+            try:
+                found = attempt(window)
+            except Exception as error:
+                found = "no"
+                print(f"{name}: {type(error).__name__}: {error}".splitlines()[0])
+            rows.append([name, found])
+        assert not window.errors, window.errors
+    table = Table("Features", ["", "how"], rows)
+    print(as_markdown(table))
+    if args.document:
+        replace_tables(args.document, {"viewer-features": table})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+"""A window's comparison with ``volpath``: which resolution, captions, and false colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.light import Light
+from mitsuba_irrcache.view.picture import Look, displayed
+from mitsuba_irrcache.view.reference import Reference
+
+#: What a window can compare: nothing, the two images, or the difference between them.
+KINDS = ("off", "swipe", "error")
+#: Pixels of the window per pixel of the reference and side: the first one is used until the time of
+#: a pass is known, then the finest with which a pass takes at most `PASS_SECONDS`.
+COARSENESS = (4, 2, 1)
+PASS_SECONDS = 3.0
+#: Passes after which the resolution is chosen.
+PROBE = 2
+#: Largest relative error that has a colour of its own; noise of few samples is larger.
+LARGEST = 1.0
+#: Colours of errors from -1 to 1, blue for too dark and red for too bright.
+_STOPS = np.array(
+    [(5, 48, 97), (67, 147, 195), (247, 247, 247), (214, 96, 77), (103, 0, 31)], dtype=float
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """The state of a comparison.
+
+    Attributes:
+        kind: one of `KINDS`.
+        text: about the reference.
+        reference: its pixels, uint8 (height, width, 3); None before the first sample.
+        error: false colours of the error, uint8 (height, width, 3), if that is displayed.
+        limit: relative error that has the strongest colour.
+    """
+
+    kind: str
+    text: str
+    reference: np.ndarray | None = None
+    error: np.ndarray | None = None
+    limit: float = 0.0
+
+
+class Comparison:
+    """Refine the reference of a view, and compare images with it."""
+
+    def __init__(self, light: Light, camera: Camera, size: tuple[int, int]) -> None:
+        self.light, self.camera, self.size = light, camera, size
+        self._reference = Reference(light, camera, size, COARSENESS[0])
+        self._is_probing = True
+
+    def belongs_to(self, light: Light, camera: Camera, size: tuple[int, int]) -> bool:
+        """Return whether this is the comparison of a view of these caches."""
+        return (self.light, self.camera, self.size) == (light, camera, size)
+
+    @property
+    def has_sample(self) -> bool:
+        return self._reference.samples > 0
+
+    @property
+    def is_done(self) -> bool:
+        return self._reference.is_done
+
+    def refine(self) -> bool:
+        """Add one sample per pixel to a band; return whether there is anything new to show."""
+        known = self._reference
+        complete = known.refine()
+        if complete and self._is_probing and known.samples == PROBE:
+            self._is_probing = False
+            finest = _finest(known.seconds / PROBE, known.coarseness)
+            if finest != known.coarseness:
+                self._reference = Reference(self.light, self.camera, self.size, finest)
+        return complete or not known.samples
+
+    def state(self, kind: str, image: np.ndarray, look: Look, backdrop: np.ndarray) -> Compared:
+        """Compare an ``image``, float (height, width, 3), that is displayed like ``look``.
+
+        ``backdrop`` is what lies behind it.
+        """
+        known = self._reference
+        text = known.comparison(image)
+        if not known.samples:
+            return Compared(kind, text)
+        if kind == "error":
+            error = known.signed_error(image)
+            limit = min(rounded(float(np.quantile(np.abs(error), 0.98))), LARGEST)
+            colours = np.kron(false_colours(error / limit), np.ones((known.coarseness,) * 2 + (1,)))
+            return Compared(kind, text, None, colours.astype(np.uint8), limit)
+        return Compared(kind, text, displayed(known.radiance(), look, known.reduced(backdrop)))
+
+
+def described(found: Compared) -> dict:
+    """Return the message about a comparison for `page/overlay.js`."""
+    if found.kind == "swipe":
+        captions = {"left": "irrcache", "right": found.text}
+        return {"mode": "swipe", "has_image": found.reference is not None, **captions}
+    message = {"mode": found.kind, "left": f"irrcache − {found.text}"}
+    if found.limit:
+        scale = {
+            "low": f"−{100 * found.limit:g} %",
+            "high": f"+{100 * found.limit:g} % of the mean",
+        }
+        colours = false_colours(np.linspace(-1, 1, 101)).round().astype(int).tolist()
+        message["scale"] = scale | {"colours": colours}
+    return message
+
+
+def false_colours(values: np.ndarray) -> np.ndarray:
+    """Return colours (..., 3) in [0, 255] of values in [-1, 1], clamped."""
+    at = np.linspace(-1, 1, len(_STOPS))
+    return np.stack([np.interp(values, at, channel) for channel in _STOPS.T], axis=-1)
+
+
+def rounded(limit: float) -> float:
+    """Return the next larger of 1, 2, 5 times a power of ten, at least 0.001."""
+    limit = max(limit, 1e-3)
+    ten = 10.0 ** np.floor(np.log10(limit))
+    return float(next(m * ten for m in (1, 2, 5, 10) if m * ten >= limit * (1 - 1e-9)))
+
+
+def _finest(seconds: float, coarseness: int) -> int:
+    """Return the coarseness to use, given the time of a pass with the present one."""
+    fine = [c for c in COARSENESS if seconds * (coarseness / c) ** 2 <= PASS_SECONDS]
+    return min([*fine, coarseness])

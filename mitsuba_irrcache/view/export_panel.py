@@ -1,0 +1,137 @@
+"""What one window saves: views, animations, and where the files go."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import viser
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.view.animation import MOST_FRAMES, along_path, turntable, write_frames
+from mitsuba_irrcache.view.camera import Camera
+from mitsuba_irrcache.view.editing import Editing
+from mitsuba_irrcache.view.keep import checked_name, keep
+from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.view.window import View
+
+
+class ExportPanel:
+    """Save the view that ``seen`` returns, and animations that begin with it.
+
+    Files are saved in ``folder``, or downloaded by the browser of the ``client`` if it is None.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        session: Session,
+        folder: Path | None,
+        editing: Editing,
+        seen: Callable[[], View | None],
+    ) -> None:
+        self._client, self._session, self._folder, self._seen = client, session, folder, seen
+        self._gone = False
+        gui = client.gui
+        with gui.add_folder("Save", order=6, expand_by_default=False):
+            self._name = gui.add_text("name", "view")
+            self._cache = gui.add_checkbox("with the cache", False)
+            self._save = gui.add_button(
+                "save view" if self._folder is not None else "download view",
+                hint="PNG, EXR with layers, and a scene for irrcache render",
+            )
+            self._saved = gui.add_markdown("")
+        with gui.add_folder("Animation", order=7, expand_by_default=False):
+            self._path: list[Camera] = []
+            self._frames = gui.add_number("frames", 72, min=1, max=MOST_FRAMES, step=1)
+            self._rate = gui.add_number("frames per second", 24, min=1, max=120, step=1)
+            turn = gui.add_button("export turntable", hint="a full circle about the upward axis")
+            self._knots = gui.add_markdown("")
+            add = gui.add_button("add this view to the path", color="gray")
+            clear = gui.add_button("clear the path", color="gray")
+            export = gui.add_button("export path", hint="a smooth path through the views")
+            self._exported = gui.add_markdown("PNG frames, and a video with imageio-ffmpeg")
+        turn.on_click(lambda _: editing.submit("turn", self._export_turntable))
+        add.on_click(lambda _: editing.submit("add", self._add_knot))
+        clear.on_click(lambda _: editing.submit("clear", self._clear_path))
+        export.on_click(lambda _: editing.submit("path", self._export_path))
+        self._save.on_click(lambda _: editing.submit("save", self._keep))
+
+    def close(self) -> None:
+        """Stop exports after the browser has disconnected."""
+        self._gone = True
+
+    def _keep(self) -> None:
+        name = checked_name(self._name.value)
+        view = self._seen()
+        if view is None:
+            return
+        self._saved.content = "saving ..."
+        try:
+            if self._folder is not None:
+                self._folder.mkdir(exist_ok=True)
+                files = keep(self._session, view, self._folder, name, self._cache.value)
+                self._saved.content = "saved " + ", ".join(f.name for f in files)
+            else:
+                self._download(view, name)
+                self._saved.content = f"downloaded {name}.zip"
+        except Exception:
+            self._saved.content = ""
+            raise
+
+    def _add_knot(self) -> None:
+        view = self._seen()
+        if view is not None:
+            self._path.append(view.camera)
+            self._knots.content = f"views of the path: {len(self._path)}"
+
+    def _clear_path(self) -> None:
+        self._path.clear()
+        self._knots.content = ""
+
+    def _export_turntable(self) -> None:
+        view = self._seen()
+        if view is not None:
+            self._export("turntable", turntable(view.camera, int(self._frames.value)))
+
+    def _export_path(self) -> None:
+        self._export("path", along_path(self._path, int(self._frames.value)))
+
+    def _export(self, name: str, cameras: list[Camera]) -> None:
+        """Write the frames of an animation to the folder, or let the browser download them."""
+        name = f"{checked_name(self._name.value)}-{name}"
+        view = self._seen()
+        if view is None:
+            return
+
+        def tell(done: int) -> None:
+            self._exported.content = f"frame {done} of {len(cameras)} ..."
+            if self._gone:
+                raise IrrcacheError("the window was closed during an export.")
+
+        tell(0)
+        rate = float(self._rate.value)
+        if self._folder is not None:
+            files = write_frames(self._session, view, cameras, self._folder / name, rate, tell)
+            self._exported.content = f"saved {len(files)} files in {name}"
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            files = write_frames(self._session, view, cameras, Path(folder), rate, tell)
+            self._offer(name, files)
+        self._exported.content = f"downloaded {name}.zip"
+
+    def _download(self, view: View, name: str) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            files = keep(self._session, view, Path(folder), name, self._cache.value)
+            self._offer(name, files)
+
+    def _offer(self, name: str, files: list[Path]) -> None:
+        """Let the browser download an archive."""
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in files:
+                archive.write(file, file.name)
+        self._client.send_file_download(f"{name}.zip", packed.getvalue(), save_immediately=True)
