@@ -110,7 +110,7 @@ def test_nodes_whose_normals_point_elsewhere_do_not_apply():
     nodes = SurfaceNodes(LOWER, UPPER)
     p, (geometric, _), _ = cover(nodes, plane, points(*plane, count=20), 9.0, 9.0)
     for tilt, expected in ((0.5, 1.0), (0.8, 0.0)):  # cosines of 0.88 and 0.7
-        tilted = mi.Normal3f(np.sin(tilt), np.cos(tilt), 0) + dr.zeros(mi.Float, dr.width(p))
+        tilted = mi.Normal3f(float(np.sin(tilt)), float(np.cos(tilt)), dr.zeros(mi.Float, 20))
         normals = geometric, tilted
         _, weights, *_ = nodes.find(p, normals, mi.UInt32(0), mi.Bool(True))
         np.testing.assert_allclose(np.array(sum(weights)), expected, atol=1e-5)
