@@ -49,6 +49,17 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def chosen_integrator(
+    scene: Path, parameters: dict[str, str], integrator: str | None
+) -> str | None:
+    """Return ``integrator``, or what replaces that of a scene if None is given: ``irrcache`` in
+    place of a path tracer, None for others.
+    """
+    if integrator is None and integrator_of(scene, parameters) in REPLACED:
+        return "irrcache"
+    return integrator
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``irrcache render``, named as those of ``mitsuba``."""
     parser.add_argument("scene", help="scene XML")
@@ -99,9 +110,7 @@ def run(args: argparse.Namespace) -> int:
     display = StageDisplay()
     with _stopwatch(seconds, "load"), display.stage(f"loading {source.name}"):
         parameters = parse_parameters(args.define)
-        integrator = args.integrator
-        if integrator is None and integrator_of(source, parameters) in REPLACED:
-            integrator = "irrcache"
+        integrator = chosen_integrator(source, parameters, args.integrator)
         scene = load_scene(source, parameters, integrator)
     if not 0 <= args.sensor < len(scene.sensors()):
         raise IrrcacheError(
@@ -148,7 +157,7 @@ def _render_progressive(
     try:
         with (
             progress_bar(scene.integrator(), display),
-            _terminated_like_interrupted(),
+            terminated_like_interrupted(),
             closing(
                 render_progressive(scene, args.sensor, args.spp, args.seed, **targets)
             ) as frames,
@@ -192,7 +201,7 @@ def _write(
 
 
 @contextmanager
-def _terminated_like_interrupted():
+def terminated_like_interrupted():
     """Treat a request to terminate like Ctrl-C within this context."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

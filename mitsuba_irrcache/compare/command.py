@@ -89,9 +89,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, write the report and print the tables; return 1 if an integrator failed."""
     require("matplotlib", "compare", "irrcache compare")
-    job, budgets = _common_job(args), _budgets(args.budget)
-    integrators = _integrators(args)
-    folder = _check_folder(Path(args.output), args.overwrite)
+    job, budgets = common_job(args), budgets_of(args.budget)
+    integrators = integrators_of(args)
+    folder = check_folder(Path(args.output), args.overwrite)
     with tempfile.TemporaryDirectory(prefix="irrcache-compare-") as scratch:
         log = Path(scratch) / "log"
         checked = run_job(
@@ -99,17 +99,17 @@ def run(args: argparse.Namespace) -> int:
             Path(scratch) / "checked.json", log,
         )  # fmt: skip
         reference = _reference(args, job, budgets, Path(scratch) / "reference.json", log)
-    _make_folders(folder)
+    make_folders(folder)
     measurements, interrupted = [], False
     for index, integrator in enumerate(integrators):
         try:
             name = file_name(index, integrator)
-            measurements.append(_measure(job, integrator, name, budgets, folder))
+            measurements.append(measure_integrator(job, integrator, name, budgets, folder))
         except KeyboardInterrupt:
             interrupted = True
             measurements += _kept(folder, name, integrator, "It was interrupted.")
             break
-    tables = _write(args, folder, measurements, reference, budgets, checked)
+    tables = write_report(args, folder, measurements, reference, budgets, checked)
     for table in tables:
         print(f"\n{table.as_text()}")
     print(f"\nreport         {folder / 'report.html'}")
@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     return 130 if interrupted else int(any(m.error for m in measurements))
 
 
-def _measure(
+def measure_integrator(
     job: dict, integrator: str, name: str, budgets: list[float], folder: Path
 ) -> Measurement:
     """Measure one integrator in two processes: with an empty and a filled kernel cache.
@@ -177,7 +177,7 @@ def _reference(
     return reference
 
 
-def _write(
+def write_report(
     args: argparse.Namespace,
     folder: Path,
     measurements: list[Measurement],
@@ -185,6 +185,10 @@ def _write(
     budgets: list[float],
     checked: dict,
 ) -> list:
+    """Write the report to ``folder``; return its tables.
+
+    ``checked`` is the result of the job `worker.check`.
+    """
     from .output import Comparison, write_output
 
     facts = _facts(args, reference, checked)
@@ -220,7 +224,8 @@ def _scene_name(args: argparse.Namespace) -> str:
     return "/".join(Path(args.scene).resolve().parts[-2:])
 
 
-def _common_job(args: argparse.Namespace) -> dict:
+def common_job(args: argparse.Namespace) -> dict:
+    """Return what all jobs of a comparison have in common, checked."""
     source = check_scene_file(args.scene)
     if args.mode not in mi.variants():
         raise IrrcacheError(f'-m is "{args.mode}"; this Mitsuba has {", ".join(mi.variants())}.')
@@ -233,7 +238,8 @@ def _common_job(args: argparse.Namespace) -> dict:
     }
 
 
-def _integrators(args: argparse.Namespace) -> list[str]:
+def integrators_of(args: argparse.Namespace) -> list[str]:
+    """Return the integrators; raise IrrcacheError for one that cannot be read or is repeated."""
     for specification in [*args.integrator, args.reference]:
         parse_integrator(specification)
     doubled = [i for i in args.integrator if args.integrator.count(i) > 1]
@@ -242,7 +248,8 @@ def _integrators(args: argparse.Namespace) -> list[str]:
     return args.integrator
 
 
-def _budgets(text: str) -> list[float]:
+def budgets_of(text: str) -> list[float]:
+    """Return the seconds in ``--budget``, sorted."""
     try:
         budgets = sorted({float(part) for part in text.split(",")})
     except ValueError:
@@ -252,7 +259,7 @@ def _budgets(text: str) -> list[float]:
     return budgets
 
 
-def _check_folder(folder: Path, overwrite: bool) -> Path:
+def check_folder(folder: Path, overwrite: bool) -> Path:
     """Check the folder for the report before any rendering starts."""
     if folder.exists() and not folder.is_dir():
         raise IrrcacheError(f'-o "{folder}" is a file; name a folder.')
@@ -270,7 +277,7 @@ def _check_folder(folder: Path, overwrite: bool) -> Path:
     return folder
 
 
-def _make_folders(folder: Path) -> None:
+def make_folders(folder: Path) -> None:
     """Create the empty report folders; only files of a former report are removed."""
     folder.mkdir(exist_ok=True)
     for name in ("results.json", "results.csv", "report.html"):

@@ -152,6 +152,12 @@ class Solver(ABC):
         complete stay in the cache.
         """
 
+    def batches_at_once(self) -> int:
+        """Return how many batches `refine` adds to the cache at once, at most: several machines
+        that compute so many each can give the same bits as one.
+        """
+        return 1
+
     def preview(self) -> Preview:
         """Return the first two batches without samples, if it `has_preview`."""
         raise NotImplementedError

@@ -124,9 +124,7 @@ class PathSolver(Solver):
         if total > 16 * LANES:
             seconds = estimator.seconds(total)
             mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
-        lanes = _lanes(cache)
-        block = min(cache.active_count, lanes // BATCH)
-        batches_at_once = max(1, lanes // (BATCH * block))
+        block, batches_at_once = self._block(), self.batches_at_once()
         remaining = samples // BATCH
         while remaining:
             count = min(batches_at_once, remaining)
@@ -141,6 +139,13 @@ class PathSolver(Solver):
             if progress is not None:
                 progress(done, total)
             remaining -= count
+
+    def _block(self) -> int:
+        """Return the voxels of one kernel launch."""
+        return min(self._task.cache.active_count, _lanes(self._task.cache) // BATCH)
+
+    def batches_at_once(self) -> int:
+        return max(1, _lanes(self._task.cache) // (BATCH * max(self._block(), 1)))
 
     def preview(self) -> Opening:
         return Opening(self._task)
