@@ -65,7 +65,7 @@ class Dispatch:
         self._counts: dict[str, Counter] = {"error": Counter(), "killed": Counter()}
         self._durations: list[float] = []
         self._workers: list[str] = []
-        self._looked = self._reminded = 0.0
+        self._looked, self._reminded = 0.0, time.monotonic()
         #: why workers cannot run these jobs, by address
         self.unfit: dict[str, str] = {}
         #: why jobs failed, by name
