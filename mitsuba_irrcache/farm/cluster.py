@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 from mitsuba_irrcache.core.argument_types import whole
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm.jobs import SOFTWARE
+from mitsuba_irrcache.farm.jobs import SOFTWARE, difference
 from mitsuba_irrcache.machine.versions import installed_version
 
 if TYPE_CHECKING:  # importing it takes a second
-    from distributed import Client, Security
+    from distributed import Client, LocalCluster, Security
 
 #: Workers on this machine by default, at most.
 MOST_WORKERS = 4
@@ -29,7 +29,10 @@ PATIENCE = 30
 _SETTINGS = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
+    "distributed.deploy.lost-worker-timeout": "5s",
 }
+#: Attempts to start the workers on this machine.
+STARTS = 3
 
 
 def add_cluster_options(parser: argparse.ArgumentParser) -> None:
@@ -101,8 +104,16 @@ def _certificates(args: argparse.Namespace) -> dict[str, str]:
     return {name: str(path) for name, path in found.items()}
 
 
+@dataclass
+class Connection:
+    """A client, and what starts workers again that died while they started; see `connected`."""
+
+    client: Client
+    refill: Callable[[], None] = lambda: None
+
+
 @contextmanager
-def connected(options: ClusterOptions) -> Iterator[Client]:
+def connected(options: ClusterOptions) -> Iterator[Connection]:
     """Connect to the scheduler, or start one; print where its state is displayed."""
     import dask
     from distributed import Client
@@ -111,9 +122,8 @@ def connected(options: ClusterOptions) -> Iterator[Client]:
     security = _security(options)
     with dask.config.set(_SETTINGS):
         if options.scheduler:
-            target = _named(options.scheduler)
             try:
-                client = Client(**target, security=security, timeout=PATIENCE)
+                client = Client(**_named(options.scheduler), security=security, timeout=PATIENCE)
             except (OSError, ValueError) as error:
                 raise IrrcacheError(
                     f'no scheduler answers at "{options.scheduler}" ({error}); start one with '
@@ -121,28 +131,43 @@ def connected(options: ClusterOptions) -> Iterator[Client]:
                 ) from error
             with client:
                 _announce(client)
-                yield client
+                yield Connection(client)
             return
         with _local(options, security) as cluster, Client(cluster, security=security) as client:
             _announce(client)
-            yield client
+            yield Connection(client, lambda: _refill(cluster, options.workers))
 
 
-def _local(options: ClusterOptions, security: Security | None) -> object:
+def _local(options: ClusterOptions, security: Security | None) -> LocalCluster:
     """Start worker processes on this machine, which no other machine can reach."""
     from distributed import LocalCluster
 
     encryption = {"security": security} if security else {}
-    return LocalCluster(
-        n_workers=options.workers,
-        threads_per_worker=1,
-        processes=True,
-        host="127.0.0.1",
-        protocol="tls" if security else "tcp",
-        dashboard_address="127.0.0.1:0",
-        **encryption,
-        silence_logs=logging.CRITICAL,
-    )
+    for _ in range(STARTS):
+        try:
+            return LocalCluster(
+                n_workers=options.workers,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                protocol="tls" if security else "tcp",
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+                **encryption,
+            )
+        except RuntimeError as error:  # one was killed while it started
+            failure = error
+    raise IrrcacheError(f"workers cannot be started on this machine: {failure}.") from failure
+
+
+def _refill(cluster: LocalCluster, count: int) -> None:
+    """Start workers again up to ``count``: Dask does not if they died while they started."""
+    from distributed.core import Status
+
+    for name, worker in list(cluster.workers.items()):
+        if worker.status in (Status.closed, Status.failed):
+            cluster.workers.pop(name, None)
+    cluster.scale(count)
 
 
 def _named(scheduler: str) -> dict[str, str]:
@@ -182,6 +207,6 @@ def unfit_workers(client: Client) -> dict[str, str]:
         answers = client.run(metadata.version, name, on_error="return")
         for address, answer in answers.items():
             if answer != wanted:
-                found = "not at all" if isinstance(answer, Exception) else answer
-                reasons.setdefault(address, []).append(f"it has {name} {found}, needed is {wanted}")
+                found = None if isinstance(answer, Exception) else answer
+                reasons.setdefault(address, []).append(difference(name, found, wanted))
     return {address: "; ".join(texts) for address, texts in reasons.items()}

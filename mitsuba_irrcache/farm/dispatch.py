@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 from uuid import uuid4
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm.cluster import unfit_workers
+from mitsuba_irrcache.farm.cluster import Connection, unfit_workers
 from mitsuba_irrcache.farm.jobs import Job
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.farm.work import run_job
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Future
 
 #: Jobs that are submitted at a time, per worker: one that runs and one that waits.
 JOBS_PER_WORKER = 2
@@ -31,8 +31,9 @@ JOBS_PER_WORKER = 2
 ATTEMPTS, ROUNDS = 2, 5
 #: Jobs that may fail before any has succeeded.
 FAILURES = 3
-#: Seconds between looks at the cluster, and between messages that no worker is there.
-INTERVAL, REMINDER = 1.0, 30.0
+#: Seconds between looks at the cluster, between attempts to start workers again that died while
+#: they started, and between messages that no worker is there.
+INTERVAL, REFILL, REMINDER = 1.0, 5.0, 30.0
 #: A job that takes so many times the median, and so many seconds, is given to a second worker if
 #: there is one that has nothing else to do.
 SLOW, SLOW_SECONDS = 4.0, 5.0
@@ -54,9 +55,9 @@ class Dispatch:
     """The jobs of one run. ``store`` is called with each finished job, once, in this thread."""
 
     def __init__(
-        self, client: Client, jobs: Sequence[Job], store: Callable[[Job, Outcome], None]
+        self, connection: Connection, jobs: Sequence[Job], store: Callable[[Job, Outcome], None]
     ) -> None:
-        self._client, self._store = client, store
+        self._client, self._refill, self._store = connection.client, connection.refill, store
         self._waiting = deque(jobs)
         self._open = {job.name: job for job in jobs}
         self._total, self._run = len(jobs), uuid4().hex[:8]
@@ -65,7 +66,8 @@ class Dispatch:
         self._counts: dict[str, Counter] = {"error": Counter(), "killed": Counter()}
         self._durations: list[float] = []
         self._workers: list[str] = []
-        self._looked, self._reminded = 0.0, time.monotonic()
+        self._looked, self._refilled = 0.0, time.monotonic()
+        self._reminded, self._reconnecting = time.monotonic(), False
         #: why workers cannot run these jobs, by address
         self.unfit: dict[str, str] = {}
         #: why jobs failed, by name
@@ -113,7 +115,14 @@ class Dispatch:
                 f"the scheduler is lost; {self._progress}. Start the command again with --resume."
             )
         if self._client.status != "running":
+            if not self._reconnecting:
+                print("the connection to the scheduler is lost; trying again", flush=True)
+            self._reconnecting = True
             return
+        self._reconnecting = False
+        if now - self._refilled > REFILL:
+            self._refilled = now
+            self._refill()
         self._workers = list(self._client.nthreads())
         if not self._workers and now - self._reminded > REMINDER:
             self._reminded = now

@@ -70,6 +70,11 @@ def software() -> tuple[tuple[str, str | None], ...]:
     return tuple((name, installed_version(name)) for name in SOFTWARE)
 
 
+def difference(name: str, found: str | None, wanted: str | None) -> str:
+    """Return why a worker with another version of a package, or without it, is not used."""
+    return f"it has {name} {found}, not {wanted}" if found else f"it lacks {name} {wanted}"
+
+
 def scene_arguments(
     scene: str | Path, parameters: dict[str, str], integrator: str | None
 ) -> dict[str, object]:

@@ -157,8 +157,8 @@ def _dispatch(options: ClusterOptions, jobs: Sequence[Job], store: Store) -> int
     """Run jobs on the cluster; return 1, and print why, if some failed."""
     if not jobs:
         return 0
-    with terminated_like_interrupted(), connected(options) as client:
-        failed = Dispatch(client, jobs, store).run()
+    with terminated_like_interrupted(), connected(options) as connection:
+        failed = Dispatch(connection, jobs, store).run()
     for name, message in failed.items():
         print(f"irrcache: {name}: {message}", file=sys.stderr)
     return int(bool(failed))

@@ -19,7 +19,7 @@ from mitsuba_irrcache.compare.command import measure_integrator
 from mitsuba_irrcache.compare.reference import render_halves
 from mitsuba_irrcache.compare.scene_files import scene_digest
 from mitsuba_irrcache.errors import IrrcacheError, original_message
-from mitsuba_irrcache.farm.jobs import Environment, software
+from mitsuba_irrcache.farm.jobs import Environment, difference, software
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
@@ -78,7 +78,7 @@ def set_up(environment: Environment) -> None:
     """Prepare this process for jobs; raise UnfitWorkerError if it is of another kind."""
     for (name, wanted), (_, found) in zip(environment.software, software(), strict=True):
         if wanted != found:
-            raise UnfitWorkerError(f"it has {name} {found or 'not at all'}, needed is {wanted}")
+            raise UnfitWorkerError(difference(name, found, wanted))
     try:
         if environment.variant.startswith("llvm"):
             require_llvm()

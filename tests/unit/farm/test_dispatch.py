@@ -9,6 +9,7 @@ from distributed import KilledWorker
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm import dispatch
+from mitsuba_irrcache.farm.cluster import Connection
 from mitsuba_irrcache.farm.dispatch import Dispatch, SchedulerLostError
 from mitsuba_irrcache.farm.jobs import Environment, Job
 from mitsuba_irrcache.farm.results import Outcome
@@ -80,7 +81,9 @@ def _soon(monkeypatch):
 def dispatched(cluster: Cluster, *names: str) -> tuple[list[str], dict[str, str]]:
     """Run jobs; return the names in the order in which they were stored, and failures."""
     stored: list[str] = []
-    failed = Dispatch(cluster, jobs(*names), lambda job, _: stored.append(job.name)).run()
+    failed = Dispatch(
+        Connection(cluster), jobs(*names), lambda job, _: stored.append(job.name)
+    ).run()
     return stored, failed
 
 
@@ -145,15 +148,15 @@ def test_jobs_of_workers_that_left_are_given_to_others(monkeypatch):
     def leave(job, _):
         cluster.workers = ("a", "c")
 
-    assert Dispatch(cluster, jobs("first", "second"), leave).run() == {}
+    assert Dispatch(Connection(cluster), jobs("first", "second"), leave).run() == {}
     assert cluster.submitted[-1] == ("first", ("c",))
 
 
 def test_a_lost_scheduler_is_reported():
-    cluster = Cluster({"second": ["lost"]})
+    cluster = Cluster({"second": ["lost"], "third": ["lost"]})
 
     def lose(job, _):
         cluster.status = "closed"
 
     with pytest.raises(SchedulerLostError, match=r"1 of 3 jobs are finished and kept.*--resume"):
-        Dispatch(cluster, jobs("first", "second", "third"), lose).run()
+        Dispatch(Connection(cluster), jobs("first", "second", "third"), lose).run()
