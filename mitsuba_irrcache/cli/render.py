@@ -267,23 +267,33 @@ def _require_progressive(scene: mi.Scene, integrator: str) -> None:
 def _describe(
     scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], samples: int = 0
 ) -> dict[str, object]:
-    """Describe how the image was made, for the header of the EXR.
+    """Describe how the image was made, for the header of the EXR; see `described`."""
+    found = described(scene, args.scene, args.sensor, args.seed, args.spp, samples)
+    return found | {f"seconds_{name}": value for name, value in seconds.items()}
 
-    ``samples`` are those per voxel of the cache that the image shows; None: those of the cache now.
+
+def described(
+    scene: mi.Scene, source: str | Path, sensor: int, seed: int, spp: int, samples: int = 0
+) -> dict[str, object]:
+    """Describe how an image of the file ``source`` was made, for the header of the EXR.
+
+    ``spp`` 0 are the scene's; ``samples`` are those per voxel of the cache that the image shows,
+    0 those of the cache now.
     """
-    described = {
+    found = {
         "version": __version__,
         "mitsuba": metadata.version("mitsuba"),
         "drjit": metadata.version("drjit"),
-        "variant": args.mode,
-        "scene": Path(args.scene).name,
+        "variant": mi.variant(),
+        "scene": Path(source).name,
         "integrator": " ".join(str(scene.integrator()).split()),
-        "sensor": args.sensor,
-        "seed": args.seed,
-        "spp": args.spp or scene.sensors()[args.sensor].sampler().sample_count(),
+        "sensor": sensor,
+        "seed": seed,
+        "spp": spp or scene.sensors()[sensor].sampler().sample_count(),
     }
-    cache = getattr(scene.integrator(), "cache", None)
+    caches = getattr(scene.integrator(), "caches", {})
+    cache = next(iter(caches.values()), None) if len(caches) == 1 else None
     if cache is not None:
         sides = "x".join(map(str, cache.grid.shape[::-1]))
-        described["cache"] = f"{sides} voxels, {samples or cache.samples} samples"
-    return described | {f"seconds_{name}": value for name, value in seconds.items()}
+        found["cache"] = f"{sides} voxels, {samples or cache.samples} samples"
+    return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -31,8 +32,8 @@ _SETTINGS = {
     "distributed.worker.memory.spill": False,
     "distributed.deploy.lost-worker-timeout": "5s",
 }
-#: Attempts to start the workers on this machine.
-STARTS = 3
+#: Seconds without a worker on this machine after which none is expected any more.
+LONGEST_START = 300.0
 
 
 def add_cluster_options(parser: argparse.ArgumentParser) -> None:
@@ -106,10 +107,17 @@ def _certificates(args: argparse.Namespace) -> dict[str, str]:
 
 @dataclass
 class Connection:
-    """A client, and what starts workers again that died while they started; see `connected`."""
+    """A client and its workers.
+
+    Attributes:
+        client: connected to the scheduler.
+        refill: starts workers of this machine again that died while they started.
+        patience: seconds to wait for a worker if there is none; a cluster may have a queue.
+    """
 
     client: Client
     refill: Callable[[], None] = lambda: None
+    patience: float = math.inf
 
 
 @contextmanager
@@ -135,29 +143,25 @@ def connected(options: ClusterOptions) -> Iterator[Connection]:
             return
         with _local(options, security) as cluster, Client(cluster, security=security) as client:
             _announce(client)
-            yield Connection(client, lambda: _refill(cluster, options.workers))
+            _refill(cluster, options.workers)
+            yield Connection(client, lambda: _refill(cluster, options.workers), LONGEST_START)
 
 
 def _local(options: ClusterOptions, security: Security | None) -> LocalCluster:
-    """Start worker processes on this machine, which no other machine can reach."""
+    """Start a scheduler for workers on this machine, which no other machine can reach."""
     from distributed import LocalCluster
 
     encryption = {"security": security} if security else {}
-    for _ in range(STARTS):
-        try:
-            return LocalCluster(
-                n_workers=options.workers,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                protocol="tls" if security else "tcp",
-                dashboard_address="127.0.0.1:0",
-                silence_logs=logging.CRITICAL,
-                **encryption,
-            )
-        except RuntimeError as error:  # one was killed while it started
-            failure = error
-    raise IrrcacheError(f"workers cannot be started on this machine: {failure}.") from failure
+    return LocalCluster(
+        n_workers=0,  # `_refill` starts them, each by itself: one may be killed while it starts
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        protocol="tls" if security else "tcp",
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+        **encryption,
+    )
 
 
 def _refill(cluster: LocalCluster, count: int) -> None:

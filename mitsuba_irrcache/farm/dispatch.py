@@ -57,7 +57,12 @@ class Dispatch:
     def __init__(
         self, connection: Connection, jobs: Sequence[Job], store: Callable[[Job, Outcome], None]
     ) -> None:
-        self._client, self._refill, self._store = connection.client, connection.refill, store
+        self._client, self._refill, self._patience = (
+            connection.client,
+            connection.refill,
+            connection.patience,
+        )
+        self._store = store
         self._waiting = deque(jobs)
         self._open = {job.name: job for job in jobs}
         self._total, self._run = len(jobs), uuid4().hex[:8]
@@ -67,7 +72,8 @@ class Dispatch:
         self._durations: list[float] = []
         self._workers: list[str] = []
         self._looked, self._refilled = 0.0, time.monotonic()
-        self._reminded, self._reconnecting = time.monotonic(), False
+        self._seen = self._reminded = time.monotonic()
+        self._reconnecting = False
         #: why workers cannot run these jobs, by address
         self.unfit: dict[str, str] = {}
         #: why jobs failed, by name
@@ -82,6 +88,7 @@ class Dispatch:
         """
         if not self._open:
             return {}
+        started = time.monotonic()
         try:
             for address, reason in unfit_workers(self._client).items():
                 self._exclude(address, reason)
@@ -96,6 +103,8 @@ class Dispatch:
             raise KeyboardInterrupt(f"{self._progress}; --resume continues") from None
         finally:
             self._cancel(list(self._attempts))
+        took, work = time.monotonic() - started, sum(self._durations)
+        print(f"{len(self._durations)} jobs in {took:.2f} s, {work:.2f} s of work", flush=True)
         return self.failed
 
     @property
@@ -124,11 +133,21 @@ class Dispatch:
             self._refilled = now
             self._refill()
         self._workers = list(self._client.nthreads())
-        if not self._workers and now - self._reminded > REMINDER:
-            self._reminded = now
-            print(f"waiting for workers, {len(self._open)} jobs are left", flush=True)
+        self._wait_for_workers(now)
         self._release_stranded()
         self._repeat_slow()
+
+    def _wait_for_workers(self, now: float) -> None:
+        if self._workers:
+            self._seen = self._reminded = now
+        elif now - self._seen > self._patience:
+            raise IrrcacheError(
+                f"no worker has started for {now - self._seen:.0f} s; {self._progress}. See whether "
+                "there is enough memory, and lower --workers."
+            )
+        elif now - self._reminded > REMINDER:
+            self._reminded = now
+            print(f"waiting for workers, {len(self._open)} jobs are left", flush=True)
 
     @property
     def _fit(self) -> list[str]:

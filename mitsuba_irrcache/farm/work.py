@@ -12,9 +12,11 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.cache.interpolation import PLAIN
 from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.cli.render import described
 from mitsuba_irrcache.compare.command import measure_integrator
 from mitsuba_irrcache.compare.reference import render_halves
 from mitsuba_irrcache.compare.scene_files import scene_digest
@@ -113,11 +115,12 @@ def frame(arguments: dict, folder: Path) -> None:
     scene = _loaded(arguments["scene"])
     if hasattr(scene.integrator(), "cached_media"):
         _prepare(scene)
-    options = {name: arguments[name] for name in ("sensor", "seed", "spp")}
-    image = mi.render(scene, **options)
-    names = scene.integrator().aov_names()
-    about = options | {"parameters": json.dumps(arguments["scene"]["parameters"])}
-    write_image(folder / arguments["file"], image.numpy(), about, names)
+    sensor, seed, spp = (arguments[name] for name in ("sensor", "seed", "spp"))
+    image = np.array(mi.render(scene, sensor=sensor, seed=seed, spp=spp))
+    source, parameters = arguments["scene"]["scene"], arguments["scene"]["parameters"]
+    about = described(scene, source, sensor, seed, spp) | {"parameters": json.dumps(parameters)}
+    names = getattr(scene.integrator(), "aov_names", list)()
+    write_image(folder / arguments["file"], image, about, names)
 
 
 def _prepare(scene: mi.Scene) -> None:
