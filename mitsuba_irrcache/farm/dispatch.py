@@ -142,8 +142,8 @@ class Dispatch:
             self._seen = self._reminded = now
         elif now - self._seen > self._patience:
             raise IrrcacheError(
-                f"no worker has started for {now - self._seen:.0f} s; {self._progress}. See whether "
-                "there is enough memory, and lower --workers."
+                f"no worker has started for {now - self._seen:.0f} s; {self._progress}. See "
+                "whether there is enough memory, and lower --workers."
             )
         elif now - self._reminded > REMINDER:
             self._reminded = now
