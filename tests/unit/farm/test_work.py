@@ -15,7 +15,7 @@ from mitsuba_irrcache.compare import reference as stored
 from mitsuba_irrcache.compare.command import common_job
 from mitsuba_irrcache.compare.results import Measurement, Snapshot
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.farm import references, work
+from mitsuba_irrcache.farm import references, studies, work
 from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
 from mitsuba_irrcache.farm.references import ReferenceRun
 from mitsuba_irrcache.farm.results import Outcome
@@ -110,7 +110,9 @@ def measured(job, integrator, name, budgets, folder) -> None:
 
 
 def test_a_study_reports_what_workers_measured(scene, environment, tmp_path, monkeypatch):
+    written: list[tuple] = []
     monkeypatch.setattr(work, "measure_integrator", measured)
+    monkeypatch.setattr(studies, "write_report", lambda *arguments: written.append(arguments))
     args = argparse.Namespace(
         scenes=[str(scene)], output=str(tmp_path), integrator=["volpath"], reference="volpath",
         mode="llvm_ad_rgb", define=[f"{k}={v}" for k, v in SMALL.items()], modules=[], sensor=0,
@@ -120,10 +122,12 @@ def test_a_study_reports_what_workers_measured(scene, environment, tmp_path, mon
     study = SceneStudy(own, common_job(own), [0.1], environment)
     (job,) = study.begin(resume=False)
     study.store(job, outcome(job, tmp_path / "scratch"))
-    truth = stored.reference(scene, SMALL, "volpath", tmp_path, spp=8)
-    report = study.report(truth)
-    assert report == tmp_path / "cloud" / "report.html"
-    assert "volpath" in (tmp_path / "cloud" / "results.csv").read_text()
+    truth = stored.Reference(np.zeros((8, 8, 3)), np.zeros((8, 8, 3)), 8, 1.0)
+    assert study.report(truth) == tmp_path / "cloud" / "report.html"
+    ((_, folder, (measurement,), reference, budgets, checked),) = written
+    assert folder == tmp_path / "cloud" and reference is truth and budgets == [0.1]
+    assert measurement.integrator == "volpath" and checked["size"] == [8, 8]
+    np.testing.assert_allclose(measurement.snapshots[0].read(folder), 0.3)
     again = SceneStudy(own, common_job(own), [0.1], environment)
     assert again.begin(resume=True) == []
 
