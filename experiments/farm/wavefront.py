@@ -206,6 +206,36 @@ def _item(faces: list[bytes], axis: int) -> bytes:
     return faces[axis]
 
 
+#: Streaming of 1024^3 grey voxels from a disk, slab by slab, once for each of the three dominant
+#: axes: bytes per voxel that are read and written. Extinction in two words; source, irradiance,
+#: loss and weight in one each, of which all are read and the last three are written; uncollided
+#: irradiance in one, read and written.
+STREAMED = (
+    ("single scattering, 256 directions", 256, 8 + 4 + 4),
+    ("all orders, a pass of 16", 16, 8 + 16 + 12),
+    ("all orders, a pass of 64", 64, 8 + 16 + 12),
+)
+SLABS, DISK, PER_DIRECTION = 1024**3, 2e9, 2e-9
+
+
+def disk_table() -> Table:
+    """Return the table of arithmetic and disk, from the numbers above."""
+    rows = []
+    for name, directions, moved in STREAMED:
+        arithmetic, disk = SLABS * directions * PER_DIRECTION, 3 * SLABS * moved / DISK
+        rows.append(
+            [
+                name,
+                f"{3 * moved}",
+                f"{arithmetic:.0f} s",
+                f"{disk:.0f} s",
+                f"{disk / arithmetic:.2f}",
+            ]
+        )
+    head = ["", "bytes per voxel", "arithmetic", "disk", "disk / arithmetic"]
+    return Table("Slabs from a disk", head, rows)
+
+
 def model_table(cases: list[Case], outcomes: list[dict]) -> Table:
     """Return the table of the model."""
     head = ["directions", "seconds", "idle", "messages", "of each", "per worker and second"]
@@ -264,6 +294,7 @@ def main() -> None:
     tables = {
         "bricks-model": model_table(LARGE, list(map(row, LARGE))),
         "bricks-check": check_table(SMALL, list(map(row, SMALL)), measured),
+        "bricks-disk": disk_table(),
     }
     for table in tables.values():
         print(table.as_text())
