@@ -40,25 +40,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``irrcache compare``."""
     add = parser.add_argument
     add("scene", help="scene XML")
-    add(
-        "-i", "--integrator", action="append", required=True, metavar="NAME{KEY=VALUE,...}",
-        help="integrator to compare, quoted, with properties; repeatable",
-    )  # fmt: skip
+    add_measurement_options(parser)
     add("-o", "--output", required=True, metavar="FOLDER", help="folder for the report")
-    add(
-        "--budget", default="1,3,12", metavar="SECONDS,...",
-        help="times to compare errors at, with compiled kernels (default: %(default)s)",
-    )  # fmt: skip
     add("-m", "--mode", default="llvm_ad_rgb", help="variant of Mitsuba (default: %(default)s)")
     add(
         "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
         help="value of a $parameter of the scene; repeatable",
     )  # fmt: skip
-    add("-s", "--sensor", type=whole(0), default=0, help="index of the sensor (default: 0)")
-    add(
-        "--reference", default=DEFAULT_REFERENCE, metavar="NAME{KEY=VALUE,...}",
-        help="unbiased integrator that makes the reference (default: %(default)s)",
-    )  # fmt: skip
+    add_reference_options(parser)
     effort = parser.add_mutually_exclusive_group()
     effort.add_argument(
         "--reference-spp", type=whole(0), default=0, metavar="N",
@@ -68,9 +57,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--reference-seconds", type=seconds, default=0.0, metavar="S",
         help=f"time for the reference (default: {REFERENCE_SHARE} times the longest budget)",
     )  # fmt: skip
+    add_modules(parser)
+    add("--overwrite", action="store_true", help="replace an existing report in the folder")
+
+
+def add_measurement_options(parser: argparse.ArgumentParser) -> None:
+    """Declare what is measured: integrators and times."""
+    add = parser.add_argument
     add(
-        "--references", type=Path, default=None, metavar="FOLDER",
-        help="folder of the references (default: irrcache/references in your cache folder)",
+        "-i", "--integrator", action="append", required=True, metavar="NAME{KEY=VALUE,...}",
+        help="integrator to compare, quoted, with properties; repeatable",
+    )  # fmt: skip
+    add(
+        "--budget", default="1,3,12", metavar="SECONDS,...",
+        help="times to compare errors at, with compiled kernels (default: %(default)s)",
     )  # fmt: skip
     add(
         "--exposure",
@@ -79,11 +79,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="EV",
         help="exposure of the displayed images in stops",
     )
+
+
+def add_reference_options(parser: argparse.ArgumentParser) -> None:
+    """Declare which reference is rendered, and where it is stored."""
+    add = parser.add_argument
+    add("-s", "--sensor", type=whole(0), default=0, help="index of the sensor (default: 0)")
     add(
-        "--import", dest="modules", action="append", default=[], metavar="MODULE",
-        help="Python module that registers third-party integrators; repeatable",
+        "--reference", default=DEFAULT_REFERENCE, metavar="NAME{KEY=VALUE,...}",
+        help="unbiased integrator that makes the reference (default: %(default)s)",
     )  # fmt: skip
-    add("--overwrite", action="store_true", help="replace an existing report in the folder")
+    add(
+        "--references", type=Path, default=None, metavar="FOLDER",
+        help="folder of the references (default: irrcache/references in your cache folder)",
+    )  # fmt: skip
+
+
+def add_modules(parser: argparse.ArgumentParser) -> None:
+    """Declare the modules that register plugins."""
+    parser.add_argument(
+        "--import", dest="modules", action="append", default=[], metavar="MODULE",
+        help="Python module that registers third-party plugins; repeatable",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:

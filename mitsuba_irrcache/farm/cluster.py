@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import math
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +15,8 @@ from typing import TYPE_CHECKING
 from mitsuba_irrcache.core.argument_types import whole
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.jobs import SOFTWARE, difference
+from mitsuba_irrcache.machine.doctor import available_cores
+from mitsuba_irrcache.machine.memory import total_memory
 from mitsuba_irrcache.machine.versions import installed_version
 
 if TYPE_CHECKING:  # importing it takes a second
@@ -32,6 +33,8 @@ _SETTINGS = {
     "distributed.worker.memory.spill": False,
     "distributed.deploy.lost-worker-timeout": "5s",
 }
+#: The answer of workers without a package.
+MISSING = metadata.PackageNotFoundError
 #: Seconds without a worker on this machine after which none is expected any more.
 LONGEST_START = 300.0
 
@@ -76,9 +79,9 @@ class ClusterOptions:
             raise IrrcacheError(
                 "--workers is for workers on this machine; with --scheduler, start workers there."
             )
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        workers = args.workers or min(cores or 1, most_workers)
-        threads = args.threads or (0 if args.scheduler else max(1, (cores or 1) // workers))
+        cores = available_cores()
+        workers = args.workers or min(cores, most_workers)
+        threads = args.threads or (0 if args.scheduler else max(1, cores // workers))
         return cls(args.scheduler or "", workers, threads, _certificates(args))
 
 
@@ -156,6 +159,7 @@ def _local(options: ClusterOptions, security: Security | None) -> LocalCluster:
         n_workers=0,  # `_refill` starts them, each by itself: one may be killed while it starts
         threads_per_worker=1,
         processes=True,
+        memory_limit=total_memory() // options.workers,
         host="127.0.0.1",
         protocol="tls" if security else "tcp",
         dashboard_address="127.0.0.1:0",
@@ -210,7 +214,9 @@ def unfit_workers(client: Client) -> dict[str, str]:
         wanted = installed_version(name)
         answers = client.run(metadata.version, name, on_error="return")
         for address, answer in answers.items():
+            if isinstance(answer, Exception) and not isinstance(answer, MISSING):
+                continue  # the worker ended meanwhile
             if answer != wanted:
-                found = None if isinstance(answer, Exception) else answer
+                found = None if isinstance(answer, MISSING) else answer
                 reasons.setdefault(address, []).append(difference(name, found, wanted))
     return {address: "; ".join(texts) for address, texts in reasons.items()}

@@ -11,7 +11,12 @@ import argparse
 from pathlib import Path
 
 from mitsuba_irrcache.cli.render import add_scene_options
-from mitsuba_irrcache.core.argument_types import finite, whole
+from mitsuba_irrcache.compare.command import (
+    add_measurement_options,
+    add_modules,
+    add_reference_options,
+)
+from mitsuba_irrcache.core.argument_types import whole
 from mitsuba_irrcache.farm.cluster import add_cluster_options
 from mitsuba_irrcache.machine.extras import require
 
@@ -29,10 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         declare(kind)
         add_scene_options(kind)
         kind.add_argument("--resume", action="store_true", help="continue an earlier run")
-        kind.add_argument(
-            "--import", dest="modules", action="append", default=[], metavar="MODULE",
-            help="Python module that registers third-party plugins; repeatable",
-        )  # fmt: skip
+        add_modules(kind)
         add_cluster_options(kind)
 
 
@@ -63,24 +65,15 @@ def _add_frame_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_reference_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="scene XML")
-    parser.add_argument("-s", "--sensor", type=whole(0), default=0, help="index (default: 0)")
     _add_reference(parser)
 
 
 def _add_study_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("scenes", nargs="+", metavar="scene", help="scene XML; repeatable")
-    add(
-        "-i", "--integrator", action="append", required=True, metavar="NAME{KEY=VALUE,...}",
-        help="integrator to compare, quoted, with properties; repeatable",
-    )  # fmt: skip
-    add("-o", "--output", required=True, metavar="FOLDER", help="folder with a report per scene")
-    add(
-        "--budget", default="1,3,12", metavar="SECONDS,...",
-        help="times to compare errors at (default: %(default)s); run one worker per machine",
-    )  # fmt: skip
-    add("-s", "--sensor", type=whole(0), default=0, help="index of the sensor (default: 0)")
-    add("--exposure", type=finite, default=0.0, metavar="EV", help="of displayed images, in stops")
+    parser.add_argument("scenes", nargs="+", metavar="scene", help="scene XML; repeatable")
+    add_measurement_options(parser)
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="FOLDER", help="folder with a report per scene"
+    )
     _add_reference(parser)
 
 
@@ -92,18 +85,10 @@ def _add_integrator(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_reference(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--reference", default="volpath", metavar="NAME{KEY=VALUE,...}",
-        help="unbiased integrator that makes the reference (default: %(default)s)",
-    )  # fmt: skip
-    add(
+    add_reference_options(parser)
+    parser.add_argument(
         "--reference-spp", type=whole(1), default=1024, metavar="N",
-        help="samples per pixel of each of its two halves (default: %(default)s)",
-    )  # fmt: skip
-    add(
-        "--references", type=Path, default=None, metavar="FOLDER",
-        help="folder of the references (default: irrcache/references in your cache folder)",
+        help="samples per pixel of each of the two halves of the reference (default: %(default)s)",
     )  # fmt: skip
 
 

@@ -132,7 +132,10 @@ class Dispatch:
         if now - self._refilled > REFILL:
             self._refilled = now
             self._refill()
-        self._workers = list(self._client.nthreads())
+        try:
+            self._workers = list(self._client.nthreads())
+        except (OSError, TimeoutError):  # the connection is being lost
+            return
         self._wait_for_workers(now)
         self._release_stranded()
         self._repeat_slow()
@@ -187,7 +190,7 @@ class Dispatch:
     # Jobs
 
     def _submit_more(self) -> None:
-        if self._client.status != "running":
+        if self._client.status != "running" or (self.unfit and not self._fit):
             return
         room = JOBS_PER_WORKER * max(len(self._fit), 1) - len(self._attempts)
         while self._waiting and room > 0:

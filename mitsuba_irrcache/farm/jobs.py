@@ -58,9 +58,14 @@ class Job:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of everything that the result depends on."""
+        """SHA-256 of everything that the result depends on; the folder of the scene does not
+        matter, nor does the name of its file.
+        """
         environment = self.environment
-        parts = [self.kind, self.arguments, environment.variant, environment.modules]
+        scene = self.arguments.get("scene", {})
+        contents = {key: value for key, value in scene.items() if key != "scene"}
+        arguments = self.arguments | {"scene": contents}
+        parts = [self.kind, arguments, environment.variant, environment.modules]
         text = json.dumps([*parts, environment.software], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 

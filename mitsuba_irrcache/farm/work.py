@@ -44,7 +44,7 @@ class _Kept:
         self.key, self.value = "", None
 
     def get(self, key: str, make: Callable[[], object]) -> object:
-        """Return what was kept for ``key``, or make it anew."""
+        """Return the value of the last job if that had the same ``key``, else a new one."""
         if key != self.key:
             self.key, self.value = "", None  # released first
             self.value, self.key = make(), key
