@@ -12,7 +12,7 @@ from mitsuba_irrcache.farm.jobs import Environment, Job
 from mitsuba_irrcache.farm.results import Checkpoints, OrderedParts, Outcome, Results
 from mitsuba_irrcache.io.scene_files import load_scene
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
-from mitsuba_irrcache.pipeline.stream_parts import StreamParts
+from mitsuba_irrcache.pipeline.stream_parts import missing_parts
 
 
 class CacheRun:
@@ -67,10 +67,7 @@ class CacheRun:
         return [job for parts in self._parts.values() for job in parts.missing]
 
     def _jobs(self, number: int, medium: CachedMedium) -> Iterator[Job]:
-        missing = StreamParts(self._scene, medium).missing(
-            medium.cache.samples, medium.target(medium.settings.samples)
-        )
-        for first, count in missing:
+        for first, count in missing_parts(medium):
             name = f"batches-{first}-{first + count - 1}"
             name = f"medium-{number}-{name}" if len(self._media) > 1 else name
             arguments = {

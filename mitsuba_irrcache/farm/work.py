@@ -25,6 +25,7 @@ from mitsuba_irrcache.farm.jobs import Environment, difference, software
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.machine.doctor import available_cores
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.pipeline.stream_parts import StreamParts
 
@@ -89,8 +90,9 @@ def set_up(environment: Environment) -> None:
         mi.set_log_level(mi.LogLevel.Error)
         for module in environment.modules:
             importlib.import_module(module)
-        if environment.threads and dr.thread_count() != environment.threads:
-            dr.set_thread_count(environment.threads)
+        threads = environment.threads or available_cores()
+        if dr.thread_count() != threads:
+            dr.set_thread_count(threads)
         dr.eval(dr.arange(mi.Float, 4))
     except Exception as error:
         message = original_message(error)

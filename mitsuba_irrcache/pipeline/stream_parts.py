@@ -44,6 +44,17 @@ class _Collector(IrradianceCache):
         self.note_samples(seed, samples)
 
 
+def missing_parts(cached: CachedMedium) -> Iterator[tuple[int, int]]:
+    """Yield the first batch and the number of batches of each part that the cache of a medium needs
+    up to the samples of its settings.
+    """
+    cache = cached.cache
+    at_once = cached.solver.batches_at_once(cache)
+    last = cached.target(cached.settings.samples) // cache.batch
+    for first in range(cache.samples // cache.batch, last, at_once):
+        yield first, min(at_once, last - first)
+
+
 class StreamParts:
     """Computes parts of the random stream of the cache of one medium, in any order.
 
@@ -54,20 +65,6 @@ class StreamParts:
         self._seed = cached.settings.seed
         self._collector = _Collector(cached.cache, cached.fingerprint(scene))
         self._solver = cached.new_solver(scene, self._collector)
-
-    @property
-    def batches_at_once(self) -> int:
-        """Batches of a part; the last one may have fewer."""
-        return self._solver.batches_at_once()
-
-    def missing(self, samples: int, target: int) -> Iterator[tuple[int, int]]:
-        """Yield the first batch and the number of batches of each part that leads from a cache of
-        ``samples`` per voxel to one of ``target``, a multiple of the batch.
-        """
-        batch, at_once = self._collector.batch, self.batches_at_once
-        last = target // batch
-        for first in range(samples // batch, last, at_once):
-            yield first, min(at_once, last - first)
 
     def compute(self, first: int, count: int) -> IrradianceCache:
         """Return ``count`` batches that begin with number ``first``."""

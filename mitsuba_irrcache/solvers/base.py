@@ -141,6 +141,13 @@ class Solver(ABC):
         """
         return False
 
+    @classmethod
+    def batches_at_once(cls, cache: IrradianceCache) -> int:
+        """Return how many batches `refine` adds to ``cache`` at once, at most: several machines
+        that compute so many each can give the same bits as one.
+        """
+        return 1
+
     @abstractmethod
     def __init__(self, task: SolverTask) -> None: ...
 
@@ -151,12 +158,6 @@ class Solver(ABC):
         The random stream goes on where it stopped. If ``progress`` raises, batches that are
         complete stay in the cache.
         """
-
-    def batches_at_once(self) -> int:
-        """Return how many batches `refine` adds to the cache at once, at most: several machines
-        that compute so many each can give the same bits as one.
-        """
-        return 1
 
     def preview(self) -> Preview:
         """Return the first two batches without samples, if it `has_preview`."""

@@ -8,7 +8,7 @@ import pytest
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.pipeline.stream_parts import StreamParts
+from mitsuba_irrcache.pipeline.stream_parts import StreamParts, missing_parts
 from mitsuba_irrcache.solvers.path import solver as path_solver
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -53,16 +53,15 @@ def test_parts_give_the_bits_of_one_run(kind, build, tmp_path):
     other = build(settings, **phase)
     (medium,) = other.integrator().cached_media(other)
     medium.use_file(other, tmp_path / "parts")
-    target = medium.target(settings["cache_spp"])
-    parts = StreamParts(other, medium)
-    spans = list(parts.missing(0, target))
+    parts, spans = StreamParts(other, medium), list(missing_parts(medium))
     assert len(spans) == expected
     for first, count in reversed(spans):
         parts.compute(first, count).save(tmp_path / f"{first}")
     assert medium.cache.samples == 0
     for first, _ in spans:
         medium.cache.append(IrradianceCache.load(tmp_path / f"{first}"), first)
-    assert medium.cache.samples == target
+    assert medium.cache.samples == settings["cache_spp"]
+    assert list(missing_parts(medium)) == []
     for name, found in values(medium.cache, tmp_path / "appended").items():
         np.testing.assert_array_equal(found, whole[name])
 
@@ -72,7 +71,7 @@ def test_a_part_is_never_counted_twice_or_too_early(build, tmp_path):
     (medium,) = scene.integrator().cached_media(scene)
     medium.use_file(scene, tmp_path / "cache")
     parts = StreamParts(scene, medium)
-    (first, second, _) = list(parts.missing(0, 160))
+    (first, second, _) = list(missing_parts(medium))
     computed = [parts.compute(*span) for span in (first, second)]
     with pytest.raises(IrrcacheError, match=r"begins with batch 8 of cache_seed 0, but .* has 0"):
         medium.cache.append(computed[1], second[0])
