@@ -53,7 +53,10 @@ def test_kills_of_workers_and_of_the_command_leave_no_trace(tmp_path):
     file, arguments = tmp_path / "light.cache", ["cache", SCENE, "-i", INTEGRATOR, "-o"]
     process = farm(*arguments, file)
     lines = lines_until(process, 1)
-    assert lines[0].startswith("scheduler tcp://127.0.0.1:") and "dashboard http" in lines[0]
+    assert (
+        lines[0].startswith("scheduler tcp://127.0.0.1:")
+        and "dashboard http://127.0.0.1:" in lines[0]
+    )
     kill_worker(process)
     lines_until(process, 1)
     process.kill()
