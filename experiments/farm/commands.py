@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import resource
 import subprocess
 import sys
 import time
@@ -17,15 +17,11 @@ SCENE = str(scene_path("cloud"))
 
 @dataclass
 class Finished:
-    """What a command printed, its seconds, and the seconds of its jobs."""
+    """What a command printed, its seconds, and the processor time of it and its workers."""
 
     text: str
     seconds: float
-
-    @property
-    def jobs(self) -> list[float]:
-        """Seconds of each job on its worker."""
-        return [float(s) for s in re.findall(r"^\[\d+/\d+\] .*: ([\d.]+) s on ", self.text, re.M)]
+    processor: float
 
 
 def command(*arguments: object) -> list[str]:
@@ -35,13 +31,20 @@ def command(*arguments: object) -> list[str]:
 
 def finished(*arguments: object) -> Finished:
     """Run ``irrcache`` to its end; raise RuntimeError with what it printed if it fails."""
-    started = time.perf_counter()
+    started, used = time.perf_counter(), _processor_time()
     done = subprocess.run(
         command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     if done.returncode:
         raise RuntimeError(done.stdout)
-    return Finished(done.stdout, time.perf_counter() - started)
+    seconds = time.perf_counter() - started
+    return Finished(done.stdout, seconds, _processor_time() - used)
+
+
+def _processor_time() -> float:
+    """Return the seconds of all processes that ended, started by this one or by these."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def cache_arguments(file: Path, **settings: object) -> list[str]:

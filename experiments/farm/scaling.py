@@ -1,13 +1,13 @@
-"""Time of one cache by one and two workers, and by one process without any: efficiency, and
+"""Time of one cache by one and two workers, and by one process without any: speed-up, and
 overhead per job.
 
-    python -m experiments.farm.scaling [--rounds 3] [--force] [--document docs/how-to/farm.md]
+    python -m experiments.farm.scaling [--rounds 2] [--force] [--document docs/how-to/farm.md]
 
-A ball of fog under a sun, by both solvers. All use one thread of Dr.Jit per process. The time of a
-run is that of its jobs, from the first to the last, without the start of processes, which is listed
-beside it; of several rounds, in turns, the shortest counts. The overhead is what workers spend
-between jobs: run time times workers, less the time within jobs, per job. Writes
-output/farm/scaling.json.
+A ball of fog under a sun, by both solvers, with one thread of Dr.Jit per process. Seconds are those
+from the first job to the last, without the start of processes. Processor time per job is that of
+all processes together, also of the scheduler and of the command: the difference between runs of
+many and of few jobs, so that the start is not in it. It does not depend on what else the machine
+does, as seconds do. Of several rounds, in turns, the least counts. Writes output/farm/scaling.json.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
 from mitsuba_irrcache.compare.tables import Table
 
-#: Settings of each solver: 24 jobs of 64 batches, and of one batch each.
+#: Settings of each solver, and samples of a job: 64 batches, and one batch.
 KINDS = {
-    "path": {"solver": "path", "resolution": 16, "cache_spp": 24 * 512},
-    "sweep": {"solver": "sweep", "resolution": 48, "cache_spp": 24 * 256},
+    "path": ({"solver": "path", "resolution": 16}, 512),
+    "sweep": ({"solver": "sweep", "resolution": 40}, 256),
 }
 WORKERS = (1, 2)
-#: One process with one thread: its seconds for the same cache, with loaded kernels.
+#: Jobs of the runs that are compared.
+FEW, MANY = 4, 20
+#: One process with one thread: seconds and processor time for a cache.
 _ALONE = """
 import sys, time
 import drjit as dr, mitsuba as mi
@@ -40,67 +42,66 @@ mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(1)
 from mitsuba_irrcache.io.scene_files import load_scene
 scene = load_scene(sys.argv[1], {}, sys.argv[2])
-started = time.perf_counter()
+started, used = time.perf_counter(), time.process_time()
 scene.integrator().prepare(scene)
 dr.sync_thread()
-print(time.perf_counter() - started)
+print(time.perf_counter() - started, time.process_time() - used)
 """
 
 
 def measure(kind: str, rounds: int) -> dict:
-    """Return the shortest times of a kind: alone, and by numbers of workers."""
-    settings = KINDS[kind]
-    found: dict = {"alone": [], "workers": {str(n): [] for n in WORKERS}}
-    for number in range(rounds + 1):  # the first round compiles kernels
-        alone = _alone(settings)
-        farmed = {str(n): _farmed(settings, n) for n in WORKERS}
-        if number:
-            found["alone"].append(alone)
-            for key, row in farmed.items():
-                found["workers"][key].append(row)
-    best = {n: min(rows, key=lambda row: row["seconds"]) for n, rows in found["workers"].items()}
-    return {"alone": min(found["alone"]), "workers": best}
+    """Return seconds and processor time per job of a kind, by numbers of workers, "none" without
+    any.
+    """
+    ways = {"none": _alone} | {str(n): partial(_farmed, n) for n in WORKERS}
+    runs: dict = {way: {FEW: [], MANY: []} for way in ways}
+    for _ in range(rounds):
+        for way, run in ways.items():
+            for jobs in (FEW, MANY):
+                settings, samples = KINDS[kind]
+                runs[way][jobs].append(run(settings | {"cache_spp": jobs * samples}))
+    found = {}
+    for way, by_jobs in runs.items():
+        used = {jobs: min(row[1] for row in rows) for jobs, rows in by_jobs.items()}
+        found[way] = {
+            "seconds": min(row[0] for row in by_jobs[MANY]),
+            "per_job": (used[MANY] - used[FEW]) / (MANY - FEW),
+        }
+    return found
 
 
-def _alone(settings: dict) -> float:
+def _alone(settings: dict) -> tuple[float, float]:
     specification = cache_arguments(Path("-"), **settings)[-1]
     command = [sys.executable, "-c", _ALONE, SCENE, specification]
-    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    seconds, used = map(float, done.stdout.split())
+    return seconds, used
 
 
-def _farmed(settings: dict, workers: int) -> dict:
+def _farmed(workers: int, settings: dict) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
         arguments = cache_arguments(Path(folder) / "light.cache", **settings)
-        options = ("--workers", workers, "--threads", 1)
-        done = finished("farm", "cache", *arguments, *options)
-    count, seconds, work = re.search(
-        r"^(\d+) jobs in ([\d.]+) s, ([\d.]+) s of work", done.text, re.MULTILINE
-    ).groups()
-    return {
-        "jobs": int(count),
-        "seconds": float(seconds),
-        "work": float(work),
-        "total": done.seconds,
-    }
+        done = finished("farm", "cache", *arguments, "--workers", workers, "--threads", 1)
+    seconds = re.search(r"^\d+ jobs in ([\d.]+) s", done.text, re.MULTILINE)[1]
+    return float(seconds), done.processor
 
 
 def table(rows: dict[str, dict]) -> Table:
     """Return the table of the documentation."""
-    head = ["solver", "workers", "jobs", "jobs, all", "speed-up", "overhead per job", "in all"]
+    head = ["solver", "workers", f"{MANY} jobs", "speed-up", "processor time per job", "overhead"]
     cells = []
     for kind, row in rows.items():
-        cells.append([f"`{kind}`", "none", "", f"{row['alone']:.1f} s", "1", "", ""])
-        for workers, found in row["workers"].items():
-            overhead = (int(workers) * found["seconds"] - found["work"]) / found["jobs"]
+        alone = row["none"]
+        for workers, found in row.items():
+            more = found["per_job"] - alone["per_job"]
             cells.append(
                 [
-                    "",
+                    f"`{kind}`" if found is alone else "",
                     workers,
-                    str(found["jobs"]),
                     f"{found['seconds']:.1f} s",
-                    f"{row['alone'] / found['seconds']:.2f}",
-                    f"{1000 * overhead:.0f} ms",
-                    f"{found['total']:.1f} s",
+                    "" if found is alone else f"{alone['seconds'] / found['seconds']:.2f}",
+                    f"{found['per_job']:.3f} s",
+                    "" if found is alone else f"{1000 * more:.0f} ms",
                 ]
             )
     return Table("Scaling", head, cells)
@@ -109,7 +110,7 @@ def table(rows: dict[str, dict]) -> Table:
 def main() -> None:
     """Run the experiment, or show its results."""
     parser = parser_of(__doc__)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=2)
     add_document(parser)
     args = parser.parse_args()
     begin()
