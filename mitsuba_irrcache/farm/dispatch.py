@@ -134,11 +134,11 @@ class Dispatch:
             self._refill()
         try:
             self._workers = list(self._client.nthreads())
+            self._wait_for_workers(now)
+            self._release_stranded()
+            self._repeat_slow()
         except (OSError, TimeoutError):  # the connection is being lost
             return
-        self._wait_for_workers(now)
-        self._release_stranded()
-        self._repeat_slow()
 
     def _wait_for_workers(self, now: float) -> None:
         if self._workers:
@@ -176,16 +176,17 @@ class Dispatch:
 
     def _repeat_slow(self) -> None:
         """Give jobs that take unusually long to workers that have nothing else to do."""
-        idle = len(self._fit) - len(self._attempts)
-        if self._waiting or idle <= 0 or not self._durations:
+        if self._waiting or not self._durations:
             return
+        jobs_by_worker = self._client.processing()
+        idle = [address for address in self._fit if not jobs_by_worker.get(address)]
         limit = max(SLOW * median(self._durations), SLOW_SECONDS)
         copies = Counter(attempt.job.name for attempt in self._attempts.values())
-        for attempt in sorted(self._attempts.values(), key=lambda a: a.started)[:idle]:
+        for attempt in sorted(self._attempts.values(), key=lambda a: a.started)[: len(idle)]:
             took = time.monotonic() - attempt.started
             if took > limit and copies[attempt.job.name] == 1:
                 print(f"{attempt.job.name} takes {took:.0f} s: started once more", flush=True)
-                self._submit(attempt.job)
+                self._submit(attempt.job, idle)
 
     # Jobs
 
@@ -199,8 +200,9 @@ class Dispatch:
                 self._submit(job)
                 room -= 1
 
-    def _submit(self, job: Job) -> None:
-        workers = self._fit if self.unfit else None
+    def _submit(self, job: Job, workers: list[str] | None = None) -> None:
+        """Submit a job, for some ``workers`` only if they are given, or if others are unfit."""
+        workers = workers or (self._fit if self.unfit else None)
         key = f"irrcache-{self._run}-{job.name}-{uuid4().hex[:8]}"
         future = self._client.submit(
             run_job, job.kind, job.arguments, job.environment,
