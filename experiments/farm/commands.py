@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mitsuba_irrcache.scenes import scene_path
+
+from mitsuba_irrcache.machine import doctor
 
 #: The scene of caches here: a ball of fog under a sun.
 SCENE = str(scene_path("cloud"))
@@ -39,6 +42,20 @@ def finished(*arguments: object) -> Finished:
         raise RuntimeError(done.stdout)
     seconds = time.perf_counter() - started
     return Finished(done.stdout, seconds, _processor_time() - used)
+
+
+def load() -> float:
+    """Return the mean number of processes that wanted a core, over the last minutes."""
+    return os.getloadavg()[1]
+
+
+def load_note(value: float) -> str:
+    """Return the note of a table whose seconds depend on the ``value`` of `load`."""
+    cores = doctor.examine_system()["cores"]
+    return (
+        f"On average {value:.0f} processes, those of other users included, wanted the {cores} "
+        "cores meanwhile."
+    )
 
 
 def _processor_time() -> float:

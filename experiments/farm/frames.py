@@ -21,7 +21,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from experiments.farm.commands import finished
+from experiments.farm.commands import finished, load, load_note
 from experiments.support.documents import replace_tables
 from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
@@ -124,6 +124,7 @@ def measure(rounds: int) -> dict:
         "sequence": min(sequence[1:]),
         "farm": min(farm[1:]),
         "difference": difference,
+        "load": load(),
     }
 
 
@@ -137,7 +138,7 @@ def table(row: dict) -> Table:
         f"{row['sequence'] / row['farm']:.2f}",
         "none" if not row["difference"] else f"{row['difference']:.2g}",
     ]
-    return Table("Frames of an evolving cloud", head, [cells])
+    return Table("Frames of an evolving cloud", head, [cells], load_note(row["load"]))
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-from experiments.farm.commands import SCENE, cache_arguments, finished
+from experiments.farm.commands import SCENE, cache_arguments, finished, load, load_note
 from experiments.support.documents import replace_tables
 from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
@@ -67,7 +67,7 @@ def measure(kind: str, rounds: int) -> dict:
             "seconds": min(row[0] for row in by_jobs[MANY]),
             "per_job": (used[MANY] - used[FEW]) / (MANY - FEW),
         }
-    return found
+    return found | {"load": load()}
 
 
 def _alone(settings: dict) -> tuple[float, float]:
@@ -92,7 +92,7 @@ def table(rows: dict[str, dict]) -> Table:
     cells = []
     for kind, row in rows.items():
         alone = row["none"]
-        for workers, found in row.items():
+        for workers, found in ((key, row[key]) for key in ("none", *map(str, WORKERS))):
             more = found["per_job"] - alone["per_job"]
             cells.append(
                 [
@@ -104,7 +104,7 @@ def table(rows: dict[str, dict]) -> Table:
                     "" if found is alone else f"{1000 * more:.0f} ms",
                 ]
             )
-    return Table("Scaling", head, cells)
+    return Table("Scaling", head, cells, load_note(max(row["load"] for row in rows.values())))
 
 
 def main() -> None:
