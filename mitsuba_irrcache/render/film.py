@@ -317,13 +317,13 @@ def _values(
     sampler: mi.Sampler,
     position: mi.Point2f,
     on_emitter: Callable[[], mi.Point2f],
-    spp: int,
+    spp: int | mi.Float,
     radiance: RadianceFunction,
 ) -> list[mi.Float]:
     """Trace samples at these positions on the film; return the values of all channels."""
     film = sensor.film()
     ray, weight = camera_ray(sensor, sampler, position)
-    ray.scale_differential(dr.rsqrt(float(spp)))
+    ray.scale_differential(dr.rsqrt(mi.Float(spp)))
     camera_sampler = CameraSampler(sampler, on_emitter)
     value, alpha, further = radiance(camera_sampler, ray, weight, mi.Bool(True))
     rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
@@ -358,6 +358,8 @@ def _refined(
     further = min(MOST_FURTHER, int(FURTHER_SHARE * count / max(pixels * per_pass, 1)))
     if not pixels or further < FEWEST_SAMPLES:
         return position, values
+    # A number of samples that differs between images must not be a constant of the kernel.
+    each = dr.opaque(mi.UInt32, further)
     lane, k = Divisor(further).split(dr.arange(mi.UInt32, pixels * per_pass * further))
     pixel, sample = Divisor(per_pass).split(lane)
     source = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
@@ -368,10 +370,11 @@ def _refined(
     within += step * dr.rsqrt(float(per_pass)) - corner
     within -= dr.floor(within)
     shift = unit_floats(mi.sample_tea_32(source - sample, dr.opaque(mi.UInt32, REFINEMENT)))
-    on_emitter = mi.Point2f(kronecker(sample * further + k, 2, shift))
+    on_emitter = mi.Point2f(kronecker(sample * each + k, 2, shift))
     own = sampler.clone()
     own.seed(seed ^ REFINEMENT, pixels * per_pass * further)
-    found = _values(sensor, own, corner + within, lambda: on_emitter, per_pass * further, radiance)
+    spp = mi.Float(each * per_pass)
+    found = _values(sensor, own, corner + within, lambda: on_emitter, spp, radiance)
     place = dr.arange(mi.UInt32, pixels * per_pass)
     pixel, sample = Divisor(per_pass).split(place)
     place = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
@@ -379,6 +382,6 @@ def _refined(
     found = [value + everywhere for value in found]
     dr.eval(found)
     for target, value in zip(values, found, strict=True):
-        dr.scatter(target, dr.block_sum(value, further) * (1 / further), place)
+        dr.scatter(target, dr.block_sum(value, further) / mi.Float(each), place)
     dr.eval(values)
     return position, values

@@ -78,6 +78,7 @@ class SurfaceIrradiance:
         those for the places that rays from these nodes meet.
         """
         first = seen = self.nodes.count
+        dr.eval(place, active)  # otherwise each lookup below evaluates one array by itself
         for generation in range(GENERATIONS):
             found = []
             while self.nodes.count < MOST_NODES:
