@@ -6,6 +6,7 @@ another worker can repeat any of them, and the first result of a job counts.
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import time
 from collections import Counter, deque
@@ -137,7 +138,7 @@ class Dispatch:
             self._wait_for_workers(now)
             self._release_stranded()
             self._repeat_slow()
-        except (OSError, TimeoutError):  # the connection is being lost
+        except (OSError, asyncio.TimeoutError):  # the connection is being lost
             return
 
     def _wait_for_workers(self, now: float) -> None:

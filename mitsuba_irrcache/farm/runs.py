@@ -98,6 +98,10 @@ def run_study(args: argparse.Namespace) -> int:
         complete = {study for study, reference in studies.items() if reference.finish()}
     for study in complete:
         print(f"report {study.report(studies[study].found)}")
+        for measurement in study.measurements:
+            if measurement.error:
+                print(f"irrcache: {measurement.integrator}: {measurement.error}", file=sys.stderr)
+                status = 1
     return status if len(complete) == len(studies) else 1
 
 

@@ -45,7 +45,12 @@ class SceneStudy:
             wanted = self._job | {"integrators": [*self._args.integrator, self._args.reference]}
             files = Path(scratch) / "checked.json", Path(scratch) / "log"
             self._checked = run_job("check", wanted, *files)
-        return [job for job in self._jobs() if not self._results.has(job)]
+        failed = {measurement.name for measurement in self.measurements if measurement.error}
+        return [
+            job
+            for job in self._jobs()
+            if job.arguments["name"] in failed or not self._results.has(job)
+        ]
 
     def _jobs(self) -> list[Job]:
         scene = scene_arguments(self._job["scene"], self._job["parameters"], None)
@@ -61,11 +66,16 @@ class SceneStudy:
         """Keep the measurements of one integrator."""
         self._results.store(job, outcome)
 
-    def report(self, reference: Reference) -> Path:
-        """Write the report of all measurements that are there; return its file."""
+    @property
+    def measurements(self) -> list[Measurement]:
+        """The measurements that are there; some may hold an error."""
         names = [file_name(n, i) for n, i in enumerate(self._args.integrator)]
         files = [self._folder / "measurements" / f"{name}.json" for name in names]
-        measurements = [Measurement.load(file) for file in files if file.exists()]
+        return [Measurement.load(file) for file in files if file.exists()]
+
+    def report(self, reference: Reference) -> Path:
+        """Write the report of all measurements that are there; return its file."""
+        measurements = self.measurements
         if not measurements:
             raise IrrcacheError(f'there are no measurements in "{self._folder}" to report.')
         write_report(

@@ -130,6 +130,9 @@ def test_a_study_reports_what_workers_measured(scene, environment, tmp_path, mon
     np.testing.assert_allclose(measurement.snapshots[0].read(folder), 0.3)
     again = SceneStudy(own, common_job(own), [0.1], environment)
     assert again.begin(resume=True) == []
+    measurement.error = "out of memory"
+    measurement.save(folder / "measurements" / f"{measurement.name}.json")
+    assert [each.name for each in again.begin(resume=True)] == [job.name]
 
 
 def test_reports_of_a_study_need_folders_of_their_own(tmp_path):
