@@ -1,13 +1,15 @@
-"""Time of one cache by one and two workers, and by one process without any: speed-up, and
+"""Time of one cache by one and two workers, and by one process without any: efficiency, and
 overhead per job.
 
-    python -m experiments.farm.scaling [--rounds 2] [--force] [--document docs/how-to/farm.md]
+    python -m experiments.farm.scaling [--rounds 4] [--force] [--document docs/how-to/farm.md]
 
 A ball of fog under a sun, by both solvers, with one thread of Dr.Jit per process. Seconds are those
 from the first job to the last, without the start of processes. Processor time per job is that of
 all processes together, also of the scheduler and of the command: the difference between runs of
-many and of few jobs, so that the start is not in it. It does not depend on what else the machine
-does, as seconds do. Of several rounds, in turns, the least counts. Writes output/farm/scaling.json.
+many and of few jobs, so that the start is not in it. It depends less on what else the machine does
+than seconds do. The efficiency is the processor time of a job in one process over that with
+workers: jobs do not wait for each other. Of several rounds, in turns, the least counts. Writes
+output/farm/scaling.json.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from mitsuba_irrcache.compare.tables import Table
 #: Settings of each solver, and samples of a job: 64 batches, and one batch.
 KINDS = {
     "path": ({"solver": "path", "resolution": 16}, 512),
-    "sweep": ({"solver": "sweep", "resolution": 40}, 256),
+    "sweep": ({"solver": "sweep", "resolution": 32}, 256),
 }
 WORKERS = (1, 2)
 #: Jobs of the runs that are compared.
@@ -88,20 +90,20 @@ def _farmed(workers: int, settings: dict) -> tuple[float, float]:
 
 def table(rows: dict[str, dict]) -> Table:
     """Return the table of the documentation."""
-    head = ["solver", "workers", f"{MANY} jobs", "speed-up", "processor time per job", "overhead"]
+    head = ["solver", "workers", f"{MANY} jobs", "processor time per job", "overhead", "efficiency"]
     cells = []
     for kind, row in rows.items():
         alone = row["none"]
         for workers, found in ((key, row[key]) for key in ("none", *map(str, WORKERS))):
-            more = found["per_job"] - alone["per_job"]
+            own, used = alone["per_job"], found["per_job"]
             cells.append(
                 [
                     f"`{kind}`" if found is alone else "",
                     workers,
                     f"{found['seconds']:.1f} s",
-                    "" if found is alone else f"{alone['seconds'] / found['seconds']:.2f}",
-                    f"{found['per_job']:.3f} s",
-                    "" if found is alone else f"{1000 * more:.0f} ms",
+                    f"{used:.3f} s",
+                    "" if found is alone else f"{1000 * (used - own):.0f} ms",
+                    "" if found is alone else f"{own / used:.0%}",
                 ]
             )
     return Table("Scaling", head, cells, load_note(max(row["load"] for row in rows.values())))
@@ -110,7 +112,7 @@ def table(rows: dict[str, dict]) -> Table:
 def main() -> None:
     """Run the experiment, or show its results."""
     parser = parser_of(__doc__)
-    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=4)
     add_document(parser)
     args = parser.parse_args()
     begin()
