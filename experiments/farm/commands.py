@@ -1,9 +1,8 @@
-"""Starts `irrcache farm` as users do, and times it."""
+"""Starts `irrcache` as users do, and times it."""
 
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -20,11 +19,10 @@ SCENE = str(scene_path("cloud"))
 
 @dataclass
 class Finished:
-    """What a command printed, its seconds, and the processor time of it and its workers."""
+    """What a command printed, and its seconds."""
 
     text: str
     seconds: float
-    processor: float
 
 
 def command(*arguments: object) -> list[str]:
@@ -34,34 +32,13 @@ def command(*arguments: object) -> list[str]:
 
 def finished(*arguments: object) -> Finished:
     """Run ``irrcache`` to its end; raise RuntimeError with what it printed if it fails."""
-    started, used = time.perf_counter(), _processor_time()
+    started = time.perf_counter()
     done = subprocess.run(
         command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     if done.returncode:
         raise RuntimeError(done.stdout)
-    seconds = time.perf_counter() - started
-    return Finished(done.stdout, seconds, _processor_time() - used)
-
-
-def load() -> float:
-    """Return the mean number of processes that wanted a core, over the last minutes."""
-    return os.getloadavg()[1]
-
-
-def load_note(value: float) -> str:
-    """Return the note of a table whose seconds depend on the ``value`` of `load`."""
-    cores = doctor.examine_system()["cores"]
-    return (
-        f"On average {value:.0f} processes, those of other users included, wanted the {cores} "
-        "cores meanwhile."
-    )
-
-
-def _processor_time() -> float:
-    """Return the seconds of all processes that ended, started by this one or by these."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
+    return Finished(done.stdout, time.perf_counter() - started)
 
 
 def cache_arguments(file: Path, **settings: object) -> list[str]:
@@ -76,3 +53,17 @@ def cache_of_one_process(file: Path, **settings: object) -> Finished:
     text = text.replace("}", f",cache_file={file}}}")
     size = ("-D", "size=4", "--spp", "1", "-o", file.with_suffix(".exr"))
     return finished("render", scene, option, text, *size)
+
+
+def load() -> float:
+    """Return the mean number of processes that wanted a core, over the last minutes."""
+    return os.getloadavg()[1]
+
+
+def load_note(value: float) -> str:
+    """Return the note of a table whose seconds depend on the ``value`` of `load`."""
+    cores = doctor.examine_system()["cores"]
+    return (
+        f"On average {value:.0f} processes, those of other users included, wanted the {cores} "
+        "cores meanwhile."
+    )

@@ -1,40 +1,51 @@
-"""Time of one cache by one and two workers, and by one process without any: efficiency, and
-overhead per job.
+"""Overhead of the jobs of one cache, and their time by one and two workers and by one process.
 
-    python -m experiments.farm.scaling [--rounds 4] [--force] [--document docs/how-to/farm.md]
+    python -m experiments.farm.scaling [--rounds 2] [--force] [--document docs/how-to/farm.md]
 
-A ball of fog under a sun, by both solvers, with one thread of Dr.Jit per process. Seconds are those
-from the first job to the last, without the start of processes. Processor time per job is that of
-all processes together, also of the scheduler and of the command: the difference between runs of
-many and of few jobs, so that the start is not in it. It depends less on what else the machine does
-than seconds do. The efficiency is the processor time of a job in one process over that with
-workers: jobs do not wait for each other. Of several rounds, in turns, the least counts. Writes
+A ball of fog under a sun, by both solvers, with one thread of Dr.Jit per process. Processor time
+per job, the median of several: in one process without any farm; in the function that a worker runs;
+of Dask for a job that does nothing, but returns as many bytes; of the command, which stores the
+result and adds it to the cache. Processor time depends less than seconds do on what else the machine does.
+Beside it the seconds of many jobs from the first to the last, of several rounds the least. Writes
 output/farm/scaling.json.
 """
 
 from __future__ import annotations
 
+import argparse
+import os
 import re
 import subprocess
 import sys
 import tempfile
+import time
 from functools import partial
 from pathlib import Path
+from statistics import median
+
+import drjit as dr
+import psutil
 
 from experiments.farm.commands import SCENE, cache_arguments, finished, load, load_note
 from experiments.support.documents import replace_tables
 from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
 from mitsuba_irrcache.compare.tables import Table
+from mitsuba_irrcache.farm import work
+from mitsuba_irrcache.farm.cache import CacheRun
+from mitsuba_irrcache.farm.cluster import ClusterOptions, add_cluster_options, connected
+from mitsuba_irrcache.farm.jobs import Environment, scene_arguments
+from mitsuba_irrcache.farm.results import Outcome
 
-#: Settings of each solver, and samples of a job: 64 batches, and one batch.
+JOBS = 16
+#: Settings of each solver: jobs of 64 batches, and of one batch.
 KINDS = {
-    "path": ({"solver": "path", "resolution": 16}, 512),
-    "sweep": ({"solver": "sweep", "resolution": 32}, 256),
+    "path": {"solver": "path", "resolution": 16, "cache_spp": JOBS * 512},
+    "sweep": {"solver": "sweep", "resolution": 32, "cache_spp": JOBS * 256},
 }
 WORKERS = (1, 2)
-#: Jobs of the runs that are compared.
-FEW, MANY = 4, 20
+#: Jobs of Dask that do nothing.
+EMPTY_JOBS = 100
 #: One process with one thread: seconds and processor time for a cache.
 _ALONE = """
 import sys, time
@@ -52,24 +63,65 @@ print(time.perf_counter() - started, time.process_time() - used)
 
 
 def measure(kind: str, rounds: int) -> dict:
-    """Return seconds and processor time per job of a kind, by numbers of workers, "none" without
-    any.
+    """Return processor times per job, and seconds of all by numbers of workers."""
+    settings = KINDS[kind]
+    worker, store, size = _parts(settings)
+    alone = [_alone(settings) for _ in range(rounds)]
+    farmed = {str(n): min(_farmed(n, settings) for _ in range(rounds)) for n in WORKERS}
+    return {
+        "alone": min(used for _, used in alone) / JOBS,
+        "worker": worker,
+        "store": store,
+        "dask": _dask(size),
+        "seconds": {"none": min(seconds for seconds, _ in alone)} | farmed,
+        "load": load(),
+    }
+
+
+def _parts(settings: dict) -> tuple[float, float, int]:
+    """Return the processor time of a job on a worker and of the command, and bytes of a result."""
+    dr.set_thread_count(1)
+    specification = cache_arguments(Path("-"), **settings)[-1]
+    environment, used, stored, size = Environment.here("llvm_ad_rgb", [], 1), [], [], 0
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        arguments = scene_arguments(SCENE, {}, specification)
+        run = CacheRun(arguments, environment, folder / "light.cache", False)
+        for job in run.begin():
+            made = folder / job.name
+            made.mkdir()
+            times = [time.process_time()]
+            work.set_up(environment)
+            work.KINDS[job.kind](job.arguments, made)
+            files = {path.name: path.read_bytes() for path in made.iterdir()}
+            times.append(time.process_time())
+            run.store(job, Outcome("here", 1.0, files))
+            times.append(time.process_time())
+            used.append(times[1] - times[0])
+            stored.append(times[2] - times[1])
+            size = sum(map(len, files.values()))
+    return median(used), median(stored), size
+
+
+def _dask(size: int) -> dict[str, float]:
+    """Return the processor time of Dask per job that returns so many bytes: of the command with its
+    scheduler, and of a worker.
     """
-    ways = {"none": _alone} | {str(n): partial(_farmed, n) for n in WORKERS}
-    runs: dict = {way: {FEW: [], MANY: []} for way in ways}
-    for _ in range(rounds):
-        for way, run in ways.items():
-            for jobs in (FEW, MANY):
-                settings, samples = KINDS[kind]
-                runs[way][jobs].append(run(settings | {"cache_spp": jobs * samples}))
-    found = {}
-    for way, by_jobs in runs.items():
-        used = {jobs: min(row[1] for row in rows) for jobs, rows in by_jobs.items()}
-        found[way] = {
-            "seconds": min(row[0] for row in by_jobs[MANY]),
-            "per_job": (used[MANY] - used[FEW]) / (MANY - FEW),
-        }
-    return found | {"load": load()}
+    parser = argparse.ArgumentParser()
+    add_cluster_options(parser)
+    options = ClusterOptions.of(parser.parse_args(["--workers", "1"]))
+    with connected(options) as connection:
+        client = connection.client
+        client.wait_for_workers(1)
+        worker = psutil.Process(next(iter(client.run(os.getpid).values())))
+        client.submit(bytes, size, pure=False).result()
+        began, before = time.process_time(), worker.cpu_times()
+        for _ in range(EMPTY_JOBS):
+            client.submit(bytes, size, pure=False).result()
+        after = worker.cpu_times()
+        here = time.process_time() - began
+    there = after.user + after.system - before.user - before.system
+    return {"command": here / EMPTY_JOBS, "worker": there / EMPTY_JOBS}
 
 
 def _alone(settings: dict) -> tuple[float, float]:
@@ -80,39 +132,48 @@ def _alone(settings: dict) -> tuple[float, float]:
     return seconds, used
 
 
-def _farmed(workers: int, settings: dict) -> tuple[float, float]:
+def _farmed(workers: int, settings: dict) -> float:
     with tempfile.TemporaryDirectory() as folder:
         arguments = cache_arguments(Path(folder) / "light.cache", **settings)
         done = finished("farm", "cache", *arguments, "--workers", workers, "--threads", 1)
-    seconds = re.search(r"^\d+ jobs in ([\d.]+) s", done.text, re.MULTILINE)[1]
-    return float(seconds), done.processor
+    return float(re.search(r"^\d+ jobs in ([\d.]+) s", done.text, re.MULTILINE)[1])
 
 
 def table(rows: dict[str, dict]) -> Table:
     """Return the table of the documentation."""
-    head = ["solver", "workers", f"{MANY} jobs", "processor time per job", "overhead", "efficiency"]
+    head = [
+        "solver",
+        "job in one process",
+        "job on a worker",
+        "Dask: worker, command",
+        "storing, adding",
+        "efficiency",
+        "workers for one command",
+        f"{JOBS} jobs: one process, 1, 2 workers",
+    ]
     cells = []
     for kind, row in rows.items():
-        alone = row["none"]
-        for workers, found in ((key, row[key]) for key in ("none", *map(str, WORKERS))):
-            own, used = alone["per_job"], found["per_job"]
-            cells.append(
-                [
-                    f"`{kind}`" if found is alone else "",
-                    workers,
-                    f"{found['seconds']:.1f} s",
-                    f"{used:.3f} s",
-                    "" if found is alone else f"{1000 * (used - own):.0f} ms",
-                    "" if found is alone else f"{own / used:.0%}",
-                ]
-            )
+        dask, command = row["dask"], row["store"] + row["dask"]["command"]
+        seconds = ", ".join(f"{row['seconds'][key]:.0f}" for key in ("none", *map(str, WORKERS)))
+        cells.append(
+            [
+                f"`{kind}`",
+                f"{1000 * row['alone']:.0f} ms",
+                f"{1000 * row['worker']:.0f} ms",
+                f"{1000 * dask['worker']:.1f}, {1000 * dask['command']:.1f} ms",
+                f"{1000 * row['store']:.1f} ms",
+                f"{row['alone'] / (row['worker'] + dask['worker']):.0%}",
+                f"{row['worker'] / command:.0f}",
+                f"{seconds} s",
+            ]
+        )
     return Table("Scaling", head, cells, load_note(max(row["load"] for row in rows.values())))
 
 
 def main() -> None:
     """Run the experiment, or show its results."""
     parser = parser_of(__doc__)
-    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--rounds", type=int, default=2)
     add_document(parser)
     args = parser.parse_args()
     begin()
