@@ -5,9 +5,9 @@
 A ball of fog under a sun, by both solvers, with one thread of Dr.Jit per process. Processor time
 per job, the median of several: in one process without any farm; in the function that a worker runs;
 of Dask for a job that does nothing, but returns as many bytes; of the command, which stores the
-result and adds it to the cache. Processor time depends less than seconds do on what else the machine does.
-Beside it the seconds of many jobs from the first to the last, of several rounds the least. Writes
-output/farm/scaling.json.
+result and adds it to the cache. Processor time depends less than seconds do on what else the
+machine does. Beside it the seconds of many jobs from the first to the last, of several rounds the
+least. Writes output/farm/scaling.json.
 """
 
 from __future__ import annotations
