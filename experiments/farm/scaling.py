@@ -162,7 +162,7 @@ def table(rows: dict[str, dict]) -> Table:
                 f"{1000 * row['worker']:.0f} ms",
                 f"{1000 * dask['worker']:.1f}, {1000 * dask['command']:.1f} ms",
                 f"{1000 * row['store']:.1f} ms",
-                f"{row['alone'] / (row['worker'] + dask['worker']):.0%}",
+                f"{row['worker'] / (row['worker'] + dask['worker']):.0%}",
                 f"{row['worker'] / command:.0f}",
                 f"{seconds} s",
             ]
