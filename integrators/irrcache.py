@@ -34,6 +34,7 @@ from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRay
 from mitsuba_irrcache.render.denoise import FILTERS, filter_illumination
 from mitsuba_irrcache.render.film import check_film, exclusive, fill_film, planes, render_film
 from mitsuba_irrcache.render.quadrature import QUADRATURES
+from mitsuba_irrcache.render.tolerance import SCALES, Certificate, ToleranceSearch
 from mitsuba_irrcache.scene.consistency import check_sensor
 from mitsuba_irrcache.solvers.base import registered
 
@@ -80,6 +81,20 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
          ``path`` 128 along a side, and 32 to 64 with surfaces or several media. An opaque
          homogeneous medium in a box or sphere has no cache: its radiance is that of a half-space.
          (Default: 0)
+
+     * - tolerance
+       - |float|
+       - Largest error (RMSE) of the image, in units of its mean radiance, e.g. 0.005.
+         ``resolution``, ``cache_spp``, ``step`` and the samples per pixel, unless
+         :code:`mi.render` is called with ``spp``, are then chosen from error estimates that are
+         measured on the image itself; those that are set are taken as they are. The estimate is
+         logged, and available as the attribute ``certificate``. 0: the fixed rules stated for each
+         property. It cannot be combined with ``cache_file``. (Default: 0)
+
+     * - tolerance_of
+       - |string|
+       - The image whose mean radiance is the unit of the tolerance: ``image``, or ``volume`` for
+         the radiance that media scatter, without visible emitters. (Default: ``image``)
 
      * - cache_spp
        - |int|
@@ -225,15 +240,19 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._step = properties.number(
             props, "step", 1.0, 1e-3, 1e3, "between 0.001 and 1000 voxel edges"
         )
+        self._chosen_step = self._step
         self._emission = props.get("emission", None)
         largest = float(np.finfo(np.float32).max)
-        scale = properties.number(
+        self._emission_scale = properties.number(
             props, "emission_scale", 1.0, 0.0, largest, "a finite number that is not negative"
         )
-        self._builder = CacheBuilder(self._settings, self._emission, scale)
+        self._builder = self._new_builder(self._settings)
         self._timeout = properties.number(
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
+        self._search = self._tolerance_search(props)
+        #: estimated error of the last image rendered with a ``tolerance``; None without
+        self.certificate: Certificate | None = None
         properties.refuse_misspelt(props.wrapped, props.values)
         self._stopping = StopCondition()
         self._camera_rays: ClosedFormCameraRays | TracedCameraRays | None = None
@@ -291,15 +310,63 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         if isinstance(self._emission, mi.Object):
             callback.put("emission", self._emission, mi.ParamFlags.NonDifferentiable)
 
-    def prepare(self, scene: mi.Scene) -> None:
+    def _new_builder(self, settings: CacheSettings) -> CacheBuilder:
+        return CacheBuilder(settings, self._emission, self._emission_scale)
+
+    def _tolerance_search(self, props: properties.RecordedProperties) -> ToleranceSearch | None:
+        """Create the search for settings that meet the ``tolerance``, None without one."""
+        tolerance = properties.number(props, "tolerance", 0.0, 0.0, 1.0, "between 0 (none) and 1")
+        unit = properties.choice(props, "tolerance_of", "image", SCALES)
+        if not tolerance:
+            return None
+        if self._settings.file:
+            raise IrrcacheError(
+                "irrcache: tolerance chooses the resolution anew for every view, so it cannot be "
+                "combined with cache_file; set resolution and cache_spp for a cache in a file."
+            )
+
+        def camera_rays(builder: CacheBuilder, step: float):
+            return camera_rays_of(
+                builder.parts, self._settings, self._hide_emitters, self._quadrature, step
+            )
+
+        step = self._step if "step" in props.wrapped else None
+        return ToleranceSearch(
+            tolerance, unit, self._settings, step, self._new_builder, camera_rays
+        )
+
+    def _meet_tolerance(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int) -> int:
+        """Choose cache and step for an image of ``sensor``; return the samples per pixel."""
+        check_sensor(scene, sensor)
+        self._stopping.begin(self._timeout)
+        progress = self._stopping.raising(self.progress)
+        found = self._search.find(scene, sensor, spp, seed, progress)
+        builder, self._chosen_step, spp, self.certificate = found
+        self._builder.adopt(builder)
+        level = mi.LogLevel.Info if self.certificate.is_met else mi.LogLevel.Warn
+        mi.Log(level, f"irrcache: {self.certificate}.")
+        return spp
+
+    def prepare(self, scene: mi.Scene, sensor: int | mi.Sensor = 0) -> None:
         """Build or complete the cache for ``scene``, unless it is up to date.
 
-        If several threads call it, one builds the cache and the others wait.
+        With a ``tolerance``, it is the cache for an image of ``sensor``. If several threads call
+        this, one builds the cache and the others wait.
         """
+        if self._search is not None:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            with dr.suspend_grad(), self._builder.lock:
+                self._meet_tolerance(scene, sensor, 0, 0)
         self._prepared(scene)
+
+    @property
+    def depends_on_view(self) -> bool:
+        """Whether a ``tolerance`` chooses the caches anew for every view."""
+        return self._search is not None
 
     def cached_media(self, scene: mi.Scene) -> list[CachedMedium]:
         """Return the visible media of ``scene``, each with its cache as far as it is filled."""
+        self._refuse_tolerance("it chooses the cache for one view, and here there is none")
         with self._builder.lock, dr.suspend_grad():
             self._builder.fit(scene)
             return list(self._builder.parts)
@@ -345,6 +412,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                 "next rendering completes them.",
             )
 
+    def _refuse_tolerance(self, reason: str) -> None:
+        if self._search is not None:
+            raise IrrcacheError(
+                f"irrcache: tolerance cannot be used here, since {reason}; set resolution, "
+                "cache_spp and step instead."
+            )
+
     def cancel(self) -> None:
         """End the current rendering, in any thread, with the samples completed so far."""
         self._stopping.cancel()
@@ -362,7 +436,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             self._settings,
             self._hide_emitters,
             self._quadrature,
-            self._step,
+            self._chosen_step,
             self._layered,
             self._with_error,
         )
@@ -393,6 +467,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         The mask is a random rounding of alpha.
         """
+        self._refuse_tolerance("another integrator calls this one, without the sensor")
         camera_rays = self._prepared(scene)
         if camera_rays is None:
             radiance, valid, _ = self._fallback().sample(scene, sampler, ray, medium, active)
@@ -417,6 +492,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         # Threads exclude each other if they share the integrator, whose cache one of them may
         # refine, or the film, which stores one image only.
         with dr.suspend_grad(), self._builder.lock, exclusive(sensor.film()):
+            if self._search is not None:
+                spp = self._meet_tolerance(scene, sensor, spp, seed)
             camera_rays = self._prepared(scene)
             if camera_rays is None:
                 film = self._render_empty(scene, sensor, seed, spp)
@@ -445,6 +522,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         See `mitsuba_irrcache.pipeline.progressive.Targets`.
         """
+        self._refuse_tolerance("a progressive run has targets of its own")
 
         def image() -> tuple[mi.TensorXf, float]:
             tensor = self.render(scene, sensor, seed, spp)
@@ -525,6 +603,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self, scene: mi.Scene, params: mi.SceneParameters, keys: list[str], seed: int
     ) -> ParameterAdjoint:
         """Return the derivatives of images of ``scene`` by the parameters ``keys``."""
+        self._refuse_tolerance("an objective would jump with the resolution")
         camera_rays = self._prepared(scene)
         check(self._builder.parts, keys, self._layered)
         (part,) = self._builder.parts

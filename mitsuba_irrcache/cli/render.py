@@ -15,15 +15,17 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache import __version__
-from mitsuba_irrcache.core.argument_types import whole
+from mitsuba_irrcache.core.argument_types import share, whole
 from mitsuba_irrcache.core.stage_display import StageDisplay
 from mitsuba_irrcache.errors import IrrcacheError, origin
 from mitsuba_irrcache.io.images import check_output, write_image
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,
+    describe_integrator,
     has_cache,
     integrator_of,
     load_scene,
+    parse_integrator,
     parse_parameters,
 )
 from mitsuba_irrcache.machine.llvm import require_llvm
@@ -90,6 +92,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--error", type=float, metavar="E",
         help="refine until the relative standard error of the cache is this, e.g. 0.02",
     )  # fmt: skip
+    parser.add_argument(
+        "--tolerance", type=share, metavar="E",
+        help="choose resolution, directions, steps and, without --spp, samples per pixel for this "
+        "error of the image in units of its mean, e.g. 0.5%%, and print the estimated error",
+    )  # fmt: skip
     parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
 
 
@@ -111,6 +118,8 @@ def run(args: argparse.Namespace) -> int:
     with _stopwatch(seconds, "load"), display.stage(f"loading {source.name}"):
         parameters = parse_parameters(args.define)
         integrator = chosen_integrator(source, parameters, args.integrator)
+        if args.tolerance:
+            integrator = _with_tolerance(integrator, source, parameters, args)
         scene = load_scene(source, parameters, integrator)
     if not 0 <= args.sensor < len(scene.sensors()):
         raise IrrcacheError(
@@ -122,8 +131,30 @@ def run(args: argparse.Namespace) -> int:
         _render_progressive(scene, args, seconds, output, display)
     else:
         image = _render(scene, args, seconds, display)
+        if args.tolerance:
+            print(scene.integrator().certificate)
         _write(output, image, scene, _describe(scene, args, seconds), seconds)
     return 0
+
+
+def _with_tolerance(
+    integrator: str | None, source: Path, parameters: dict[str, str], args: argparse.Namespace
+) -> str:
+    """Return the specification of the integrator with the tolerance."""
+    if args.budget or args.error:
+        raise IrrcacheError(
+            "--tolerance has a target of its own; leave --budget and --error away, or use the "
+            "property timeout for a limit of the time."
+        )
+    if integrator is None and integrator_of(source, parameters) == "irrcache":
+        raise IrrcacheError(
+            f'the scene "{source}" has properties of irrcache of its own; state tolerance there, '
+            "or add -i irrcache to replace them."
+        )
+    name, properties = parse_integrator(integrator or integrator_of(source, parameters))
+    if name != "irrcache":
+        raise IrrcacheError(f'--tolerance is a property of irrcache; "{name}" has none.')
+    return describe_integrator(name, properties | {"tolerance": args.tolerance})
 
 
 def _render(
@@ -132,7 +163,7 @@ def _render(
     integrator = scene.integrator()
     name = "projection" if has_cache(scene) else "render"
     try:
-        if has_cache(scene):
+        if has_cache(scene) and not args.tolerance:  # which depends on the view
             with _kernel_stopwatch(seconds, "cache"), progress_bar(integrator, display):
                 integrator.prepare(scene)
         with _kernel_stopwatch(seconds, name), display.stage("rendering (compiling kernels first)"):
@@ -291,6 +322,9 @@ def described(
         "seed": seed,
         "spp": spp or scene.sensors()[sensor].sampler().sample_count(),
     }
+    certificate = getattr(scene.integrator(), "certificate", None)
+    if certificate is not None:
+        found |= {"spp": certificate.settings["spp"], "error": str(certificate)}
     caches = getattr(scene.integrator(), "caches", {})
     cache = next(iter(caches.values()), None) if len(caches) == 1 else None
     if cache is not None:

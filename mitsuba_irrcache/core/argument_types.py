@@ -63,3 +63,13 @@ def seconds(text: str) -> float:
     if not value > 0:
         raise ValueError
     return value
+
+
+@argument("a share of the mean radiance such as 0.5% or 0.005, above 0 and at most 100%")
+def share(text: str) -> float:
+    """Convert a percentage or a fraction above 0 and at most 1."""
+    number, percent, rest = text.strip().partition("%")
+    value = finite_number(number) / (100 if percent else 1)
+    if rest or not 0 < value <= 1:
+        raise ValueError
+    return value

@@ -115,7 +115,7 @@ def cache_part(arguments: dict, folder: Path) -> None:
 def frame(arguments: dict, folder: Path) -> None:
     """Render an image; the caches of the last frame are used again where they fit."""
     scene = _loaded(arguments["scene"])
-    if hasattr(scene.integrator(), "cached_media"):
+    if not getattr(scene.integrator(), "depends_on_view", True):
         _prepare(scene)
     sensor, seed, spp = (arguments[name] for name in ("sensor", "seed", "spp"))
     image = np.array(mi.render(scene, sensor=sensor, seed=seed, spp=spp))

@@ -99,6 +99,15 @@ class CacheBuilder:
             for number, part in enumerate(self.parts):
                 self._refine(scene, part, _progress_of_one(progress, number, len(self.parts)))
 
+    def adopt(self, other: CacheBuilder) -> None:
+        """Take over media and caches of another builder of the same scene, and its settings."""
+        with self.lock:
+            if self.parts is other.parts:
+                return
+            self.settings, self.samples = other.settings, other.samples
+            self.parts, self._snapshot = other.parts, other._snapshot
+            self.revision += 1
+
     def fit(self, scene: mi.Scene) -> None:
         """Update the media to ``scene``; invalid caches become empty."""
         with self.lock:

@@ -88,3 +88,10 @@ def test_parts_of_another_scene_are_refused(build, tmp_path):
     (strange,) = other.integrator().cached_media(other)
     with pytest.raises(IrrcacheError, match="settings differs"):
         medium.cache.append(StreamParts(other, strange).compute(0, 1), 0)
+
+
+def test_a_tolerance_has_no_cache_without_a_view(build):
+    scene = build({"solver": "path", "tolerance": 0.1})
+    assert scene.integrator().depends_on_view
+    with pytest.raises(IrrcacheError, match="tolerance cannot be used here, since it chooses"):
+        scene.integrator().cached_media(scene)
