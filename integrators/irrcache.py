@@ -26,6 +26,7 @@ from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
 from mitsuba_irrcache.machine.versions import check_versions
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.defaults import choose_stock
 from mitsuba_irrcache.pipeline.progressive import Frame, Targets, frames
 from mitsuba_irrcache.render.aovs import AOVS, Layers, parse_aovs
@@ -357,6 +358,18 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             with dr.suspend_grad(), self._builder.lock:
                 self._meet_tolerance(scene, sensor, 0, 0)
         self._prepared(scene)
+
+    @property
+    def depends_on_view(self) -> bool:
+        """Whether a ``tolerance`` chooses the caches anew for every view."""
+        return self._search is not None
+
+    def cached_media(self, scene: mi.Scene) -> list[CachedMedium]:
+        """Return the visible media of ``scene``, each with its cache as far as it is filled."""
+        self._refuse_tolerance("it chooses the cache for one view, and here there is none")
+        with self._builder.lock, dr.suspend_grad():
+            self._builder.fit(scene)
+            return list(self._builder.parts)
 
     def _prepared(self, scene: mi.Scene) -> ClosedFormCameraRays | TracedCameraRays | None:
         """Return the camera rays for the cache of ``scene``; None if no medium is visible."""

@@ -137,6 +137,22 @@ class IrradianceCache:
         """See `Interpolation`."""
         return self.interpolation.voxel_classes
 
+    def empty_copy(self, batch: int = 0) -> IrradianceCache:
+        """Return a cache of the same voxels and settings without samples; ``batch``: those of a
+        batch, if they differ.
+        """
+        return IrradianceCache(
+            self.grid,
+            self.active,
+            self.channels,
+            self.max_depth,
+            dict(self.fingerprint),
+            batch or self.batch,
+            self.correlated,
+            self.moments,
+            self.interpolation,
+        )
+
     # ------------------------------------------------------------------ statistics
 
     @property
@@ -352,9 +368,38 @@ class IrradianceCache:
 
         Raises IrrcacheError if the caches belong to different scenes or share a seed.
         """
+        self._require_alike(other, "merge")
+        common = sorted(self.streams.keys() & other.streams.keys())
+        if common:
+            raise IrrcacheError(
+                f"IrradianceCache.merge: both caches were computed with cache_seed {common[0]}, so "
+                "their samples are identical, not independent; compute one of them with "
+                "another cache_seed."
+            )
+        self._take(other)
+
+    def append(self, part: IrradianceCache, first: int) -> None:
+        """Add a ``part`` of one random stream whose first batch has the number ``first`` there.
+
+        Parts that `refine` of the solver would add one by one, appended in this order, give the
+        same bits. Raises IrrcacheError if the part belongs to another scene, or does not continue
+        the samples of this cache, so that no batch is counted twice.
+        """
+        self._require_alike(part, "append")
+        (seed,) = part.streams
+        present = self.streams.get(seed, 0) // self.batch
+        if present != first:
+            raise IrrcacheError(
+                f"IrradianceCache.append: the part begins with batch {first} of cache_seed {seed}, "
+                f"but the cache has {present} batches of it; append the parts in their order."
+            )
+        self._take(part)
+
+    def _require_alike(self, other: IrradianceCache, method: str) -> None:
+        """Raise IrrcacheError if ``other`` belongs to another scene or has other settings."""
         for name in differing(self.fingerprint, other.fingerprint):
             raise IrrcacheError(
-                f"IrradianceCache.merge: the caches belong to different scenes: {name} differs."
+                f"IrradianceCache.{method}: the caches belong to different scenes: {name} differs."
             )
         attributes = ("max_depth", "channels", "batch", "correlated", "moments")
         mine = {"shape": self.grid.shape} | {name: getattr(self, name) for name in attributes}
@@ -365,22 +410,23 @@ class IrradianceCache:
                 for name in mine
                 if mine[name] != its[name]
             )
-            raise IrrcacheError(f"IrradianceCache.merge: {differences}.")
-        common = sorted(self.streams.keys() & other.streams.keys())
-        if common:
-            raise IrrcacheError(
-                f"IrradianceCache.merge: both caches were computed with cache_seed {common[0]}, so "
-                "their samples are identical, not independent; compute one of them with "
-                "another cache_seed."
-            )
+            raise IrrcacheError(f"IrradianceCache.{method}: {differences}.")
+
+    def _take(self, other: IrradianceCache) -> None:
+        """Add all samples of ``other``."""
         with other._lock:  # never hold both locks: two threads may merge two caches into each other
             totals, spreads, moments = other._totals, other._spreads, other._moments
             streams = other.streams
         with self._lock:
             count = sum(streams.values()) // other.batch
-            self._totals, self._spreads = self._merged(totals, spreads, count)
-            self._moments = totals_of_pairs(self._moments, moments)
-            self.streams = self.streams | streams
+            merged = self._merged(totals, spreads, count)
+            moments = totals_of_pairs(self._moments, moments)
+            dr.eval(merged, moments)
+            self._totals, self._spreads, self._moments, self.streams = (
+                *merged,
+                moments,
+                self.streams | {s: self.streams.get(s, 0) + n for s, n in streams.items()},
+            )
 
     # ------------------------------------------------------------------ files
 

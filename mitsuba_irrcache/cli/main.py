@@ -1,4 +1,4 @@
-"""The command ``irrcache``: render, view, compare, fit, import, doctor."""
+"""The command ``irrcache``: render, view, compare, farm, fit, import, doctor."""
 
 from __future__ import annotations
 
@@ -64,6 +64,7 @@ COMMANDS = (
     ("render", "cli.render", "render a scene with irrcache", ""),
     ("view", "view.command", "display a scene or a volume in the browser", "view"),
     ("compare", "compare.command", "compare integrators: error against time", "compare"),
+    ("farm", "farm.command", "render on many machines, or processes of this one", "farm"),
     ("fit", "cli.fit", "fit a volume to images of it", "volumes"),
     ("import", "volumes.importer", "convert a CT, MR or other volume to a scene", "volumes"),
     ("doctor", "machine.doctor", "check this machine and say what to install", ""),

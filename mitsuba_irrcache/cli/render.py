@@ -51,6 +51,17 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def chosen_integrator(
+    scene: Path, parameters: dict[str, str], integrator: str | None
+) -> str | None:
+    """Return ``integrator``, or what replaces that of a scene if None is given: ``irrcache`` in
+    place of a path tracer, None for others.
+    """
+    if integrator is None and integrator_of(scene, parameters) in REPLACED:
+        return "irrcache"
+    return integrator
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``irrcache render``, named as those of ``mitsuba``."""
     parser.add_argument("scene", help="scene XML")
@@ -106,9 +117,7 @@ def run(args: argparse.Namespace) -> int:
     display = StageDisplay()
     with _stopwatch(seconds, "load"), display.stage(f"loading {source.name}"):
         parameters = parse_parameters(args.define)
-        integrator = args.integrator
-        if integrator is None and integrator_of(source, parameters) in REPLACED:
-            integrator = "irrcache"
+        integrator = chosen_integrator(source, parameters, args.integrator)
         if args.tolerance:
             integrator = _with_tolerance(integrator, source, parameters, args)
         scene = load_scene(source, parameters, integrator)
@@ -179,7 +188,7 @@ def _render_progressive(
     try:
         with (
             progress_bar(scene.integrator(), display),
-            _terminated_like_interrupted(),
+            terminated_like_interrupted(),
             closing(
                 render_progressive(scene, args.sensor, args.spp, args.seed, **targets)
             ) as frames,
@@ -223,7 +232,7 @@ def _write(
 
 
 @contextmanager
-def _terminated_like_interrupted():
+def terminated_like_interrupted():
     """Treat a request to terminate like Ctrl-C within this context."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -289,26 +298,36 @@ def _require_progressive(scene: mi.Scene, integrator: str) -> None:
 def _describe(
     scene: mi.Scene, args: argparse.Namespace, seconds: dict[str, float], samples: int = 0
 ) -> dict[str, object]:
-    """Describe how the image was made, for the header of the EXR.
+    """Describe how the image was made, for the header of the EXR; see `described`."""
+    found = described(scene, args.scene, args.sensor, args.seed, args.spp, samples)
+    return found | {f"seconds_{name}": value for name, value in seconds.items()}
 
-    ``samples`` are those per voxel of the cache that the image shows; None: those of the cache now.
+
+def described(
+    scene: mi.Scene, source: str | Path, sensor: int, seed: int, spp: int, samples: int = 0
+) -> dict[str, object]:
+    """Describe how an image of the file ``source`` was made, for the header of the EXR.
+
+    ``spp`` 0 are the scene's; ``samples`` are those per voxel of the cache that the image shows,
+    0 those of the cache now.
     """
-    described = {
+    found = {
         "version": __version__,
         "mitsuba": metadata.version("mitsuba"),
         "drjit": metadata.version("drjit"),
-        "variant": args.mode,
-        "scene": Path(args.scene).name,
+        "variant": mi.variant(),
+        "scene": Path(source).name,
         "integrator": " ".join(str(scene.integrator()).split()),
-        "sensor": args.sensor,
-        "seed": args.seed,
-        "spp": args.spp or scene.sensors()[args.sensor].sampler().sample_count(),
+        "sensor": sensor,
+        "seed": seed,
+        "spp": spp or scene.sensors()[sensor].sampler().sample_count(),
     }
     certificate = getattr(scene.integrator(), "certificate", None)
     if certificate is not None:
-        described |= {"spp": certificate.settings["spp"], "error": str(certificate)}
-    cache = getattr(scene.integrator(), "cache", None)
+        found |= {"spp": certificate.settings["spp"], "error": str(certificate)}
+    caches = getattr(scene.integrator(), "caches", {})
+    cache = next(iter(caches.values()), None) if len(caches) == 1 else None
     if cache is not None:
         sides = "x".join(map(str, cache.grid.shape[::-1]))
-        described["cache"] = f"{sides} voxels, {samples or cache.samples} samples"
-    return described | {f"seconds_{name}": value for name, value in seconds.items()}
+        found["cache"] = f"{sides} voxels, {samples or cache.samples} samples"
+    return found

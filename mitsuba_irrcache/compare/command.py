@@ -40,25 +40,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``irrcache compare``."""
     add = parser.add_argument
     add("scene", help="scene XML")
-    add(
-        "-i", "--integrator", action="append", required=True, metavar="NAME{KEY=VALUE,...}",
-        help="integrator to compare, quoted, with properties; repeatable",
-    )  # fmt: skip
+    add_measurement_options(parser)
     add("-o", "--output", required=True, metavar="FOLDER", help="folder for the report")
-    add(
-        "--budget", default="1,3,12", metavar="SECONDS,...",
-        help="times to compare errors at, with compiled kernels (default: %(default)s)",
-    )  # fmt: skip
     add("-m", "--mode", default="llvm_ad_rgb", help="variant of Mitsuba (default: %(default)s)")
     add(
         "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
         help="value of a $parameter of the scene; repeatable",
     )  # fmt: skip
-    add("-s", "--sensor", type=whole(0), default=0, help="index of the sensor (default: 0)")
-    add(
-        "--reference", default=DEFAULT_REFERENCE, metavar="NAME{KEY=VALUE,...}",
-        help="unbiased integrator that makes the reference (default: %(default)s)",
-    )  # fmt: skip
+    add_reference_options(parser)
     effort = parser.add_mutually_exclusive_group()
     effort.add_argument(
         "--reference-spp", type=whole(0), default=0, metavar="N",
@@ -68,9 +57,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--reference-seconds", type=seconds, default=0.0, metavar="S",
         help=f"time for the reference (default: {REFERENCE_SHARE} times the longest budget)",
     )  # fmt: skip
+    add_modules(parser)
+    add("--overwrite", action="store_true", help="replace an existing report in the folder")
+
+
+def add_measurement_options(parser: argparse.ArgumentParser) -> None:
+    """Declare what is measured: integrators and times."""
+    add = parser.add_argument
     add(
-        "--references", type=Path, default=None, metavar="FOLDER",
-        help="folder of the references (default: irrcache/references in your cache folder)",
+        "-i", "--integrator", action="append", required=True, metavar="NAME{KEY=VALUE,...}",
+        help="integrator to compare, quoted, with properties; repeatable",
+    )  # fmt: skip
+    add(
+        "--budget", default="1,3,12", metavar="SECONDS,...",
+        help="times to compare errors at, with compiled kernels (default: %(default)s)",
     )  # fmt: skip
     add(
         "--exposure",
@@ -79,19 +79,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="EV",
         help="exposure of the displayed images in stops",
     )
+
+
+def add_reference_options(parser: argparse.ArgumentParser) -> None:
+    """Declare which reference is rendered, and where it is stored."""
+    add = parser.add_argument
+    add("-s", "--sensor", type=whole(0), default=0, help="index of the sensor (default: 0)")
     add(
-        "--import", dest="modules", action="append", default=[], metavar="MODULE",
-        help="Python module that registers third-party integrators; repeatable",
+        "--reference", default=DEFAULT_REFERENCE, metavar="NAME{KEY=VALUE,...}",
+        help="unbiased integrator that makes the reference (default: %(default)s)",
     )  # fmt: skip
-    add("--overwrite", action="store_true", help="replace an existing report in the folder")
+    add(
+        "--references", type=Path, default=None, metavar="FOLDER",
+        help="folder of the references (default: irrcache/references in your cache folder)",
+    )  # fmt: skip
+
+
+def add_modules(parser: argparse.ArgumentParser) -> None:
+    """Declare the modules that register plugins."""
+    parser.add_argument(
+        "--import", dest="modules", action="append", default=[], metavar="MODULE",
+        help="Python module that registers third-party plugins; repeatable",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write the report and print the tables; return 1 if an integrator failed."""
     require("matplotlib", "compare", "irrcache compare")
-    job, budgets = _common_job(args), _budgets(args.budget)
-    integrators = _integrators(args)
-    folder = _check_folder(Path(args.output), args.overwrite)
+    job, budgets = common_job(args), budgets_of(args.budget)
+    integrators = integrators_of(args)
+    folder = check_folder(Path(args.output), args.overwrite)
     with tempfile.TemporaryDirectory(prefix="irrcache-compare-") as scratch:
         log = Path(scratch) / "log"
         checked = run_job(
@@ -99,17 +116,17 @@ def run(args: argparse.Namespace) -> int:
             Path(scratch) / "checked.json", log,
         )  # fmt: skip
         reference = _reference(args, job, budgets, Path(scratch) / "reference.json", log)
-    _make_folders(folder)
+    make_folders(folder)
     measurements, interrupted = [], False
     for index, integrator in enumerate(integrators):
         try:
             name = file_name(index, integrator)
-            measurements.append(_measure(job, integrator, name, budgets, folder))
+            measurements.append(measure_integrator(job, integrator, name, budgets, folder))
         except KeyboardInterrupt:
             interrupted = True
             measurements += _kept(folder, name, integrator, "It was interrupted.")
             break
-    tables = _write(args, folder, measurements, reference, budgets, checked)
+    tables = write_report(args, folder, measurements, reference, budgets, checked)
     for table in tables:
         print(f"\n{table.as_text()}")
     print(f"\nreport         {folder / 'report.html'}")
@@ -119,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
     return 130 if interrupted else int(any(m.error for m in measurements))
 
 
-def _measure(
+def measure_integrator(
     job: dict, integrator: str, name: str, budgets: list[float], folder: Path
 ) -> Measurement:
     """Measure one integrator in two processes: with an empty and a filled kernel cache.
@@ -177,7 +194,7 @@ def _reference(
     return reference
 
 
-def _write(
+def write_report(
     args: argparse.Namespace,
     folder: Path,
     measurements: list[Measurement],
@@ -185,6 +202,10 @@ def _write(
     budgets: list[float],
     checked: dict,
 ) -> list:
+    """Write the report to ``folder``; return its tables.
+
+    ``checked`` is the result of the job `worker.check`.
+    """
     from .output import Comparison, write_output
 
     facts = _facts(args, reference, checked)
@@ -220,7 +241,8 @@ def _scene_name(args: argparse.Namespace) -> str:
     return "/".join(Path(args.scene).resolve().parts[-2:])
 
 
-def _common_job(args: argparse.Namespace) -> dict:
+def common_job(args: argparse.Namespace) -> dict:
+    """Return what all jobs of a comparison have in common, checked."""
     source = check_scene_file(args.scene)
     if args.mode not in mi.variants():
         raise IrrcacheError(f'-m is "{args.mode}"; this Mitsuba has {", ".join(mi.variants())}.')
@@ -233,7 +255,8 @@ def _common_job(args: argparse.Namespace) -> dict:
     }
 
 
-def _integrators(args: argparse.Namespace) -> list[str]:
+def integrators_of(args: argparse.Namespace) -> list[str]:
+    """Return the integrators; raise IrrcacheError for one that cannot be read or is repeated."""
     for specification in [*args.integrator, args.reference]:
         parse_integrator(specification)
     doubled = [i for i in args.integrator if args.integrator.count(i) > 1]
@@ -242,7 +265,8 @@ def _integrators(args: argparse.Namespace) -> list[str]:
     return args.integrator
 
 
-def _budgets(text: str) -> list[float]:
+def budgets_of(text: str) -> list[float]:
+    """Return the seconds in ``--budget``, sorted."""
     try:
         budgets = sorted({float(part) for part in text.split(",")})
     except ValueError:
@@ -252,7 +276,7 @@ def _budgets(text: str) -> list[float]:
     return budgets
 
 
-def _check_folder(folder: Path, overwrite: bool) -> Path:
+def check_folder(folder: Path, overwrite: bool) -> Path:
     """Check the folder for the report before any rendering starts."""
     if folder.exists() and not folder.is_dir():
         raise IrrcacheError(f'-o "{folder}" is a file; name a folder.')
@@ -270,7 +294,7 @@ def _check_folder(folder: Path, overwrite: bool) -> Path:
     return folder
 
 
-def _make_folders(folder: Path) -> None:
+def make_folders(folder: Path) -> None:
     """Create the empty report folders; only files of a former report are removed."""
     folder.mkdir(exist_ok=True)
     for name in ("results.json", "results.csv", "report.html"):

@@ -99,7 +99,9 @@ def reference(
         desc=f"reference {path.stem}", unit="spp", delay=1.0, leave=False, disable=None
     ) as bar:
         while found is None or found.spp < spp or found.seconds < seconds:
-            found = _extend(scene, found, sensor, min(CHUNK, spp) if spp else CHUNK)
+            done = 0 if found is None else found.spp
+            chunk = min(CHUNK, spp) if spp else CHUNK
+            found = joined(found, render_halves(scene, sensor, done, chunk))
             bar.update(found.spp - bar.n)
             if advance is not None:
                 advance(found.spp, found.seconds)
@@ -110,17 +112,23 @@ def reference(
     return found
 
 
-def _extend(scene: mi.Scene, old: Reference | None, sensor: int, spp: int) -> Reference:
-    """Return the reference with ``spp`` more samples, continuing the sequence of seeds."""
+def render_halves(scene: mi.Scene, sensor: int, first: int, spp: int) -> Reference:
+    """Render ``spp`` samples per pixel of both halves that follow the ``first`` ones.
+
+    Each half has a sequence of seeds of its own.
+    """
     started = time.perf_counter()
-    done = 0 if old is None else old.spp
-    new = [
-        np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed + done), dtype=np.float64)
+    a, b = [
+        np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed + first), dtype=np.float64)
         for seed in (1_000_000_000, 2_000_000_000)
     ]
-    seconds = time.perf_counter() - started
+    return Reference(a, b, spp, time.perf_counter() - started)
+
+
+def joined(old: Reference | None, new: Reference) -> Reference:
+    """Return the reference with all samples of both."""
     if old is None:
-        return Reference(new[0], new[1], spp, seconds)
-    share = spp / (done + spp)
-    a, b = (o + (n - o) * share for o, n in zip((old.a, old.b), new, strict=True))
-    return Reference(a, b, done + spp, old.seconds + seconds)
+        return new
+    share = new.spp / (old.spp + new.spp)
+    a, b = (o + (n - o) * share for o, n in ((old.a, new.a), (old.b, new.b)))
+    return Reference(a, b, old.spp + new.spp, old.seconds + new.seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from functools import lru_cache
 from pathlib import Path
 
 import mitsuba as mi
@@ -45,6 +46,13 @@ def scene_digest(path: Path, parameters: dict[str, str]) -> str:
 
 
 def _digest(file: Path) -> bytes:
+    """Compute the SHA-256 of a file, once for as long as it is not written to."""
+    state = file.stat()
+    return _digest_of(file, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _digest_of(file: Path, size: int, modified: int) -> bytes:
     sha = hashlib.sha256()
     with open(file, "rb") as stream:
         while block := stream.read(1 << 20):

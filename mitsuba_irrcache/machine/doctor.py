@@ -115,7 +115,7 @@ def examine_system() -> dict[str, Any]:
         "platform": platform.platform(),
         "processor": _processor(),
         "vector_extensions": _vector_extensions(),
-        "cores": _cores(),
+        "cores": available_cores(),
         "memory": total_memory(),
         "free_memory": available_memory(),
     }
@@ -280,7 +280,7 @@ def _vector_extensions() -> list[str]:
     return [extension for extension in _EXTENSIONS if extension in present]
 
 
-def _cores() -> int:
+def available_cores() -> int:
     """Number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

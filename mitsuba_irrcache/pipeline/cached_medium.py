@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
 
@@ -225,6 +225,12 @@ class CachedMedium:
             return empty({})
         return self._resume(empty(self._fingerprint(scene, grid, moments)), edited) or empty({})
 
+    def fingerprint(self, scene: mi.Scene) -> dict[str, str]:
+        """Return the digests of all that the cache depends on, see `IrradianceCache`."""
+        return self.cache.fingerprint or self._fingerprint(
+            scene, self.cache.grid, self.cache.moments
+        )
+
     @property
     def _is_lit(self) -> bool:
         """Whether the scene has any emitter or emissive medium."""
@@ -301,7 +307,7 @@ class CachedMedium:
         """Grow the first two batches up to ``samples`` in total; return whether any were added."""
         cache = self.cache
         if self._opening is None:
-            self._opening = self._new_solver(scene).preview()
+            self._opening = self.new_solver(scene).preview()
         size = min(samples // 2, cache.batch)
         if size <= self._opening.size:
             return False
@@ -310,38 +316,39 @@ class CachedMedium:
             self._opening.fill(cache)
             self._opening = self._preview = None
         else:
-            self._preview = IrradianceCache(
-                cache.grid,
-                cache.active,
-                cache.channels,
-                cache.max_depth,
-                batch=size,
-                moments=cache.moments,
-                interpolation=cache.interpolation,
-            )
+            self._preview = cache.empty_copy(size)
             self._opening.fill(self._preview)
         return True
 
     def _fill(self, scene: mi.Scene, missing: int, progress: Progress | None) -> None:
-        solver = self._kept_solver or self._new_solver(scene)
+        solver = self._kept_solver or self.new_solver(scene)
         if solver.is_kept:
             self._kept_solver = solver
         solver.refine(missing, progress)
         release_unused_memory(self.cache.grid.voxel_count)
 
-    def _new_solver(self, scene: mi.Scene) -> Solver:
+    def new_solver(self, scene: mi.Scene, cache: IrradianceCache | None = None) -> Solver:
+        """Return a solver that fills the cache, or another ``cache`` of the same voxels."""
         settings = self.settings
         return self.solver(
             SolverTask(
                 scene,
                 self.description,
                 self.medium,
-                self.cache,
+                cache or self.cache,
                 settings.seed,
                 settings.rr_depth,
                 self._pause,
             )
         )
+
+    def use_file(self, scene: mi.Scene, file: str | Path) -> None:
+        """Load the cache from ``file``, or empty it, as if that were the ``cache_file``."""
+        self.settings = replace(self.settings, file=str(file))
+        empty = self.cache.empty_copy()
+        empty.fingerprint = self._fingerprint(scene, empty.grid, empty.moments)
+        self.saved_samples = 0
+        self.cache, self._kept_solver = self._resume(empty, edited=False), None
 
     def save_as(self, scene: mi.Scene, file: str | Path) -> None:
         """Write a copy of the cache, with the fingerprint of ``scene``, to a file of any name."""

@@ -141,6 +141,13 @@ class Solver(ABC):
         """
         return False
 
+    @classmethod
+    def batches_at_once(cls, cache: IrradianceCache) -> int:
+        """Return how many batches `refine` adds to ``cache`` at once, at most: several machines
+        that compute so many each can give the same bits as one.
+        """
+        return 1
+
     @abstractmethod
     def __init__(self, task: SolverTask) -> None: ...
 

@@ -70,6 +70,19 @@ def read(path) -> np.ndarray:
 # Images
 
 
+def test_render_several_media(folder):
+    """Their caches are in no header, since there is no single one; the image is written."""
+    other = """<shape type="sphere"> <point name="center" x="4" y="0" z="0"/> <bsdf type="null"/>
+        <medium name="interior" type="homogeneous" id="ball"> <float name="albedo" value="0.5"/>
+        </medium> </shape>"""
+    (folder / "two.xml").write_text(SCENE.replace("EXTRA", other))
+    flags = ["--spp", 1, "-i", "irrcache{solver=path,resolution=4,cache_spp=8}"]
+    assert run("render", folder / "two.xml", "-o", folder / "out.exr", *flags) == 0
+    header = OpenImageIO.ImageInput.open(str(folder / "out.exr")).spec()
+    assert header.getattribute("irrcache:cache") is None
+    assert "resolution = 4" in header.getattribute("irrcache:integrator")
+
+
 def test_render(folder, capsys):
     """``render`` writes an EXR with its settings in the header and a PNG, and prints the times."""
     assert run("render", folder / "scene.xml", "-o", folder / "out.exr", "--spp", 16) == 0

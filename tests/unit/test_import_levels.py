@@ -24,7 +24,7 @@ LEVELS = (
     {"render"},
     {"gradients"},
     {"integrators", "cli", "compare"},
-    {"view"},
+    {"farm", "view"},
 )
 #: Folders that import less than their level permits.
 ONLY = {"volumes": {"errors", "core", "io", "machine"}}

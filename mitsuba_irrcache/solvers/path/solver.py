@@ -109,6 +109,10 @@ class PathSolver(Solver):
             return False
         return hole_in(scene, medium, grid, occupied_box(grid, active)) is None
 
+    @classmethod
+    def batches_at_once(cls, cache: IrradianceCache) -> int:
+        return max(1, _lanes(cache) // (BATCH * max(_block(cache), 1)))
+
     def __init__(self, task: SolverTask) -> None:
         self._task = task
 
@@ -124,9 +128,7 @@ class PathSolver(Solver):
         if total > 16 * LANES:
             seconds = estimator.seconds(total)
             mi.Log(mi.LogLevel.Info, f"irrcache: {total:.3g} paths, about {seconds:.0f} s")
-        lanes = _lanes(cache)
-        block = min(cache.active_count, lanes // BATCH)
-        batches_at_once = max(1, lanes // (BATCH * block))
+        block, batches_at_once = _block(cache), self.batches_at_once(cache)
         remaining = samples // BATCH
         while remaining:
             count = min(batches_at_once, remaining)
@@ -160,6 +162,11 @@ def _blocks(count: int, width: int) -> Iterator[mi.UInt32]:
 def _lanes(cache: IrradianceCache) -> int:
     """Return the paths per kernel launch: fewer if moments of the radiance are stored as well."""
     return LANES // 8 if cache.moments else LANES
+
+
+def _block(cache: IrradianceCache) -> int:
+    """Return the voxels of one kernel launch."""
+    return min(cache.active_count, _lanes(cache) // BATCH)
 
 
 def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:

@@ -1,0 +1,1 @@
+"""Rendering on many workers with ``dask.distributed`` (extra ``farm``)."""

@@ -1,0 +1,130 @@
+"""Many frames of one scene file: values of its parameters, and sensors, to images."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import glob
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from mitsuba_irrcache.cli.render import chosen_integrator
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
+from mitsuba_irrcache.io.scene_files import load_scene
+
+#: Frames of one run, at most: a slip such as 0:1:1e9 is refused.
+MOST_FRAMES = 1_000_000
+
+
+def rows_of(variations: list[str], table: Path | None, folder: Path) -> list[dict[str, str]]:
+    """Return the values of the varying parameters of each frame; one row without any if nothing
+    varies.
+
+    ``variations`` are texts KEY=VALUES, where VALUES are first:last:count, a list a,b,c, or a
+    pattern of file names in the ``folder`` of the scene; all have to have the same length.
+    ``table`` is a CSV file with one column per parameter and one row per frame.
+    """
+    columns = {} if table is None else _columns(table)
+    for text in variations:
+        key, equals, values = text.partition("=")
+        if not equals or not key or not values:
+            raise IrrcacheError(f'cannot read --vary "{text}"; write KEY=0:1:24 or KEY=a,b,c.')
+        if key in columns:
+            raise IrrcacheError(f"--vary {key} is given twice, or is a column of the table, too.")
+        columns[key] = _values(text, values, folder)
+    lengths = {len(values) for values in columns.values()}
+    if len(lengths) > 1:
+        counts = ", ".join(f"{key} has {len(values)}" for key, values in columns.items())
+        raise IrrcacheError(f"parameters vary together, frame by frame, but {counts} values.")
+    count = lengths.pop() if lengths else 1
+    return [{key: values[i] for key, values in columns.items()} for i in range(count)]
+
+
+def _values(text: str, values: str, folder: Path) -> list[str]:
+    parts = values.split(":")
+    if len(parts) == 3:
+        try:
+            first, last, count = float(parts[0]), float(parts[1]), int(parts[2])
+        except ValueError:
+            count = 0
+        if not 1 <= count <= MOST_FRAMES:
+            raise IrrcacheError(
+                f'cannot read --vary "{text}"; first:last:count are two numbers and a whole one '
+                f"from 1 to {MOST_FRAMES}."
+            )
+        return [f"{value:.9g}" for value in np.linspace(first, last, count)]
+    if any(character in values for character in "*?["):
+        found = sorted(glob.glob(values, root_dir=folder))
+        if not found:
+            raise IrrcacheError(f'--vary "{text}": no file in "{folder}" has such a name.')
+        return found
+    return values.split(",")
+
+
+def _columns(table: Path) -> dict[str, list[str]]:
+    try:
+        with open(table, newline="", encoding="utf-8") as file:
+            head, *rows = [row for row in csv.reader(file) if row]
+    except (OSError, ValueError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or "a first row with names is needed"
+        raise IrrcacheError(f'cannot read the table "{table}": {reason}.') from error
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(head):
+            raise IrrcacheError(
+                f'row {number} of "{table}" has {len(row)} values, but the first row names '
+                f"{len(head)}."
+            )
+    if not rows:
+        raise IrrcacheError(f'"{table}" has no rows of values below the names.')
+    return {name.strip(): [row[i].strip() for row in rows] for i, name in enumerate(head)}
+
+
+def sensors_of(text: str, available: int) -> list[int]:
+    """Return the indices of sensors in a list such as ``0,2``, or of ``all``."""
+    if text == "all":
+        return list(range(available))
+    try:
+        chosen = [int(part) for part in text.split(",")]
+    except ValueError:
+        chosen = [-1]
+    wrong = [index for index in chosen if not 0 <= index < available]
+    if wrong or len(set(chosen)) < len(chosen):
+        raise IrrcacheError(
+            f'--sensors is "{text}", but the scene has {available} sensor(s), counted from 0; '
+            'write a list such as 0,2, or "all".'
+        )
+    return chosen
+
+
+def frame_jobs(
+    args: argparse.Namespace,
+    scene: Path,
+    parameters: dict[str, str],
+    integrator: str | None,
+    environment: Environment,
+) -> Iterator[Job]:
+    """Yield a job for each frame and sensor, of the parsed arguments of ``irrcache farm frames``.
+
+    The scene of the first frame is loaded here, so that errors in it are found at once.
+    """
+    rows = rows_of(args.vary, args.table, scene.parent)
+    integrator = chosen_integrator(scene, parameters | rows[0], integrator)
+    loaded = load_scene(scene, parameters | rows[0], integrator)
+    sensors = sensors_of(args.sensors, len(loaded.sensors()))
+    digits = max(4, len(str(len(rows) - 1)))
+    for number, row in enumerate(rows):
+        arguments = scene_arguments(scene, parameters | row, integrator)
+        for sensor in sensors:
+            name = f"frame-{number:0{digits}d}"
+            name += f"-sensor-{sensor}" if len(sensors) > 1 else ""
+            own = {
+                "scene": arguments,
+                "sensor": sensor,
+                "seed": args.seed,
+                "spp": args.spp,
+                "file": f"{name}.exr",
+            }
+            yield Job(name, "frame", own, environment)

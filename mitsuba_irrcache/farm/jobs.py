@@ -1,0 +1,97 @@
+"""Jobs: what workers compute, and the digest of everything that their results depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mitsuba as mi
+
+from mitsuba_irrcache.compare.scene_files import scene_digest
+from mitsuba_irrcache.machine.versions import DISTRIBUTION, installed_version
+
+#: Packages that have to be of the same version on all machines.
+SOFTWARE = (DISTRIBUTION, "mitsuba", "drjit")
+
+
+@dataclass(frozen=True)
+class Environment:
+    """What all jobs of a run have in common.
+
+    Attributes:
+        variant: of Mitsuba.
+        modules: Python modules that register plugins.
+        software: versions by package, which have to be those of the workers.
+        threads: of Dr.Jit in each worker; 0: all that the worker may use. Results do not depend on
+            it.
+    """
+
+    variant: str
+    modules: tuple[str, ...] = ()
+    software: tuple[tuple[str, str | None], ...] = ()
+    threads: int = 0
+
+    @classmethod
+    def here(cls, variant: str, modules: list[str], threads: int) -> Environment:
+        """Return the environment of jobs that this process submits."""
+        return cls(variant, tuple(modules), software(), threads)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One unit of work, a pure function of its ``arguments``.
+
+    Attributes:
+        name: unique in its run, also as the name of a file.
+        kind: one of `work.KINDS`.
+        arguments: JSON-serialisable.
+        environment: that of the run.
+    """
+
+    name: str
+    kind: str
+    arguments: dict
+    environment: Environment
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of everything that the result depends on; the folder of the scene does not
+        matter, nor does the name of its file.
+        """
+        environment = self.environment
+        scene = self.arguments.get("scene", {})
+        contents = {key: value for key, value in scene.items() if key != "scene"}
+        arguments = self.arguments | {"scene": contents}
+        parts = [self.kind, arguments, environment.variant, environment.modules]
+        text = json.dumps([*parts, environment.software], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def software() -> tuple[tuple[str, str | None], ...]:
+    """Return the versions of `SOFTWARE` in this process."""
+    return tuple((name, installed_version(name)) for name in SOFTWARE)
+
+
+def difference(name: str, found: str | None, wanted: str | None) -> str:
+    """Return why a worker with another version of a package, or without it, is not used."""
+    return f"it has {name} {found}, not {wanted}" if found else f"it lacks {name} {wanted}"
+
+
+def scene_arguments(
+    scene: str | Path, parameters: dict[str, str], integrator: str | None
+) -> dict[str, object]:
+    """Return the arguments of a job that name a scene, with the digest of its files.
+
+    The variant has to be set, since Mitsuba's parser finds the files.
+    """
+    path = Path(scene).resolve()
+    return {
+        "scene": str(path),
+        "parameters": parameters,
+        "integrator": integrator,
+        "contents": scene_digest(path, parameters),
+        "variant": mi.variant(),
+    }

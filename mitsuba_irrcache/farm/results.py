@@ -1,0 +1,187 @@
+"""Results of jobs as files, which appear whole or not at all, each with a record of its inputs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+
+from mitsuba_irrcache.compare.results import write_json
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.farm.jobs import Job
+from mitsuba_irrcache.io.files import atomic_write
+from mitsuba_irrcache.pipeline.builder import CHECKPOINT_SECONDS, CHECKPOINT_SHARE
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a worker returns: ``files`` by name, or why there are none.
+
+    Attributes:
+        worker: its address.
+        seconds: duration of the job.
+        files: contents by name.
+        unfit: why this worker cannot run the jobs of this run, while others may.
+        error: why the job failed.
+    """
+
+    worker: str
+    seconds: float = 0.0
+    files: dict[str, bytes] = field(default_factory=dict)
+    unfit: str = ""
+    error: str = ""
+
+
+class Results:
+    """Finished jobs of a folder.
+
+    The record of a job is written after its files: a job with a record is finished. It holds the
+    digest of the job's inputs, and those of its files.
+    """
+
+    def __init__(self, folder: Path, records: str = ".farm") -> None:
+        """``records`` is the name of the folder in ``folder`` that holds them."""
+        self.folder, self._records = folder, folder / records
+
+    def begin(self, resume: bool) -> None:
+        """Create the folders; raise IrrcacheError if there are results that are not to be resumed,
+        or if the folder holds anything else.
+        """
+        if self.folder.exists() and not self.folder.is_dir():
+            raise IrrcacheError(f'"{self.folder}" is a file; name a folder.')
+        if not self.folder.parent.is_dir():
+            raise IrrcacheError(
+                f'cannot write "{self.folder}": "{self.folder.parent}" does not exist.'
+            )
+        if self.has_any and not resume:
+            raise IrrcacheError(
+                f'"{self.folder}" holds results of an earlier run; add --resume to continue it, '
+                "or name another folder."
+            )
+        if not self._records.is_dir() and self.folder.is_dir() and any(self.folder.iterdir()):
+            raise IrrcacheError(
+                f'"{self.folder}" is not empty and holds no results of irrcache farm; name another '
+                "folder."
+            )
+        self._records.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def has_any(self) -> bool:
+        """Whether there is any finished job."""
+        return self._records.is_dir() and any(self._records.iterdir())
+
+    def has(self, job: Job) -> bool:
+        """Whether the job is finished, with the same inputs, and its files are as they were."""
+        try:
+            record = json.loads(self._record(job).read_text())
+            files = record["files"]
+            return record["digest"] == job.digest and all(
+                _digest((self.folder / name).read_bytes()) == known for name, known in files.items()
+            )
+        except (OSError, ValueError, KeyError):  # no record, or a damaged one
+            return False
+
+    def store(self, job: Job, outcome: Outcome) -> None:
+        """Write the files of a job, then its record."""
+        self._record(job).unlink(missing_ok=True)
+        for name, content in outcome.files.items():
+            (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(self.folder / name) as file:
+                file.write(content)
+        record = {
+            "digest": job.digest,
+            "files": {name: _digest(content) for name, content in outcome.files.items()},
+            "seconds": outcome.seconds,
+            "worker": outcome.worker,
+        }
+        write_json(self._record(job), record)
+
+    def remove(self, job: Job) -> None:
+        """Remove the files of a job and its record."""
+        try:
+            names = json.loads(self._record(job).read_text())["files"]
+        except (OSError, ValueError, KeyError):
+            return
+        self._record(job).unlink(missing_ok=True)
+        for name in names:
+            (self.folder / name).unlink(missing_ok=True)
+
+    def _record(self, job: Job) -> Path:
+        return self._records / f"{job.name}.json"
+
+
+class OrderedParts:
+    """Results that arrive in any order and are added to a whole in the order of their jobs.
+
+    Each waits as a file; `missing` are the jobs without one. ``add`` is called with each job and
+    its file; the file is removed by `forget`, once the whole is written.
+    """
+
+    def __init__(
+        self, results: Results, jobs: Iterable[Job], add: Callable[[Job, Path], None]
+    ) -> None:
+        self._results, self._add = results, add
+        self._queue = deque(jobs)
+        self._present = {job.name for job in self._queue if results.has(job)}
+        self._added: list[Job] = []
+        self.missing = [job for job in self._queue if job.name not in self._present]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all parts were added."""
+        return not self._queue
+
+    def store(self, job: Job, outcome: Outcome) -> None:
+        """Keep the result of a job, and add all that are next now."""
+        self._results.store(job, outcome)
+        self._present.add(job.name)
+        self.advance()
+
+    def advance(self) -> None:
+        """Add all results that are next; one that does not fit is removed, so that another run
+        computes it again.
+        """
+        while self._queue and self._queue[0].name in self._present:
+            job = self._queue[0]
+            try:
+                self._add(job, self._results.folder / job.arguments["file"])
+            except IrrcacheError:
+                self._results.remove(job)
+                raise
+            self._added.append(self._queue.popleft())
+
+    def forget(self) -> None:
+        """Remove the files of results that were added."""
+        for job in self._added:
+            self._results.remove(job)
+        self._added = []
+
+
+class Checkpoints:
+    """Decides when a whole is written again: not too often, for the share of time that it takes."""
+
+    def __init__(self) -> None:
+        self._ended, self._took = perf_counter(), 0.0
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the last time is long ago."""
+        limit = max(CHECKPOINT_SECONDS, self._took / CHECKPOINT_SHARE)
+        return perf_counter() - self._ended >= limit
+
+    @contextmanager
+    def measured(self) -> Iterator[None]:
+        """Measure the time of writing."""
+        started = perf_counter()
+        yield
+        self._ended = perf_counter()
+        self._took = self._ended - started
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,168 @@
+"""The runs of ``irrcache farm``: from its arguments to jobs, and from their results to files."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mitsuba as mi
+
+from mitsuba_irrcache.cli.render import chosen_integrator, terminated_like_interrupted
+from mitsuba_irrcache.compare.command import budgets_of, common_job, integrators_of
+from mitsuba_irrcache.compare.reference import default_folder, reference_path
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.farm.cache import CacheRun
+from mitsuba_irrcache.farm.cluster import MOST_WORKERS, ClusterOptions, connected
+from mitsuba_irrcache.farm.dispatch import Dispatch
+from mitsuba_irrcache.farm.frames import frame_jobs
+from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
+from mitsuba_irrcache.farm.references import ReferenceRun
+from mitsuba_irrcache.farm.results import Outcome, Results
+from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
+from mitsuba_irrcache.io.scene_files import (
+    check_scene_file,
+    load_scene,
+    parse_integrator,
+    parse_parameters,
+)
+from mitsuba_irrcache.machine.llvm import require_llvm
+
+Store = Callable[[Job, Outcome], None]
+
+
+def run_cache(args: argparse.Namespace) -> int:
+    """Fill the caches of a scene."""
+    options, environment = _begin(args)
+    scene, parameters, integrator = _scene(args)
+    _check_parent(args.output)
+    integrator = chosen_integrator(scene, parameters, integrator)
+    arguments = scene_arguments(scene, parameters, integrator)
+    cache = CacheRun(arguments, environment, args.output, args.resume)
+    try:
+        status = _dispatch(options, cache.begin(), cache.store)
+    finally:
+        complete = cache.finish()
+    if complete:
+        print(f"wrote {', '.join(cache.files)}")
+    return status
+
+
+def run_frames(args: argparse.Namespace) -> int:
+    """Render the frames of a scene."""
+    options, environment = _begin(args)
+    results = Results(args.output)
+    results.begin(args.resume)
+    jobs = list(frame_jobs(args, *_scene(args), environment))
+    status = _dispatch(options, [job for job in jobs if not results.has(job)], results.store)
+    there = sum(map(results.has, jobs))
+    print(f"{there} of {len(jobs)} frames are in {args.output}")
+    return status
+
+
+def run_reference(args: argparse.Namespace) -> int:
+    """Render, or continue, a reference."""
+    options, environment = _begin(args)
+    scene, parameters, _ = _scene(args)
+    reference = _reference(args, scene, parameters, environment)
+    try:
+        status = _dispatch(options, reference.missing, reference.store)
+    finally:
+        reference.finish()
+    print(f"{2 * reference.found.spp} samples per pixel in two halves, {reference.path}")
+    return status
+
+
+def run_study(args: argparse.Namespace) -> int:
+    """Measure all integrators on all scenes, and write a report for each scene."""
+    options, environment = _begin(args, most_workers=1)
+    integrators_of(args)
+    budgets, studies, stores = budgets_of(args.budget), {}, {}
+    Path(args.output).mkdir(exist_ok=True)
+    jobs: list[Job] = []
+    for own in arguments_by_scene(args):
+        job = common_job(own)
+        study = SceneStudy(own, job, budgets, environment)
+        missing = study.begin(args.resume)
+        where = Path(job["scene"]), job["parameters"]
+        reference = _reference(args, *where, environment)
+        studies[study] = reference
+        stores |= {each.name: reference.store for each in reference.missing}
+        stores |= {each.name: study.store for each in missing}
+        jobs = [*reference.missing, *jobs, *missing]
+    try:
+        status = _dispatch(options, jobs, lambda job, outcome: stores[job.name](job, outcome))
+    finally:
+        complete = {study for study, reference in studies.items() if reference.finish()}
+    for study in complete:
+        print(f"report {study.report(studies[study].found)}")
+        for measurement in study.measurements:
+            if measurement.error:
+                print(f"irrcache: {measurement.integrator}: {measurement.error}", file=sys.stderr)
+                status = 1
+    return status if len(complete) == len(studies) else 1
+
+
+KINDS = {
+    "cache": run_cache,
+    "frames": run_frames,
+    "reference": run_reference,
+    "study": run_study,
+}
+
+
+def _begin(
+    args: argparse.Namespace, most_workers: int = MOST_WORKERS
+) -> tuple[ClusterOptions, Environment]:
+    """Check the options of all runs, and set the variant."""
+    options = ClusterOptions.of(args, most_workers)
+    if args.mode.startswith("llvm"):
+        require_llvm()
+    mi.set_variant(args.mode)
+    mi.set_log_level(mi.LogLevel.Warn)
+    for module in args.modules:
+        importlib.import_module(module)
+    return options, Environment.here(args.mode, args.modules, options.threads)
+
+
+def _scene(args: argparse.Namespace) -> tuple[Path, dict[str, str], str | None]:
+    """Return the checked scene file, its parameters, and the integrator that replaces its own."""
+    scene, parameters = check_scene_file(args.scene), parse_parameters(args.define)
+    integrator = getattr(args, "integrator", None)
+    if integrator is not None:
+        parse_integrator(integrator)
+    return scene, parameters, integrator
+
+
+def _check_parent(file: Path) -> None:
+    if not file.parent.is_dir():
+        raise IrrcacheError(f'cannot write "{file}": the folder "{file.parent}" does not exist.')
+    if file.is_dir():
+        raise IrrcacheError(f'cannot write "{file}": it is a folder; name a file.')
+
+
+def _reference(
+    args: argparse.Namespace, scene: Path, parameters: dict[str, str], environment: Environment
+) -> ReferenceRun:
+    arguments = scene_arguments(scene, parameters, args.reference)
+    available = len(load_scene(scene, parameters, args.reference).sensors())
+    if args.sensor >= available:
+        raise IrrcacheError(
+            f"--sensor is {args.sensor}, but the scene has {available} sensor(s), counted from 0."
+        )
+    folder = (args.references or default_folder()).resolve()
+    path = reference_path(scene, parameters, args.reference, args.sensor, folder)
+    return ReferenceRun(arguments, args.sensor, path, args.reference_spp, environment)
+
+
+def _dispatch(options: ClusterOptions, jobs: Sequence[Job], store: Store) -> int:
+    """Run jobs on the cluster; return 1, and print why, if some failed."""
+    if not jobs:
+        return 0
+    with terminated_like_interrupted(), connected(options) as connection:
+        failed = Dispatch(connection, jobs, store).run()
+    for name, message in failed.items():
+        print(f"irrcache: {name}: {message}", file=sys.stderr)
+    return int(bool(failed))

@@ -1,0 +1,91 @@
+"""``irrcache farm`` on worker processes of this machine, some of which are killed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import psutil
+import pytest
+from mitsuba_irrcache.scenes import scene_path
+
+from mitsuba_irrcache.cli.main import main
+from mitsuba_irrcache.io.images import read_image
+from mitsuba_irrcache.io.scene_files import load_scene
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SCENE = str(scene_path("cloud"))
+#: Seven jobs of a third of a second.
+INTEGRATOR = "irrcache{solver=path,resolution=16,max_depth=3,cache_spp=3584}"
+
+
+def farm(*arguments: object) -> subprocess.Popen:
+    """Start ``irrcache farm`` with two workers."""
+    command = [sys.executable, "-m", "mitsuba_irrcache", "farm", *map(str, arguments)]
+    return subprocess.Popen(
+        [*command, "--workers", "2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def lines_until(process: subprocess.Popen, count: int) -> list[str]:
+    """Return what a command prints until ``count`` jobs are finished."""
+    lines: list[str] = []
+    for line in process.stdout:
+        lines.append(line)
+        if sum(line.startswith("[") for line in lines) == count:
+            break
+    return lines
+
+
+def kill_worker(process: subprocess.Popen) -> None:
+    """Kill one worker of a command, if that has not ended."""
+    children = psutil.Process(process.pid).children(recursive=True)
+    for worker in [c for c in children if "spawn_main" in " ".join(c.cmdline())][:1]:
+        worker.kill()
+
+
+def test_kills_of_workers_and_of_the_command_leave_no_trace(tmp_path):
+    """The cache file equals that of one process that nobody disturbs, byte by byte."""
+    file, arguments = tmp_path / "light.cache", ["cache", SCENE, "-i", INTEGRATOR, "-o"]
+    process = farm(*arguments, file)
+    lines = lines_until(process, 1)
+    assert (
+        lines[0].startswith("scheduler tcp://127.0.0.1:")
+        and "dashboard http://127.0.0.1:" in lines[0]
+    )
+    kill_worker(process)
+    lines_until(process, 1)
+    process.kill()
+    process.communicate()
+    assert len(list(Path(f"{file}.parts").glob("*.part"))) >= 2
+    assert main(["farm", *arguments, str(file)]) == 1  # not without --resume
+    process = farm(*arguments, file, "--resume")
+    lines_until(process, 1)
+    kill_worker(process)
+    said = process.communicate()[0]
+    assert process.returncode == 0 and f"wrote {file}" in said, said
+    assert not Path(f"{file}.parts").exists()
+    alone = INTEGRATOR.replace("}", f",cache_file={tmp_path / 'alone.cache'}}}")
+    scene = load_scene(SCENE, {}, alone)
+    scene.integrator().prepare(scene)
+    assert file.read_bytes() == (tmp_path / "alone.cache").read_bytes()
+
+
+def test_frames_equal_images_that_are_rendered_one_by_one(tmp_path, capsys):
+    integrator = "irrcache{solver=path,resolution=8,cache_spp=64}"
+    frames = tmp_path / "frames"
+    varied = ["--vary", "sigma_t=2,2,3", "-D", "size=16", "--spp", "2", "-i", integrator]
+    process = farm("frames", SCENE, "-o", frames, *varied)
+    said = process.communicate()[0]
+    assert process.returncode == 0 and f"3 of 3 frames are in {frames}" in said, said
+    for number, sigma_t in enumerate((2, 2, 3)):
+        scene = load_scene(SCENE, {"sigma_t": str(sigma_t), "size": "16"}, integrator)
+        found = read_image(frames / f"frame-{number:04d}.exr")
+        np.testing.assert_array_equal(found, np.array(mi.render(scene, spp=2, seed=0)))
+    # Nothing is left to be done: no cluster is started.
+    assert main(["farm", "frames", SCENE, "-o", str(frames), *varied, "--resume"]) == 0
+    assert capsys.readouterr().out == f"3 of 3 frames are in {frames}\n"

@@ -1,0 +1,148 @@
+"""What workers refuse, and references and studies of jobs that are run here one by one."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_irrcache.scenes import scene_path
+
+from mitsuba_irrcache.compare import reference as stored
+from mitsuba_irrcache.compare.command import common_job
+from mitsuba_irrcache.compare.results import Measurement, Snapshot
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.farm import references, studies, work
+from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
+from mitsuba_irrcache.farm.references import ReferenceRun
+from mitsuba_irrcache.farm.results import Outcome
+from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
+from mitsuba_irrcache.farm.work import KINDS, UnfitWorkerError, set_up
+from mitsuba_irrcache.io.images import write_image
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SMALL = {"size": "8", "max_depth": "3"}
+
+
+@pytest.fixture
+def environment():
+    """Return the environment of jobs of this process."""
+    return Environment.here("llvm_ad_rgb", [], 0)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Return a copy of a scene."""
+    path = tmp_path / "cloud.xml"
+    path.write_text(Path(scene_path("cloud")).read_text())
+    return path
+
+
+def outcome(job: Job, folder: Path) -> Outcome:
+    """Run a job as a worker does, in a new ``folder``."""
+    folder.mkdir()
+    KINDS[job.kind](job.arguments, folder)
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return Outcome(
+        "here", files={str(path.relative_to(folder)): path.read_bytes() for path in files}
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"software": (("mitsuba_irrcache", "0.0.1"),)}, "it has mitsuba_irrcache .*, not 0.0.1"),
+        ({"variant": "cuda_no_such"}, "cuda_no_such cannot be used"),
+        ({"modules": ("no_such_module",)}, "no_such_module"),
+    ],
+    ids=str,
+)
+def test_a_worker_of_another_kind_says_why(environment, change, said):
+    set_up(environment)
+    with pytest.raises(UnfitWorkerError, match=said):
+        set_up(replace(environment, **change))
+
+
+def test_a_worker_that_sees_other_files_says_so(scene, tmp_path):
+    arguments = {"scene": scene_arguments(scene, SMALL, "volpath"), "sensor": 0, "first": 0}
+    arguments |= {"spp": 1, "file": "part.npz"}
+    scene.write_text(scene.read_text().replace("albedo", "albedo "))
+    with pytest.raises(UnfitWorkerError, match=r"the files of .*cloud.xml.* differ"):
+        KINDS["reference_part"](arguments, tmp_path)
+    scene.unlink()
+    with pytest.raises(UnfitWorkerError, match=r"it has no file .*cloud.xml"):
+        KINDS["reference_part"](arguments, tmp_path)
+
+
+def test_a_reference_of_jobs_is_the_one_of_one_process(scene, environment, tmp_path, monkeypatch):
+    """Its launches arrive in reverse order, with an interruption between."""
+    for module in (stored, references):
+        monkeypatch.setattr(module, "CHUNK", 2)
+    arguments = scene_arguments(scene, SMALL, "volpath")
+    path = tmp_path / "references" / "cloud.npz"
+    run = ReferenceRun(arguments, 0, path, 8, environment)
+    jobs = run.missing
+    for number, job in enumerate((jobs[0], jobs[3])):
+        run.store(job, outcome(job, tmp_path / f"before-{number}"))
+    assert not run.finish() and stored.Reference.load(path).spp == 2
+    run = ReferenceRun(arguments, 0, path, 8, environment)
+    assert [job.name for job in run.missing] == [jobs[1].name, jobs[2].name]
+    for number, job in enumerate(reversed(run.missing)):
+        run.store(job, outcome(job, tmp_path / f"after-{number}"))
+    assert run.finish() and not path.with_name("cloud.npz.parts").exists()
+    found = stored.Reference.load(path)
+    alone = stored.reference(scene, SMALL, "volpath", tmp_path, spp=8)
+    assert found.spp == alone.spp == 8
+    # Mitsuba's film adds in no fixed order.
+    np.testing.assert_allclose([found.a, found.b], [alone.a, alone.b], rtol=1e-5, atol=1e-6)
+    assert np.abs(found.a - found.b).max() > 1e-3
+
+
+def measured(job, integrator, name, budgets, folder) -> None:
+    """Stand in for `measure_integrator`, which starts several processes."""
+    write_image(folder / "images" / f"{name}.exr", np.full((8, 8, 3), 0.3, np.float32), {})
+    snapshot = Snapshot(budgets[0], {"image": 0.1}, 4, f"images/{name}.exr")
+    Measurement(integrator, name, [snapshot]).save(folder / "measurements" / f"{name}.json")
+
+
+def test_a_study_reports_what_workers_measured(scene, environment, tmp_path, monkeypatch):
+    written: list[tuple] = []
+    monkeypatch.setattr(work, "measure_integrator", measured)
+    monkeypatch.setattr(studies, "write_report", lambda *arguments: written.append(arguments))
+    args = argparse.Namespace(
+        scenes=[str(scene)], output=str(tmp_path), integrator=["volpath"], reference="volpath",
+        mode="llvm_ad_rgb", define=[f"{k}={v}" for k, v in SMALL.items()], modules=[], sensor=0,
+        exposure=0.0,
+    )  # fmt: skip
+    (own,) = arguments_by_scene(args)
+    study = SceneStudy(own, common_job(own), [0.1], environment)
+    (job,) = study.begin(resume=False)
+    study.store(job, outcome(job, tmp_path / "scratch"))
+    truth = stored.Reference(np.zeros((8, 8, 3)), np.zeros((8, 8, 3)), 8, 1.0)
+    assert study.report(truth) == tmp_path / "cloud" / "report.html"
+    ((_, folder, (measurement,), reference, budgets, checked),) = written
+    assert folder == tmp_path / "cloud" and reference is truth and budgets == [0.1]
+    assert measurement.integrator == "volpath" and checked["size"] == [8, 8]
+    np.testing.assert_allclose(measurement.snapshots[0].read(folder), 0.3)
+    again = SceneStudy(own, common_job(own), [0.1], environment)
+    assert again.begin(resume=True) == []
+    measurement.error = "out of memory"
+    measurement.save(folder / "measurements" / f"{measurement.name}.json")
+    assert [each.name for each in again.begin(resume=True)] == [job.name]
+
+
+def test_reports_of_a_study_need_folders_of_their_own(tmp_path):
+    args = argparse.Namespace(scenes=["a/scene.xml", "b/a.xml"], output=str(tmp_path))
+    with pytest.raises(IrrcacheError, match='2 scenes are called "a"'):
+        arguments_by_scene(args)
+
+
+def test_the_digest_of_a_scene_is_that_of_its_contents(scene):
+    before = scene_arguments(scene, SMALL, None)
+    assert before == scene_arguments(scene, SMALL, None) and mi.variant() == before["variant"]
+    scene.write_text(scene.read_text().replace('value="0.95"', 'value="0.94"'))
+    assert before["contents"] != scene_arguments(scene, SMALL, None)["contents"]
