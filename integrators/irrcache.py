@@ -340,7 +340,16 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         check_sensor(scene, sensor)
         self._stopping.begin(self._timeout)
         progress = self._stopping.raising(self.progress)
-        found = self._search.find(scene, sensor, spp, seed, progress)
+        try:
+            found = self._search.find(scene, sensor, spp, seed, progress)
+        except Stopped:
+            self.certificate = None
+            mi.Log(
+                mi.LogLevel.Warn,
+                "irrcache: stopped before the error of the image was known; the tolerance is not "
+                "guaranteed.",
+            )
+            return spp
         builder, self._chosen_step, spp, self.certificate = found
         self._builder.adopt(builder)
         level = mi.LogLevel.Info if self.certificate.is_met else mi.LogLevel.Warn

@@ -149,7 +149,6 @@ class ToleranceSearch:
         self._new_builder, self._camera_rays = new_builder, camera_rays
         self._levels: list[Level] = []
         self._samples = settings.samples
-        self._revision = -1
         self._notes: list[str] = []
         self._view: tuple = ()  # what the last result was found for
         self._found: tuple | None = None
@@ -168,7 +167,7 @@ class ToleranceSearch:
         """
         rays = _probe_rays(sensor)
         self._begin(scene, progress)
-        view = self._revision, spp, *_values_of(rays)
+        view = spp, *_values_of(rays)
         if view != self._view:
             self._view, self._notes = (), []
             self._found = self._search(scene, sensor, rays, (spp, seed), progress)
@@ -215,15 +214,14 @@ class ToleranceSearch:
         """Bring the coarsest cache up to date; discard all others if the scene has changed."""
         if not self._levels:
             self._levels = [self._level(self._settings.resolution or COARSEST)]
-        first = self._levels[0]
-        before = first.builder.revision
-        first.builder.fit(scene)
-        if first.builder.revision != before or self._revision < 0:
+        first = self._levels[0].builder
+        before = first.revision
+        first.fit(scene)
+        if first.revision != before:
             del self._levels[1:]
-            self._samples = self._settings.samples
-            first.builder.samples = self._samples
-        first.builder.update(scene, progress)
-        self._revision = first.builder.revision
+            self._view = ()
+            self._samples = first.samples = self._settings.samples
+        first.update(scene, progress)
 
     def _level(self, resolution: int, seed: int = 0, samples: int = 0) -> Level:
         """Return a level whose cache is empty."""

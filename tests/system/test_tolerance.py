@@ -75,12 +75,24 @@ def test_a_moved_camera_has_the_same_cache_and_an_edit_a_new_one(mono):
     edited = np.array(mi.render(scene))
     assert integrator.cache is not cache
     other = Case("directional").scene(tolerance=TOLERANCE)
-    sensor, params = mi.traverse(other.sensors()[0]), mi.traverse(other)
+    sensor, others = mi.traverse(other.sensors()[0]), mi.traverse(other)
     sensor["to_world"] = sensor["to_world"] @ mi.ScalarTransform4f().rotate([0, 1, 0], 3)
     sensor.update()
-    params["body.interior_medium.albedo.value.value"] = 0.4
-    params.update()
+    others["body.interior_medium.albedo.value.value"] = 0.4
+    others.update()
     np.testing.assert_array_equal(edited, np.array(mi.render(other)))
+    for albedo in 0.5, 0.6:
+        before = integrator.certificate
+        params["body.interior_medium.albedo.value.value"] = albedo
+        params.update()
+        mi.render(scene)
+        assert integrator.certificate is not before
+
+
+def test_an_estimate_that_is_stopped_is_no_certificate(mono):
+    scene = Case("directional").scene(tolerance=TOLERANCE, timeout=1e-4)
+    assert np.isfinite(np.array(mi.render(scene))).all()
+    assert scene.integrator().certificate is None
 
 
 def test_scenes_without_a_cache_have_no_estimate(mono):
