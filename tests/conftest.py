@@ -24,6 +24,15 @@ from tests.support.scenes import (
 )
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _modules_are_not_searched():
+    """Exclude what the modules hold from garbage collection, which is fast then."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
 @pytest.fixture
 def rgb():
     """Select the variant ``llvm_ad_rgb`` and silence the log."""
@@ -39,6 +48,10 @@ def mono():
 
 
 def _set_variant(name: str) -> None:
+    """Select a variant, without the objects of earlier scenes: their methods would be compiled into
+    every kernel.
+    """
+    gc.collect()
     if mi.variant() != name:
         mi.set_variant(name)
     mi.set_log_level(mi.LogLevel.Error)

@@ -17,7 +17,8 @@ KINDS = ("off", "swipe", "error")
 #: a pass is known, then the finest with which a pass takes at most `PASS_SECONDS`.
 COARSENESS = (4, 2, 1)
 PASS_SECONDS = 3.0
-#: Passes after which the resolution is chosen.
+#: Passes after which the resolution is chosen. The time of the first one does not count, since
+#: kernels may be compiled in it.
 PROBE = 2
 #: Largest relative error that has a colour of its own; noise of few samples is larger.
 LARGEST = 1.0
@@ -53,6 +54,7 @@ class Comparison:
         self.light, self.camera, self.size = light, camera, size
         self._reference = Reference(light, camera, size, COARSENESS[0])
         self._is_probing = True
+        self._first_seconds = 0.0
 
     def belongs_to(self, light: Light, camera: Camera, size: tuple[int, int]) -> bool:
         """Return whether this is the comparison of a view of these caches."""
@@ -70,9 +72,12 @@ class Comparison:
         """Add one sample per pixel to a band; return whether there is anything new to show."""
         known = self._reference
         complete = known.refine()
+        if complete and self._is_probing and known.samples == 1:
+            self._first_seconds = known.seconds
         if complete and self._is_probing and known.samples == PROBE:
             self._is_probing = False
-            finest = _finest(known.seconds / PROBE, known.coarseness)
+            seconds = (known.seconds - self._first_seconds) / (PROBE - 1)
+            finest = _finest(seconds, known.coarseness)
             if finest != known.coarseness:
                 self._reference = Reference(self.light, self.camera, self.size, finest)
         return complete or not known.samples
