@@ -101,6 +101,7 @@ def test_windows_that_are_resized_and_closed(browser, reachable):
     window.page.close()
 
 
+@pytest.mark.slow  # downloads of the browser take minutes on busy machines
 def test_transfer_functions_and_archives_are_exchanged(browser, reachable, tmp_path):
     """Transfer functions and scenes are exchanged through the browser.
 
