@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
@@ -11,10 +12,22 @@ from pathlib import Path
 
 from mitsuba_irrcache.scenes import scene_path
 
+from experiments.support.options import add_document, begin
+from experiments.support.store import Store
 from mitsuba_irrcache.machine import doctor
 
 #: The scene of caches here: a ball of fog under a sun.
 SCENE = str(scene_path("cloud"))
+
+
+def begun(parser: argparse.ArgumentParser, name: str) -> tuple[argparse.Namespace, Store]:
+    """Parse the command line of an experiment; return its options and its rows of this ``name``."""
+    add_document(parser)
+    args = parser.parse_args()
+    begin()
+    folder = args.output / "farm"
+    folder.mkdir(parents=True, exist_ok=True)
+    return args, Store(folder / f"{name}.json", args.force)
 
 
 @dataclass

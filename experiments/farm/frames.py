@@ -21,10 +21,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from experiments.farm.commands import finished, load, load_note
+from experiments.farm.commands import begun, finished, load, load_note
 from experiments.support.documents import replace_tables
-from experiments.support.options import add_document, begin, parser_of
-from experiments.support.store import Store
+from experiments.support.options import parser_of
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.io.images import read_image
 from mitsuba_irrcache.volumes.phantom.cloud import cloud
@@ -145,12 +144,7 @@ def main() -> None:
     """Run the experiment, or show its results."""
     parser = parser_of(__doc__)
     parser.add_argument("--rounds", type=int, default=2)
-    add_document(parser)
-    args = parser.parse_args()
-    begin()
-    folder = args.output / "farm"
-    folder.mkdir(parents=True, exist_ok=True)
-    store = Store(folder / "frames.json", args.force)
+    args, store = begun(parser, "frames")
     row = store.row("frames", lambda: measure(args.rounds))
     print(table(row).as_text())
     if args.document:

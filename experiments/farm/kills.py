@@ -18,10 +18,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from experiments.farm.commands import cache_arguments, cache_of_one_process, command
+from experiments.farm.commands import begun, cache_arguments, cache_of_one_process, command
 from experiments.support.documents import replace_tables
-from experiments.support.options import add_document, begin, parser_of
-from experiments.support.store import Store
+from experiments.support.options import parser_of
 from mitsuba_irrcache.compare.tables import Table
 
 #: A cache of 18 batches per job, each of which takes about a second.
@@ -98,12 +97,7 @@ def main() -> int:
     """Run the experiment, or show its results."""
     parser = parser_of(__doc__)
     parser.add_argument("--kills", type=int, default=100)
-    add_document(parser)
-    args = parser.parse_args()
-    begin()
-    folder = args.output / "farm"
-    folder.mkdir(parents=True, exist_ok=True)
-    store = Store(folder / "kills.json", args.force)
+    args, store = begun(parser, "kills")
     with tempfile.TemporaryDirectory() as scratch:
         row = store.row(f"{args.kills}", lambda: kill_farm(Path(scratch), args.kills))
     print(table(row).as_text())

@@ -26,10 +26,9 @@ from statistics import median
 import drjit as dr
 import psutil
 
-from experiments.farm.commands import SCENE, cache_arguments, finished, load, load_note
+from experiments.farm.commands import SCENE, begun, cache_arguments, finished, load, load_note
 from experiments.support.documents import replace_tables
-from experiments.support.options import add_document, begin, parser_of
-from experiments.support.store import Store
+from experiments.support.options import parser_of
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.farm import work
 from mitsuba_irrcache.farm.cache import CacheRun
@@ -174,12 +173,7 @@ def main() -> None:
     """Run the experiment, or show its results."""
     parser = parser_of(__doc__)
     parser.add_argument("--rounds", type=int, default=2)
-    add_document(parser)
-    args = parser.parse_args()
-    begin()
-    folder = args.output / "farm"
-    folder.mkdir(parents=True, exist_ok=True)
-    store = Store(folder / "scaling.json", args.force)
+    args, store = begun(parser, "scaling")
     rows = {kind: store.row(kind, partial(measure, kind, args.rounds)) for kind in KINDS}
     print(table(rows).as_text())
     if args.document:

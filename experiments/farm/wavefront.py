@@ -19,9 +19,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from experiments.farm.commands import begun
 from experiments.support.documents import replace_tables
-from experiments.support.options import add_document, begin, parser_of
-from experiments.support.store import Store
+from experiments.support.options import parser_of
 from mitsuba_irrcache.compare.tables import Table
 
 #: Rounds of the check, of which the fastest counts.
@@ -279,12 +279,7 @@ def check_table(cases: list[Case], outcomes: list[dict], measured: list[float]) 
 def main() -> None:
     """Run the model and its check, or show their results."""
     parser = parser_of(__doc__)
-    add_document(parser)
-    args = parser.parse_args()
-    begin()
-    folder = args.output / "farm"
-    folder.mkdir(parents=True, exist_ok=True)
-    store = Store(folder / "wavefront.json", args.force)
+    args, store = begun(parser, "wavefront")
 
     def row(case: Case) -> dict:
         key = f"model {case}"

@@ -40,7 +40,7 @@ from mitsuba_irrcache.render.film import CameraSampler, PixelPositions, camera_r
 SHARES = {"voxels": 0.62, "directions": 0.62, "steps": 0.3, "pixels": 0.35}
 #: Values of the property ``tolerance_of``.
 SCALES = ("image", "volume")
-#: Rays that are compared, pixels that are sampled, and samples in each of their groups.
+#: Rays that are compared, pixels that are sampled, and seeds with which they are.
 RAYS, PIXELS, GROUPS = 1 << 14, 1 << 8, 4
 #: Resolution of the first cache, the ratio between resolutions, and its minimum.
 COARSEST, LARGEST_RATIO, SMALLEST_RATIO = 16, 2.0, 1.4
@@ -223,13 +223,13 @@ class ToleranceSearch:
             self._samples = first.samples = self._settings.samples
         first.update(scene, progress)
 
-    def _level(self, resolution: int, seed: int = 0, samples: int = 0) -> Level:
+    def _level(self, resolution: int, seed: int = 0) -> Level:
         """Return a level whose cache is empty."""
         settings = replace(
             self._settings,
             resolution=resolution,
             seed=self._settings.seed + seed,
-            samples=samples or self._samples,
+            samples=self._samples,
             file="",
         )
         return Level(resolution, self._new_builder(settings), self._camera_rays)
@@ -479,8 +479,7 @@ def _pixel_samples(
     corner = mi.Vector2f(mi.Float(x), mi.Float(y)) + mi.Vector2f(film.crop_offset())
     found = []
     for group in range(GROUPS):
-        sampler = sensor.sampler().clone()
-        sampler.set_sample_count(spp)
+        sampler = _sampler(sensor, spp)
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed + group, pixels * spp)
         spread = PixelPositions(sampler, seed + group, spp)
@@ -497,9 +496,14 @@ def _pixel_samples(
 
 def _rounded(sensor: mi.Sensor, spp: int) -> int:
     """Return the samples per pixel that the sensor's sampler uses for ``spp``."""
+    return _sampler(sensor, spp).sample_count()
+
+
+def _sampler(sensor: mi.Sensor, spp: int) -> mi.Sampler:
+    """Return a copy of the sensor's sampler for ``spp`` samples per pixel."""
     sampler = sensor.sampler().clone()
     sampler.set_sample_count(spp)
-    return sampler.sample_count()
+    return sampler
 
 
 def _values_of(rays: Rays) -> tuple:
