@@ -1,4 +1,4 @@
-"""Direct irradiance of area emitters of simple shapes near a medium.
+"""Direct irradiance of area emitters of simple shapes.
 
 Without a medium and other surfaces the irradiance is E(p) = L Omega(p), in closed form
 (`lights/solid_angle`). It varies by an order of magnitude within a voxel next to the emitter, and
@@ -15,10 +15,13 @@ continuous across its plane.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, spread
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
@@ -26,7 +29,6 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.grids.root_field import ExtendedField
 from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
-from mitsuba_irrcache.lights.falloff import REACH, edges_away
 from mitsuba_irrcache.lights.solid_angle import SolidAngle
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
@@ -34,16 +36,19 @@ from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 #: Number of points on an emitter: for all voxels together, and minimum and maximum for each voxel.
-SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 1 << 24, 16, 512
+SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 1 << 24, 32, 512
+#: Number of points on an emitter over which the phase function is averaged at a lookup, beyond its
+#: moments; with a forward peak, which the moments exclude.
+PHASE_SAMPLES, PEAK_SAMPLES = 4, 16
 #: Weight [sr] added to each point, so that their sum is positive in the plane of a flat emitter.
 SMALL_ANGLE = 1e-6
 #: Number of positions at which the error of interpolated optical depths is measured.
 TESTS = 2048
 #: Number of positions on an emitter from which its distance to the voxels is measured.
 POSITIONS = 64
-#: Maximum number of emitters treated in this way, and of their values at all voxels: about 14
-#: numbers each. The irradiance of further emitters is interpolated.
-MOST_LIGHTS, MOST_VALUES = 8, 1 << 24
+#: Maximum number of emitters treated in this way, and of their values at all voxels: about 14 and
+#: the moments for each. The irradiance of further emitters is interpolated.
+MOST_LIGHTS, MOST_VALUES, VALUES = 8, 14 << 24, 14
 
 
 class AreaLight(DirectLight):
@@ -57,15 +62,20 @@ class AreaLight(DirectLight):
         grid: Grid,
         voxels: mi.UInt32,
         classes: VoxelClasses | None = None,
+        order: int = 0,
     ) -> None:
-        """Compute the factors; ``classes`` is None if no surface is among the voxels."""
+        """Compute the factors; ``classes`` is None if no surface is among the voxels, ``order`` as
+        for `DirectLight`.
+        """
         self._solid_angle, self._radiance = SolidAngle.of(emitter), _radiance(emitter)
         # An emitter does not keep its shape alive, which Mitsuba accesses as long as it exists.
         self._shape = emitter.get_shape()
         self._area = dr.opaque(mi.Float, float(np.ravel(self._shape.surface_area())[0]))
         self._edges = classes.cut_cells if classes is not None else None
         self._scene, self._found = scene, None
-        arguments = scene, emitter, medium, grid, voxels, classes
+        samples = PEAK_SAMPLES if medium.phase.forward else PHASE_SAMPLES
+        self._phase_samples = dr.opaque(mi.UInt32, samples)
+        arguments = scene, emitter, medium, grid, voxels, classes, order
         self._follows_closest_line = True
         super().__init__(*arguments)
         if not _is_inside(self._shape, medium):
@@ -98,9 +108,17 @@ class AreaLight(DirectLight):
         """
         if not self._follows_closest_line:
             return dr.full(mi.Float, 1, dr.width(p))
+        return self._closest_length(p)
+
+    def _closest_length(self, p: mi.Point3f) -> mi.Float:
+        """Return the length in the medium of the line to the closest point of the emitter."""
         offset = self._solid_angle.closest(p) - p
         distance = dr.norm(offset)
         direction = dr.select(distance > 0, offset / distance, mi.Vector3f(0, 0, 1))
+        return self._length_within(p, direction, distance)
+
+    def _length_within(self, p: mi.Point3f, direction: mi.Vector3f, distance: mi.Float) -> mi.Float:
+        """Return the length in the medium of a line from ``p``."""
         hit, near, far = self._medium.intersect(mi.Ray3f(p, direction))
         near, far = dr.maximum(near, 0), dr.minimum(far, distance)
         return dr.maximum(dr.select(hit, far - near, 0), 0)
@@ -118,7 +136,7 @@ class AreaLight(DirectLight):
         stream = random_stream(mi.sample_tea_32(voxel, hashed_seed((TESTS, 1))[0]))
         others = Media.around(self._medium).without(self._medium)
         count = dr.opaque(mi.UInt32, MOST_SAMPLES)
-        transmitted, _, weight = self._sums(self._scene, others, p, count, stream)
+        transmitted, _, weight, *_ = self._sums(self._scene, others, p, count, stream)
         exact = dr.mean(transmitted) / dr.maximum(weight, 1e-20)
         scale = dr.select(self._medium.contains(p), self._solid_angle.at(p), 0)
         error = dr.abs(dr.mean(mi.Spectrum(dr.exp(-self.depth(p)))) - exact)
@@ -135,25 +153,84 @@ class AreaLight(DirectLight):
         rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
         others = Media.around(self._medium).without(self._medium)
         count = dr.opaque(mi.UInt32, count)
-        transmitted, visible, weight = self._sums(scene, others, p, count, rng)
+        transmitted, visible, weight, odd, odd_weight, angular = self._sums(
+            scene, others, p, count, rng, self.order
+        )
         mean = dr.select(weight > 0, transmitted / weight, 1)
         passed = dr.select(transmitted > 0, visible / transmitted, 0)
         grey = self._medium.sigma_t.channels == 1
-        depth = -dr.log(dr.maximum(mean[0] if grey else mi.Color3f(mean), 1e-30))
-        dr.eval(depth, passed)
+        # The logarithm of a noisy mean is too small by half its relative variance. The variance of
+        # a mean over n points of a lattice is proportional to n^-2, so that one half of the points
+        # differs from all by three times the variance of all.
+        half = dr.select(odd_weight > 0, odd / odd_weight, mean)
+        bias = dr.square(dr.select(mean > 0, (half - mean) / mean, 0)) / 6
+        depth = -dr.log(dr.maximum(mean, 1e-30)) - bias
+        depth = depth[0] if grey else mi.Color3f(depth)
+        seen = dr.mean(visible)
+        self._angular_means = [
+            dr.select(seen > 0, a / dr.select(seen > 0, seen, 1), 0) for a in angular
+        ]
+        dr.eval(depth, passed, self._angular_means)
         self._found = depth, passed
         return depth, passed
 
+    def angular_means(self) -> list[mi.Float]:
+        return self._angular_means
+
+    @property
+    def has_one_direction(self) -> bool:
+        return False
+
+    def mean_rest(self, basis: AngularBasis, p: mi.Point3f, direction: mi.Vector3f) -> mi.Float:
+        """Average `AngularBasis.rest` over the radiance from the emitter.
+
+        Its points differ between lookups, so that the error of sharp phase functions is noise. The
+        radiance is weighted by the transmittance along each line for the mean extinction.
+        """
+        first, second = (dr.reinterpret_array(mi.UInt32, v) for v in (p.x + p.y, p.z))
+        rng = random_stream(mi.sample_tea_32(first, second))
+        length, depth = self._closest_length(p), self.depth(p)
+        depth = depth if isinstance(depth, mi.Float) else dr.mean(depth)
+        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
+        return self._mean_rest(basis, p, direction, mean, self._phase_samples, rng)
+
     @symbolic
-    def _sums(self, scene: mi.Scene, others: Media, p: mi.Point3f, count: mi.UInt32, rng: mi.PCG32):
+    def _mean_rest(
+        self,
+        basis: AngularBasis,
+        p: mi.Point3f,
+        direction: mi.Vector3f,
+        sigma_t: mi.Float,
+        count: mi.UInt32,
+        rng: mi.PCG32,
+    ):
+        """See `mean_rest`, with ``count`` points and the mean extinction ``sigma_t``."""
+        vertex = dr.zeros(mi.Interaction3f, dr.width(p))
+        vertex.p = p
+        shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
+        total, sum_of_weights, k = mi.Float(0), mi.Float(0), mi.UInt32(0)
+        while dr.hint(k < count, label="phase function over an emitter"):
+            _, towards, distance, weight = self._sample(vertex, k, shift)
+            weight *= dr.exp(-sigma_t * self._length_within(p, towards, distance))
+            total += dr.select(weight > 0, weight * basis.rest(p, direction, towards), 0)
+            sum_of_weights += weight
+            k += 1
+        return dr.select(sum_of_weights > 0, total / sum_of_weights, 0)
+
+    @symbolic
+    def _sums(self, scene: mi.Scene, others: Media, p: mi.Point3f, count: mi.UInt32, rng, order=0):
         """Sum over ``count`` points of the emitter: the solid angle for which each stands, times
-        the transmittance of the medium, also times the visibility past others, and alone.
+        the transmittance of the medium, also times the visibility past others, and alone; the
+        first and the last of these over every other point; and the second, averaged over the
+        channels, times the spherical harmonics of its direction from degree 1 to ``order``.
         """
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))
         vertex.p = p
         shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
         transmitted, visible, total = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
-        k = mi.UInt32(0)
+        odd, odd_total = mi.Spectrum(0), mi.Float(0)
+        angular = [mi.Float(0) for _ in range(order * (order + 2))]
+        pair, k = 1 if self._solid_angle.density > 0 else 0, mi.UInt32(0)
         while dr.hint(k < count, label="points on an emitter"):
             target, direction, distance, weight = self._sample(vertex, k, shift)
             seen = weight > 0
@@ -164,8 +241,15 @@ class AreaLight(DirectLight):
             transmitted += passed
             visible += dr.select(seen, passed * past, 0)
             total += weight
+            is_odd = ((k >> pair) & 1) == 1
+            odd += dr.select(is_odd, passed, 0)
+            odd_total += dr.select(is_odd, weight, 0)
+            if dr.hint(order > 0, mode="scalar"):
+                angular = _with_harmonics(
+                    angular, direction, dr.select(seen, dr.mean(passed * past), 0), order
+                )
             k += 1
-        return transmitted, visible, total
+        return transmitted, visible, total, odd, odd_total, angular
 
     def _sample(
         self, vertex: mi.Interaction3f, k: mi.UInt32, shift: mi.Vector2f
@@ -224,21 +308,49 @@ def area_lights_of(
     grid: Grid,
     voxels: mi.UInt32,
     classes: VoxelClasses | None = None,
+    order: int = 0,
 ) -> list[AreaLight]:
-    """Return the direct light of the area emitters of simple shapes near the voxels.
+    """Return the direct light of the area emitters of simple shapes.
 
-    The list is empty for anisotropic scattering: the moments of the cache include such emitters.
+    ``order`` as for `DirectLight`.
     """
-    if not medium.phase.is_isotropic or medium.is_isolated or not dr.width(voxels):
+    if medium.is_isolated or not dr.width(voxels):
         return []
     lights = [
         emitter
         for emitter in EmittersByKind(scene.emitters()).of(EmitterKind.AREA)
-        if SolidAngle.of(emitter) is not None and _is_near(emitter, grid)
+        if SolidAngle.of(emitter) is not None
     ]
     lights.sort(key=_power, reverse=True)
-    count = min(MOST_LIGHTS, MOST_VALUES // dr.width(voxels))
-    return [AreaLight(scene, e, medium, grid, voxels, classes) for e in lights[:count]]
+    values = (VALUES + order * (order + 2)) * dr.width(voxels)
+    count = min(MOST_LIGHTS, MOST_VALUES // values)
+    return [AreaLight(scene, e, medium, grid, voxels, classes, order) for e in lights[:count]]
+
+
+def moments_of(
+    lights: Sequence[DirectLight], basis: AngularBasis, grid: Grid, voxels: mi.UInt32
+) -> AngularField | None:
+    """Create the field of the moments of the radiance from all ``lights`` with extent, relative to
+    their irradiance at the ``voxels``; None without any.
+    """
+    lights = [light for light in lights if not light.has_one_direction]
+    if not lights:
+        return None
+    rows = [mi.Float(0)] * (1 + basis.order * (basis.order + 2))
+    for light in lights:
+        irradiance = dr.mean(light.irradiance)
+        means = [mi.Float(1), *light.angular_means()]
+        rows = [dr.fma(irradiance, y, total) for y, total in zip(means, rows, strict=True)]
+    phi, *moments = (spread(grid, voxels, [values], None) for values in rows)
+    return AngularField(basis, grid, [phi], moments)
+
+
+def _with_harmonics(
+    sums: list[mi.Float], direction: mi.Vector3f, weight: mi.Float, order: int
+) -> list[mi.Float]:
+    """Add the spherical harmonics of a ``direction`` from degree 1 to ``order``, times a weight."""
+    harmonics = dr.sh_eval(direction, order)[1:]
+    return [dr.fma(weight, y, total) for y, total in zip(harmonics, sums, strict=True)]
 
 
 def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:
@@ -251,12 +363,6 @@ def _positions(shape: mi.Shape) -> mi.Point3f:
     rng = np.random.default_rng(POSITIONS)
     sample = mi.Point2f(np.float32(rng.random((2, POSITIONS))))
     return shape.sample_position(0.0, sample).p
-
-
-def _is_near(emitter: mi.Emitter, grid: Grid) -> bool:
-    """Whether the irradiance of an emitter is not smooth enough for interpolation."""
-    positions = _positions(emitter.get_shape())
-    return edges_away(np.array(positions, dtype=np.float64), grid) <= REACH
 
 
 def _radiance(emitter: mi.Emitter) -> mi.Spectrum:

@@ -19,6 +19,7 @@ from itertools import pairwise
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.conservative import unbiased
 from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
 from mitsuba_irrcache.core.jit import symbolic
@@ -57,9 +58,13 @@ class DirectLight:
         grid: Grid,
         voxels: mi.UInt32,
         survey: VoxelClasses | None = None,
+        order: int = 0,
     ) -> None:
-        """Compute mean extinctions and irradiance; ``survey`` is None without surfaces."""
-        self._kind = kind_of(emitter)
+        """Compute mean extinctions and irradiance; ``survey`` is None without surfaces.
+
+        ``order`` is that of `angular_means`.
+        """
+        self._kind, self.order = kind_of(emitter), order
         self.emitter, self._medium = emitter, medium
         self.distant = self._kind is EmitterKind.SUN
         p = VoxelSamplePoints(scene, grid).of(voxels)
@@ -94,6 +99,11 @@ class DirectLight:
             dr.eval(self._means)
         return self._means
 
+    @property
+    def has_one_direction(self) -> bool:
+        """Whether its radiance comes from a single direction at each position."""
+        return True
+
     def unobstructed(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
         """Evaluate the unobstructed irradiance E at world positions."""
         at = dr.zeros(mi.Interaction3f, dr.width(p))
@@ -110,6 +120,18 @@ class DirectLight:
         """Return the length in the medium of the line from world positions to the emitter."""
         _, near, far = self._line(p)
         return dr.maximum(far - near, 0)
+
+    def angular_means(self) -> list[mi.Float]:
+        """Return the mean spherical harmonics of the directions to the emitter, weighted by its
+        irradiance at the voxels, from degree 1 on: ``order`` (order + 2) values.
+        """
+        return list(dr.sh_eval(self.towards(self._centres), self.order))[1:]
+
+    def towards(self, p: mi.Point3f) -> mi.Vector3f:
+        """Return the direction from world positions to an emitter without extent."""
+        at = dr.zeros(mi.Interaction3f, dr.width(p))
+        at.p = p
+        return self.emitter.sample_direction(at, mi.Point2f(0.5))[0].d
 
     def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Return the transmittance of surfaces and other media on that line."""
@@ -197,19 +219,20 @@ def direct_lights_of(
     voxels: mi.UInt32,
     dense: bool,
     survey: VoxelClasses | None = None,
+    order: int = 0,
 ) -> list[DirectLight]:
     """Return the direct light of all spot lights of a scene.
 
-    Includes points and suns if the voxels are ``dense`` and there are no surfaces. The list is
-    empty for anisotropic scattering, where the cache stores the irradiance of such emitters as
-    narrow sources.
+    Includes points and suns if the voxels are ``dense`` and there are no surfaces. ``order`` as for
+    `DirectLight`.
     """
-    if not medium.phase.is_isotropic or not dr.width(voxels):
+    if not dr.width(voxels):
         return []
     emitters = spot_lights(scene)
     if dense and medium.is_isolated:
         emitters = EmittersByKind(scene.emitters()).of(EmitterKind.SUN, *POINT_LIKE)
-    return [DirectLight(scene, emitter, medium, grid, voxels, survey) for emitter in emitters]
+    rest = medium, grid, voxels, survey, order
+    return [DirectLight(scene, emitter, *rest) for emitter in emitters]
 
 
 def _on_grid(
@@ -259,13 +282,38 @@ def _past_others(
 class DirectLightAlongRays:
     """Direct light of an emitter, evaluated along camera rays."""
 
-    def __init__(self, light: DirectLight) -> None:
-        self._light = light
+    def __init__(
+        self,
+        light: DirectLight,
+        basis: AngularBasis | None = None,
+        moments: AngularField | None = None,
+    ) -> None:
+        """``basis`` is None for isotropic scattering. For anisotropic scattering, ``moments`` are
+        those of the radiance from all emitters with extent (see `area_light.moments_of`).
+        """
+        self._light, self._basis, self._moments = light, basis, moments
 
-    def at(self, p: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
-        """Evaluate the irradiance at world positions."""
+    def _gain(self, p: mi.Point3f, direction: mi.Vector3f, with_peak: bool) -> mi.Float:
+        """Mean of `AngularBasis.gain` over the radiance from the emitter."""
+        light, basis = self._light, self._basis
+        if light.has_one_direction:
+            return basis.gain(p, direction, light.towards(p), with_peak)
+        view = direction, basis.basis(direction)
+        smooth = self._moments.factor(p, *view, mi.Bool(True), with_peak)
+        if not basis.has_rest(with_peak):
+            return smooth
+        return dr.maximum(smooth + light.mean_rest(basis, p, direction), 0)
+
+    def at(
+        self, p: mi.Point3f, active: mi.Bool, direction: mi.Vector3f | None = None
+    ) -> mi.Spectrum:
+        """Evaluate the irradiance at world positions, for anisotropic scattering times 4 pi times
+        the phase function for scattering into ``direction``, without a forward peak.
+        """
         light = self._light
         passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
+        if self._basis is not None:
+            passed = passed * self._gain(p, direction, with_peak=False)
         return mi.Spectrum(passed) * light.unobstructed(p, active)
 
     def mean_extinction(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
@@ -316,6 +364,8 @@ class DirectLightAlongRays:
         # Scale to the absorptance that the quadrature rule computes.
         absorbed = absorptance(0.5 * (near + far))
         rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
+        if self._basis is not None:
+            total *= self._gain(ray(0.5 * (a + b)), ray.d, with_peak=True)
         return total * mi.Spectrum(rule) * dr.inv_four_pi
 
     def _parts(

@@ -240,11 +240,10 @@ class IrradianceCache:
         It excludes `direct_lights` and is divided by the `falloff`, if any. It has one channel if
         all channels are identical. Its ``maximum`` is an upper bound of Phi.
         """
-        means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
-        brightest = [dr.max(m)[0] for m in means] if self.direct_lights else []
+        totals = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        brightest = [dr.max(m)[0] for m in totals] if self.direct_lights else []
         brightest += [light.maximum for light in self.direct_lights]
-        for light in self.direct_lights:
-            means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]
+        means = self._interpolated_means()
         known, roots = marked(self.grid, self.active), [dr.sqrt(m) for m in means]
         variance = share = None
         if not self.correlated:  # errors shared by neighbours do not bias interpolation
@@ -273,17 +272,26 @@ class IrradianceCache:
 
     @_consistent
     def directional_field(self, channels: int) -> AngularField | None:
-        """Create the field for lookups of the angular moments; None for isotropic scattering."""
+        """Create the field for lookups of the angular moments; None for isotropic scattering.
+
+        As `field`, it excludes `direct_lights`.
+        """
         if not self.moments:
             return None
-        n = mi.Float(self._batch_count)
-        phi = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        n, phi = mi.Float(self._batch_count), self._interpolated_means()
         means = [mi.Float(0) if m is None else m / n for m in self._moments]
         scattered = []
         for values in (phi, means):
             chosen = [v for i, v in enumerate(values) if i % self.channels < channels]
             scattered.append([self._tensor([v]).array for v in chosen])
         return AngularField(self.directional, self.grid, *scattered)
+
+    def _interpolated_means(self) -> list[mi.Float]:
+        """Phi of the active voxels in each channel, without `direct_lights`."""
+        means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        for light in self.direct_lights:
+            means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]
+        return means
 
     def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
         """Variance of the voxels over their squared mean, at most 1; 0 if unknown."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
@@ -12,7 +12,11 @@ from threading import Lock
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.cache.angular import (
+    AngularBasis,
+    order_of_direct_light,
+    sources_of,
+)
 from mitsuba_irrcache.cache.area_light import area_lights_of
 from mitsuba_irrcache.cache.direct_light import direct_lights_of
 from mitsuba_irrcache.cache.interpolation import Interpolation
@@ -177,11 +181,8 @@ class CachedMedium:
             grid = grid.shared(medium.sigma_t.grid, medium.albedo.grid)
         else:
             grid, size_reason = choose_grid(medium, settings.resolution, solver.size_rule)
-        basis = None
-        if not medium.phase.is_isotropic:
-            basis = AngularBasis(medium.phase, sources_of(scene))
-        moments = basis.count if basis is not None else 0
-        self._check_memory(grid, moments)
+        basis, order = _angular_basis(scene, medium), order_of_direct_light(medium.phase)
+        self._check_memory(grid, basis.count if basis is not None else 0, (order + 1) ** 2)
         warn_of_dense_border(medium, grid)
         active = active_voxels(medium, grid)
         classes = solver.voxel_classes(scene, media, medium, grid, active)
@@ -202,9 +203,12 @@ class CachedMedium:
         direct_lights = []
         if solver.knows_direct_lights(scene, medium, grid, active):
             dense = border_error(medium, grid) > SMALL_BORDER_ERROR
-            direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes)
-            direct_lights += area_lights_of(scene, medium, grid, active, classes)
-        falloff = InverseSquareFactor.of(scene, grid, [light.emitter for light in direct_lights])
+            direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes, order)
+            direct_lights += area_lights_of(scene, medium, grid, active, classes, order)
+        known = [light.emitter for light in direct_lights]
+        falloff = InverseSquareFactor.of(scene, grid, known)
+        basis = _angular_basis(scene, medium, known)
+        moments = basis.count if basis is not None else 0
         interpolation = Interpolation(basis, falloff, direct_lights, classes)
 
         def empty(fingerprint: dict[str, str]) -> IrradianceCache:
@@ -236,16 +240,19 @@ class CachedMedium:
         """Whether the scene has any emitter or emissive medium."""
         return bool(self.description.emitters) or self.medium.emission is not None
 
-    def _check_memory(self, grid: Grid, moments: int) -> None:
+    def _check_memory(self, grid: Grid, moments: int, direct_moments: int) -> None:
         """Refuse a cache that exceeds the available memory while it is filled or looked up.
 
-        The field of its errors needs as much again (experiments/paper/memory).
+        The field of its errors needs as much again (experiments/paper/memory). ``direct_moments``
+        are those of the radiance directly from area emitters.
         """
         channels, max_depth = 1 if mi.is_monochromatic else 3, self.settings.max_depth
         numbers = self.solver.numbers_per_voxel(
             self.medium, max_depth, moments, grid.voxel_count, channels
         )
         needed = 4 * grid.voxel_count * (numbers + 8) * (2 if self.settings.with_error else 1)
+        if moments and not self.medium.is_isolated:
+            needed += 4 * grid.voxel_count * 2 * direct_moments
         what = f"irrcache: a cache of {' x '.join(map(str, grid.shape[::-1]))} voxels"
         require_memory(needed, what, "lower resolution")
         if grid.voxel_count >= 2**32:
@@ -386,6 +393,18 @@ class CachedMedium:
         if differing(fingerprint, self.cache.fingerprint):
             raise CacheFileError(f'"{file}" has been replaced by the cache of another scene')
         return samples >= self.cache.samples
+
+
+def _angular_basis(
+    scene: mi.Scene, medium: MediumGrid, known: Sequence[mi.Emitter] = ()
+) -> AngularBasis | None:
+    """Create the angular basis of anisotropic scattering in a scene; None if it is isotropic.
+
+    The direct irradiance of the emitters ``known`` is not part of it.
+    """
+    if medium.phase.is_isotropic:
+        return None
+    return AngularBasis(medium.phase, *sources_of(scene, known))
 
 
 def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> None:

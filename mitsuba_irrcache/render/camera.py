@@ -13,6 +13,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.cache.area_light import moments_of
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.cache.surface import SurfaceNodes
 from mitsuba_irrcache.cache.uncertainty import uncertainty_of
@@ -79,7 +81,7 @@ def camera_rays_of(
             directional=cache.directional_field(field.channels),
             edges=cache.voxel_classes.cut_cells if cache.voxel_classes is not None else None,
             falloff=cache.falloff,
-            direct_lights=[DirectLightAlongRays(light) for light in cache.direct_lights],
+            direct_lights=_along_rays(cache),
         )
         del field  # already copied by the projection
         release_unused_memory(cache.grid.voxel_count)
@@ -92,6 +94,16 @@ def camera_rays_of(
         return ClosedFormCameraRays(projections[0], settings.max_depth, hide_emitters, closed_form)
     depths = settings.max_depth, settings.rr_depth
     return TracedCameraRays(parts[0].description, projections, *depths, hide_emitters)
+
+
+def _along_rays(cache: IrradianceCache) -> list[DirectLightAlongRays]:
+    """Prepare the direct lights of a cache for lookups along rays."""
+    lights, basis = cache.direct_lights, cache.directional
+    moments = None
+    if basis is not None and lights:
+        basis = AngularBasis(basis.phase, [], order=lights[0].order)
+        moments = moments_of(lights, basis, cache.grid, cache.active)
+    return [DirectLightAlongRays(light, basis, moments) for light in lights]
 
 
 class RayResult:

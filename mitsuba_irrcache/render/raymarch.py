@@ -75,7 +75,7 @@ class Projection:
         self.directional = directional
         #: inverse-square factor of lamps, by which the cached irradiance is divided
         self.falloff = falloff
-        #: spot lights, which are excluded from the cached irradiance
+        #: emitters whose direct irradiance is excluded from the cached one
         self._direct_lights = list(direct_lights)
         #: surfaces that cut voxels, if any, and the irradiance they select voxels from
         self._edges = (edges, irradiance) if edges is not None else None
@@ -140,12 +140,12 @@ class Projection:
         phi = self._exclude_occluded(p, phi, active)
         if self.falloff is not None:
             phi = phi * self.falloff.at(p)
+        if self.directional is not None:
+            view = self.angular_terms(direction)
+            phi = phi * self.directional.factor(p, *view, active, with_peak=False)
         for light in self._direct_lights:
-            phi = phi + light.at(p, active)
-        if self.directional is None:
-            return phi
-        view = self.angular_terms(direction)
-        return phi * self.directional.factor(p, *view, active, with_peak=False)
+            phi = phi + light.at(p, active, direction)
+        return phi
 
     @property
     def truncates_peak(self) -> bool:

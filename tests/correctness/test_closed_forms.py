@@ -208,7 +208,7 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     index, moments = dr.arange(mi.UInt32, grid.voxel_count), None
     solver, least = sn_solver.Sweep, sn_solver.BATCH
     if not medium.phase.is_isotropic:
-        moments = AngularBasis(medium.phase, sources_of(scene))
+        moments = AngularBasis(medium.phase, *sources_of(scene))
         solver, least = AnisotropicSweep, minimum_batch(moments.order)
     batch = sn_solver.batch_of(samples, least)
     count = moments.count if moments else 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import zip_longest
-
 import drjit as dr
 import mitsuba as mi
 
@@ -42,9 +40,10 @@ class AnisotropicSweep(Sweep):
         super().__init__(scene, medium, cache, *rest)
         if not cache.active_count:
             return
-        # Point-like lights, in the order of `DistantIllumination.point_lights`.
+        # Point-like lights, in the order of `DistantIllumination.point_lights`, except known ones.
         points = [s for s in self._sources if s.sharp and not s.far]
         self._point_directions = [s.seen_from(self._sample_points)[0] for s in points]
+        self._known = {id(light.irradiance): light for light in cache.direct_lights}
 
     def _new_level(self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks) -> MultigridLevel:
         all_axes = not self._medium.is_isolated
@@ -61,12 +60,20 @@ class AnisotropicSweep(Sweep):
         smooth, own = moments.uncollided(used, tracks)
         swept = sum((values for values in own if values is not None), smooth) * scale
         smooth *= scale
-        # Found voxel by voxel: irradiance of point-like lights, then moments of other sources.
-        sampled = [[m[channels[0]] for m in found] for found in (*self._direct, *self._emission)]
-        points = sampled[: len(self._point_directions)]
-        others = sampled[len(self._point_directions) :]
-        narrow = self._narrow_sources(own, scale, points, others)
-        uncollided = moments.moment(swept, 0) + sum(values[0] for values in sampled)
+        # Found voxel by voxel: irradiance of known emitters, which their moments exclude, and of
+        # point-like lights; moments of other sources.
+        known, unknown = [], []
+        for found in (*self._direct, *self._emission):
+            (known if id(found[0]) in self._known else unknown).append(
+                [m[channels[0]] for m in found]
+            )
+        points = unknown[: len(self._point_directions)]
+        others = unknown[len(self._point_directions) :]
+        narrow = self._narrow_sources(own[: len(self._sources)], scale, points, others)
+        uncollided = moments.moment(swept, 0) + sum(values[0] for values in (*known, *unknown))
+        if self._sun_irradiance:  # swept as the source of further orders only
+            suns = own[-1]
+            uncollided += self._from_suns(channels[0]) - moments.moment(suns, 0) * scale
         scattered = None
         if several:
             scattered = self._swept(self._level(channels), sets, channels) - swept
@@ -98,10 +105,17 @@ class AnisotropicSweep(Sweep):
     def _sampled(self, channel: int) -> list[mi.Float]:
         """As `Sweep._sampled`, with moments."""
         count, found = self._moments.count, []
-        for direction, (irradiance, *more) in zip_longest(self._point_directions, self._direct):
+        directions = iter(self._point_directions)
+        for irradiance, *more in self._direct:
+            light = self._known.get(id(irradiance))
+            if light is not None:
+                value = light.means[channel]
+                higher = (value * mean for mean in light.angular_means()[: count - 1])
+                found.append(concatenated([value, *higher]))
+                continue
             value = irradiance[channel] * self._inverse_square_mean
-            if direction is not None:
-                found.append(self._moments.from_direction(value, direction))
+            if not more:
+                found.append(self._moments.from_direction(value, next(directions)))
             else:
                 higher = (
                     moment[channel] * self._inverse_square_mean for moment in more[: count - 1]

@@ -57,10 +57,13 @@ class OrdinateSet:
         where the irradiance of suns is to be separate, it comes last.
         """
         directions, incoming, _, offsets = merged([each.ordinates for each in sets])
-        parts = [incoming] if angular_basis is None else angular_basis.apart(directions, incoming)
+        suns = []
         if sets[0]._is_sun is not None:
             is_sun = np.concatenate([each._is_sun for each in sets])[:, None, None]
-            parts = [np.where(is_sun, 0, incoming), np.where(is_sun, incoming, 0)]
+            suns = [np.where(is_sun, incoming, 0)]
+            incoming = np.where(is_sun, 0, incoming)
+        parts = [incoming] if angular_basis is None else angular_basis.apart(directions, incoming)
+        parts += suns
         used = [part.any(axis=(1, 2)) for part in parts]
         return [
             (directions[rows], part[rows], offsets[rows])

@@ -95,7 +95,7 @@ def test_scattered_radiance_from_moments_and_from_directions(scenes, objects, to
     scene = scene_of(scenes, hg(g), **objects)
     media, count = compile_scene(scene).media, 1 << 16
     medium = media.grids[0]
-    directional = AngularBasis(medium.phase, sources_of(scene))
+    directional = AngularBasis(medium.phase, *sources_of(scene))
     rng, p = mi.PCG32(count), mi.Point3f(0.2, 0.5, -0.3)
     spread = [rng.next_float32() for _ in range(4)]
     limits = [dr.opaque(mi.UInt32, n) for n in (3, 100)]
