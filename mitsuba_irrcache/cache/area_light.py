@@ -37,6 +37,8 @@ from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 #: Number of points on an emitter: for all voxels together, and minimum and maximum for each voxel.
 SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 1 << 24, 32, 512
+#: Largest mean bias of the optical depths due to the number of points; most of it is corrected.
+LARGEST_BIAS = 5e-4
 #: Number of points on an emitter over which the phase function is averaged at a lookup, beyond its
 #: moments; with a forward peak, which the moments exclude.
 PHASE_SAMPLES, PEAK_SAMPLES = 4, 16
@@ -128,12 +130,7 @@ class AreaLight(DirectLight):
 
         It is evaluated at random positions in random voxels.
         """
-        rng = np.random.default_rng(TESTS)
-        number = mi.UInt32(rng.integers(dr.width(self._voxels), size=TESTS).astype(np.uint32))
-        voxel = dr.gather(mi.UInt32, self._voxels, number)
-        offset = mi.Vector3f(np.float32(rng.random((3, TESTS))))
-        p = self._grid.world.point(mi.Point3f(*self._grid.voxel_indices(voxel)) + offset)
-        stream = random_stream(mi.sample_tea_32(voxel, hashed_seed((TESTS, 1))[0]))
+        p, stream = self._test_positions()
         others = Media.around(self._medium).without(self._medium)
         count = dr.opaque(mi.UInt32, MOST_SAMPLES)
         transmitted, _, weight, *_ = self._sums(self._scene, others, p, count, stream)
@@ -143,36 +140,54 @@ class AreaLight(DirectLight):
         total, reference = dr.sum(scale * error), dr.sum(scale * exact)
         return float(total[0]) / max(float(reference[0]), 1e-30)
 
+    def _test_positions(self) -> tuple[mi.Point3f, mi.PCG32]:
+        """Return random positions in random voxels, and a random stream for each."""
+        rng = np.random.default_rng(TESTS)
+        number = mi.UInt32(rng.integers(dr.width(self._voxels), size=TESTS).astype(np.uint32))
+        voxel = dr.gather(mi.UInt32, self._voxels, number)
+        offset = mi.Vector3f(np.float32(rng.random((3, TESTS))))
+        p = self._grid.world.point(mi.Point3f(*self._grid.voxel_indices(voxel)) + offset)
+        stream = random_stream(mi.sample_tea_32(voxel, hashed_seed((TESTS, 1))[0]))
+        return p, stream
+
     def _attenuation(
         self, scene: mi.Scene, p: mi.Point3f
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
         if self._found is not None:
             return self._found
-        voxels = self._voxels
-        count = int(np.clip(SAMPLES // dr.width(voxels), FEWEST_SAMPLES, MOST_SAMPLES))
+        voxels, count = self._voxels, self._sample_count(scene)
         rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
         others = Media.around(self._medium).without(self._medium)
         count = dr.opaque(mi.UInt32, count)
-        transmitted, visible, weight, odd, odd_weight, angular = self._sums(
-            scene, others, p, count, rng, self.order
-        )
-        mean = dr.select(weight > 0, transmitted / weight, 1)
+        sums = self._sums(scene, others, p, count, rng, self.order)
+        transmitted, visible, _, _, _, angular = sums
         passed = dr.select(transmitted > 0, visible / transmitted, 0)
-        grey = self._medium.sigma_t.channels == 1
-        # The logarithm of a noisy mean is too small by half its relative variance. The variance of
-        # a mean over n points of a lattice is proportional to n^-2, so that one half of the points
-        # differs from all by three times the variance of all.
-        half = dr.select(odd_weight > 0, odd / odd_weight, mean)
-        bias = dr.square(dr.select(mean > 0, (half - mean) / mean, 0)) / 6
+        mean, bias = _mean_and_bias(*sums)
         depth = -dr.log(dr.maximum(mean, 1e-30)) - bias
-        depth = depth[0] if grey else mi.Color3f(depth)
+        depth = depth[0] if self._medium.sigma_t.channels == 1 else mi.Color3f(depth)
         seen = dr.mean(visible)
-        self._angular_means = [
-            dr.select(seen > 0, a / dr.select(seen > 0, seen, 1), 0) for a in angular
-        ]
+        share = dr.select(seen > 0, 1 / dr.select(seen > 0, seen, 1), 0)
+        self._angular_means = [share * total for total in angular]
         dr.eval(depth, passed, self._angular_means)
         self._found = depth, passed
         return depth, passed
+
+    def _sample_count(self, scene: mi.Scene) -> int:
+        """Return the number of points for each voxel: as many as `SAMPLES` in all permit, or, where
+        the transmittance varies over the emitter, as many as `LARGEST_BIAS` requires.
+        """
+        permitted = np.clip(SAMPLES // dr.width(self._voxels), FEWEST_SAMPLES, MOST_SAMPLES)
+        p, stream = self._test_positions()
+        others = Media.around(self._medium).without(self._medium)
+        count = dr.opaque(mi.UInt32, FEWEST_SAMPLES)
+        mean, bias = _mean_and_bias(*self._sums(scene, others, p, count, stream))
+        weight = self._solid_angle.at(p) * mean
+        weight = dr.select(self._medium.contains(p), dr.mean(weight), 0)
+        total, relative = dr.sum(weight), dr.sum(weight * dr.mean(bias))
+        dr.eval(total, relative)
+        bias = float(relative[0]) / max(float(total[0]), 1e-30)
+        required = FEWEST_SAMPLES * np.sqrt(bias / LARGEST_BIAS)
+        return int(np.clip(np.ceil(required), permitted, MOST_SAMPLES))
 
     def angular_means(self) -> list[mi.Float]:
         return self._angular_means
@@ -325,6 +340,26 @@ def area_lights_of(
     values = (VALUES + order * (order + 2)) * dr.width(voxels)
     count = min(MOST_LIGHTS, MOST_VALUES // values)
     return [AreaLight(scene, e, medium, grid, voxels, classes, order) for e in lights[:count]]
+
+
+def _mean_and_bias(
+    transmitted: mi.Spectrum,
+    visible: mi.Spectrum,
+    weight: mi.Float,
+    odd: mi.Spectrum,
+    odd_weight: mi.Float,
+    angular: list[mi.Float],
+) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """Return the mean transmittance from the results of `AreaLight._sums`, and the bias of minus
+    its logarithm.
+
+    The bias is half the relative variance of the mean. The variance of a mean over n points of a
+    lattice is proportional to n^-2, so that the mean over one half of the points differs from that
+    over all by a square of three times the variance of the latter.
+    """
+    mean = dr.select(weight > 0, transmitted / weight, 1)
+    half = dr.select(odd_weight > 0, odd / odd_weight, mean)
+    return mean, dr.square(dr.select(mean > 0, (half - mean) / mean, 0)) / 6
 
 
 def moments_of(
