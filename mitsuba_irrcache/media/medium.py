@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.immutable import Immutable
-from mitsuba_irrcache.grids.boundary import Boundary
+from mitsuba_irrcache.grids.boundary import Boundary, safe_rcp
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
@@ -115,8 +115,11 @@ class MediumGrid(Immutable):
         """Whether the line of a ray intersects the medium, and its distances of entry and exit."""
         hit, near, far = self.boundary.intersect(ray)
         if self.bbox is not None:
-            _, box_near, box_far = self._clip.ray_intersect(ray)
-            near, far = dr.maximum(near, box_near), dr.minimum(far, box_far)
+            # Mitsuba's box accepts the rays of the first variant only that was used in the process.
+            rcp = safe_rcp(ray.d)
+            sides = (self._clip.min - ray.o) * rcp, (self._clip.max - ray.o) * rcp
+            near = dr.maximum(near, dr.max(dr.minimum(*sides)))
+            far = dr.minimum(far, dr.min(dr.maximum(*sides)))
         return hit & (near < far), near, far
 
 
