@@ -25,6 +25,7 @@ from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, spread
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
+from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.grids.root_field import ExtendedField
@@ -74,20 +75,10 @@ class AreaLight(DirectLight):
         self._shape = emitter.get_shape()
         self._area = dr.opaque(mi.Float, float(np.ravel(self._shape.surface_area())[0]))
         self._edges = classes.cut_cells if classes is not None else None
-        self._scene, self._found = scene, None
         samples = PEAK_SAMPLES if medium.phase.forward else PHASE_SAMPLES
         self._phase_samples = dr.opaque(mi.UInt32, samples)
-        arguments = scene, emitter, medium, grid, voxels, classes, order
         self._follows_closest_line = True
-        super().__init__(*arguments)
-        if not _is_inside(self._shape, medium):
-            by_line = self._depth_error()
-            self._follows_closest_line = False
-            super().__init__(*arguments)
-            if by_line < self._depth_error():
-                self._follows_closest_line = True
-                super().__init__(*arguments)
-        self._scene = self._found = None
+        super().__init__(scene, emitter, medium, grid, voxels, classes, order)
         self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
 
     # docs/primer, eq. (2.9)
@@ -125,7 +116,20 @@ class AreaLight(DirectLight):
         near, far = dr.maximum(near, 0), dr.minimum(far, distance)
         return dr.maximum(dr.select(hit, far - near, 0), 0)
 
-    def _depth_error(self) -> float:
+    def _extinction(
+        self, scene: mi.Scene, depth: mi.Float | mi.Color3f, classes: VoxelClasses | None
+    ) -> GridField:
+        """As for all direct light, with that `length` which has the smaller error."""
+        by_length = self.extinction = super()._extinction(scene, depth, classes)
+        if _is_inside(self._shape, self._medium):
+            return by_length
+        error = self._depth_error(scene)
+        self._follows_closest_line = False
+        by_depth = self.extinction = super()._extinction(scene, depth, classes)
+        self._follows_closest_line = error < self._depth_error(scene)
+        return by_length if self._follows_closest_line else by_depth
+
+    def _depth_error(self, scene: mi.Scene) -> float:
         """Estimate the relative error of the irradiance due to interpolated optical depths.
 
         It is evaluated at random positions in random voxels.
@@ -133,7 +137,7 @@ class AreaLight(DirectLight):
         p, stream = self._test_positions()
         others = Media.around(self._medium).without(self._medium)
         count = dr.opaque(mi.UInt32, MOST_SAMPLES)
-        transmitted, _, weight, *_ = self._sums(self._scene, others, p, count, stream)
+        transmitted, _, weight, *_ = self._sums(scene, others, p, count, stream)
         exact = dr.mean(transmitted) / dr.maximum(weight, 1e-20)
         scale = dr.select(self._medium.contains(p), self._solid_angle.at(p), 0)
         error = dr.abs(dr.mean(mi.Spectrum(dr.exp(-self.depth(p)))) - exact)
@@ -153,8 +157,6 @@ class AreaLight(DirectLight):
     def _attenuation(
         self, scene: mi.Scene, p: mi.Point3f
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
-        if self._found is not None:
-            return self._found
         voxels, count = self._voxels, self._sample_count(scene)
         rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
         others = Media.around(self._medium).without(self._medium)
@@ -169,7 +171,6 @@ class AreaLight(DirectLight):
         share = dr.select(seen > 0, 1 / dr.select(seen > 0, seen, 1), 0)
         self._angular_means = [share * total for total in angular]
         dr.eval(depth, passed, self._angular_means)
-        self._found = depth, passed
         return depth, passed
 
     def _sample_count(self, scene: mi.Scene) -> int:

@@ -69,11 +69,9 @@ class DirectLight:
         self.distant = self._kind is EmitterKind.SUN
         p = VoxelSamplePoints(scene, grid).of(voxels)
         self._grid, self._voxels, self._centres = grid, voxels, p
-        length, sigma_t = self.length(p), medium.sigma_t.at_world(p)
         depth, self._passed = self._attenuation(scene, p)
-        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
         #: mean extinction on the line to the emitter, for lookups
-        self.extinction = self._field_of_extinction(mean, survey)
+        self.extinction = self._extinction(scene, depth, survey)
         # transmittance of surfaces and other media at the voxels; None without any
         self._others = self._field_of_others(self._passed, survey) if medium.is_traced else None
         self._means: mi.Spectrum | None = None
@@ -152,10 +150,18 @@ class DirectLight:
             dr.eval(passed)
         return depth, passed
 
+    def _extinction(
+        self, scene: mi.Scene, depth: mi.Float | mi.Color3f, survey: VoxelClasses | None
+    ) -> GridField:
+        """Create the field of the mean extinction, given optical depths at the voxels."""
+        length, sigma_t = self.length(self._centres), self._medium.sigma_t.at_world(self._centres)
+        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
+        return self._field_of_extinction(mean, survey)
+
     def _field_of_extinction(
         self, mean: mi.Float | mi.Color3f, survey: VoxelClasses | None
     ) -> GridField:
-        """Create the field of the mean extinction."""
+        """Create a field from the mean extinction at the voxels."""
         return _on_grid(self._grid, self._voxels, mean, survey)
 
     def _field_of_others(self, passed: mi.Spectrum, survey: VoxelClasses | None) -> GridField:
@@ -295,6 +301,7 @@ class DirectLightAlongRays:
 
     def _gain(self, p: mi.Point3f, direction: mi.Vector3f, with_peak: bool) -> mi.Float:
         """Mean of `AngularBasis.gain` over the radiance from the emitter."""
+        # docs/primer, eq. (2.11)
         light, basis = self._light, self._basis
         if light.has_one_direction:
             return basis.gain(p, direction, light.towards(p), with_peak)

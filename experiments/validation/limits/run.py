@@ -1,7 +1,7 @@
 """Convergence of images to exact references as resolution and cache_spp grow and step decreases.
 
     python -m experiments.validation.limits.run [--only TEXT] [--solver sweep|path] [--budget 280]
-        [--force]
+        [--force] [--document FILE]
 
 Coarse grids of high contrast, every emitter and phase function, both solvers (see cases.py). For
 max_depth 2 the reference is a quadrature without noise; for others Monte Carlo with a standard
@@ -12,6 +12,8 @@ from caches of other seeds. A case *converges* if the last error, or the limit, 
 three standard errors.
 
 Rows are saved in output/limits/results.json; no case is started after ``--budget`` seconds.
+``--document`` writes the errors of ``sweep`` on the grids of 4^3 voxels into a marked table: the
+smaller one of the error at the finest resolution and the limit, with its standard error.
 """
 
 from __future__ import annotations
@@ -23,10 +25,12 @@ import mitsuba as mi
 import numpy as np
 
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
-from experiments.support.options import begin, parser_of
+from experiments.support.documents import replace_tables
+from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
-from experiments.validation.limits.cases import Case, cases
+from experiments.validation.limits.cases import EMITTERS, Case, cases
 from experiments.validation.limits.reference import orders, single
+from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import IrrcacheError, origin
 
 #: Resolutions with samples per voxel; the last two with several seeds. With few samples images of
@@ -128,9 +132,36 @@ def attempt(case: Case, solver: str, store: Store) -> dict:
         return {"refused": str(origin(problem))}
 
 
+#: Columns of the table in a document: phase function and max_depth.
+COLUMNS = (
+    ("isotropic", 2), ("hg 0.3", 2), ("hg 0.58", 2), ("hg -0.4", 2), ("rayleigh", 2),
+    ("isotropic", 3), ("isotropic", -1), ("hg 0.58", -1),
+)  # fmt: skip
+
+
+def matrix(rows: dict[str, dict]) -> Table:
+    """Return the errors of ``sweep`` by emitter, phase function and depth, in %."""
+    titles = [f"{phase}, {'all' if depth < 0 else depth}" for phase, depth in COLUMNS]
+    body = []
+    for emitter in EMITTERS:
+        cases = [Case(emitter, phase, max_depth=depth) for phase, depth in COLUMNS]
+        body.append([emitter, *(cell(rows.get(f"sweep: {case.name}")) for case in cases)])
+    return Table("", ["emitter", *titles], body)
+
+
+def cell(row: dict | None) -> str:
+    """Return the error of a case and its standard error, in %."""
+    if row is None or "refused" in row:
+        return "" if row is None else "refused"
+    found = summary(row)
+    least = min(found["fine"], found["limit"], key=abs)
+    return f"{100 * least:+.2f} ({100 * found['noise']:.2f})"
+
+
 def run() -> None:
     """Compute missing rows, and print the table."""
     parser = parser_of(__doc__)
+    add_document(parser)
     parser.add_argument("--only", default="", help="cases whose name contains this")
     parser.add_argument("--solver", choices=("sweep", "path"), help="one of the two")
     parser.add_argument("--budget", type=float, default=280, help="no case is begun later")
@@ -150,6 +181,8 @@ def run() -> None:
                 print(f"{name:55} not computed yet; run again", flush=True)
                 continue
             print(line(name, store.row(name, partial(attempt, case, solver, store))), flush=True)
+    if args.document:
+        replace_tables(args.document, {"limits": matrix(store.rows)})
 
 
 if __name__ == "__main__":
