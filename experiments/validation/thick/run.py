@@ -1,6 +1,7 @@
 """Errors at default settings for thick voxels, coarse data, or narrow spot lights.
 
     python -m experiments.validation.thick.run [--only TEXT] [--seconds S] [--force] [-o output]
+        [--document FILE]
 
 Every case of `cases` is rendered with ``irrcache`` at default settings and compared with two
 independent images of volpath, of ``--seconds`` of processor time together. The table shows the
@@ -10,7 +11,9 @@ processor time of a cold image. volpath offsets rays at surfaces by about 2e-4 h
 media with 300 mean free paths are too dark by 2 % under a sky, by 9 % in the sun; these rows are
 marked.
 
-Rows and references are saved in output/thick; ``--force`` discards the rows. No data are needed.
+Rows and references are saved in output/thick; ``--force`` discards the rows. ``--document`` writes
+the number of cases of each class, the median and the largest RMSE, and the largest block into a
+marked table, without the marked rows. No data are needed.
 """
 
 from __future__ import annotations
@@ -23,9 +26,11 @@ from time import process_time
 import mitsuba as mi
 import numpy as np
 
-from experiments.support.options import Options, begin, parser_of
+from experiments.support.documents import replace_tables
+from experiments.support.options import Options, add_document, begin, parser_of
 from experiments.support.store import Store
 from experiments.validation.thick.cases import CLASSES, scene
+from mitsuba_irrcache.compare.tables import Table
 
 PIXELS, BLOCK, SPP = 48, 4, 256
 #: Largest ratio of volpath's ray offset to a mean free path.
@@ -89,9 +94,31 @@ def line(name: str, row: dict) -> str:
     return f"{name:58} {mean}, {rmse}, {block}, {row['seconds']:.1f} s{mark}"
 
 
+def classes(rows: dict[str, dict]) -> Table:
+    """Return a table with one row for each class of cases."""
+    body = []
+    for kind in CLASSES:
+        own = {
+            key.removeprefix(f"{kind}: "): row
+            for key, row in rows.items()
+            if key.startswith(f"{kind}: ") and row["offset"] <= TRUSTED
+        }
+        if not own:
+            continue
+        largest = [max(own, key=lambda key, x=x: own[key][x]) for x in ("rmse", "block")]
+        worst = [
+            f"{own[key][x]:.1f} ({own[key][f'{x}_noise']:.1f}), {key}"
+            for key, x in zip(largest, ("rmse", "block"), strict=True)
+        ]
+        median = np.median([row["rmse"] for row in own.values()])
+        body.append([kind, str(len(own)), f"{median:.2f}", *worst])
+    return Table("", ["class", "cases", "median RMSE [%]", "largest RMSE", "largest block"], body)
+
+
 def run() -> None:
     """Compute missing rows and print the table."""
     parser = parser_of(__doc__)
+    add_document(parser)
     parser.add_argument("--only", default="", help="cases whose name contains this")
     parser.add_argument("--seconds", type=float, default=20.0, help="of volpath for each case")
     args = parser.parse_args()
@@ -105,6 +132,8 @@ def run() -> None:
                 file = options.folder("thick") / f"{re.sub('[^0-9a-z]+', '-', key)}.npy"
                 row = store.row(key, partial(measure, objects, depth, args.seconds, file))
                 print(line(key, row), flush=True)
+    if args.document:
+        replace_tables(args.document, {"thick": classes(store.rows)})
 
 
 if __name__ == "__main__":
