@@ -350,10 +350,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
                 "guaranteed.",
             )
             return spp
+        before = self.certificate
         builder, self._chosen_step, spp, self.certificate = found
         self._builder.adopt(builder)
-        level = mi.LogLevel.Info if self.certificate.is_met else mi.LogLevel.Warn
-        mi.Log(level, f"irrcache: {self.certificate}.")
+        if self.certificate is not before:
+            exceeded = self.certificate.parts and not self.certificate.is_met
+            level = mi.LogLevel.Warn if exceeded else mi.LogLevel.Info
+            mi.Log(level, f"irrcache: {self.certificate}.")
         return spp
 
     def prepare(self, scene: mi.Scene, sensor: int | mi.Sensor = 0) -> None:

@@ -76,7 +76,7 @@ class Certificate:
         tolerance: the error that was asked for.
         tolerance_of: "image", or "volume" if the unit is the mean radiance of the media alone.
         parts: estimated RMSE by "voxels", "directions", "steps" and "pixels"; parts that do not
-            exist for a scene are 0.
+            exist for a scene are 0. Empty if there is no estimate.
         settings: what was chosen: "resolution", "cache_spp", "step" and "spp".
         open_points: what the estimate does not include, or why the tolerance was not reached.
     """
@@ -89,17 +89,21 @@ class Certificate:
 
     @property
     def error(self) -> float:
-        """Return the estimated RMSE of the image in units of the mean radiance."""
+        """Return the estimated RMSE of the image in units of the mean radiance; NaN if unknown."""
+        if not self.parts:
+            return float("nan")
         return float(np.sqrt(sum(part**2 for part in self.parts.values())))
 
     @property
     def is_met(self) -> bool:
-        """Whether the estimated error is at most the tolerance."""
+        """Whether the estimated error is at most the tolerance; False without an estimate."""
         return self.error <= self.tolerance
 
     def __str__(self) -> str:
         parts = ", ".join(f"{name} {100 * value:.2g} %" for name, value in self.parts.items())
         settings = ", ".join(f"{name} {value:g}" for name, value in self.settings.items())
+        if not self.parts:
+            return "; ".join((*self.open_points, settings))
         text = (
             f"error {100 * self.error:.2g} % of the mean radiance of the {self.tolerance_of} "
             f"({parts}), tolerance {100 * self.tolerance:.2g} %: {settings}"

@@ -100,6 +100,7 @@ def test_scenes_without_a_cache_have_no_estimate(mono):
     mi.render(scene)
     certificate = scene.integrator().certificate
     assert certificate.parts == {}
+    assert not certificate.is_met and np.isnan(certificate.error)
     assert "nothing is scattered" in str(certificate)
 
 
