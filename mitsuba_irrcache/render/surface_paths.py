@@ -27,6 +27,7 @@ from mitsuba_irrcache.transport.path import (
     is_null,
     medium_after,
     power_heuristic,
+    sample_bsdf,
     visibility,
 )
 
@@ -178,7 +179,7 @@ class SurfacePaths:
         clear = mi.Bool(not from_node)
         end_number, end_factor = mi.UInt32(0), mi.Spectrum(0)
         depth, crossings = mi.UInt32(0), mi.UInt32(0)
-        context, active = mi.BSDFContext(), mi.Bool(active)
+        active = mi.Bool(active)
         while dr.hint(active, label="surface paths"):
             survival = dr.minimum(dr.max(throughput) * dr.square(eta), MAX_SURVIVAL)
             survival = dr.select(depth > self.rr_depth, survival, 1)
@@ -247,17 +248,15 @@ class SurfacePaths:
             vertex = vertex_at(si)
             choice = rng.next_float32(scatters)
             sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
-            bsdf_sample, f = bsdf.sample(context, si, choice, sample, scatters)
+            direction, f, scale, is_vertex, density = sample_bsdf(si, choice, sample, scatters)
             throughput = dr.select(scatters, throughput * f, throughput)
-            eta = dr.select(scatters, eta * bsdf_sample.eta, eta)
-            is_vertex = scatters & ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
-            delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
-            pdf = dr.select(is_vertex, dr.select(delta, 0, bsdf_sample.pdf), pdf)
+            eta = dr.select(scatters, eta * scale, eta)
+            pdf = dr.select(is_vertex, density, pdf)
             last = dr.select(is_vertex, vertex, last)
             first &= ~is_vertex
             interacted |= is_vertex
             depth = dr.select(is_vertex, depth + 1, depth)
-            direction = dr.select(scatters, si.to_world(bsdf_sample.wo), ray.d)
+            direction = dr.select(scatters, direction, ray.d)
             pointer = dr.select(crosses | scatters, medium_after(si, direction, pointer), pointer)
             ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
             crossings += 1
@@ -362,7 +361,6 @@ class SurfacePaths:
         found, nearest, travelled = mi.Bool(False), mi.Float(dr.inf), mi.Float(0)
         nearest_surface = mi.Float(dr.inf)
         bounces, crossings, active = mi.UInt32(0), mi.UInt32(0), mi.Bool(active)
-        context = mi.BSDFContext()
         while dr.hint(active, label="towards a diffuse surface"):
             for projection in self.projections:
                 inside = active & (bounces == 0) & (pointer == projection.medium.pointer)
@@ -386,9 +384,9 @@ class SurfacePaths:
             scatters = surface & ~diffuse
             choice = rng.next_float32(scatters)
             sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
-            bsdf_sample, f = si.bsdf().sample(context, si, choice, sample, scatters)
+            direction, f, *_ = sample_bsdf(si, choice, sample, scatters)
             scatters &= dr.max(f) > 0
-            direction = dr.select(scatters, si.to_world(bsdf_sample.wo), ray.d)
+            direction = dr.select(scatters, direction, ray.d)
             pointer = dr.select(crosses | scatters, medium_after(si, direction, pointer), pointer)
             ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
             bounces = dr.select(scatters, bounces + 1, bounces)

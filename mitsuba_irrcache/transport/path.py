@@ -395,12 +395,10 @@ def trace(
         # Sample the BSDF or the phase function and continue the path.
         choice = rng.next_float32(active)
         sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
-        bsdf_sample, value = bsdf.sample(context, si, choice, sample, scatters)
+        towards, value, scale, is_vertex, density = sample_bsdf(si, choice, sample, scatters)
         throughput = dr.select(scatters, throughput * value, throughput)
-        eta = dr.select(scatters, eta * bsdf_sample.eta, eta)
-        is_vertex = scatters & ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
-        delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
-        pdf = dr.select(is_vertex, dr.select(delta, 0, bsdf_sample.pdf), pdf)
+        eta = dr.select(scatters, eta * scale, eta)
+        pdf = dr.select(is_vertex, density, pdf)
         pdf = dr.select(collided, dr.inv_four_pi, pdf)
         direction = mi.warp.square_to_uniform_sphere(sample)
         if dr.hint(not media.isotropic, mode="scalar"):
@@ -409,7 +407,7 @@ def trace(
             )
             throughput = dr.select(collided, throughput * value, throughput)
             pdf = dr.select(collided, density, pdf)
-        next_direction = dr.select(skipped, ray.d, si.to_world(bsdf_sample.wo))
+        next_direction = dr.select(skipped, ray.d, towards)
         next_ray = si.spawn_ray(next_direction)
         pointer = dr.select(scatters, medium_after(si, next_direction, pointer), pointer)
         ray.o = dr.select(collided, vertex.p, next_ray.o)
@@ -422,6 +420,22 @@ def trace(
         active &= (collided | surface) & (depth < max_depth) & (crossings < MOST_CROSSINGS)
     end = PathEnd(end_position, end_direction, end_medium, end_throughput)
     return direct, scattered, interacted, end, rng
+
+
+def sample_bsdf(
+    si: mi.SurfaceInteraction3f, choice: mi.Float, sample: mi.Point2f, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool, mi.Float]:
+    """Sample a direction from the BSDF at ``si``.
+
+    Returns the direction in the world, the BSDF over its density, the factor of the relative
+    refractive index, whether the path has a vertex here (not where it passes a null interface), and
+    the density [1/sr], 0 for mirrors and smooth refraction.
+    """
+    found, value = si.bsdf().sample(mi.BSDFContext(), si, choice, sample, active)
+    is_vertex = active & ~mi.has_flag(found.sampled_type, mi.BSDFFlags.Null)
+    delta = mi.has_flag(found.sampled_type, mi.BSDFFlags.Delta)
+    density = dr.select(delta, 0, found.pdf)
+    return si.to_world(found.wo), value, found.eta, is_vertex, density
 
 
 def _phase_value(
