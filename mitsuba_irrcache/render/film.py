@@ -28,8 +28,8 @@ LANES = 1 << 22
 OUTLIER, MOST_FURTHER, FURTHER_SHARE = 4.0, 64, 0.5
 #: Fewest samples of a pixel from which its variance is estimated.
 FEWEST_SAMPLES = 4
-#: Decorrelates new samples from others.
-REFINEMENT = 0x9E3779B9
+#: Decorrelates new samples from others, and from those of other passes.
+REFINEMENT, PASS = 0x9E3779B9, 0x85EBCA6B
 #: The sampler stores the number of samples per pixel in 32 bits.
 SPP_LIMIT = 1 << 32
 
@@ -89,7 +89,8 @@ def render_film(
         spread.first = dr.opaque(mi.UInt32, done)
         samples = _sampled(sensor, sampler, spread, frame, spp, radiance)
         if refine and per_pass >= FEWEST_SAMPLES:
-            samples = _refined(sensor, sampler, seed, per_pass, radiance, *samples)
+            stream = REFINEMENT ^ (done * PASS & 0xFFFFFFFF)
+            samples = _refined(sensor, sampler, seed, stream, per_pass, radiance, *samples)
         found = reconstructed(film, border, per_pass, *samples)
         sums = found if sums is None else [a + b for a, b in zip(sums, found, strict=True)]
         if per_pass < spp:
@@ -335,6 +336,7 @@ def _refined(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
     seed: int,
+    stream: int,
     per_pass: int,
     radiance: RadianceFunction,
     position: mi.Point2f,
@@ -343,7 +345,8 @@ def _refined(
     """Replace the samples of those few pixels whose standard deviation is far above the mean of
     all, such as those at the edge of a lamp, by means of new samples around them.
 
-    The new samples do not depend on those by which pixels are chosen, so there is no bias.
+    The new samples do not depend on those by which pixels are chosen, so there is no bias. The
+    ``stream`` differs between the passes of an image, whose samples are independent.
     """
     count = dr.width(position)
     everywhere = dr.zeros(mi.Float, count)
@@ -363,16 +366,16 @@ def _refined(
     lane, k = Divisor(further).split(dr.arange(mi.UInt32, pixels * per_pass * further))
     pixel, sample = Divisor(per_pass).split(lane)
     source = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
-    words = mi.sample_tea_32(source, dr.opaque(mi.UInt32, REFINEMENT))
+    words = mi.sample_tea_32(source, dr.opaque(mi.UInt32, stream))
     within = dr.gather(mi.Point2f, mi.Point2f(position), source)
     corner = dr.floor(within)
     step = mi.Point2f(kronecker(k, 2, unit_floats(words))) - 0.5
     within += step * dr.rsqrt(float(per_pass)) - corner
     within -= dr.floor(within)
-    shift = unit_floats(mi.sample_tea_32(source - sample, dr.opaque(mi.UInt32, REFINEMENT)))
+    shift = unit_floats(mi.sample_tea_32(source - sample, dr.opaque(mi.UInt32, stream)))
     on_emitter = mi.Point2f(kronecker(sample * each + k, 2, shift))
     own = sampler.clone()
-    own.seed(seed ^ REFINEMENT, pixels * per_pass * further)
+    own.seed(seed ^ stream, pixels * per_pass * further)
     spp = mi.Float(each * per_pass)
     found = _values(sensor, own, corner + within, lambda: on_emitter, spp, radiance)
     place = dr.arange(mi.UInt32, pixels * per_pass)

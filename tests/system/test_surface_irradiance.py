@@ -286,3 +286,21 @@ def test_edges_of_lamps_get_more_samples(scenes, kernels, monkeypatch):
     assert noise < 0.7 * plain_noise
     many = scenes.image(scene, spp=1024)[..., 0].mean()
     assert abs(refined.mean() - many) < 4 * plain_noise / np.sqrt(12 * SIZE**2)
+
+
+def test_passes_of_an_image_have_independent_new_samples(scenes, monkeypatch):
+    objects = {
+        "smoke": bound(interior=fog((0.3, 0.3, 0.3)), scale=(0.6, 0.6, 0.6)),
+        "lamp": lamp((0.8, 0.6, 0.5), (0, 0, -3), 0.3, (50, 40, 30)),
+        "floor": ground(), "emitter": {"type": "constant", "radiance": 0.2},
+    }  # fmt: skip
+    scene, streams, refined = scene_of(scenes, objects), [], film._refined
+
+    def recorded(*args):
+        streams.append(args[3])
+        return refined(*args)
+
+    monkeypatch.setattr(film, "_refined", recorded)
+    monkeypatch.setattr(film, "LANES", 8 * SIZE**2)
+    scenes.image(scene, spp=32)
+    assert len(streams) == len(set(streams)) == 4
