@@ -194,13 +194,15 @@ def test_scenes_that_share_a_cache_file(make, tmp_path, solver):
 def test_a_failure_in_one_thread_leaves_the_others_their_cache(make):
     scene = make()
     expected = image(make())
+    # Loaded beforehand: Dr.Jit traces the methods of all shapes that exist, also of those which
+    # another thread is just creating.
+    wrong = [make(emission=-1.0) for _ in range(2)]
 
-    def fail() -> None:
-        raise_it = make(emission=-1.0)
+    def fail(number: int) -> None:
         with pytest.raises(RuntimeError):
-            image(raise_it)
+            image(wrong[number])
 
-    found = together(fail, lambda: image(scene), fail)[1]
+    found = together(lambda: fail(0), lambda: image(scene), lambda: fail(1))[1]
     np.testing.assert_array_equal(found, expected)
 
 
