@@ -135,7 +135,7 @@ def attempt(case: Case, solver: str, store: Store) -> dict:
 #: Columns of the table in a document: phase function and max_depth.
 COLUMNS = (
     ("isotropic", 2), ("hg 0.3", 2), ("hg 0.58", 2), ("hg -0.4", 2), ("rayleigh", 2),
-    ("isotropic", 3), ("isotropic", -1), ("hg 0.58", -1),
+    ("isotropic", 3), ("isotropic", -1),
 )  # fmt: skip
 
 
