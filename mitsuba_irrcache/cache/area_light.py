@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
+from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_direct_light
 from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, spread
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
@@ -47,7 +47,7 @@ PHASE_SAMPLES, PEAK_SAMPLES = 4, 16
 SMALL_ANGLE = 1e-6
 #: Number of positions at which the error of interpolated optical depths is measured.
 TESTS = 2048
-#: Number of positions on an emitter from which its distance to the voxels is measured.
+#: Number of positions on an emitter at which it is tested whether it lies in the medium.
 POSITIONS = 64
 #: Maximum number of emitters treated in this way, and of their values at all voxels: about 14 and
 #: the moments for each. The irradiance of further emitters is interpolated.
@@ -65,11 +65,8 @@ class AreaLight(DirectLight):
         grid: Grid,
         voxels: mi.UInt32,
         classes: VoxelClasses | None = None,
-        order: int = 0,
     ) -> None:
-        """Compute the factors; ``classes`` is None if no surface is among the voxels, ``order`` as
-        for `DirectLight`.
-        """
+        """Compute the factors; ``classes`` is None if no surface is among the voxels."""
         self._solid_angle, self._radiance = SolidAngle.of(emitter), _radiance(emitter)
         # An emitter does not keep its shape alive, which Mitsuba accesses as long as it exists.
         self._shape = emitter.get_shape()
@@ -78,7 +75,7 @@ class AreaLight(DirectLight):
         samples = PEAK_SAMPLES if medium.phase.forward else PHASE_SAMPLES
         self._phase_samples = dr.opaque(mi.UInt32, samples)
         self._follows_closest_line = True
-        super().__init__(scene, emitter, medium, grid, voxels, classes, order)
+        super().__init__(scene, emitter, medium, grid, voxels, classes)
         self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
 
     # docs/primer, eq. (2.9)
@@ -135,9 +132,8 @@ class AreaLight(DirectLight):
         It is evaluated at random positions in random voxels.
         """
         p, stream = self._test_positions()
-        others = Media.around(self._medium).without(self._medium)
         count = dr.opaque(mi.UInt32, MOST_SAMPLES)
-        transmitted, _, weight, *_ = self._sums(scene, others, p, count, stream)
+        transmitted, _, weight, *_ = self._sums(scene, p, count, stream)
         exact = dr.mean(transmitted) / dr.maximum(weight, 1e-20)
         scale = dr.select(self._medium.contains(p), self._solid_angle.at(p), 0)
         error = dr.abs(dr.mean(mi.Spectrum(dr.exp(-self.depth(p)))) - exact)
@@ -159,9 +155,7 @@ class AreaLight(DirectLight):
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
         voxels, count = self._voxels, self._sample_count(scene)
         rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
-        others = Media.around(self._medium).without(self._medium)
-        count = dr.opaque(mi.UInt32, count)
-        sums = self._sums(scene, others, p, count, rng, self.order)
+        sums = self._sums(scene, p, dr.opaque(mi.UInt32, count), rng, self.order)
         transmitted, visible, _, _, _, angular = sums
         passed = dr.select(transmitted > 0, visible / transmitted, 0)
         mean, bias = _mean_and_bias(*sums)
@@ -179,9 +173,8 @@ class AreaLight(DirectLight):
         """
         permitted = np.clip(SAMPLES // dr.width(self._voxels), FEWEST_SAMPLES, MOST_SAMPLES)
         p, stream = self._test_positions()
-        others = Media.around(self._medium).without(self._medium)
         count = dr.opaque(mi.UInt32, FEWEST_SAMPLES)
-        mean, bias = _mean_and_bias(*self._sums(scene, others, p, count, stream))
+        mean, bias = _mean_and_bias(*self._sums(scene, p, count, stream))
         weight = self._solid_angle.at(p) * mean
         weight = dr.select(self._medium.contains(p), dr.mean(weight), 0)
         total, relative = dr.sum(weight), dr.sum(weight * dr.mean(bias))
@@ -234,7 +227,9 @@ class AreaLight(DirectLight):
         return dr.select(sum_of_weights > 0, total / sum_of_weights, 0)
 
     @symbolic
-    def _sums(self, scene: mi.Scene, others: Media, p: mi.Point3f, count: mi.UInt32, rng, order=0):
+    def _sums(
+        self, scene: mi.Scene, p: mi.Point3f, count: mi.UInt32, rng: mi.PCG32, order: int = 0
+    ):
         """Sum over ``count`` points of the emitter: the solid angle for which each stands, times
         the transmittance of the medium, also times the visibility past others, and alone; the
         first and the last of these over every other point; and the second, averaged over the
@@ -246,6 +241,7 @@ class AreaLight(DirectLight):
         transmitted, visible, total = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
         odd, odd_total = mi.Spectrum(0), mi.Float(0)
         angular = [mi.Float(0) for _ in range(order * (order + 2))]
+        others = Media.around(self._medium).without(self._medium)
         pair, k = 1 if self._solid_angle.density > 0 else 0, mi.UInt32(0)
         while dr.hint(k < count, label="points on an emitter"):
             target, direction, distance, weight = self._sample(vertex, k, shift)
@@ -324,12 +320,8 @@ def area_lights_of(
     grid: Grid,
     voxels: mi.UInt32,
     classes: VoxelClasses | None = None,
-    order: int = 0,
 ) -> list[AreaLight]:
-    """Return the direct light of the area emitters of simple shapes.
-
-    ``order`` as for `DirectLight`.
-    """
+    """Return the direct light of the area emitters of simple shapes."""
     if medium.is_isolated or not dr.width(voxels):
         return []
     lights = [
@@ -338,9 +330,10 @@ def area_lights_of(
         if SolidAngle.of(emitter) is not None
     ]
     lights.sort(key=_power, reverse=True)
+    order = order_of_direct_light(medium.phase)
     values = (VALUES + order * (order + 2)) * dr.width(voxels)
     count = min(MOST_LIGHTS, MOST_VALUES // values)
-    return [AreaLight(scene, e, medium, grid, voxels, classes, order) for e in lights[:count]]
+    return [AreaLight(scene, e, medium, grid, voxels, classes) for e in lights[:count]]
 
 
 def _mean_and_bias(
@@ -391,14 +384,9 @@ def _with_harmonics(
 
 def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:
     """Whether any of `POSITIONS` points of a shape lies in the medium."""
-    return bool(dr.any(medium.contains(_positions(shape))))
-
-
-def _positions(shape: mi.Shape) -> mi.Point3f:
-    """Sample points of a shape."""
     rng = np.random.default_rng(POSITIONS)
     sample = mi.Point2f(np.float32(rng.random((2, POSITIONS))))
-    return shape.sample_position(0.0, sample).p
+    return bool(dr.any(medium.contains(shape.sample_position(0.0, sample).p)))
 
 
 def _radiance(emitter: mi.Emitter) -> mi.Spectrum:

@@ -19,7 +19,7 @@ from itertools import pairwise
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
+from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_direct_light
 from mitsuba_irrcache.cache.conservative import unbiased
 from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
 from mitsuba_irrcache.core.jit import symbolic
@@ -58,13 +58,11 @@ class DirectLight:
         grid: Grid,
         voxels: mi.UInt32,
         survey: VoxelClasses | None = None,
-        order: int = 0,
     ) -> None:
-        """Compute mean extinctions and irradiance; ``survey`` is None without surfaces.
-
-        ``order`` is that of `angular_means`.
-        """
-        self._kind, self.order = kind_of(emitter), order
+        """Compute mean extinctions and irradiance; ``survey`` is None without surfaces."""
+        #: order of `angular_means`
+        self.order = order_of_direct_light(medium.phase)
+        self._kind = kind_of(emitter)
         self.emitter, self._medium = emitter, medium
         self.distant = self._kind is EmitterKind.SUN
         p = VoxelSamplePoints(scene, grid).of(voxels)
@@ -104,9 +102,7 @@ class DirectLight:
 
     def unobstructed(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
         """Evaluate the unobstructed irradiance E at world positions."""
-        at = dr.zeros(mi.Interaction3f, dr.width(p))
-        at.p = p
-        _, light = self.emitter.sample_direction(at, mi.Point2f(0.5), active)
+        _, light = self._sample_emitter(p, active)
         return dr.select(active, light, 0)
 
     def depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
@@ -127,9 +123,17 @@ class DirectLight:
 
     def towards(self, p: mi.Point3f) -> mi.Vector3f:
         """Return the direction from world positions to an emitter without extent."""
+        return self._sample_emitter(p)[0].d
+
+    def _sample_emitter(
+        self, p: mi.Point3f, active: mi.Bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """Return the direction from world positions to an emitter without extent, and its
+        unobstructed irradiance.
+        """
         at = dr.zeros(mi.Interaction3f, dr.width(p))
         at.p = p
-        return self.emitter.sample_direction(at, mi.Point2f(0.5))[0].d
+        return self.emitter.sample_direction(at, mi.Point2f(0.5), active)
 
     def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
         """Return the transmittance of surfaces and other media on that line."""
@@ -172,9 +176,7 @@ class DirectLight:
         """Return rays from world positions to the emitter, and the distances at which they enter
         and leave the medium; they do not intersect it unless the first one is smaller.
         """
-        at = dr.zeros(mi.Interaction3f, dr.width(p))
-        at.p = p
-        record, _ = self.emitter.sample_direction(at, mi.Point2f(0.5))
+        record, _ = self._sample_emitter(p)
         ray = mi.Ray3f(p, record.d)
         hit, near, far = self._medium.intersect(ray)
         near, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
@@ -225,20 +227,17 @@ def direct_lights_of(
     voxels: mi.UInt32,
     dense: bool,
     survey: VoxelClasses | None = None,
-    order: int = 0,
 ) -> list[DirectLight]:
     """Return the direct light of all spot lights of a scene.
 
-    Includes points and suns if the voxels are ``dense`` and there are no surfaces. ``order`` as for
-    `DirectLight`.
+    Includes points and suns if the voxels are ``dense`` and there are no surfaces.
     """
     if not dr.width(voxels):
         return []
     emitters = spot_lights(scene)
     if dense and medium.is_isolated:
         emitters = EmittersByKind(scene.emitters()).of(EmitterKind.SUN, *POINT_LIKE)
-    rest = medium, grid, voxels, survey, order
-    return [DirectLight(scene, emitter, *rest) for emitter in emitters]
+    return [DirectLight(scene, emitter, medium, grid, voxels, survey) for emitter in emitters]
 
 
 def _on_grid(

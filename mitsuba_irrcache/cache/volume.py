@@ -164,7 +164,7 @@ class IrradianceCache:
     @_consistent
     def irradiance(self) -> mi.TensorXf:
         """Phi, both layers, (z, y, x, channel)."""
-        return self._tensor([a + b for a, b in zip(self._means(0), self._means(1), strict=True)])
+        return self._tensor(self._both_layers())
 
     @property
     @_consistent
@@ -197,7 +197,7 @@ class IrradianceCache:
         Channels share their samples, so their errors add. The error is 0 with fewer than two
         batches.
         """
-        means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        means = self._both_layers()
         variances = [self._variance(c) for c in range(self.channels)]
         errors = [mi.Float(0 if v is None else dr.sqrt(v)) for v in variances]
         return sum(means) / self.channels, sum(errors) / self.channels
@@ -240,8 +240,7 @@ class IrradianceCache:
         It excludes `direct_lights` and is divided by the `falloff`, if any. It has one channel if
         all channels are identical. Its ``maximum`` is an upper bound of Phi.
         """
-        totals = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
-        brightest = [dr.max(m)[0] for m in totals] if self.direct_lights else []
+        brightest = [dr.max(m)[0] for m in self._both_layers()] if self.direct_lights else []
         brightest += [light.maximum for light in self.direct_lights]
         means = self._interpolated_means()
         known, roots = marked(self.grid, self.active), [dr.sqrt(m) for m in means]
@@ -288,7 +287,7 @@ class IrradianceCache:
 
     def _interpolated_means(self) -> list[mi.Float]:
         """Phi of the active voxels in each channel, without `direct_lights`."""
-        means = [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
+        means = self._both_layers()
         for light in self.direct_lights:
             means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]
         return means
@@ -301,6 +300,10 @@ class IrradianceCache:
         # Do not divide squares: they underflow for values below 1e-19.
         error = mi.Float(dr.sqrt(variance)) / dr.select(mean > 0, mean, 1)
         return dr.minimum(dr.square(error), 1)
+
+    def _both_layers(self) -> list[mi.Float]:
+        """Phi of the active voxels in each channel."""
+        return [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
 
     def _means(self, layer: int) -> list[mi.Float]:
         n, first = self._batch_count, layer * self.channels

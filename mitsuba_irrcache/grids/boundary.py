@@ -76,11 +76,17 @@ class Boundary:
 
 def _intersect_box(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
     """Intersect the cube [-1, 1]^3 by the slab method, also for rays that lie in a face."""
-    rcp = safe_rcp(d)
-    lower, upper = (-1.0 - o) * rcp, (1.0 - o) * rcp
-    near = dr.max(dr.minimum(lower, upper))
-    far = dr.min(dr.maximum(lower, upper))
+    near, far = intersect_slabs(-1.0, 1.0, o, d)
     return near < far, near, far
+
+
+def intersect_slabs(
+    lower: mi.Point3f | float, upper: mi.Point3f | float, o: mi.Point3f, d: mi.Vector3f
+) -> tuple[mi.Float, mi.Float]:
+    """Return the distances at which lines enter and leave the box from ``lower`` to ``upper``."""
+    rcp = safe_rcp(d)
+    sides = (lower - o) * rcp, (upper - o) * rcp
+    return dr.max(dr.minimum(*sides)), dr.min(dr.maximum(*sides))
 
 
 def _intersect_sphere(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.immutable import Immutable
-from mitsuba_irrcache.grids.boundary import Boundary, safe_rcp
+from mitsuba_irrcache.grids.boundary import Boundary, intersect_slabs
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
@@ -116,10 +116,8 @@ class MediumGrid(Immutable):
         hit, near, far = self.boundary.intersect(ray)
         if self.bbox is not None:
             # Mitsuba's box accepts the rays of the first variant only that was used in the process.
-            rcp = safe_rcp(ray.d)
-            sides = (self._clip.min - ray.o) * rcp, (self._clip.max - ray.o) * rcp
-            near = dr.maximum(near, dr.max(dr.minimum(*sides)))
-            far = dr.minimum(far, dr.min(dr.maximum(*sides)))
+            first, last = intersect_slabs(self._clip.min, self._clip.max, ray.o, ray.d)
+            near, far = dr.maximum(near, first), dr.minimum(far, last)
         return hit & (near < far), near, far
 
 

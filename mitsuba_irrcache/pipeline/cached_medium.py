@@ -181,8 +181,8 @@ class CachedMedium:
             grid = grid.shared(medium.sigma_t.grid, medium.albedo.grid)
         else:
             grid, size_reason = choose_grid(medium, settings.resolution, solver.size_rule)
-        basis, order = _angular_basis(scene, medium), order_of_direct_light(medium.phase)
-        self._check_memory(grid, basis.count if basis is not None else 0, (order + 1) ** 2)
+        basis = _angular_basis(scene, medium)
+        self._check_memory(grid, basis.count if basis is not None else 0)
         warn_of_dense_border(medium, grid)
         active = active_voxels(medium, grid)
         classes = solver.voxel_classes(scene, media, medium, grid, active)
@@ -203,11 +203,12 @@ class CachedMedium:
         direct_lights = []
         if solver.knows_direct_lights(scene, medium, grid, active):
             dense = border_error(medium, grid) > SMALL_BORDER_ERROR
-            direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes, order)
-            direct_lights += area_lights_of(scene, medium, grid, active, classes, order)
+            direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes)
+            direct_lights += area_lights_of(scene, medium, grid, active, classes)
         known = [light.emitter for light in direct_lights]
         falloff = InverseSquareFactor.of(scene, grid, known)
-        basis = _angular_basis(scene, medium, known)
+        if known:
+            basis = _angular_basis(scene, medium, known)
         moments = basis.count if basis is not None else 0
         interpolation = Interpolation(basis, falloff, direct_lights, classes)
 
@@ -240,11 +241,10 @@ class CachedMedium:
         """Whether the scene has any emitter or emissive medium."""
         return bool(self.description.emitters) or self.medium.emission is not None
 
-    def _check_memory(self, grid: Grid, moments: int, direct_moments: int) -> None:
+    def _check_memory(self, grid: Grid, moments: int) -> None:
         """Refuse a cache that exceeds the available memory while it is filled or looked up.
 
-        The field of its errors needs as much again (experiments/paper/memory). ``direct_moments``
-        are those of the radiance directly from area emitters.
+        The field of its errors needs as much again (experiments/paper/memory).
         """
         channels, max_depth = 1 if mi.is_monochromatic else 3, self.settings.max_depth
         numbers = self.solver.numbers_per_voxel(
@@ -252,7 +252,9 @@ class CachedMedium:
         )
         needed = 4 * grid.voxel_count * (numbers + 8) * (2 if self.settings.with_error else 1)
         if moments and not self.medium.is_isolated:
-            needed += 4 * grid.voxel_count * 2 * direct_moments
+            # Moments of the radiance directly from area emitters, in single precision.
+            order = order_of_direct_light(self.medium.phase)
+            needed += 4 * grid.voxel_count * 2 * (order + 1) ** 2
         what = f"irrcache: a cache of {' x '.join(map(str, grid.shape[::-1]))} voxels"
         require_memory(needed, what, "lower resolution")
         if grid.voxel_count >= 2**32:

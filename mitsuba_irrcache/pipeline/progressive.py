@@ -195,13 +195,8 @@ class _Run:
                 self.goal, self.stage.samples = self.builder.target, first
 
     def refine(self, samples: int, checkpoint: Callable[[], None]) -> None:
-        """A pass of so many samples per voxel."""
-        done = self._samples
-        # A larger pass than the first two batches lack would have a kernel size of its own.
-        self._update(
-            done + samples if done >= self._opening else min(done + samples, self._opening),
-            checkpoint,
-        )
+        """A pass until the cache has so many ``samples`` per voxel."""
+        self._update(samples, checkpoint)
 
     def frame(self, image: Callable[[], tuple[mi.TensorXf, float]]) -> Frame:
         """An image of the cache as it is."""
@@ -210,21 +205,29 @@ class _Run:
             tensor, filtering = image()
             dr.sync_thread()
             # Another thread may refine the cache once the lock is released.
-            samples, self._is_last = self._samples, self._is_fulfilled
+            samples = self._samples
+            self._is_last = self._is_fulfilled_by(samples)
         self.schedule.note_image(perf_counter() - started, filtering)
         return Frame(tensor, samples, self.error, dict(self.schedule.seconds))
 
     def next_pass(self) -> int:
-        """Samples per voxel of the next pass; 0 when it is time for an image."""
-        if self._is_fulfilled:
+        """Samples per voxel after the next pass; 0 when it is time for an image."""
+        # Another thread may refine the cache between two reads, and a pass on top of its samples
+        # would exceed the target.
+        done = self._samples
+        if self._is_fulfilled_by(done):
             return 0
-        needed = self.goal - self._samples
+        needed = self.goal - done
         if self.targets.standard_error and math.isnan(self.error):
             needed = min(needed, 1)
         elif self.targets.standard_error:
             ratio = self.error / self.targets.standard_error
-            needed = min(needed, self._samples * (ratio**2 - 1))
-        return self.schedule.next_pass(self._samples, needed)
+            needed = min(needed, done * (ratio**2 - 1))
+        samples = self.schedule.next_pass(done, needed)
+        if samples == 0:
+            return 0
+        # A larger pass than the first two batches lack would have a kernel size of its own.
+        return done + samples if done >= self._opening else min(done + samples, self._opening)
 
     @property
     def is_over(self) -> bool:
@@ -235,12 +238,11 @@ class _Run:
     def _samples(self) -> int:
         return self.builder.done
 
-    @property
-    def _is_fulfilled(self) -> bool:
-        """Whether the cache fulfils the targets."""
+    def _is_fulfilled_by(self, samples: int) -> bool:
+        """Whether a cache with so many samples per voxel fulfils the targets."""
         wanted = self.targets.standard_error
         exact = wanted > 0 and self.error <= wanted
-        return exact or self._samples >= self.goal or self.builder.is_dark
+        return exact or samples >= self.goal or self.builder.is_dark
 
     def _update(self, samples: int, checkpoint: Callable[[], None]) -> None:
         with self.builder.lock:

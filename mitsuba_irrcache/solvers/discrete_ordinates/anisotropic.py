@@ -43,7 +43,6 @@ class AnisotropicSweep(Sweep):
         # Point-like lights, in the order of `DistantIllumination.point_lights`, except known ones.
         points = [s for s in self._sources if s.sharp and not s.far]
         self._point_directions = [s.seen_from(self._sample_points)[0] for s in points]
-        self._known = {id(light.irradiance): light for light in cache.direct_lights}
 
     def _new_level(self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks) -> MultigridLevel:
         all_axes = not self._medium.is_isolated
@@ -64,7 +63,7 @@ class AnisotropicSweep(Sweep):
         # point-like lights; moments of other sources.
         known, unknown = [], []
         for found in (*self._direct, *self._emission):
-            (known if id(found[0]) in self._known else unknown).append(
+            (known if id(found[0]) in self._known_lights else unknown).append(
                 [m[channels[0]] for m in found]
             )
         points = unknown[: len(self._point_directions)]
@@ -107,7 +106,7 @@ class AnisotropicSweep(Sweep):
         count, found = self._moments.count, []
         directions = iter(self._point_directions)
         for irradiance, *more in self._direct:
-            light = self._known.get(id(irradiance))
+            light = self._known_lights.get(id(irradiance))
             if light is not None:
                 value = light.means[channel]
                 higher = (value * mean for mean in light.angular_means()[: count - 1])

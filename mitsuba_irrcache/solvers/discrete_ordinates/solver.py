@@ -114,6 +114,8 @@ class Sweep:
         if cache.falloff is not None and cache.max_depth != 2:
             self._inverse_square_mean = cache.falloff.spread(cache.active)
             dr.eval(self._inverse_square_mean)
+        #: direct lights of the cache by the identity of their irradiance
+        self._known_lights = {id(light.irradiance): light for light in cache.direct_lights}
         #: sampled voxel by voxel in a batch, from each point-like light and from area emitters, and
         #: from the emission: irradiance, then moments, if they do not follow from the direction
         self._direct: list[list[mi.Spectrum]] = []
@@ -434,7 +436,7 @@ class Sweep:
         """Irradiance at the active voxels from emitters which are sampled voxel by voxel, the mean
         over each voxel.
         """
-        known = {id(d.irradiance): d for d in self.cache.direct_lights}
+        known = self._known_lights
         direct = [
             known[id(irradiance)].means[channel]
             if id(irradiance) in known
