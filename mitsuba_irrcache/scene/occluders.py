@@ -13,7 +13,7 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.consistency import described
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, is_solid
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, is_solid, transmits
 
 #: Offsets of the rays along each axis that detect surfaces: through the corners and the centre of
 #: each voxel's face.
@@ -46,9 +46,7 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
 
 
 def _is_solid(shape: mi.Shape) -> bool:
-    bsdf = shape.bsdf()
-    null = is_null(int(bsdf.flags()) if bsdf is not None else 0)
-    return not null or shape.is_emitter() or shape.is_sensor()
+    return not is_null(_flags(shape)) or shape.is_emitter() or shape.is_sensor()
 
 
 def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
@@ -185,3 +183,20 @@ def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str 
         if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
             return described(shape)
     return None
+
+
+def refracting_boundary(scene: mi.Scene, medium: MediumGrid) -> str | None:
+    """Return the name of a shape that ``medium`` fills and through whose surface radiance passes
+    other than straight; None without any.
+    """
+    for shape in scene.shapes():
+        inner, flags = shape.interior_medium(), _flags(shape)
+        if inner is None or inner == shape.exterior_medium() or is_null(flags):
+            continue
+        if transmits(flags) and dr.all(mi.MediumPtr(inner) == medium.pointer):
+            return described(shape)
+    return None
+
+
+def _flags(shape: mi.Shape) -> int:
+    return int(shape.bsdf().flags()) if shape.bsdf() is not None else 0

@@ -130,6 +130,11 @@ def is_null(flags: mi.UInt32) -> mi.Bool:
     return (flags & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
 
 
+def transmits(flags: mi.UInt32) -> mi.Bool:
+    """Whether a BSDF with these flags lets radiance through, refracted, scattered or straight."""
+    return (flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)) != 0
+
+
 def is_solid(si: mi.SurfaceInteraction3f) -> mi.Bool:
     """Whether a surface is more than the boundary of a medium: it scatters or emits."""
     return ~is_null(si.bsdf().flags()) | (si.shape.emitter() != None)  # noqa: E711

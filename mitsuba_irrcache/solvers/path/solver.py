@@ -26,7 +26,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.occluders import hole_in
+from mitsuba_irrcache.scene.occluders import hole_in, refracting_boundary
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.grid_size import SizeAmongSurfaces, SizeRule
@@ -106,6 +106,8 @@ class PathSolver(Solver):
         if medium.is_isolated or not dr.width(active):
             return medium.is_isolated
         if not medium.has_exact_boundary or medium.others:
+            return False
+        if refracting_boundary(scene, medium) is not None:
             return False
         return hole_in(scene, medium, grid, occupied_box(grid, active)) is None
 
