@@ -13,8 +13,8 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.scene.medium_probe import probe
-from mitsuba_irrcache.scene.occluders import first_surface, hole_in
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
+from mitsuba_irrcache.scene.occluders import first_surface, hole_in, refracting_boundary
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, transmits
 
 #: Number of rays from each voxel that determine its medium.
 RAYS = 16
@@ -32,6 +32,9 @@ class VoxelClasses(Immutable):
         cut_cells: cells between voxels that surfaces cut; None where there are none.
         separated: for x, y, z, whether a surface lies between the centre of a voxel and that of the
             next one along this axis; None where there are no cut cells.
+        inside: the voxels whose centres are in the medium, where its boundary refracts: values on
+            both sides have nothing to do with each other, and lookups extrapolate from inside. None
+            for other boundaries.
     """
 
     def __init__(self, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid) -> None:
@@ -49,7 +52,11 @@ class VoxelClasses(Immutable):
             number = dr.select(count > best, i, number)
             best = dr.maximum(best, count)
         dr.eval(number)
-        cut_cells = CutCells(scene, grid)
+        self.inside = None
+        if refracting_boundary(scene, medium) is not None:
+            self.inside = number == medium.number + 1
+            dr.eval(self.inside)
+        cut_cells = CutCells(scene, grid, None if self.inside is None else medium.pointer)
         self.medium_number, self.enclosed = number, enclosed
         self.cut_cells = cut_cells if cut_cells.count else None
         self.separated = None
@@ -57,14 +64,19 @@ class VoxelClasses(Immutable):
             self.separated = tuple(_separated(scene, grid, axis) for axis in range(3))
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.readable = within | (total > 0)
+        if self.inside is not None:
+            self.readable &= self.inside
         dr.eval(self.readable)
 
     def filled(self, values: mi.Float, channels: int) -> mi.Float:
-        """Replace zeros of enclosed voxels in ``values`` by the means of their neighbours.
+        """Replace zeros of enclosed voxels in ``values`` by the means of their neighbours, and
+        values outside of a boundary that refracts by extrapolation.
 
         Near a curved surface, lookups that `cut_cells` restrict to one side still read some of
         these voxels.
         """
+        if self.inside is not None:
+            values = extended(self.grid, values, self.inside, channels)
         voxel = dr.arange(mi.UInt32, self.grid.voxel_count)
         positive = mi.Bool(False)
         for c in range(channels):
@@ -95,7 +107,8 @@ def _probed(
     while dr.hint(k < count, label="voxel classes"):
         u, direction = kronecker(k, 3), fibonacci_direction(k, RAYS, azimuth=0.4)
         pointer = _medium_at(scene, medium, grid.world.point(corner + 0.5), direction, exact)
-        meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction)
+        is_medium = pointer == medium.pointer
+        meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction, is_medium)
         backs += dr.select(meets_back, mi.UInt32(1), 0)
         votes[0] += dr.select(pointer == None, mi.UInt32(1), 0)  # noqa: E711
         for i in range(len(media.grids)):
@@ -118,15 +131,18 @@ def _medium_at(
 
 
 @symbolic
-def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
-    """Whether rays hit the first surface that is not null from behind."""
+def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f, is_medium: mi.Bool):
+    """Whether rays hit the first surface that is not null from behind; not if it transmits and
+    ``p`` is in the medium.
+    """
     ray, back = mi.Ray3f(p, direction), mi.Bool(False)
     crossings, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="backs"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         solid = active & ~is_null(si.bsdf().flags())
-        back |= solid & (dr.dot(si.n, direction) > 0)
+        encloses = ~(is_medium & transmits(si.bsdf().flags()))
+        back |= solid & encloses & (dr.dot(si.n, direction) > 0)
         ray = si.spawn_ray(direction)
         crossings += 1
         active &= ~solid & (crossings < MOST_CROSSINGS)
@@ -146,6 +162,51 @@ def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
     *_, found = first_surface(scene, start, stop, exists)
     dr.eval(found)
     return found
+
+
+def extended(grid: Grid, values: mi.Float, valid: mi.Bool, channels: int = 1) -> mi.Float:
+    """Extrapolate ``values``, which are not negative, from valid voxels to two layers around these.
+
+    The result is the mean over all straight lines through two valid neighbours, or one.
+    """
+    index = dr.arange(mi.UInt32, grid.voxel_count * channels)
+    voxel = index // channels
+    for _ in range(2):
+        dr.eval(values, valid)
+        total, weights = mi.Float(0), mi.Float(0)
+        for step in np.ndindex(3, 3, 3):
+            offset = [s - 1 for s in step]
+            squared = sum(o * o for o in offset)
+            if not squared:
+                continue
+            (one, there), (two, beyond) = (
+                _neighbour(grid, voxel, [n * o for o in offset]) for n in (1, 2)
+            )
+            there &= dr.gather(mi.Bool, valid, one, there)
+            beyond &= there & dr.gather(mi.Bool, valid, two, beyond)
+            channel = index - voxel * channels
+            near = dr.gather(mi.Float, values, one * channels + channel, there)
+            far = dr.gather(mi.Float, values, two * channels + channel, beyond)
+            change = dr.select(beyond, dr.clip(near - far, -0.5 * near, 0.5 * near), 0)
+            total += dr.select(there, (near + change) / squared, 0)
+            weights += dr.select(there, mi.Float(1 / squared), 0)
+        own = dr.gather(mi.Bool, valid, voxel)
+        mean = total / dr.select(weights > 0, weights, 1)
+        values = dr.select(own, values, dr.select(weights > 0, mean, 0))
+        every = dr.arange(mi.UInt32, grid.voxel_count) * channels
+        valid = valid | (dr.gather(mi.Float, weights + dr.zeros(mi.Float, len(index)), every) > 0)
+    dr.eval(values)
+    return values
+
+
+def _neighbour(grid: Grid, voxel: mi.UInt32, offset: list[int]) -> tuple[mi.UInt32, mi.Bool]:
+    """The voxels so many along each axis away, and whether they exist."""
+    at = [mi.Int32(p) + o for p, o in zip(grid.voxel_indices(voxel), offset, strict=True)]
+    inside = mi.Bool(True)
+    for a, side in zip(at, grid.sides, strict=True):
+        inside &= (a >= 0) & (a < mi.Int32(side))
+    nx, ny, _ = grid.sides
+    return mi.UInt32((at[2] * mi.Int32(ny) + at[1]) * mi.Int32(nx) + at[0]), inside
 
 
 def neighbourhood(

@@ -29,6 +29,7 @@ from mitsuba_irrcache.core.sequences import hashed_seed, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.medium_probe import probe
+from mitsuba_irrcache.scene.occluders import refracting_boundary
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.crossings import (
     SurfaceCrossings,
@@ -80,6 +81,8 @@ class SurfaceBoundary:
         #: without this medium, which is convex: a ray that leaves it straight never meets it again
         self.other_media = self.media.without(medium)
         self.angular_basis = angular_basis
+        #: whether radiance enters the medium refracted, and is reflected within it
+        self.refracts = refracting_boundary(scene, medium) is not None
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
 
