@@ -29,6 +29,7 @@ from mitsuba_irrcache.scene.consistency import (
     described,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.scene.occluders import refracting_boundary
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, transmits
 
 #: The offset of Mitsuba's secondary rays from a surface should not exceed this part of the shortest
@@ -83,7 +84,9 @@ def compile_scene(
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
-    return SceneDescription(Media(grids), visible, emitters, brightest, _has_surfaces(scene))
+    refracts = any(refracting_boundary(scene, grid) for grid in visible if grid.is_traced)
+    surfaces = _has_surfaces(scene)
+    return SceneDescription(Media(grids), visible, emitters, brightest, surfaces, refracts)
 
 
 def _has_surfaces(scene: mi.Scene) -> bool:

@@ -22,6 +22,7 @@ class SceneDescription:
         brightest: radiance that no emitter exceeds; None where no rays are traced, see
             `MediumGrid.is_traced`.
         has_surfaces: whether any shape is more than the boundary of a medium.
+        refracts: whether radiance leaves any visible medium other than straight.
     """
 
     media: Media
@@ -29,6 +30,7 @@ class SceneDescription:
     emitters: EmittersByKind
     brightest: mi.Float | None = None
     has_surfaces: bool = False
+    refracts: bool = False
 
     @property
     def emits(self) -> bool:

@@ -11,13 +11,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, occupied_box
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.occluders import (
-    boxes_meet,
-    corners_of,
-    hole_in,
-    obstacle,
-    refracting_boundary,
-)
+from mitsuba_irrcache.scene.occluders import boxes_meet, corners_of, hole_in, obstacle
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
@@ -72,10 +66,6 @@ class SweepSolver(Solver):
             return None
         if not medium.has_exact_boundary:
             return f"{name} is bounded by other shapes than one box or sphere"
-        glass = refracting_boundary(scene, medium)
-        import os
-        if glass is not None and not os.environ.get("GLASS"):
-            return f"{name} is bounded by {glass}, which is more than a null boundary"
         if max_depth > 2:
             return (
                 "among surfaces it finds one or all orders of scattering, not those of max_depth "
