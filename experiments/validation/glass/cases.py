@@ -88,7 +88,7 @@ def torus(interior: dict, bsdf: dict) -> dict:
     ring = large + small * np.cos(b)
     points = np.stack([ring * np.cos(a), small * np.sin(b), -ring * np.sin(a)], -1).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
-    corner = [(i + k) % n * m + (j + l) % m for k, l in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    corner = [(i + k) % n * m + (j + h) % m for k, h in ((0, 0), (1, 0), (1, 1), (0, 1))]
     faces = np.concatenate(
         [np.stack([corner[k] for k in t], -1).reshape(-1, 3) for t in ((0, 1, 2), (0, 2, 3))]
     )
@@ -100,6 +100,11 @@ def torus(interior: dict, bsdf: dict) -> dict:
     file = tempfile.NamedTemporaryFile(suffix=".ply", delete=False).name
     mesh.write_ply(file)
     return {"type": "ply", "filename": file, "bsdf": bsdf, "interior": interior}
+
+
+def jade() -> dict:
+    """Return a green medium."""
+    return fluid(15, (0.9, 0.98, 0.93))
 
 
 def map_of_the_sky() -> dict:
@@ -136,9 +141,10 @@ CASES: dict[str, Callable[[], dict]] = {
     "milk of depth 40, sky": lambda: {"a": ball(fluid(40))} | SKY,
     "milk of depth 20, map": lambda: {"a": ball(fluid(20))} | map_of_the_sky(),
     "milk of depth 20, lamp": lambda: {"a": ball(fluid(20))} | DIM | lamp(),
-    "rough jade, sky": lambda: {"a": ball(fluid(15, (0.9, 0.98, 0.93)), ROUGH)} | SKY,
-    "rough jade, hg 0.3, map": lambda: {"a": ball(fluid(10, 0.97, **HG), ROUGH)} | map_of_the_sky(),
-    "rough jade, cube, lamp": lambda: {"a": cube(fluid(15, (0.9, 0.98, 0.93)), ROUGH)} | DIM | lamp(),
+    "rough jade, sky": lambda: {"a": ball(jade(), ROUGH)} | SKY,
+    "rough jade, hg 0.3, map": lambda: {"a": ball(fluid(10, 0.97, **HG), ROUGH)}
+    | map_of_the_sky(),
+    "rough jade, cube, lamp": lambda: {"a": cube(jade(), ROUGH)} | DIM | lamp(),
     "rough jade, mesh, sky": lambda: {"a": torus(fluid(8, 0.95), ROUGH)} | SKY,
     "glass cube on a floor, lamp": lambda: {"a": cube(fluid(6, 0.95))} | floor() | DIM | lamp(),
     "smoke in a glass cube, map": lambda: {"a": cube(smoke(15.0), scale=(1, 1, 1))}
