@@ -153,6 +153,8 @@ class BoundaryOrdinateSet:
 
     def uncollided_collisions(self, level: MultigridLevel) -> mi.Float:
         """The mean irradiance of collisions due to radiance straight from emitters."""
+        if not any(part.any() for part in self.incoming.has_emitters):
+            return dr.zeros(mi.Float, level.tracks.active_count * level.channels)
         table = level.tracks.table(*self.ordinates)
         source = self.incoming.emitter_source(self.channels, table, self.numbers)
         table.boundary_source = source
