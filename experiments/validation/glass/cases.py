@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 
 import mitsuba as mi
@@ -81,7 +80,7 @@ def tumbler() -> dict:
     return milk | {"wall": wall} | ends
 
 
-def torus(interior: dict, bsdf: dict) -> dict:
+def torus(interior: dict, bsdf: dict) -> mi.Mesh:
     """Return a mesh without UVs, filled with a medium."""
     n, m, large, small = 48, 24, 0.7, 0.35
     a, b = np.meshgrid(np.arange(n) / n * 2 * np.pi, np.arange(m) / m * 2 * np.pi, indexing="ij")
@@ -92,14 +91,14 @@ def torus(interior: dict, bsdf: dict) -> dict:
     faces = np.concatenate(
         [np.stack([corner[k] for k in t], -1).reshape(-1, 3) for t in ((0, 1, 2), (0, 2, 3))]
     )
-    mesh = mi.Mesh("torus", len(points), len(faces), has_vertex_normals=False)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = points.astype(np.float32).ravel()
-    params["faces"] = faces.astype(np.uint32).ravel()
-    params.update()
-    file = tempfile.NamedTemporaryFile(suffix=".ply", delete=False).name
-    mesh.write_ply(file)
-    return {"type": "ply", "filename": file, "bsdf": bsdf, "interior": interior}
+    properties = mi.Properties()
+    properties["bsdf"], properties["interior"] = mi.load_dict(bsdf), mi.load_dict(interior)
+    mesh = mi.Mesh("torus", len(points), len(faces), props=properties)
+    values = mi.traverse(mesh)
+    values["vertex_positions"] = points.astype(np.float32).ravel()
+    values["faces"] = faces.astype(np.uint32).ravel()
+    values.update()
+    return mesh
 
 
 def jade() -> dict:
