@@ -65,7 +65,7 @@ class VoxelClasses(Immutable):
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.readable = within | (total > 0)
         if self.inside is not None:
-            self.readable &= self.inside
+            self.readable &= self.inside | within
         dr.eval(self.readable)
 
     def filled(self, values: mi.Float, channels: int) -> mi.Float:

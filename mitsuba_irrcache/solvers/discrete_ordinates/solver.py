@@ -107,8 +107,8 @@ class Sweep:
         self._medium = medium
         # The tracks come first: `occupied_box` evaluates the coordinates of all voxels, which the
         # sample points would otherwise share and store.
-        self._surfaces = _surfaces_among(scene, cache)
         self._refracts = medium.is_traced and refracting_boundary(scene, medium) is not None
+        self._surfaces = _surfaces_among(scene, cache, medium if self._refracts else None)
         self._prepare_tracks(pause)
         self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
         #: mean of 1/r^2 over a voxel, over its value at the sample point, in multiple scattering:
@@ -475,11 +475,17 @@ class Sweep:
         return [place + c for c in range(len(channels))]
 
 
-def _surfaces_among(scene: mi.Scene, cache: IrradianceCache) -> SurfaceVoxels | None:
-    """The voxels near surfaces, None where there are none in the box of the active voxels."""
+def _surfaces_among(
+    scene: mi.Scene, cache: IrradianceCache, medium: MediumGrid | None
+) -> SurfaceVoxels | None:
+    """The voxels near surfaces, None where there are none in the box of the active voxels.
+
+    ``medium`` is given if its boundary refracts.
+    """
     if cache.voxel_classes is None:
         return None
-    surfaces = SurfaceVoxels(scene, cache.grid, *occupied_box(cache.grid, cache.active))
+    box = occupied_box(cache.grid, cache.active)
+    surfaces = SurfaceVoxels(scene, cache.grid, *box, medium, cache.active)
     return surfaces if surfaces.count else None
 
 
