@@ -29,7 +29,6 @@ from mitsuba_irrcache.scene.consistency import (
     described,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
-from mitsuba_irrcache.scene.occluders import refracting_boundary
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, transmits
 
 #: The offset of Mitsuba's secondary rays from a surface should not exceed this part of the shortest
@@ -84,9 +83,7 @@ def compile_scene(
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
-    refracts = any(refracting_boundary(scene, grid) for grid in visible if grid.is_traced)
-    surfaces = _has_surfaces(scene)
-    return SceneDescription(Media(grids), visible, emitters, brightest, surfaces, refracts)
+    return SceneDescription(Media(grids), visible, emitters, brightest, _has_surfaces(scene))
 
 
 def _has_surfaces(scene: mi.Scene) -> bool:
@@ -131,6 +128,7 @@ def _baked(
             emission=emission,
             is_isolated=is_isolated,
             has_exact_boundary=exact is not None,
+            refracts=any(_refracts(shape) for shape in filled),
         )
         grids.append(grid)
         if _is_visible(scene, medium):
@@ -150,6 +148,11 @@ def _is_visible(scene: mi.Scene, medium: mi.Medium) -> bool:
     return any(is_null(_flags(s)) for s in _around(scene, medium)) or any(
         sensor.get_medium() == medium for sensor in scene.sensors()
     )
+
+
+def _refracts(shape: mi.Shape) -> bool:
+    """Whether radiance passes a shape other than straight, or is reflected by it as well."""
+    return transmits(_flags(shape)) and not is_null(_flags(shape))
 
 
 def _around(scene: mi.Scene, medium: mi.Medium) -> list[mi.Shape]:

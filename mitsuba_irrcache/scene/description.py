@@ -22,7 +22,6 @@ class SceneDescription:
         brightest: radiance that no emitter exceeds; None where no rays are traced, see
             `MediumGrid.is_traced`.
         has_surfaces: whether any shape is more than the boundary of a medium.
-        refracts: whether radiance leaves any visible medium other than straight.
     """
 
     media: Media
@@ -30,7 +29,11 @@ class SceneDescription:
     emitters: EmittersByKind
     brightest: mi.Float | None = None
     has_surfaces: bool = False
-    refracts: bool = False
+
+    @property
+    def refracts(self) -> bool:
+        """Whether the boundary of any visible medium refracts."""
+        return any(grid.refracts for grid in self.visible)
 
     @property
     def emits(self) -> bool:

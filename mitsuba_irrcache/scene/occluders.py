@@ -13,7 +13,7 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.consistency import described
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, is_solid, transmits
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, is_solid
 
 #: Offsets of the rays along each axis that detect surfaces: through the corners and the centre of
 #: each voxel's face.
@@ -181,19 +181,6 @@ def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str 
         ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
         corners = np.array(list(itertools.product(*ends.T)))
         if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
-            return described(shape)
-    return None
-
-
-def refracting_boundary(scene: mi.Scene, medium: MediumGrid) -> str | None:
-    """Return the name of a shape that ``medium`` fills and through whose surface radiance passes
-    other than straight; None without any.
-    """
-    for shape in scene.shapes():
-        inner, flags = shape.interior_medium(), _flags(shape)
-        if inner is None or inner == shape.exterior_medium() or is_null(flags):
-            continue
-        if transmits(flags) and dr.all(mi.MediumPtr(inner) == medium.pointer):
             return described(shape)
     return None
 

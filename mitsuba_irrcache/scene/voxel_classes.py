@@ -13,7 +13,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.scene.medium_probe import probe
-from mitsuba_irrcache.scene.occluders import first_surface, hole_in, refracting_boundary
+from mitsuba_irrcache.scene.occluders import first_surface, hole_in
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, transmits
 
 #: Number of rays from each voxel that determine its medium.
@@ -53,7 +53,7 @@ class VoxelClasses(Immutable):
             best = dr.maximum(best, count)
         dr.eval(number)
         self.inside = None
-        if refracting_boundary(scene, medium) is not None:
+        if medium.refracts:
             self.inside = number == medium.number + 1
             dr.eval(self.inside)
         cut_cells = CutCells(scene, grid, None if self.inside is None else medium.pointer)

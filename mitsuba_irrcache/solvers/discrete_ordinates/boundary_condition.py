@@ -29,7 +29,6 @@ from mitsuba_irrcache.core.sequences import hashed_seed, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.medium_probe import probe
-from mitsuba_irrcache.scene.occluders import refracting_boundary
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.crossings import (
     SurfaceCrossings,
@@ -82,7 +81,7 @@ class SurfaceBoundary:
         self.other_media = self.media.without(medium)
         self.angular_basis = angular_basis
         #: whether radiance enters the medium refracted, and is reflected within it
-        self.refracts = refracting_boundary(scene, medium) is not None
+        self.refracts = medium.refracts
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
 

@@ -42,8 +42,8 @@ BEYOND = 2.0
 class SurfaceVoxels:
     """The voxels near surfaces, in the box of ``grid`` between ``lower`` and ``upper`` (x, y, z).
 
-    ``medium`` is given if its boundary refracts, with the ``active`` voxels. Then those that it cuts
-    are voxels of the medium, wherever their centres are: nothing outside counts.
+    ``medium`` is given if its boundary refracts, with the ``active`` voxels. Then those that it
+    cuts are voxels of the medium, wherever their centres are: nothing outside counts.
 
     Attributes:
         voxels: flat indices of the voxels that surfaces cut and of their neighbours, ascending.

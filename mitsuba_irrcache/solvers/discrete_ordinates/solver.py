@@ -29,7 +29,6 @@ from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.occluders import refracting_boundary
 from mitsuba_irrcache.solvers.base import Progress
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import merged
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
@@ -107,10 +106,12 @@ class Sweep:
         self._medium = medium
         # The tracks come first: `occupied_box` evaluates the coordinates of all voxels, which the
         # sample points would otherwise share and store.
-        self._refracts = medium.is_traced and refracting_boundary(scene, medium) is not None
-        self._surfaces = _surfaces_among(scene, cache, medium if self._refracts else None)
+        self._surfaces = _surfaces_among(scene, cache, medium if medium.refracts else None)
         self._prepare_tracks(pause)
         self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
+        if medium.refracts:
+            self._sample_points = medium.boundary.drawn_inside(self._sample_points)
+            dr.eval(self._sample_points)
         #: mean of 1/r^2 over a voxel, over its value at the sample point, in multiple scattering:
         #: what is scattered near a light is the mean over the voxel
         self._inverse_square_mean = mi.Float(1)
@@ -151,7 +152,7 @@ class Sweep:
     def _prepare_tracks(self, pause: Callable[[], None]) -> None:
         """The tracks of each channel of the extinction, and what multiple scattering needs."""
         medium, cache, grid = self._medium, self.cache, self.cache.grid
-        if self._refracts:
+        if medium.refracts:
             # Tracks end at the glass: voxels that it cuts are not thinner for that.
             medium = medium.replaced(boundary=Boundary("box", medium.boundary.to_world))
         detail = extinction_grid(medium, grid)

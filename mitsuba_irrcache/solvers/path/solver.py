@@ -26,7 +26,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.scene.occluders import hole_in, refracting_boundary
+from mitsuba_irrcache.scene.occluders import hole_in
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.grid_size import SizeAmongSurfaces, SizeRule
@@ -38,8 +38,9 @@ from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 #: bytes each).
 LANES = 1 << 21
 
-#: Samples of all voxels together by default, without and among surfaces, where each is more work;
-#: and samples per voxel, at least and at most.
+#: Samples of all voxels together by default, without and among surfaces, where each is more work,
+#: but not behind glass, where no emitter can be sampled: with 2^22 the error of jade under an
+#: environment map was 2.4 %. And samples per voxel, at least and at most.
 PATHS, PATHS_AMONG_SURFACES = 2**24, 2**22
 FEWEST_SAMPLES, MOST_SAMPLES = 16, 256
 
@@ -76,7 +77,8 @@ class PathSolver(Solver):
 
     @classmethod
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
-        paths = PATHS_AMONG_SURFACES if medium.is_traced else PATHS
+        few = medium.is_traced and not medium.refracts
+        paths = PATHS_AMONG_SURFACES if few else PATHS
         return int(np.clip(paths // max(active_count, 1), FEWEST_SAMPLES, MOST_SAMPLES))
 
     @classmethod
@@ -105,9 +107,7 @@ class PathSolver(Solver):
         """Whether straight lines within the boundary of ``medium`` stay in it up to a surface."""
         if medium.is_isolated or not dr.width(active):
             return medium.is_isolated
-        if not medium.has_exact_boundary or medium.others:
-            return False
-        if refracting_boundary(scene, medium) is not None:
+        if not medium.has_exact_boundary or medium.others or medium.refracts:
             return False
         return hole_in(scene, medium, grid, occupied_box(grid, active)) is None
 
