@@ -82,6 +82,8 @@ class SurfaceBoundary:
         self.angular_basis = angular_basis
         #: whether radiance enters the medium refracted, and is reflected within it
         self.refracts = medium.refracts
+        #: whether tracks carry what glass refracts from emitters; else see `refracted_light`
+        self.carries_refracted = True
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
 
@@ -489,7 +491,8 @@ def _trace_all(
             boundary.scene, boundary.media, begin, boundary.max_depth, boundary.rr_depth, False,
             rng, hit & (weight > 0), lambda medium: medium == boundary.pointer,
         )  # fmt: skip
-        emitted = emitted + weight * scattered
+        if boundary.carries_refracted:
+            emitted = emitted + weight * scattered
         direction = end.direction
         reflected = weight * end.weight * dr.inv_four_pi
         if boundary.surfaces is None:

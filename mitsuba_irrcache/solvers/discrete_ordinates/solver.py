@@ -46,6 +46,10 @@ from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     OrdinateSet,
     boundary_ordinate_sets,
 )
+from mitsuba_irrcache.solvers.discrete_ordinates.refracted_light import (
+    is_needed,
+    refracted_irradiance,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
     collision_albedo,
     extinction_grid,
@@ -144,6 +148,8 @@ class Sweep:
         self._boundary = SurfaceBoundary(
             scene, medium, large, rr_depth, cache.directional, self._surfaces
         )
+        if medium.refracts and medium.phase.is_isotropic and is_needed(scene):
+            self._boundary.carries_refracted = False
         emitters = small, self._illumination.point_lights
         self._emitter_sampling = EmitterSampling(
             scene, medium, *emitters, self._sample_points, cache.directional
@@ -246,6 +252,9 @@ class Sweep:
         surroundings = self._boundary, self._illumination, self._tracks[0]
         sets, spectra = boundary_ordinate_sets(*surroundings, passes, pairs, rng, seed)
         self._direct = self._with_known_lights(self._emitter_sampling.irradiance(seed))
+        if not self._boundary.carries_refracted:
+            arguments = self._boundary, cache.grid, cache.active, seed
+            self._direct.append([refracted_irradiance(*arguments)])
         grey = grey_media and is_grey([*spectra, *chain(*self._direct, *self._emission)])
         return sets, grey, np.ones(cache.channels)
 
