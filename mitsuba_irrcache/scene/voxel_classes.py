@@ -37,7 +37,15 @@ class VoxelClasses(Immutable):
             for other boundaries.
     """
 
-    def __init__(self, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        media: Media,
+        medium: MediumGrid,
+        grid: Grid,
+        by_centre: bool = False,
+    ) -> None:
+        """``by_centre``: values are those of the centres of voxels, not means over them."""
         self.grid = grid
         index = dr.arange(mi.UInt32, grid.voxel_count)
         box = np.zeros(3, int), grid.resolution
@@ -65,7 +73,7 @@ class VoxelClasses(Immutable):
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.readable = within | (total > 0)
         if self.inside is not None:
-            self.readable &= self.inside | within
+            self.readable &= self.inside | (within & (not by_centre))
         dr.eval(self.readable)
 
     def filled(self, values: mi.Float, channels: int) -> mi.Float:

@@ -18,7 +18,7 @@ from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
 from mitsuba_irrcache.transport.path import PathStart, trace
 
-#: Paths of a batch for all voxels together, and for each one, at least and at most; and of a launch.
+#: Paths of a batch for all voxels together, and for each one, at least and at most; of a launch.
 PATHS, FEWEST, MOST, LANES = 1 << 23, 16, 1024, 1 << 21
 #: Number that is added to that of the random stream.
 STREAM = 0x6A00

@@ -98,7 +98,9 @@ class PathSolver(Solver):
     def voxel_classes(
         cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> VoxelClasses | None:
-        return VoxelClasses(scene, media, medium, grid) if medium.is_traced else None
+        if not medium.is_traced:
+            return None
+        return VoxelClasses(scene, media, medium, grid, by_centre=True)
 
     @classmethod
     def knows_direct_lights(
