@@ -52,7 +52,8 @@ class VoxelClasses(Immutable):
         # Rays can miss a boundary that nearly coincides with walls; its closed form cannot.
         exact = medium.has_exact_boundary and not medium.others
         exact = exact and hole_in(scene, medium, grid, box) is None
-        *votes, within, backs = _probed(scene, media, medium, grid, index, exact)
+        glass = any(_is_glass(shape) for shape in scene.shapes())
+        *votes, within, backs = _probed(scene, media, medium, grid, index, exact, glass)
         within, enclosed = within > 0, backs == RAYS
         dr.eval(votes, within, enclosed)
         best, number = mi.UInt32(0), mi.UInt32(0)
@@ -101,12 +102,19 @@ class VoxelClasses(Immutable):
 
 @symbolic
 def _probed(
-    scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index: mi.UInt32, exact: bool
+    scene: mi.Scene,
+    media: Media,
+    medium: MediumGrid,
+    grid: Grid,
+    index: mi.UInt32,
+    exact: bool,
+    glass: bool,
 ):
     """Numbers of rays from each voxel: those whose origin, the voxel's centre, is in no medium and
     in each medium; those whose origin, a random position in the voxel, is in ``medium``; those that
     hit the back of a surface first. ``exact``: positions within the medium's boundary, and only
-    these, are in it, whatever the rays meet.
+    these, are in it, whatever the rays meet. ``glass``: there are shapes that transmit, whose backs
+    do not count for positions in ``medium``.
     """
     corner = mi.Point3f(*grid.voxel_indices(index))
     votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
@@ -115,7 +123,10 @@ def _probed(
     while dr.hint(k < count, label="voxel classes"):
         u, direction = kronecker(k, 3), fibonacci_direction(k, RAYS, azimuth=0.4)
         pointer = _medium_at(scene, medium, grid.world.point(corner + 0.5), direction, exact)
-        is_medium = pointer == medium.pointer
+        is_medium = mi.Bool(False)
+        if dr.hint(glass, mode="scalar"):
+            there = probe(scene, grid.world.point(corner + 0.5), direction)
+            is_medium = there == medium.pointer
         meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction, is_medium)
         backs += dr.select(meets_back, mi.UInt32(1), 0)
         votes[0] += dr.select(pointer == None, mi.UInt32(1), 0)  # noqa: E711
@@ -126,6 +137,11 @@ def _probed(
         within += dr.select(pointer == medium.pointer, mi.UInt32(1), 0)
         k += 1
     return [*votes, within, backs]
+
+
+def _is_glass(shape: mi.Shape) -> bool:
+    flags = int(shape.bsdf().flags()) if shape.bsdf() is not None else 0
+    return bool(transmits(flags)) and not is_null(flags)
 
 
 def _medium_at(

@@ -19,7 +19,9 @@ from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import Surfa
 from mitsuba_irrcache.transport.path import PathStart, trace
 
 #: Paths of a batch for all voxels together, and for each one, at least and at most; of a launch.
-PATHS, FEWEST, MOST, LANES = 1 << 23, 16, 1024, 1 << 21
+PATHS, FEWEST, MOST, LANES = 1 << 24, 16, 1024, 1 << 21
+#: Weight of positions outside of the medium, which are moved to its boundary.
+OUTSIDE = 1e-4
 #: Number that is added to that of the random stream.
 STREAM = 0x6A00
 
@@ -62,6 +64,8 @@ def _mean(
     u = kronecker(k, 4, shift)
     within = mi.Point3f(u[2], u[3], rng.next_float32())
     p = grid.world.point(mi.Point3f(*grid.voxel_indices(voxel)) + within)
+    # Only positions in the medium count, unless there are none.
+    weight = dr.select(boundary.medium.contains(p), 1, OUTSIDE)
     p = boundary.medium.boundary.drawn_inside(p)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
     pointer = dr.select(mi.Bool(True), boundary.pointer, dr.zeros(mi.MediumPtr, dr.width(lane)))
@@ -70,8 +74,9 @@ def _mean(
         boundary.scene, boundary.media, start, boundary.max_depth, boundary.rr_depth, False, rng,
         mi.Bool(True), lambda medium: medium == boundary.pointer,
     )  # fmt: skip
-    values = [c * (4 * dr.pi / samples) + dr.zeros(mi.Float, dr.width(lane)) for c in scattered]
-    dr.eval(values)
-    means = [dr.block_sum(value, samples) for value in values]
+    values = [c * weight * (4 * dr.pi) for c in scattered]
+    dr.eval(values, weight)
+    total = dr.block_sum(weight, samples)
+    means = [dr.block_sum(value, samples) / total for value in values]
     dr.eval(means)
     return means
