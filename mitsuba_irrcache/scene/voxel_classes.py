@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -198,11 +200,7 @@ def extended(grid: Grid, values: mi.Float, valid: mi.Bool, channels: int = 1) ->
     for _ in range(2):
         dr.eval(values, valid)
         total, weights = mi.Float(0), mi.Float(0)
-        for step in np.ndindex(3, 3, 3):
-            offset = [s - 1 for s in step]
-            squared = sum(o * o for o in offset)
-            if not squared:
-                continue
+        for offset, squared in _directions():
             (one, there), (two, beyond) = (
                 _neighbour(grid, voxel, [n * o for o in offset]) for n in (1, 2)
             )
@@ -221,6 +219,14 @@ def extended(grid: Grid, values: mi.Float, valid: mi.Bool, channels: int = 1) ->
         valid = valid | (dr.gather(mi.Float, weights + dr.zeros(mi.Float, len(index)), every) > 0)
     dr.eval(values)
     return values
+
+
+def _directions() -> Iterator[tuple[list[int], int]]:
+    """Yield the offsets of the 26 neighbours of a voxel, and their squared lengths."""
+    for step in np.ndindex(3, 3, 3):
+        offset = [s - 1 for s in step]
+        if any(offset):
+            yield offset, sum(o * o for o in offset)
 
 
 def _neighbour(grid: Grid, voxel: mi.UInt32, offset: list[int]) -> tuple[mi.UInt32, mi.Bool]:
@@ -242,19 +248,9 @@ def neighbourhood(
     index = dr.arange(mi.UInt32, grid.voxel_count * channels)
     voxel = index // channels
     channel = index - voxel * channels
-    places = [mi.Int32(p) for p in grid.voxel_indices(voxel)]
-    nx, ny, _ = grid.sides
     total, weights = mi.Float(0), mi.Float(0)
-    for step in np.ndindex(3, 3, 3):
-        offset = [s - 1 for s in step]
-        squared = sum(o * o for o in offset)
-        if not squared:
-            continue
-        at = [p + o for p, o in zip(places, offset, strict=True)]
-        inside = mi.Bool(True)
-        for a, side in zip(at, grid.sides, strict=True):
-            inside &= (a >= 0) & (a < side)
-        there = mi.UInt32((at[2] * ny + at[1]) * nx + at[0])
+    for offset, squared in _directions():
+        there, inside = _neighbour(grid, voxel, offset)
         inside &= dr.gather(mi.Bool, valid, there, inside)
         value = dr.gather(mi.Float, values, there * channels + channel, inside)
         total += dr.select(inside, value / squared, 0)

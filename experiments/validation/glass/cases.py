@@ -7,7 +7,7 @@ from collections.abc import Callable
 import mitsuba as mi
 import numpy as np
 
-from experiments.validation.thick.cases import SKY, SUN, lamp
+from experiments.validation.thick.cases import SKY, SUN, lamp, scene
 
 GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
 ROUGH = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.6, "ext_ior": 1.0}
@@ -210,11 +210,8 @@ CASES: dict[str, Callable[[], dict]] = {
 def build(name: str, integrator: dict, pixels: int) -> mi.Scene:
     """Load the scene of a case."""
     found = CASES[name]()
-    film = {
-        "type": "hdrfilm", "width": pixels, "height": pixels, "pixel_format": "rgb",
-        "component_format": "float32", "rfilter": {"type": "box"},
-    }  # fmt: skip
+    own = found.pop("sensor", {})
+    described = scene(found, integrator, pixels)
     look = mi.ScalarTransform4f().look_at([2.2, 1.9, 3.0], [0, 0, 0], [0, 1, 0])
-    sensor = {"type": "perspective", "fov": 35, "to_world": look, "film": film}
-    sensor |= found.pop("sensor", {})
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor} | found)
+    described["sensor"] |= {"to_world": look} | own
+    return mi.load_dict(described)
