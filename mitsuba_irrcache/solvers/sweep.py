@@ -143,7 +143,7 @@ class SweepSolver(Solver):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        return not medium.refracts
+        return True
 
     def __init__(self, task: SolverTask) -> None:
         kind = Sweep if task.cache.directional is None else AnisotropicSweep

@@ -154,7 +154,7 @@ CASES: dict[str, Callable[[], dict]] = {
     | SKY,
     "coloured albedo and extinction, sky": lambda: {
         "a": ball(
-            fluid(18, (0.95, 0.9, 0.8), sigma_t=colour(0.2, 0.5, 0.9), scale=9.0)
+            fluid(18, (0.95, 0.9, 0.8), sigma_t=colour(0.6, 0.7, 0.9), scale=8.0)
         )
     }
     | SKY,

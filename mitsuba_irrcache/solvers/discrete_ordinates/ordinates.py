@@ -33,6 +33,9 @@ from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 #: Ordinates of a pass along which radiance enters among surfaces: it varies more from one direction
 #: to the next than the radiance between voxels.
 BOUNDARY_ORDINATES = 64
+#: The same in boxes of glass, where all tracks of an ordinate meet a face at the same angle and are
+#: reflected totally or not: with 64 the mean irradiance under a lamp has a noise of 1.3 %.
+BOUNDARY_ORDINATES_IN_GLASS = 256
 
 
 class OrdinateSet:
@@ -218,7 +221,9 @@ def boundary_ordinate_sets(
     """
     several = passes > 1
     joint = boundary.angular_basis is not None or boundary.refracts
-    many = max(BOUNDARY_ORDINATES // 2, pairs) if several else pairs
+    flat = boundary.refracts and boundary.surfaces is None
+    many = BOUNDARY_ORDINATES_IN_GLASS if flat else BOUNDARY_ORDINATES
+    many = max(many // 2, pairs) if several else pairs
     # The first one is independent, the union of the others is even.
     sets = illumination.ordinates(1, many, rng)
     if several:
