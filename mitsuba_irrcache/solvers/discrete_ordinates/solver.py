@@ -148,7 +148,9 @@ class Sweep:
         self._boundary = SurfaceBoundary(
             scene, medium, large, rr_depth, cache.directional, self._surfaces
         )
-        if medium.refracts and medium.phase.is_isotropic and is_needed(scene):
+        # What refracted radiance scatters first counts as a third order.
+        isotropic, all_orders = medium.phase.is_isotropic, cache.max_depth < 0
+        if medium.refracts and isotropic and all_orders and is_needed(scene):
             self._boundary.carries_refracted = False
         emitters = small, self._illumination.point_lights
         self._emitter_sampling = EmitterSampling(
