@@ -27,9 +27,19 @@ STREAM = 0x6A00
 
 
 def is_needed(scene: mi.Scene) -> bool:
-    """Whether anything but a constant environment illuminates the scene."""
+    """Whether glass refracts anything but a constant environment. Suns and points contribute
+    nothing through smooth glass, which no path can hit them through.
+    """
+    rough = int(mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission)
+    scatters = any(
+        shape.bsdf() is not None and int(shape.bsdf().flags()) & rough for shape in scene.shapes()
+    )
     kinds = (kind_of(emitter) for emitter in scene.emitters())
-    return any(kind is not EmitterKind.CONSTANT_ENVIRONMENT for kind in kinds)
+    return any(
+        scatters or not (kind.has_one_direction or kind.is_point_like)
+        for kind in kinds
+        if kind is not EmitterKind.CONSTANT_ENVIRONMENT
+    )
 
 
 def refracted_irradiance(
