@@ -41,6 +41,10 @@ def rendered(scenes, objects: dict, settings: dict, **options) -> tuple[mi.Scene
 
 FURNACES = {
     "sphere": (lambda: {"a": ball(radius=1.0, bsdf=GLASS, interior=milk())}, "sweep", 2.25),
+    "coloured extinction": (
+        lambda: {"a": ball(radius=1.0, bsdf=GLASS, interior=fog((1, 2, 4), (1, 1, 1)))}, "sweep",
+        2.25,
+    ),
     "cube": (lambda: {"a": cube(milk(), bsdf=GLASS)}, "sweep", 2.25),
     "hollow globe": (globe, "sweep", 1.0),
     "anisotropic": (

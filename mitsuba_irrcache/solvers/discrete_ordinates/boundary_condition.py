@@ -180,7 +180,7 @@ class IncomingRadiance:
         cells[:, 0] -= start
         here = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
         first_crossing = None
-        if self.crossings is not None and tracks is self.tracks:
+        if self.crossings is not None and tracks.surfaces is not None:
             # Coarser levels, which only correct the solution, do without surfaces among the voxels.
             table.crossings = self.crossings.of_table(numbers)
             begin, end = (int(2 * self.crossings.starts[n]) for n in (numbers[0], numbers[-1] + 1))
