@@ -198,6 +198,12 @@ class CachedMedium:
             f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {dr.width(active)} "
             f"of {grid.voxel_count} see the medium",
         )
+        if medium.refracts and solver.name == "path":
+            mi.Log(
+                mi.LogLevel.Info,
+                f"irrcache: {self.label}behind glass the solver path finds emitters by chance, as "
+                "volpath does, which is faster for a single small image.",
+            )
         samples = settings.samples or solver.default_samples(
             medium, settings.max_depth, dr.width(active)
         )

@@ -33,6 +33,10 @@ def globe() -> dict:
     }
 
 
+def coloured() -> dict:
+    return {"a": ball(radius=1.0, bsdf=GLASS, interior=fog((1, 2, 4), (1, 1, 1)))}
+
+
 def rendered(scenes, objects: dict, settings: dict, **options) -> tuple[mi.Scene, np.ndarray]:
     integrator = {"type": "irrcache", "rr_depth": 1000} | settings
     scene = scenes.load(integrator, None, 16, default_solver="auto", **objects)
@@ -41,10 +45,7 @@ def rendered(scenes, objects: dict, settings: dict, **options) -> tuple[mi.Scene
 
 FURNACES = {
     "sphere": (lambda: {"a": ball(radius=1.0, bsdf=GLASS, interior=milk())}, "sweep", 2.25),
-    "coloured extinction": (
-        lambda: {"a": ball(radius=1.0, bsdf=GLASS, interior=fog((1, 2, 4), (1, 1, 1)))}, "sweep",
-        2.25,
-    ),
+    "coloured extinction": (coloured, "sweep", 2.25),
     "cube": (lambda: {"a": cube(milk(), bsdf=GLASS)}, "sweep", 2.25),
     "hollow globe": (globe, "sweep", 1.0),
     "anisotropic": (
@@ -57,11 +58,13 @@ FURNACES = {
 @pytest.mark.parametrize(("build", "solver", "inside"), FURNACES.values(), ids=FURNACES)
 def test_white_furnace(scenes, build, solver, inside):
     """Without absorption, in uniform radiance 1, the radiance is 1 everywhere, and n^2 in glass of
-    the refractive index n.
+    the refractive index n; without noise by `sweep` if all channels have the same extinction.
     """
     settings = {"solver": solver, "resolution": 12}
     scene, image = rendered(scenes, build() | WHITE, settings, spp=8)
     tolerance = 0.005 if solver == "path" else 0.001
+    if build is coloured:  # paths choose collisions of one channel at random
+        tolerance = 0.015
     np.testing.assert_allclose(image, 1, atol=3 * tolerance)
     assert abs(image.mean() - 1) < tolerance
     values = np.array(scene.integrator().cache.irradiance)
