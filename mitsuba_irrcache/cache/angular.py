@@ -108,6 +108,10 @@ class Source:
         total = sum(row[i] for i, row in enumerate(self._covariance))
         return dr.maximum(total - along_view * inverse, 0) * inverse
 
+    def is_same(self, other: Source) -> bool:
+        """Whether ``other`` is at the same place, or in the same direction."""
+        return self.far == other.far and np.array_equal(self._direction, other._direction)
+
     def covers(self, directions: np.ndarray) -> np.ndarray:
         """Whether ``directions`` (..., 3) point to this source; False unless it is ``far``."""
         return (directions @ self._direction >= self._cosine) & self.far
@@ -129,7 +133,7 @@ class AngularBasis:
         camera rays evaluate their irradiance in closed form. ``order`` is by default that which
         the phase function requires.
         """
-        self.phase, self.sources, self._others = phase, sources, others
+        self.phase, self.sources, self.others = phase, sources, others
         self.order = phase.order if order is None else order
         self._factors = [
             dr.opaque(mi.Float, float(4 * np.pi * phase.moments[degree]))
@@ -181,7 +185,7 @@ class AngularBasis:
     ) -> mi.Bool:
         """Whether rays that hit something ``far``, or an emitter ``near``, hit a narrow source."""
         found = mi.Bool(False)
-        for source in (*self.sources, *self._others):
+        for source in (*self.sources, *self.others):
             towards, cosine = source.seen_from(origin)
             found |= (far if source.far else near) & (dr.dot(direction, towards) >= cosine)
         return found

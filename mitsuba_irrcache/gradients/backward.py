@@ -8,11 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.conservative import conserving
-from mitsuba_irrcache.cache.direct_light import DirectLight, DirectLightAlongRays
+from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import LUMINANCE, CameraPass, FilmAdjoint
+from mitsuba_irrcache.gradients.fluence import FluenceFields
+from mitsuba_irrcache.gradients.forward_peak import with_forward_peak
 from mitsuba_irrcache.gradients.parameters import (
     ALBEDO,
     EMISSION,
@@ -25,17 +26,17 @@ from mitsuba_irrcache.gradients.parameters import (
 from mitsuba_irrcache.gradients.points import add_ways
 from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
+from mitsuba_irrcache.gradients.scattering import split
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.grids.fields import Field
-from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
-from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 
 #: Pairs of ordinates for the default directions of the cache, with others in proportion; those
 #: under environments that vary, whose spots they have to find; and the fewest.
@@ -43,9 +44,9 @@ PAIRS, MOST_PAIRS, FEWEST_PAIRS = 24, 128, 8
 UNEVEN = (EmitterKind.ENVIRONMENT_MAP,)
 #: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
 MARGIN = 256.0
-#: Bytes for camera samples and copies of tracks; numbers for each voxel, and for each of its
-#: channels.
-MEMORY, NUMBERS = 3 << 27, (40, 25)
+#: Bytes for camera samples and copies of tracks; numbers for each voxel, for each of its channels,
+#: and for each further moment of these.
+MEMORY, NUMBERS = 3 << 27, (40, 25, 12)
 #: Optical depth of a voxel below which its collisions do not matter.
 EMPTY = 1e-6
 
@@ -69,8 +70,6 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
             "Reduce the scene to one medium under distant and point lights",
         )
     name = f'medium "{medium.name}"'
-    if not medium.phase.is_isotropic:
-        refuse_all(keys, f"the phase function of {name} is not isotropic", "Make it isotropic")
     if part.half_space is not None:
         refuse_all(keys, f"{name} is opaque and homogeneous, and has no cache", "Set resolution")
     if part.solver.name != "sweep":
@@ -126,7 +125,7 @@ class ParameterAdjoint:
     def _adjoint(self) -> MediumAdjoint:
         wanted: dict[str, int] = {}
         for key, role in self._of_medium.items():
-            field = field_of(self._part.medium, role)
+            field = field_of(original_of(self._part.medium), role)
             own = field.channels if field.grid is not None else channels_of(self._params[key])
             wanted[role] = max(wanted.get(role, 1), own)
         march = self._camera_rays, self._step
@@ -135,9 +134,14 @@ class ParameterAdjoint:
     def _by_parameters(self, found: dict[str, mi.Float]) -> dict[str, object]:
         result = {}
         for key, role in self._of_medium.items():
-            value, field = self._params[key], field_of(self._part.medium, role)
+            value, field = self._params[key], field_of(original_of(self._part.medium), role)
             result[key] = shaped_like(value, by_parameter(value, field, found[role]))
         return result
+
+
+def original_of(medium: MediumGrid) -> MediumGrid:
+    """The medium of the scene, which is not scaled by delta-M."""
+    return medium.original or medium
 
 
 def field_of(medium: MediumGrid, role: str) -> Field:
@@ -182,8 +186,14 @@ class MediumAdjoint:
         self._camera_rays, step = image
         self._medium, self._emitters = part.medium, emitters
         self._transport: AdjointTransport | None = None
-        self._collided: list[mi.Float] = []
-        field, falloff, lights, colour = None, None, [], None
+        #: channels of the sums at the data of each field of the medium
+        self._sums = dict(wanted)
+        if self._medium.original is not None and {SIGMA_T, ALBEDO} & wanted.keys():
+            # The extinction and albedo of the medium depend on the albedo of the scene's, both.
+            most = max(self._medium.channels, *wanted.values())
+            self._sums |= {SIGMA_T: most} | ({ALBEDO: most} if ALBEDO in wanted else {})
+        self._fluence: FluenceFields | None = None
+        colour = None
         if part.cache is not None:
             self.grid = part.cache.grid
             self._check_memory()
@@ -194,19 +204,19 @@ class MediumAdjoint:
                 (part.settings.seed, seed),
                 self._pairs,
                 part.settings.max_depth == 2,
-                wanted,
+                self._sums,
                 self._medium.channels == max(wanted.values(), default=3) == 1
                 and not emitters
                 and EMISSION not in wanted,
             )
-            field, falloff, lights = self._irradiance()
+            self._fluence = FluenceFields(scene, self._medium, part.cache, self._transport)
             self._quadrature = VoxelQuadrature(self._medium, self.grid)
             self._extinction = list(self._quadrature.extinction())
             dr.eval(self._extinction)
             if self._transport.channels == 1:
                 factors = [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
                 colour = mi.Spectrum(factors)
-        self._march = CameraReplay(self._medium, field, falloff, lights, colour, step)
+        self._march = CameraReplay(self._medium, self._fluence, colour, step)
 
     @property
     def _pairs(self) -> int:
@@ -221,55 +231,13 @@ class MediumAdjoint:
 
     def _check_memory(self) -> None:
         """Refuse an adjoint solve that cannot be held."""
-        channels = 1 if mi.is_monochromatic else 3
+        channels, moments = 1 if mi.is_monochromatic else 3, values_per_voxel(self._part.cache) - 1
+        counts = 1, channels, channels * moments
         needed = MEMORY + 4 * self.grid.voxel_count * sum(
-            n * c for n, c in zip(NUMBERS, (1, channels), strict=True)
+            n * c for n, c in zip(NUMBERS, counts, strict=True)
         )
         sides = " x ".join(map(str, self.grid.shape[::-1]))
         require_memory(needed, f"irrcache: a gradient with {sides} voxels", "lower resolution")
-
-    # The irradiance
-
-    def _irradiance(self) -> tuple[RootField, InverseSquareFactor | None, list]:
-        """The irradiance at all voxels, also where there is no matter, for lookups."""
-        cache, grid = self._part.cache, self.grid
-        count, voxels = grid.voxel_count, dr.arange(mi.UInt32, grid.voxel_count)
-        channels, colour = self._transport.channels, self._transport.colour
-        cached, all_channels = cache.irradiance.array, cache.channels
-        # The brightest of all channels that differ by a factor.
-        own = range(channels) if channels == all_channels else [int(colour.argmax())]
-        place = voxels * all_channels
-        known = [
-            dr.gather(mi.Float, cached, place + c) * dr.opaque(mi.Float, 1 / float(colour[c]))
-            for c in own
-        ]
-        swept, self._collided = self._transport.irradiance(known)
-        has_value = dr.zeros(mi.Bool, count)
-        if cache.active_count and cache.samples:
-            dr.scatter(has_value, mi.Bool(True), cache.active)
-        total = [dr.select(has_value, a, b) for a, b in zip(known, swept, strict=True)]
-        brightest = _largest(total)
-        lights = [
-            DirectLight(self._scene, light.emitter, self._medium, grid, voxels)
-            for light in cache.direct_lights
-        ]
-        for light in lights:
-            total = [
-                dr.maximum(t - light.irradiance[c] * dr.opaque(mi.Float, 1 / float(colour[c])), 0)
-                for t, c in zip(total, own, strict=True)
-            ]
-        falloff = InverseSquareFactor.of(self._scene, grid, [light.emitter for light in lights])
-        roots = [dr.sqrt(dr.maximum(t, 0)) for t in total]
-        if falloff is not None:
-            smooth = dr.rsqrt(falloff.of_voxels(voxels))
-            roots = [r * smooth for r in roots]
-        values = interleaved(roots, count)
-        values = conserving(grid, values, dr.full(mi.Bool, True, count), channels)
-        field = RootField(grid, values, channels)
-        if falloff is not None:
-            field.maximum *= falloff.maximum(voxels)
-        field.maximum = max([field.maximum, brightest, *(light.maximum for light in lights)])
-        return field, falloff, [DirectLightAlongRays(light) for light in lights]
 
     # The camera
 
@@ -281,18 +249,51 @@ class MediumAdjoint:
         for each in film.passes():
             span, behind, hit, offset = self._rays(each, film.medium)
             march = each.ray, span, each.radiance
-            ahead, passed = self._march.radiance(*march, behind, offset, hit)
-            dr.eval(ahead, passed)
+            ahead, passed = self._march.radiance(*march, offset, hit)
+            narrow, passed = self._attenuation(each.ray.d, passed)
+            ahead, unscattered = ahead + passed * behind, mi.Spectrum(0)
+            if narrow is not None:
+                unscattered = dr.select(narrow, passed * behind, 0)
+                ahead = ahead - unscattered
+            dr.eval(ahead, passed, unscattered)
             if self._camera_rays.background(self._scene, each.ray, mi.Bool(True))[0]:
                 self._emitters.add_background(each.ray, passed * each.radiance)
             if splats is None:
-                splats = self._camera_splats(ahead, film)
-            self._march.replay(*march, ahead, offset, hit, splats)
+                splats = self._camera_splats(ahead + unscattered, film)
+            self._march.replay(*march, ahead, offset, hit, splats, unscattered)
             dr.eval()
-        found = {role: getattr(splats, role).values() for role in self._wanted}
+        found = self._at_data({role: getattr(splats, role).values() for role in self._sums})
+        if splats.unscattered is not None:
+            found[SIGMA_T] = found[SIGMA_T] + splats.unscattered.values()
         if splats.collisions is None:
             return found, None
-        return found, self._fluence(splats.collisions)
+        return found, self._adjoint_fluence(splats.collisions)
+
+    @property
+    def _is_scaled(self) -> bool:
+        """Whether a forward peak of the phase function counts as unscattered (see `delta_m`)."""
+        return self._medium.original is not None and self._fluence is not None
+
+    def _attenuation(
+        self, direction: mi.Vector3f, transmittance: mi.Spectrum
+    ) -> tuple[mi.Bool | None, mi.Spectrum]:
+        """Whether rays along ``direction`` meet a narrow source behind the medium (None: none is
+        attenuated in another way), and what reaches them of the radiance behind it.
+        """
+        if not self._is_scaled:
+            return None, transmittance
+        basis = self._transport.scattering.basis
+        narrow = basis.hits_source(mi.Point3f(0), direction, mi.Bool(True), mi.Bool(False))
+        exponent = dr.opaque(mi.Float, self._medium.unscattered_exponent)
+        return narrow, dr.select(narrow, dr.power(transmittance, exponent), transmittance)
+
+    def _at_data(self, found: dict[str, mi.Float]) -> dict[str, mi.Float]:
+        """Derivatives by what is wanted of the scene's medium, from those of the medium that is
+        rendered.
+        """
+        if self._medium.original is None or self._sums.keys() <= {EMISSION}:
+            return found
+        return with_forward_peak(self._medium, found, self._sums[SIGMA_T], self._wanted)
 
     def _rays(self, each: CameraPass, medium: mi.Medium | None) -> tuple:
         """For camera rays the distances between which they are in the medium, the weighted radiance
@@ -314,47 +315,59 @@ class MediumAdjoint:
         lengths = np.linalg.norm(self._medium.frame[:3, :3], axis=0)
         diagonal, rays = float(np.linalg.norm(lengths)), film.samples * MARGIN
         largest = film.largest * film.pixels * MARGIN
+        peak = self._medium.phase.peak
         brightest = max(float(dr.max(dr.max(dr.abs(ahead)))[0]) * rays, 1e-30)
         irradiance = self._march.irradiance
-        mean = irradiance.maximum / (4 * np.pi) if irradiance is not None else 0.0
-        needs = self._transport is not None
+        mean = irradiance.maximum * peak / (4 * np.pi) if irradiance is not None else 0.0
+        collisions = unscattered = None
+        if self._transport is not None:
+            layers = self._transport.channels * self._transport.scattering.camera_count
+            collisions = VoxelSums(self.grid, layers, largest * peak)
+        if self._is_scaled and SIGMA_T in self._wanted:
+            original, bound = self._medium.original.sigma_t, brightest * diagonal
+            unscattered = splat_of(original, self._wanted[SIGMA_T], bound)
         return CameraSplats(
             self._splat(SIGMA_T, (brightest + largest * mean) * diagonal),
             self._splat(ALBEDO, largest * mean),
-            VoxelSums(self.grid, self._transport.channels, largest) if needs else None,
+            collisions,
             self._splat(EMISSION, largest * diagonal),
+            unscattered,
         )
 
     def _splat(self, role: str, bound: float) -> GridSplat | ConstantSplat | None:
         """Empty sums of the derivative by a field of the medium; None if it is not wanted."""
-        if role not in self._wanted:
+        if role not in self._sums:
             return None
-        field = field_of(self._medium, role)
-        if field.grid is None:
-            return ConstantSplat(self._wanted[role], bound)
-        return GridSplat(field.grid, field.channels, bound)
+        return splat_of(field_of(self._medium, role), self._sums[role], bound)
 
     # Transport
 
-    def _fluence(self, sums: VoxelSums) -> list[mi.Float]:
-        """The adjoint fluence of camera rays for collisions in the voxels, by channel."""
+    def _adjoint_fluence(self, sums: VoxelSums) -> list[mi.Float]:
+        """The adjoint fluence of camera rays for collisions in the voxels, by channel: its layers
+        one after the other.
+        """
         # docs/primer, eq. (8.4)
         least = dr.opaque(mi.Float, EMPTY / float(self.grid.voxel_size.min()))
         per_volume = dr.opaque(mi.Float, 1 / volume_of(self.grid))
+        values, count = sums.values(), self._transport.scattering.camera_count
         found = [
-            dr.select(mean > least, total * per_volume / dr.maximum(mean, least), 0)
-            for total, mean in zip(sums.values(), self._extinction, strict=False)
+            [
+                dr.select(mean > least, total * per_volume / dr.maximum(mean, least), 0)
+                for total in values[c * count : (c + 1) * count]
+            ]
+            for c, mean in zip(range(self._transport.channels), self._extinction, strict=False)
         ]
         dr.eval(found)
-        return found
+        return [concatenated(layers) for layers in found]
 
     def transported(self, fluence: list[mi.Float]) -> dict[str, mi.Float]:
         """Derivatives by what is wanted, at the data's voxels, of the radiance that reaches the
         voxels, given the adjoint ``fluence`` of camera rays.
         """
         transport = self._transport
-        camera = fluence[: transport.channels]
-        found = transport.derivatives(self._collided, camera, self._extinction)
+        count = transport.scattering.camera_count
+        camera = [split(values, count) for values in fluence[: transport.channels]]
+        found = transport.derivatives(self._fluence.collided, camera, self._extinction)
         self._emitters.add_transport(transport, found)
         if not self._wanted:
             return {}
@@ -367,26 +380,39 @@ class MediumAdjoint:
         }
         of_medium = splats[SIGMA_T], splats[ALBEDO], found, transport.albedo
         self._quadrature.add(*of_medium, splats[EMISSION])
-        result = {role: splats[role].values() for role in self._wanted}
-        if SIGMA_T in self._wanted:
-            lights = zip(transport.point_lights, transport.from_points, strict=True)
-            for emitter, irradiance in lights:
-                result[SIGMA_T] = result[SIGMA_T] + self._along_ways(emitter, irradiance, found)
-        return result
+        result = {role: splats[role].values() for role in self._sums}
+        if SIGMA_T in self._sums:
+            for light in range(len(transport.point_lights)):
+                result[SIGMA_T] = result[SIGMA_T] + self._along_ways(light, found)
+        return self._at_data(result)
 
-    def _along_ways(
-        self, emitter: mi.Emitter, irradiance: mi.Spectrum, found: Derivatives
-    ) -> mi.Float:
+    def _along_ways(self, light: int, found: Derivatives) -> mi.Float:
         """The derivative by the extinction between a point-like light and the voxels."""
-        grid = self.grid
+        grid, transport = self.grid, self._transport
         share = dr.opaque(mi.Float, -volume_of(grid))
-        removed = irradiance * mi.Spectrum(*found.direct) * share
+        worth = transport.worth_of_point(light, found)
+        removed = transport.from_points[light] * worth * share
         dr.eval(removed)
         diagonal = float(np.linalg.norm(grid.side_lengths))
         bound = float(dr.max(dr.max(dr.abs(removed)))[0]) * grid.voxel_count * diagonal * 3
-        splat = self._splat(SIGMA_T, bound * MARGIN)
-        add_ways(self._medium, emitter, self._transport.positions, removed, self._march.step, splat)
+        splat, emitter = self._splat(SIGMA_T, bound * MARGIN), transport.point_lights[light]
+        add_ways(self._medium, emitter, transport.positions, removed, self._march.step, splat)
         return splat.values()
+
+
+def splat_of(field: Field, channels: int, bound: float) -> GridSplat | ConstantSplat:
+    """Empty sums of the derivative by a ``field``."""
+    if field.grid is None:
+        return ConstantSplat(channels, bound)
+    return GridSplat(field.grid, channels, bound)
+
+
+def values_per_voxel(cache: IrradianceCache) -> int:
+    """Layers of the adjoint fluence that camera rays leave in the voxels of a ``cache``."""
+    basis = cache.directional
+    if basis is None:
+        return 1
+    return (basis.order + 1) ** 2 + len(basis.sources) + len(basis.others)
 
 
 def _largest(channels: list[mi.Float]) -> float:
