@@ -79,6 +79,8 @@ class Case:
     filter: str = "box"
     pixels: str = "rgb"
     emissive: bool = False
+    #: mean cosine of a Henyey-Greenstein phase function; None: isotropic scattering
+    g: float | None = None
     parameters: tuple[str, ...] = ("sigma_t", "albedo")
 
     def sigma_t(self) -> np.ndarray:
@@ -138,6 +140,10 @@ class Case:
         )
 
     def _medium(self, place: np.ndarray) -> dict:
+        phase = {} if self.g is None else {"phase": {"type": "hg", "g": self.g}}
+        return self._volumes(place) | phase
+
+    def _volumes(self, place: np.ndarray) -> dict:
         if self.homogeneous:
             peak = self.depth * self.cache / EDGE
             extinction = [float(e) * peak for e in self.extinction]
