@@ -30,7 +30,8 @@ from mitsuba_irrcache.gradients.scattering import split
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.grids.fields import Field
-from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of, position_of
+from mitsuba_irrcache.lights.falloff import edges_away
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
@@ -38,9 +39,10 @@ from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 
-#: Pairs of ordinates for the default directions of the cache, with others in proportion; those
-#: under environments that vary, whose spots they have to find; and the fewest.
-PAIRS, MOST_PAIRS, FEWEST_PAIRS = 24, 128, 8
+#: Pairs of ordinates for the default directions of the cache, with others in proportion; those for
+#: phase functions with a forward peak, whose moments are of higher order; those under environments
+#: that vary, whose spots they have to find; and the fewest.
+PAIRS, SHARP_PAIRS, MOST_PAIRS, FEWEST_PAIRS = 24, 64, 128, 8
 UNEVEN = (EmitterKind.ENVIRONMENT_MAP,)
 #: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
 MARGIN = 256.0
@@ -77,6 +79,15 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
     depth = part.settings.max_depth
     if depth > 2:
         refuse_all(keys, f"max_depth is {depth}", "Set max_depth to 1, 2 or -1")
+    if medium.phase.forward and part.cache is not None:
+        for light in part.description.emitters.of(*POINT_LIKE):
+            # Irradiance and scattering into rays vary too much within the voxels around it.
+            if edges_away(position_of(light)[:, None], part.cache.grid) < 1:
+                refuse_all(
+                    keys,
+                    f'emitter "{light.id()}" is in {name}, which scatters sharply',
+                    "Move it out of the medium, or make the phase function broader",
+                )
 
 
 class ParameterAdjoint:
@@ -227,7 +238,8 @@ class MediumAdjoint:
             self._medium, part.settings.max_depth, part.cache.active_count
         )
         share = (part.cache.samples or usual) / usual
-        return max(FEWEST_PAIRS, round((MOST_PAIRS if uneven else PAIRS) * share))
+        pairs = SHARP_PAIRS if self._medium.phase.forward else PAIRS
+        return max(FEWEST_PAIRS, round((MOST_PAIRS if uneven else pairs) * share))
 
     def _check_memory(self) -> None:
         """Refuse an adjoint solve that cannot be held."""
