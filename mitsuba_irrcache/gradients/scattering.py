@@ -25,8 +25,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Values of a channel at all voxels, layer by layer.
-Layers = list[mi.Float]
+#: Values of a channel at all voxels (mi.Float), layer by layer.
+Layers = list
 
 
 class OrdinatePart:
