@@ -206,7 +206,7 @@ def anisotropic() -> dict[str, Case]:
         for g in (-0.4, 0.3, 0.6, 0.85):
             found[f"hg {g}, {label}"] = Case(g=g, emitters=emitters)
         found[f"hg 0.85, {label}, 512 directions"] = Case(g=0.85, emitters=emitters, directions=512)
-    both = _under(sky=SKY, sun=SUN)
+    both, by_g = _under(sky=SKY, sun=SUN), {"parameters": ("g",)}
     empty = {"empty_beyond": 0.5, "changed": (0.75, 0.85)}
     return found | {
         "hg 0.3, point": Case(g=0.3, emitters=_under(point=POINT)),
@@ -221,6 +221,15 @@ def anisotropic() -> dict[str, Case]:
         "hg 0.6, data finer than the cache": Case(data=24, cache=12, depth=0.2, g=0.6),
         "hg 0.3, sphere": Case(shape="sphere", g=0.3),
         "hg 0.6, homogeneous": Case(homogeneous=True, depth=0.1, g=0.6, emitters=both),
+        "hg 0.54, sun, single": Case(g=0.54, emitters=_under(sun=SUN), max_depth=2, **by_g),
+        "hg 0.54, envmap": Case(g=0.54, emitters=lambda: {"sky": sky_with_sun()}, **by_g),
+        "hg -0.45, sun": Case(g=-0.45, emitters=_under(sun=SUN), **by_g),
+        "hg 0.65, sun": Case(g=0.65, emitters=_under(sun=SUN), **by_g),
+        "hg 0.65, coloured albedo": Case(g=0.65, emitters=both, albedo=(0.6, 0.75, 0.85), **by_g),
+        "hg 0.65, spot": Case(g=0.65, emitters=lambda: {"spot": spot()}, **by_g),
+        "hg 0.82, sun, 512 directions": Case(
+            g=0.823, emitters=_under(sun=SUN), directions=512, **by_g
+        ),
         "hg 0.6, radiance of sky and sun": Case(g=0.6, emitters=both, parameters=("sky", "sun")),
         "hg 0.3, intensity of a point": Case(
             g=0.3, emitters=_under(point=POINT), parameters=("point",)

@@ -17,6 +17,7 @@ interpolated in the same way, so that voxels with little irradiance have little 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from itertools import count, islice
 
 import drjit as dr
@@ -322,6 +323,12 @@ class AngularField:
         rows += [mi.Float(0)] * (self._loads * WIDTH - len(rows))
         self.data = interleaved(rows, grid.voxel_count)
         dr.eval(self.data)
+
+    def in_basis(self, directional: AngularBasis) -> AngularField:
+        """The same moments with another phase function."""
+        field = copy(self)
+        field.directional = directional
+        return field
 
     def factor(
         self,

@@ -17,6 +17,7 @@ from mitsuba_irrcache.gradients.forward_peak import with_forward_peak
 from mitsuba_irrcache.gradients.parameters import (
     ALBEDO,
     EMISSION,
+    MEAN_COSINE,
     SIGMA_T,
     channels_of,
     refuse_all,
@@ -136,6 +137,9 @@ class ParameterAdjoint:
     def _adjoint(self) -> MediumAdjoint:
         wanted: dict[str, int] = {}
         for key, role in self._of_medium.items():
+            if role == MEAN_COSINE:
+                wanted[role] = 1
+                continue
             field = field_of(original_of(self._part.medium), role)
             own = field.channels if field.grid is not None else channels_of(self._params[key])
             wanted[role] = max(wanted.get(role, 1), own)
@@ -145,7 +149,11 @@ class ParameterAdjoint:
     def _by_parameters(self, found: dict[str, mi.Float]) -> dict[str, object]:
         result = {}
         for key, role in self._of_medium.items():
-            value, field = self._params[key], field_of(original_of(self._part.medium), role)
+            value = self._params[key]
+            if role == MEAN_COSINE:
+                result[key] = shaped_like(value, found[role])
+                continue
+            field = field_of(original_of(self._part.medium), role)
             result[key] = shaped_like(value, by_parameter(value, field, found[role]))
         return result
 
@@ -180,8 +188,9 @@ class MediumAdjoint:
     """Derivatives by the medium of ``part`` in ``scene``; ``image`` are the camera rays and the
     integrator's property ``step``.
 
-    ``wanted`` maps what is wanted, `SIGMA_T`, `ALBEDO` or `EMISSION`, to its channels; the
-    derivatives by ``emitters`` are added to their parameters. The ordinates depend on ``seed``.
+    ``wanted`` maps what is wanted, `SIGMA_T`, `ALBEDO`, `EMISSION` or `MEAN_COSINE`, to its
+    channels; the derivatives by ``emitters`` are added to their parameters. The ordinates depend on
+    ``seed``.
     """
 
     def __init__(
@@ -199,10 +208,12 @@ class MediumAdjoint:
         self._transport: AdjointTransport | None = None
         #: channels of the sums at the data of each field of the medium
         self._sums = dict(wanted)
-        if self._medium.original is not None and {SIGMA_T, ALBEDO} & wanted.keys():
+        if self._medium.original is not None and wanted.keys() - {EMISSION}:
             # The extinction and albedo of the medium depend on the albedo of the scene's, both.
             most = max(self._medium.channels, *wanted.values())
-            self._sums |= {SIGMA_T: most} | ({ALBEDO: most} if ALBEDO in wanted else {})
+            self._sums |= {SIGMA_T: most}
+            if wanted.keys() & {ALBEDO, MEAN_COSINE}:
+                self._sums[ALBEDO] = most
         self._fluence: FluenceFields | None = None
         colour = None
         if part.cache is not None:
@@ -227,7 +238,14 @@ class MediumAdjoint:
             if self._transport.channels == 1:
                 factors = [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
                 colour = mi.Spectrum(factors)
-        self._march = CameraReplay(self._medium, self._fluence, colour, step)
+        beside, phases = None, self._transport.beside if self._transport is not None else None
+        if phases is not None:
+            marches = [
+                CameraReplay(self._medium, self._fluence.scattered_by(phase), colour, step)
+                for phase in (phases.below, phases.above)
+            ]
+            beside = (*marches, phases.step)
+        self._march = CameraReplay(self._medium, self._fluence, colour, step, beside)
 
     @property
     def _pairs(self) -> int:
@@ -305,7 +323,9 @@ class MediumAdjoint:
         """
         if self._medium.original is None or self._sums.keys() <= {EMISSION}:
             return found
-        return with_forward_peak(self._medium, found, self._sums[SIGMA_T], self._wanted)
+        phases = self._transport.beside
+        change = phases.forward if phases is not None else 0.0
+        return with_forward_peak(self._medium, found, self._sums[SIGMA_T], self._wanted, change)
 
     def _rays(self, each: CameraPass, medium: mi.Medium | None) -> tuple:
         """For camera rays the distances between which they are in the medium, the weighted radiance
@@ -344,6 +364,7 @@ class MediumAdjoint:
             collisions,
             self._splat(EMISSION, largest * diagonal),
             unscattered,
+            ConstantSplat(1, largest * mean * MARGIN) if MEAN_COSINE in self._wanted else None,
         )
 
     def _splat(self, role: str, bound: float) -> GridSplat | ConstantSplat | None:
@@ -392,7 +413,10 @@ class MediumAdjoint:
         }
         of_medium = splats[SIGMA_T], splats[ALBEDO], found, transport.albedo
         self._quadrature.add(*of_medium, splats[EMISSION])
-        result = {role: splats[role].values() for role in self._sums}
+        result = {role: splats[role].values() for role in self._sums if role in splats}
+        if MEAN_COSINE in self._wanted:
+            total = sum(np.array(values, dtype=np.float64).sum() for values in found.g)
+            result[MEAN_COSINE] = mi.Float(total * volume_of(self.grid))
         if SIGMA_T in self._sums:
             for light in range(len(transport.point_lights)):
                 result[SIGMA_T] = result[SIGMA_T] + self._along_ways(light, found)

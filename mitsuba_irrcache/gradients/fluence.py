@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 
@@ -16,6 +18,7 @@ from mitsuba_irrcache.gradients.transport import AdjointTransport
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.media.phase import Phase
 
 
 class FluenceFields:
@@ -80,7 +83,17 @@ class FluenceFields:
             self.irradiance.maximum *= falloff.maximum(voxels)
         maxima = [self.irradiance.maximum, brightest, *(light.maximum for light in lights)]
         self.irradiance.maximum = max(maxima)
+        self._lights = lights
         self.direct_lights = [DirectLightAlongRays(light, basis) for light in lights]
+
+    def scattered_by(self, phase: Phase) -> FluenceFields:
+        """The same fluence with another phase function for scattering into camera rays."""
+        fields, known = copy(self), self._cache.directional
+        basis = AngularBasis(phase, known.sources, order=known.order)
+        fields.angular = self.angular.in_basis(basis)
+        basis = AngularBasis(phase, [], order=known.order)
+        fields.direct_lights = [DirectLightAlongRays(light, basis) for light in self._lights]
+        return fields
 
     def _known(self, channel: int) -> Layers:
         """The layers of a channel of the cache at all voxels: the irradiance, moments, and the

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.gradients.parameters import ALBEDO, SIGMA_T
+from mitsuba_irrcache.gradients.parameters import ALBEDO, MEAN_COSINE, SIGMA_T
 from mitsuba_irrcache.gradients.splatting import GridSplat
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.grids.grid import Grid
@@ -16,10 +16,15 @@ from mitsuba_irrcache.media.medium import MediumGrid
 
 
 def with_forward_peak(
-    medium: MediumGrid, found: dict[str, mi.Float], channels: int, wanted: dict[str, int]
+    medium: MediumGrid,
+    found: dict[str, mi.Float],
+    channels: int,
+    wanted: dict[str, int],
+    change: float = 0.0,
 ) -> dict[str, mi.Float]:
     """Derivatives by the extinction and albedo of ``medium.original``, of those that are
-    ``wanted``, in so many channels, from those by ``medium`` in ``channels``.
+    ``wanted``, in so many channels, from those by ``medium`` in ``channels``; and that by the mean
+    cosine of the phase function, by which the share of the peak has the derivative ``change``.
     """
     # docs/primer, eq. (8.14)
     share, field = medium.phase.forward, medium.sigma_t
@@ -32,17 +37,27 @@ def with_forward_peak(
     if SIGMA_T in wanted:
         values = [(1 - share * a) * d for a, d in zip(albedo, by_sigma_t, strict=False)]
         result[SIGMA_T] = _at_data(medium.original.sigma_t, p, values, wanted[SIGMA_T])
+    by_share = 0.0
+    if MEAN_COSINE in wanted:
+        triples = zip(albedo, sigma_t, by_sigma_t, strict=False)
+        by_share -= sum(_total(a * s * d) for a, s, d in triples)
     if ALBEDO in wanted:
         values = [-share * s * d for s, d in zip(sigma_t, by_sigma_t, strict=False)]
         result[ALBEDO] = _at_data(medium.original.albedo, p, values, wanted[ALBEDO])
-        p = _positions(medium.albedo.grid)
-        albedo = list(mi.Spectrum(medium.original.albedo.at_world(p)))
-        by_albedo = _channels(found[ALBEDO], channels)
-        values = [
-            d * (1 - share) / dr.square(1 - share * a)
-            for a, d in zip(albedo, by_albedo, strict=False)
-        ]
+    if ALBEDO not in found:
+        return result
+    p = _positions(medium.albedo.grid)
+    albedo = list(mi.Spectrum(medium.original.albedo.at_world(p)))
+    by_albedo = [
+        (a, d / dr.square(1 - share * a))
+        for a, d in zip(albedo, _channels(found[ALBEDO], channels), strict=False)
+    ]
+    if ALBEDO in wanted:
+        values = [d * (1 - share) for _, d in by_albedo]
         result[ALBEDO] += _at_data(medium.original.albedo, p, values, wanted[ALBEDO])
+    if MEAN_COSINE in wanted:
+        by_share += sum(_total(a * (a - 1) * d) for a, d in by_albedo)
+        result[MEAN_COSINE] = found[MEAN_COSINE] + mi.Float(change * by_share)
     dr.eval(result)
     return result
 
@@ -58,6 +73,10 @@ def _channels(values: mi.Float, count: int) -> list[mi.Float]:
     """So many interleaved channels, each as an array."""
     index = dr.arange(mi.UInt32, dr.width(values) // count) * count
     return [dr.gather(mi.Float, values, index + c) for c in range(count)]
+
+
+def _total(values: mi.Float) -> float:
+    return float(np.array(values, dtype=np.float64).sum())
 
 
 def _at_data(field: Field, p: mi.Point3f, values: list[mi.Float], channels: int) -> mi.Float:

@@ -30,8 +30,8 @@ OPAQUE = 1e-6
 class CameraSplats:
     """Where the replay adds derivatives: by extinction, albedo and emission at positions, and the
     adjoint fluence of collisions in voxels, layer by layer of each channel. ``unscattered`` is that
-    by the extinction before delta-M scaling, which attenuates narrow sources behind the medium.
-    None where a derivative is not wanted.
+    by the extinction before delta-M scaling, which attenuates narrow sources behind the medium;
+    ``g`` that by the mean cosine of the phase function. None where a derivative is not wanted.
 
     It is no dataclass, whose fields would be state of the recorded loop.
     """
@@ -43,9 +43,10 @@ class CameraSplats:
         collisions: VoxelSums | None,
         emission: GridSplat | ConstantSplat | None = None,
         unscattered: GridSplat | ConstantSplat | None = None,
+        g: ConstantSplat | None = None,
     ) -> None:
         self.sigma_t, self.albedo, self.emission = sigma_t, albedo, emission
-        self.collisions, self.unscattered = collisions, unscattered
+        self.collisions, self.unscattered, self.g = collisions, unscattered, g
 
 
 class InScattering:
@@ -55,6 +56,10 @@ class InScattering:
 
     def __init__(self, field: AngularField, basis: AngularBasis) -> None:
         self._field, self._basis = field, basis
+
+    def in_basis(self, basis: AngularBasis) -> InScattering:
+        """The same with another phase function of the field."""
+        return InScattering(self._field.in_basis(basis), self._basis)
 
     def view(self, direction: mi.Vector3f) -> tuple:
         """What depends on the ``direction`` of rays alone."""
@@ -89,7 +94,8 @@ class CameraReplay:
     scattered.
 
     All channels of the fluence are one, times the factors ``colour``, unless that is None. ``step``
-    is the integrator's property.
+    is the integrator's property. ``beside`` are marches with phase functions beside that of the
+    medium, and the difference between their mean cosines; None where none is known.
     """
 
     def __init__(
@@ -98,8 +104,12 @@ class CameraReplay:
         fluence: FluenceAlongRays | None,
         colour: mi.Spectrum | None,
         step: float,
+        beside: tuple[CameraReplay, CameraReplay, float] | None = None,
     ) -> None:
-        self.medium, self.colour = medium, colour
+        self.medium, self.colour, self._beside = medium, colour, None
+        if beside is not None:
+            *marches, difference = beside
+            self._beside = marches, dr.opaque(mi.Float, 1 / difference)
         self.irradiance = self._falloff = self._angular = None
         self._direct_lights: list[DirectLightAlongRays] = []
         if fluence is not None:
@@ -137,6 +147,20 @@ class CameraReplay:
         for light in self._direct_lights:
             phi = phi + light.at(p, active, direction, with_peak=True)
         return phi * dr.inv_four_pi
+
+    def views_beside(self, direction: mi.Vector3f) -> list[tuple]:
+        """Results of `view` of the marches beside this one."""
+        return [] if self._beside is None else [m.view(direction) for m in self._beside[0]]
+
+    def by_mean_cosine(self, p: mi.Point3f, active: mi.Bool, views: list[tuple]) -> mi.Spectrum:
+        """The derivative of `mean_radiance` by the mean cosine of the phase function."""
+        if self._beside is None:
+            return mi.Spectrum(0)
+        marches, factor = self._beside
+        below, above = (
+            march.mean_radiance(p, active, view) for march, view in zip(marches, views, strict=True)
+        )
+        return (above - below) * factor
 
     def collisions(
         self, collided: mi.Spectrum, p: mi.Point3f, active: mi.Bool, view: tuple
@@ -199,6 +223,7 @@ class CameraReplay:
         k, t, ahead = mi.Float(0), mi.Float(near), mi.Spectrum(ahead)
         passed, active = mi.Spectrum(adjoint), mi.Bool(active) & (near < far)
         transmittance, view = mi.Spectrum(1), self.view(ray.d)
+        beside = self.views_beside(ray.d) if dr.hint(splats.g is not None, mode="scalar") else []
         while dr.hint(active, label="camera rays"):
             end = minimum(dr.fma(k + offset, self.step, near), far)
             p, length = ray(0.5 * (t + end)), end - t
@@ -221,6 +246,9 @@ class CameraReplay:
             if dr.hint(splats.collisions is not None, mode="scalar"):
                 values = self.collisions(passed * absorbed, p, active, view)
                 splats.collisions.add(p, values, active)
+            if dr.hint(splats.g is not None, mode="scalar"):
+                change = passed * absorbed * albedo * self.by_mean_cosine(p, active, beside)
+                splats.g.add(p, of_channels(change, 1), active)
             if dr.hint(splats.unscattered is not None, mode="scalar"):
                 change = of_channels(-length * unscattered, splats.unscattered.channels)
                 splats.unscattered.add(p, change, active)

@@ -151,11 +151,6 @@ class AnisotropicScattering(IsotropicScattering):
         self.solving_pairs = directions_of(basis.order) // 2
         moments = [float(basis.phase.moments[degree]) for degree in self._moments.degrees]
         self._factors = [dr.opaque(mi.Float, 4 * np.pi * g) for g in moments]
-        # What travels against a direction has moments of the opposite sign if they are odd.
-        self._products = [
-            dr.opaque(mi.Float, (-g if degree % 2 else g) / (1 if degree else 4 * np.pi))
-            for degree, g in zip(self._moments.degrees, moments, strict=True)
-        ]
 
     def new_level(
         self, sigma_t: mi.Float, albedo: list[mi.Float], tracks: Tracks
@@ -200,8 +195,17 @@ class AnisotropicScattering(IsotropicScattering):
     def scattered(self, layers: Layers, scale: mi.Float) -> Layers:
         return [scale * g * layer for g, layer in zip(self._factors, layers, strict=True)]
 
-    def product(self, fluence: Layers, adjoint: Layers) -> mi.Float:
-        triples = zip(self._products, fluence, adjoint, strict=True)
+    def product(
+        self, fluence: Layers, adjoint: Layers, moments: np.ndarray | None = None
+    ) -> mi.Float:
+        """As for isotropic scattering; by another phase function if its ``moments`` are given."""
+        moments = self.basis.phase.moments if moments is None else moments
+        # What travels against a direction has moments of the opposite sign if they are odd.
+        factors = [
+            dr.opaque(mi.Float, (-1) ** n * float(moments[n]) / (1 if n else 4 * np.pi))
+            for n in self._moments.degrees
+        ]
+        triples = zip(factors, fluence, adjoint, strict=True)
         return sum(factor * a * b for factor, a, b in triples)
 
     def into(self, scattered: Layers, direction: mi.Vector3f) -> mi.Float:

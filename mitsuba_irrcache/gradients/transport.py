@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.gradients.parameters import EMISSION, SIGMA_T
+from mitsuba_irrcache.gradients.parameters import EMISSION, MEAN_COSINE, SIGMA_T
+from mitsuba_irrcache.gradients.phase_function import PhasesBeside
 from mitsuba_irrcache.gradients.scattering import (
     Layers,
     of_channels,
@@ -43,23 +44,29 @@ class Derivatives:
     channel of the radiance: by the extinction, for collisions of the voxel's albedo;
     ``collided``, by the scattering coefficient, Phi Phi* / (4 pi); and ``emitted``, by emission
     that is scattered. ``direct`` is, for each channel and part of the radiance, the scattered
-    importance of what enters from emitters (see `scattering`).
+    importance of what enters from emitters (see `scattering`); ``g``, by the mean cosine of the
+    phase function.
     """
 
     def __init__(
-        self, sigma_t: list, collided: list, direct: list[list[Layers]], emitted: list
+        self,
+        sigma_t: list,
+        collided: list,
+        direct: list[list[Layers]],
+        emitted: list,
+        g: Sequence = (),
     ) -> None:
         self.sigma_t, self.collided = sigma_t, collided
-        self.direct, self.emitted = direct, emitted
+        self.direct, self.emitted, self.g = direct, emitted, g
 
 
 class AdjointTransport:
     """The transport equation in all voxels of ``grid``, and its adjoint.
 
     ``pairs`` of opposite ordinates are used. With ``single``, radiance is scattered once only.
-    ``wanted`` are the derivatives to be found, `SIGMA_T` and `EMISSION` if they are among them. If
-    the medium and what is wanted are ``grey``, and all emitters have one colour, a single channel
-    stands for all: ``colour`` holds the factors of the radiance of each.
+    ``wanted`` are the derivatives to be found: `SIGMA_T`, `EMISSION` and `MEAN_COSINE` may be among
+    them. If the medium and what is wanted are ``grey``, and all emitters have one colour, a single
+    channel stands for all: ``colour`` holds the factors of the radiance of each.
     """
 
     def __init__(
@@ -75,6 +82,8 @@ class AdjointTransport:
     ) -> None:
         self.grid, self._medium, self.single, self._wanted = grid, medium, single, wanted
         self.scattering = scattering_of(scene, medium)
+        #: phase functions beside that of the medium, if derivatives by its mean cosine are wanted
+        self.beside = PhasesBeside(medium.phase) if MEAN_COSINE in wanted else None
         colours = 1 if mi.is_monochromatic else 3
         rng = np.random.default_rng((*seed, 0x67726164))
         illumination = DistantIllumination(scene)
@@ -238,7 +247,7 @@ class AdjointTransport:
         # docs/primer, eq. (8.6)
         scattering = self.scattering
         totals, travelled, emitted = self.adjoint(camera)
-        sigma_t, collided, direct = [], [], []
+        sigma_t, collided, direct, by_g = [], [], [], []
         for level, own in self.levels:
             for c in own:
                 scale = self.albedo[c] * dr.inv_four_pi
@@ -247,10 +256,13 @@ class AdjointTransport:
                     adjoint = [scattering.scattered(layers, scale) for layers in totals[c]]
                     sigma_t.append(self._products(level, c, source, adjoint))
                 collided.append(scattering.product(phi[c], travelled[c]))
+                if self.beside is not None:
+                    change = scattering.product(phi[c], travelled[c], self.beside.moments)
+                    by_g.append(extinction[c] * self.albedo[c] * change)
                 scale = extinction[c] * scale
                 direct.append([scattering.scattered(layers, scale) for layers in totals[c]])
-        dr.eval(sigma_t, collided, direct)
-        return Derivatives(sigma_t, collided, direct, emitted)
+        dr.eval(sigma_t, collided, direct, by_g)
+        return Derivatives(sigma_t, collided, direct, emitted, by_g)
 
     def _products(
         self, level: MultigridLevel, channel: int, source: Layers | None, adjoint: list[Layers]
