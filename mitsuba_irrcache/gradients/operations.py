@@ -17,8 +17,9 @@ import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import graph_variables
-from mitsuba_irrcache.gradients.backward import ParameterAdjoint, values_per_voxel
+from mitsuba_irrcache.gradients.backward import ParameterAdjoint
 from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients.medium import values_per_voxel
 from mitsuba_irrcache.gradients.parameters import enabled
 
 
