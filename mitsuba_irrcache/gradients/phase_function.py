@@ -26,6 +26,8 @@ class PhasesBeside:
         forward: derivative of the share of a truncated forward peak.
     """
 
+    # docs/primer, eq. (8.15)
+
     def __init__(self, phase: Phase) -> None:
         g = float(np.array(mi.traverse(phase.plugin)["g"]).ravel()[0])
         ends = [float(np.clip(g + step, -LARGEST, LARGEST)) for step in (-STEP, STEP)]

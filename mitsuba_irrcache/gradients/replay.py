@@ -75,6 +75,7 @@ class InScattering:
         """Layers of the importance of a ray: moments of its direction, and what the irradiance of
         each narrow source is weighted by.
         """
+        # docs/primer, eq. (8.12)
         direction, _, moments = view
         gains = [1 + gain for gain in self._basis.gains(p, direction, active)]
         return [mi.Float(1), *moments, *gains]

@@ -199,6 +199,7 @@ class AnisotropicScattering(IsotropicScattering):
         self, fluence: Layers, adjoint: Layers, moments: np.ndarray | None = None
     ) -> mi.Float:
         """As for isotropic scattering; by another phase function if its ``moments`` are given."""
+        # docs/primer, eq. (8.13)
         moments = self.basis.phase.moments if moments is None else moments
         # What travels against a direction has moments of the opposite sign if they are odd.
         factors = [
