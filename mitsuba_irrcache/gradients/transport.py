@@ -297,11 +297,13 @@ class AdjointTransport:
         # Ordinates of emitters alone have no weight, but what enters along them meets W, too.
         backward = tracks.table(directions, 0 * incoming, np.ones_like(weights), offsets)
         dr.eval(source, adjoint)
-        swept: list[mi.Float] = []
+        swept = list(adjoint)
 
         def importance_of(group: PairGroup) -> mi.Float:
-            swept[:] = [scattering.along(level, adjoint, group)]
-            return swept[0]
+            found = scattering.along(level, adjoint, group)
+            if scattering.count > 1:
+                swept[:] = [found]
+            return found
 
         both = zip(
             tracks.sweep_separately(forward, lambda group: scattering.along(level, source, group)),
@@ -324,7 +326,7 @@ def _pair_products(
     grid: Grid, group: PairGroup, radiance: mi.Float, importance: mi.Float, adjoint: mi.Float
 ):
     """Sums over the ordinates of a group of the means over voxels of (S - L) W; ``adjoint`` is the
-    source S* of the importance, laid out as both, ordinate by ordinate.
+    source S* of the importance, laid out as both, ordinate by ordinate, or the same along all.
 
     Within a voxel both decay towards their sources S and S*, L forwards and W backwards: with
     L - S and W - S* in its middle, the mean is -(L - S) [S* sinh(tau/2) / (tau/2) + W - S*].
@@ -332,7 +334,8 @@ def _pair_products(
     # docs/primer, eq. (8.7)
     voxels = dr.opaque(mi.UInt32, grid.voxel_count)
     voxel = dr.arange(mi.UInt32, grid.voxel_count)
-    k, count = mi.UInt32(0), group.count * 2
+    each = dr.width(adjoint) > grid.voxel_count
+    own, k, count = dr.gather(mi.Float, adjoint, voxel), mi.UInt32(0), group.count * 2
     total = dr.zeros(mi.Float, grid.voxel_count)
     while dr.hint(k < count, label="ordinates"):
         number = k // 2
@@ -340,7 +343,8 @@ def _pair_products(
         area = dr.max(dr.abs(grid.coordinates.vector(group.direction(number))))
         _, light, _, depth = dr.gather(mi.Vector4f, radiance, place)
         _, weight, _, _ = dr.gather(mi.Vector4f, importance, opposite)
-        own = dr.gather(mi.Float, adjoint, opposite)
+        if dr.hint(each, mode="scalar"):
+            own = dr.gather(mi.Float, adjoint, opposite)
         half = 0.5 * depth / area
         series = 1 + half * half * (1 / 6)
         mean = dr.select(half < 0.1, series, dr.sinh(half) / half)
