@@ -148,7 +148,9 @@ def solver_of(build: Callable[[], dict], pixels: int) -> str:
 
 
 def table(rows: dict[str, dict], pixels: int) -> Table:
-    """Tabulate the rows; errors below the resolution of the reference count as that."""
+    """Tabulate the rows; errors below the resolution of the reference count as that, and targets
+    below it are not resolved.
+    """
     head = ["scene", "solver"]
     head += [f"RMSE {target:.1%}" for target in TARGETS]
     head += [f"camera moved, {min(TARGETS):.1%}", "faster below"]
@@ -163,7 +165,12 @@ def _speeds(row: dict) -> list[str]:
     for target, key in [(t, "cold") for t in TARGETS] + [(min(TARGETS), "moved")]:
         found = [r[key] for r in row["irrcache"] if max(r["rmse"], row["resolved"]) <= target]
         stock = cost / target**2
-        cells.append(f"{stock / min(found):.2g} x, {min(found):.2g} s" if found else "not reached")
+        if row["resolved"] > target:
+            cells.append("not resolved")
+        elif not found:
+            cells.append("not reached")
+        else:
+            cells.append(f"{stock / min(found):.2g} x, {min(found):.2g} s")
     # An image of error e takes the cache's time and that of its samples, which goes with e^-2.
     last = row["irrcache"][-1]
     error, once = max(last["rmse"], row["resolved"]), max(last["cold"] - last["moved"], 1e-3)

@@ -135,10 +135,13 @@ class AnisotropicMultigridLevel(MultigridLevel):
     def prolong(self, values: mi.Float) -> mi.Float:
         """As `MultigridLevel.prolong`; moments that the coarser level does not have are 0."""
         moments, count = self.coarser.moments, self.coarser.tracks.active_count
-        moment, place = layer_and_index(self.tracks.active_count, self.moments.count)
-        known = moment < dr.opaque(mi.UInt32, moments.count)
-        begin = dr.select(known, moment, 0) * dr.opaque(mi.UInt32, count)
-        return dr.select(known, self._interpolated(values, place, 1, begin), 0)
+        moment, place = layer_and_index(self.tracks.active_count, moments.count)
+        begin = moment * dr.opaque(mi.UInt32, count)
+        known = self._interpolated(values, place, 1, begin)
+        result = dr.opaque(mi.Float, 0, self.moments.count * self.tracks.active_count)
+        dr.scatter(result, known, dr.arange(mi.UInt32, dr.width(known)))
+        dr.eval(result)
+        return result
 
     def sweep(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
         """As `MultigridLevel.sweep`, for all moments."""
