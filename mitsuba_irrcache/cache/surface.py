@@ -196,7 +196,8 @@ class SurfaceNodes:
             dr.eval(is_new, active, slot)
             if not dr.any(active)[0]:
                 break
-        is_new |= lane < self.count
+        first = dr.opaque(mi.UInt32, self.count)
+        is_new |= lane < first
         chosen = dr.compress(is_new)
         # Renumber: lanes become numbers of nodes.
         renumbered = dr.zeros(mi.UInt32, count)
@@ -210,7 +211,6 @@ class SurfaceNodes:
         dr.eval(self._slots, self.keys)
         if total == before:
             return mi.UInt32(), mi.UInt32()
-        first = dr.opaque(mi.UInt32, before)
         numbers = dr.arange(mi.UInt32, total - before) + first
         # The keys of the table come first and are all in use.
         place = dr.gather(mi.UInt32, chosen, numbers) - first

@@ -145,8 +145,8 @@ class SurfaceIrradiance:
             dr.gather(mi.UInt32, self.nodes.streams(numbers)[0], lane), self._seed
         )
         shift = unit_floats(words)
-        index = mi.Float(k) * (1 / count)
-        u = (index + shift[0] * (1 / count), kronecker(k, 1, [shift[1]])[0])
+        share = dr.opaque(mi.Float, 1 / count)  # one kernel for all numbers of rays
+        u = (mi.Float(k) * share + shift[0] * share, kronecker(k, 1, [shift[1]])[0])
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*u))
         geometric, shading = (dr.gather(mi.Normal3f, n, lane) for n in normals)
         vertex = dr.zeros(mi.Interaction3f, dr.width(lane))
