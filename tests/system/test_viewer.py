@@ -74,7 +74,7 @@ def test_edit_save_reload_and_second_window(browser, started):
     # A saved scene renders to the displayed image.
     window.unfold("Save")
     window.page.get_by_role("button", name="save view", exact=True).click()
-    window.page.get_by_text("saved view").wait_for()
+    window.page.get_by_text("saved view").wait_for(state="attached")  # whether folded or not
     kept = folder / "kept" / "view.xml"
     assert main(["render", str(kept), "-o", str(folder / "again.exr")]) == 0
     again = np.rint(255 * read_image(folder / "again.png"))
