@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.performance.kinds.run import box, smoke
+from experiments.performance.kinds.scenes import box, smoke
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.base import solver_named

@@ -20,7 +20,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from experiments.performance.kinds import run as kinds
+from experiments.performance.kinds import scenes as kinds
 from experiments.support.options import begin
 from mitsuba_irrcache.errors import IrrcacheError
 

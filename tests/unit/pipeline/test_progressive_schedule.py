@@ -15,6 +15,8 @@ from mitsuba_irrcache.pipeline.progressive import (
     IMAGE_SHARE,
     OPENING,
     Schedule,
+    Targets,
+    _Run,
 )
 
 
@@ -117,3 +119,33 @@ def test_a_cache_from_a_file_is_shown_at_once():
     assert schedule.next_pass(512, math.inf) == 0
     schedule.note_image(0.1)
     assert 0 < schedule.next_pass(512, math.inf) <= 512
+
+
+class RefinedByOthers:
+    """A builder whose cache another thread refines by a batch after each look at its samples."""
+
+    is_dark = False
+
+    def __init__(self):
+        self._done = 0
+
+    @property
+    def done(self) -> int:
+        self._done += BATCH
+        return self._done
+
+
+@pytest.mark.parametrize("goal", [4 * BATCH, 5 * BATCH, 9 * BATCH])
+def test_passes_of_other_threads_do_not_add_up(goal):
+    """The samples after the next pass do not exceed the target, however often other threads refine
+    the cache meanwhile.
+    """
+    run = _Run(RefinedByOthers(), None, None, Targets(cache_spp=goal), None)
+    run.goal = goal
+    run.schedule.note_pass(BATCH, 0.1)
+    run.schedule.note_image(0.01)
+    asked = []
+    run._update = lambda samples, _: asked.append(samples)
+    while samples := run.next_pass():
+        run.refine(samples, None)
+    assert asked and max(asked) <= goal
