@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated, layer_and_index
+from mitsuba_irrcache.core.jit import concatenated, symbolic
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import layer_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     BoundaryOrdinateSet,
