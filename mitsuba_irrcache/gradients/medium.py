@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.gradients.emitters import EmitterAdjoint
 from mitsuba_irrcache.gradients.film import CameraPass, FilmAdjoint
 from mitsuba_irrcache.gradients.fluence import FluenceFields
@@ -30,7 +31,6 @@ from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 
 #: Pairs of ordinates for the default directions of the cache, with others in proportion; those for
 #: phase functions with a forward peak, whose moments are of higher order; those under environments

@@ -16,10 +16,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import directions_of
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated, interleaved_channels
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import interleaved_channels
 from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup
