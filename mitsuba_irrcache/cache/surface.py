@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import concatenated, symbolic
 
 #: Node number of keys that are not in the table.
 NONE = 0xFFFFFFFF
@@ -173,7 +173,7 @@ class SurfaceNodes:
         They have to be completed by `place`.
         """
         parts = [self.keys] if self.count else []
-        candidates = dr.concat([*parts, *keys])
+        candidates = concatenated([*parts, *keys])
         count = dr.width(candidates)
         size = 1 << max(2 * count - 1, 1).bit_length()
         slots = dr.full(mi.UInt32, NONE, size)
@@ -196,7 +196,8 @@ class SurfaceNodes:
             dr.eval(is_new, active, slot)
             if not dr.any(active)[0]:
                 break
-        is_new |= lane < self.count
+        first = dr.opaque(mi.UInt32, self.count)
+        is_new |= lane < first
         chosen = dr.compress(is_new)
         # Renumber: lanes become numbers of nodes.
         renumbered = dr.zeros(mi.UInt32, count)
@@ -210,7 +211,6 @@ class SurfaceNodes:
         dr.eval(self._slots, self.keys)
         if total == before:
             return mi.UInt32(), mi.UInt32()
-        first = dr.opaque(mi.UInt32, before)
         numbers = dr.arange(mi.UInt32, total - before) + first
         # The keys of the table come first and are all in use.
         place = dr.gather(mi.UInt32, chosen, numbers) - first
@@ -263,7 +263,7 @@ class SurfaceNodes:
             dr.ravel(mi.Vector4f(geometric.x, geometric.y, geometric.z, mi.Float(medium))),
         )
         old = self._places, self._normals, self._geometric
-        joined = [dr.concat([a, b]) if known else b for a, b in zip(old, new, strict=True)]
+        joined = [concatenated([a, b]) if known else b for a, b in zip(old, new, strict=True)]
         self._places, self._normals, self._geometric = joined
         dr.eval(joined)
 

@@ -1,4 +1,4 @@
-"""Dr.Jit loops written in Python syntax, and integer division by constants."""
+"""Dr.Jit loops written in Python syntax, integer division by constants, and concatenation."""
 
 from __future__ import annotations
 
@@ -75,6 +75,21 @@ def unravelled(index: mi.UInt32, sides: Sequence[Divisor]) -> tuple[mi.UInt32, .
         index, place = side.split(index)
         places.append(place)
     return (*places, index)
+
+
+def concatenated(parts: Sequence[dr.ArrayBase]) -> dr.ArrayBase:
+    """Concatenate arrays of one type by kernels that do not depend on their widths, as those of
+    ``dr.concat`` do.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    result = dr.empty(type(parts[0]), sum(dr.width(part) for part in parts))
+    start = 0
+    for part in parts:
+        dr.scatter(result, part, dr.arange(mi.UInt32, dr.width(part)) + dr.opaque(mi.UInt32, start))
+        start += dr.width(part)
+    dr.eval(result)
+    return result
 
 
 def graph_variables(value: object) -> list[int]:

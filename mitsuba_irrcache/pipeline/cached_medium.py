@@ -343,7 +343,11 @@ class CachedMedium:
         solver = self._kept_solver or self.new_solver(scene)
         if solver.is_kept:
             self._kept_solver = solver
-        solver.refine(missing, progress)
+        solver.use(scene)
+        try:
+            solver.refine(missing, progress)
+        finally:
+            solver.use(None)
         release_unused_memory(self.cache.grid.voxel_count)
 
     def new_solver(self, scene: mi.Scene, cache: IrradianceCache | None = None) -> Solver:

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.core.jit import Divisor, symbolic
+from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
 from mitsuba_irrcache.render.surface_paths import SurfacePaths, facing, lambertian
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
@@ -145,8 +145,8 @@ class SurfaceIrradiance:
             dr.gather(mi.UInt32, self.nodes.streams(numbers)[0], lane), self._seed
         )
         shift = unit_floats(words)
-        index = mi.Float(k) * (1 / count)
-        u = (index + shift[0] * (1 / count), kronecker(k, 1, [shift[1]])[0])
+        share = dr.opaque(mi.Float, 1 / count)  # one kernel for all numbers of rays
+        u = (mi.Float(k) * share + shift[0] * share, kronecker(k, 1, [shift[1]])[0])
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*u))
         geometric, shading = (dr.gather(mi.Normal3f, n, lane) for n in normals)
         vertex = dr.zeros(mi.Interaction3f, dr.width(lane))
@@ -182,10 +182,10 @@ class SurfaceIrradiance:
     def _solve(self) -> None:
         """Solve E = E_0 + H E by iteration."""
         # docs/primer, eq. (5.8)
-        total = [dr.concat([part.own[c] for part in self._exchange]) for c in self._channels]
+        total = [concatenated([part.own[c] for part in self._exchange]) for c in self._channels]
         for _ in range(MOST_ITERATIONS):
             parts = [part.gathered(total) for part in self._exchange]
-            following = [dr.concat([part[c] for part in parts]) for c in self._channels]
+            following = [concatenated([part[c] for part in parts]) for c in self._channels]
             change = sum(dr.sum(dr.abs(a - b)) for a, b in zip(following, total, strict=True))
             scale = sum(dr.sum(a) for a in following)
             dr.eval(following, change, scale)
@@ -221,8 +221,8 @@ def _joined(parts: Sequence) -> object:
     if isinstance(first, tuple):
         return tuple(_joined(each) for each in zip(*parts, strict=True))
     if isinstance(first, (mi.Point3f, mi.Normal3f)):
-        return type(first)(*(dr.concat([part[k] for part in parts]) for k in range(3)))
-    return dr.concat(list(parts))
+        return type(first)(*(concatenated([part[k] for part in parts]) for k in range(3)))
+    return concatenated(list(parts))
 
 
 @symbolic

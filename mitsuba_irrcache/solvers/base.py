@@ -83,7 +83,7 @@ class Solver(ABC):
     #: whether all voxels share their samples, and so their errors
     is_correlated: ClassVar[bool] = False
     #: whether one instance should be kept for all samples, since it holds tables that take a while
-    #: to be made; the others do not outlive a call, so that they do not hold the scene
+    #: to be made, see `use`; the others do not outlive a call, so that they do not hold the scene
     is_kept: ClassVar[bool] = False
     #: whether the first batches may be shown while they are incomplete, see `preview`
     has_preview: ClassVar[bool] = False
@@ -157,6 +157,13 @@ class Solver(ABC):
 
         The random stream goes on where it stopped. If ``progress`` raises, batches that are
         complete stay in the cache.
+        """
+
+    def use(self, scene: mi.Scene | None) -> None:  # noqa: B027 (most hold nothing)
+        """Refine in this ``scene`` from now on; hold none between calls, where it is None.
+
+        A scene holds its integrator, and that a kept solver. If this held the scene, neither would
+        ever be freed: garbage collection does not see references within Mitsuba.
         """
 
     def preview(self) -> Preview:

@@ -150,5 +150,8 @@ class SweepSolver(Solver):
         options = task.seed, task.rr_depth, task.pause
         self._sweep = kind(task.scene, task.medium, task.cache, *options)
 
+    def use(self, scene: mi.Scene | None) -> None:
+        self._sweep.use(scene)
+
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         self._sweep.refine(samples, progress)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
+from time import monotonic, sleep
 
 import numpy as np
 
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.session import Session
-from mitsuba_irrcache.view.window import Picture
+from mitsuba_irrcache.view.window import Picture, View, Window
 
 SCENE = """<scene version="3.0.0">
     <integrator type="irrcache"> <integer name="max_depth" value="2"/> </integrator>
@@ -39,6 +42,9 @@ SCENE = """<scene version="3.0.0">
 
 
 SIZE = (48, 40)
+#: Seconds after which an expected image counts as missing. Kernels may be compiled before it, while
+#: other programs use the machine.
+PATIENCE = 240.0
 
 
 class Screen:
@@ -53,7 +59,7 @@ class Screen:
             self.pictures.append(picture)
             self._news.notify_all()
 
-    def wait(self, condition, seconds: float = 20) -> Picture:
+    def wait(self, condition, seconds: float = PATIENCE) -> Picture:
         """Wait for an image that fulfils ``condition``; the last recorded one counts, too."""
         with self._news:
             found = self._news.wait_for(
@@ -62,6 +68,18 @@ class Screen:
             )
         assert found, f"none of {len(self.pictures)} pictures"
         return found
+
+
+def drag(session: Session, window: Window, view: View, condition: Callable[[], bool]) -> View:
+    """Turn the camera of ``view`` like a mouse until ``condition`` holds; return the last view."""
+    began, moved = monotonic(), view
+    for degrees in count(1):
+        assert monotonic() - began < PATIENCE, "the images of the moving camera are not those"
+        moved = replace(view, camera=turned(view.camera, degrees))
+        session.look(window, moved)
+        sleep(0.02)
+        if condition():
+            return moved
 
 
 def front(session: Session) -> Camera:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from PIL import Image
 
-from experiments.performance.viewer.browser import Window
+from experiments.performance.viewer.browser import PATIENCE, Window
 
 SIZE = (620, 260)
 #: Hides what lies over the image.
@@ -18,11 +18,7 @@ HIDDEN = "#irrcache-overlay {visibility: hidden}"
 
 def settled(window: Window) -> np.ndarray:
     """Wait for the final image; return the screenshot (height, width, 3) as float."""
-    count = -1
-    while count != len(window.shown()) or not window.note().startswith("final"):
-        window.wait_for("^final", 90)
-        count = len(window.shown())
-        time.sleep(0.3)
+    window.wait_until_final()
     return screen(window)
 
 
@@ -32,6 +28,28 @@ def after(window: Window, act: Callable[[], None]) -> np.ndarray:
     act()
     window.wait_for_picture(count, round(window.canvas()["width"]))
     return settled(window)
+
+
+def finally_(window: Window, condition: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """Return the first final screenshot that fulfils ``condition``.
+
+    After several edits, those before it may show the state between two of them.
+    """
+    began = time.monotonic()
+    while not condition(shot := settled(window)):
+        assert time.monotonic() - began < PATIENCE, "no final image fulfils the condition"
+    return shot
+
+
+def drag_until_coarse(window: Window, width: int) -> None:
+    """Drag over the image until one narrower than ``width`` is displayed.
+
+    On a busy machine, none may arrive during a single drag.
+    """
+    began, count = time.monotonic(), len(window.shown())
+    while all(image["width"] >= width for image in window.shown()[count:]):
+        assert time.monotonic() - began < PATIENCE, "no image of a moving camera is coarser"
+        window.orbit(12, 8, 0.02)
 
 
 def screen(window: Window) -> np.ndarray:

@@ -192,8 +192,8 @@ def test_edited_objects_are_solved_for_anew(scenes):
     params["object.bsdf.reflectance.value"] = mi.Color3f(0.1, 0.7, 0.9)
     params["object.to_world"] = mi.ScalarTransform4f().translate([-0.3, 0, 0.1]).scale(0.3)
     params.update()
+    found = scenes.image(scene, spp=4)
+    del scene, params  # kernels differ where there are two
     edited = ball((-0.3, 0, 0.1), 0.3, bsdf=diffuse(0.1, 0.7, 0.9))
     fresh = scenes.load(integrator, None, **(objects | {"object": edited}))
-    np.testing.assert_allclose(
-        scenes.image(scene, spp=4), scenes.image(fresh, spp=4), rtol=2e-3, atol=1e-4
-    )
+    np.testing.assert_allclose(found, scenes.image(fresh, spp=4), rtol=2e-3, atol=1e-4)

@@ -12,7 +12,15 @@ import pytest
 
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.io.images import read_image
-from tests.support.viewer_windows import SIZE, after, difference, screen, settled
+from tests.support.viewer_windows import (
+    SIZE,
+    after,
+    difference,
+    drag_until_coarse,
+    finally_,
+    screen,
+    settled,
+)
 
 pytest.importorskip("playwright")
 from experiments.performance.viewer.browser import Browser, chromium, viewer
@@ -56,18 +64,17 @@ def test_edit_save_reload_and_second_window(browser, started):
     assert window.field("preset").input_value() == "ct-chest"
 
     # Dragging rotates the camera, the wheel moves it closer; meanwhile images have low resolution.
-    count = len(window.shown())
-    window.orbit(12, 8, 0.02)
-    assert min(s["width"] for s in window.shown()[count:]) < first.shape[1]
+    drag_until_coarse(window, first.shape[1])
+    settled(window)
     window.page.mouse.move(100, 200)
     closer = after(window, lambda: window.zoom(-3))
     assert window.shown()[-1]["width"] == first.shape[1]
     assert difference(closer, first) > 3
 
     # A saved scene renders to the displayed image.
-    window.page.get_by_text("Save", exact=True).click()
+    window.unfold("Save")
     window.page.get_by_role("button", name="save view", exact=True).click()
-    window.page.get_by_text("saved view").wait_for(timeout=20000)
+    window.page.get_by_text("saved view").wait_for(state="attached")  # whether folded or not
     kept = folder / "kept" / "view.xml"
     assert main(["render", str(kept), "-o", str(folder / "again.exr")]) == 0
     again = np.rint(255 * read_image(folder / "again.png"))
@@ -77,20 +84,20 @@ def test_edit_save_reload_and_second_window(browser, started):
     assert difference(shown, closer) < 1
 
     # A point of the transfer function is dragged, added and removed on the plot, and undone.
-    points = window.curve()
+    points, count = window.curve(), len(window.shown())
     window.drag_point(8, 120, 0.6)
     assert window.curve()[8] == pytest.approx([120, 0.6], abs=4)
     window.page.mouse.click(*window.place_of(-600, 0.4))
     window.wait_for_curve(len(points) + 1)
-    window.wait_for_picture(len(window.shown()))
+    window.wait_for_picture(count)
     denser = screen(window)
     window.page.keyboard.press("Delete")
     window.wait_for_curve(len(points))
     for _ in range(3):
         window.page.keyboard.press("Control+z")
-    undone = settled(window)
+    undone = finally_(window, lambda shot: difference(shot, closer) < 1)
     assert window.curve() == points
-    assert difference(undone, closer) < 1 and difference(denser, closer) > 2
+    assert difference(denser, closer) > 2
 
     # The sun is dragged on its sphere.
     sphere = window.page.locator("irrcache-light canvas")
@@ -102,7 +109,7 @@ def test_edit_save_reload_and_second_window(browser, started):
     elsewhere = settled(other)
     assert difference(elsewhere, denser) > 3
     assert difference(screen(window), denser) < 0.5
-    other.page.get_by_text("Save", exact=True).click()
+    other.unfold("Save")
     other.enter("name", "../escaped")
     other.page.get_by_role("button", name="save view", exact=True).click()
     other.page.get_by_text("is no name for a file").first.wait_for()
@@ -130,7 +137,7 @@ def test_pages_of_other_sites_are_refused(started):
         protocol = [f"viser-v{__version__}"]
         with connect(address, origin=origin, subprotocols=protocol, max_size=None) as connection:
             try:
-                connection.recv(timeout=5)
+                connection.recv(timeout=60)
             except ConnectionClosed:
                 return False
             return True

@@ -58,6 +58,11 @@ SENSORS = """<scene version="3.0.0">
             <translate y="-1.3"/> </transform>
     </shape>
 </scene>"""
+#: JavaScript: whether the panel is beside the image of a window of this width.
+PANEL_IS_BESIDE = """width => {
+    const box = document.querySelector('#root canvas[data-engine]').getBoundingClientRect();
+    return box.x == 0 && 250 < width - box.width && width - box.width < 350;
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -85,15 +90,14 @@ def test_windows_that_are_resized_and_closed(browser, reachable):
     refused = browser.open(reachable.partition("?")[0])
     assert "token" in refused.page.inner_text("body")
     window = browser.open(reachable, SIZE)
-    window.wait_for("^(at rest|final)", 60)
+    window.wait_for("^(at rest|final)")
     for width, height in ((800, 300), (830, 310), (600, 280)):
         window.page.set_viewport_size({"width": width, "height": height})
-        panel = width - window.canvas()["width"]
-        assert 250 < panel < 350 and window.canvas()["x"] == 0  # the panel is beside the image
-        window.wait_until_shown((round(width - panel), height))
+        window.page.wait_for_function(PANEL_IS_BESIDE, arg=width)
+        window.wait_until_shown((round(window.canvas()["width"]), height))
     for _ in range(2):
         other = browser.open(reachable, (600, 200))
-        other.wait_for("per pixel$", 60)
+        other.wait_for("per pixel$")
         other.orbit(5, 10, 0.02)
         other.page.close()
     time.sleep(0.5)
@@ -137,9 +141,9 @@ def test_transfer_functions_and_archives_are_exchanged(browser, reachable, tmp_p
     assert difference(back, first) < 1.5
 
     page.get_by_text("Save", exact=True).click()
-    with page.expect_download(timeout=90_000) as download:
+    with page.expect_download() as download:
         page.get_by_role("button", name="download view", exact=True).click()
-        page.get_by_text("downloaded view.zip").wait_for(timeout=80_000)
+        page.get_by_text("downloaded view.zip").wait_for()
     archive = tmp_path / "view.zip"
     download.value.save_as(archive)
     assert window.errors == []
@@ -181,7 +185,7 @@ def test_cameras_and_environment_of_a_scene_with_surfaces(browser, tmp_path, sce
         # The comparison: a caption from the beginning, then volpath on the right of the divider.
         window.choose("volpath", "swipe")
         window.page.locator("#irrcache-overlay .right", has_text="volpath").wait_for()
-        window.wait_for(r"volpath, \d{2,} samples per pixel.*; RMSE", 90)
+        window.wait_for(r"volpath, \d{2,} samples per pixel.*; RMSE")
         divider = window.page.locator("#irrcache-overlay .divider").bounding_box()
         mouse, middle = window.page.mouse, divider["y"] + divider["height"] / 2
         mouse.move(divider["x"] + divider["width"] / 2, middle)

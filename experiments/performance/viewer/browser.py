@@ -15,12 +15,17 @@ from playwright.sync_api import Locator, Page, sync_playwright
 
 #: Names under which Chromium is installed.
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+#: Seconds after which an expected event counts as missing. Kernels may be compiled before it, while
+#: other programs use the machine.
+PATIENCE = 240.0
 #: Records the time of every mouse event, and of every displayed image that was made of received
-#: data instead of the page's own.
+#: data instead of the page's own. Only final images are sent as PNG.
 _HOOKS = """
 (() => {
   const now = () => performance.timeOrigin + performance.now();
   window.__moves = []; window.__shown = [];
+  const kinds = {}, create = URL.createObjectURL;
+  URL.createObjectURL = blob => { const url = create(blob); kinds[url] = blob.type; return url; };
   for (const kind of ['pointermove', 'wheel'])
     window.addEventListener(kind, () => window.__moves.push(now()), true);
   for (const name of ['texImage2D', 'texSubImage2D']) {
@@ -28,7 +33,8 @@ _HOOKS = """
     WebGL2RenderingContext.prototype[name] = function (...args) {
       const image = args[args.length - 1];
       if (image instanceof HTMLImageElement && image.src.startsWith('blob:')) {
-        const entry = {width: image.width, height: image.height, src: image.src, at: 0};
+        const final = kinds[image.src] == 'image/png';
+        const entry = {width: image.width, height: image.height, src: image.src, at: 0, final};
         window.__shown.push(entry);
         requestAnimationFrame(() => { entry.at = now(); });
       }
@@ -66,7 +72,7 @@ def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
         raise
     finally:
         process.terminate()
-        process.wait(60)
+        process.wait(PATIENCE)
 
 
 class Window:
@@ -74,6 +80,7 @@ class Window:
 
     def __init__(self, page: Page, address: str) -> None:
         self.page = page
+        page.set_default_timeout(1000 * PATIENCE)
         #: console messages: (kind, text)
         self.console: list[tuple[str, str]] = []
         page.on("console", lambda message: self.console.append((message.type, message.text)))
@@ -92,7 +99,7 @@ class Window:
         return [t / 1000 for t in self.page.evaluate("window.__moves")]
 
     def shown(self) -> list[dict]:
-        """Return the displayed images: "at" (seconds), "width" and "height"."""
+        """Return the displayed images: "at" (seconds), "width", "height" and "final"."""
         entries = self.page.evaluate("window.__shown.filter(e => e.at > 0)")
         return [entry | {"at": entry["at"] / 1000} for entry in entries]
 
@@ -105,12 +112,12 @@ class Window:
         found = self.page.get_by_text(re.compile(r"per pixel$")).first
         return found.inner_text() if found.count() else ""
 
-    def wait_for(self, note: str, seconds: float = 20.0) -> None:
+    def wait_for(self, note: str, seconds: float = PATIENCE) -> None:
         """Wait until the window's text about its image matches."""
         pattern = re.compile(note)
         self.page.get_by_text(pattern).first.wait_for(state="attached", timeout=1000 * seconds)
 
-    def wait_for_picture(self, after: int, width: int = 0, seconds: float = 60.0) -> None:
+    def wait_for_picture(self, after: int, width: int = 0, seconds: float = PATIENCE) -> None:
         """Wait for an image beyond the first ``after``, of this width if one is given."""
         self.page.wait_for_function(
             "([n, w]) => __shown.slice(n).some(e => e.at > 0 && (w == 0 || e.width == w))",
@@ -118,11 +125,19 @@ class Window:
             timeout=1000 * seconds,
         )
 
-    def wait_until_shown(self, size: tuple[int, int], seconds: float = 60.0) -> None:
+    def wait_until_shown(self, size: tuple[int, int], seconds: float = PATIENCE) -> None:
         """Wait until the image on display, which may follow the text about it, has this size."""
         self.page.wait_for_function(
             "([w, h]) => { const e = __shown.at(-1); return e && e.width == w && e.height == h; }",
             arg=list(size),
+            timeout=1000 * seconds,
+        )
+
+    def wait_until_final(self, seconds: float = PATIENCE) -> None:
+        """Wait until the image on display is final, and the text about it says so, too."""
+        self.wait_for("^final", seconds)
+        self.page.wait_for_function(
+            "() => { const e = __shown.at(-1); return e && e.at > 0 && e.final; }",
             timeout=1000 * seconds,
         )
 
@@ -153,7 +168,7 @@ class Window:
         """Return the points [value, opacity] of the transfer function."""
         return self.page.evaluate("document.querySelector('irrcache-transfer').points.opacity")
 
-    def wait_for_curve(self, points: int, seconds: float = 20.0) -> None:
+    def wait_for_curve(self, points: int, seconds: float = PATIENCE) -> None:
         """Wait until the transfer function of the viewer has so many points."""
         self.page.wait_for_function(
             "n => document.querySelector('irrcache-transfer').state.opacity.length == n",
@@ -210,7 +225,9 @@ class Browser:
         self._playwright = sync_playwright().start()
         # Shared memory of containers is small, and a page that needs more of it crashes.
         arguments = ["--no-sandbox", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
-        self._browser = self._playwright.chromium.launch(executable_path=chromium(), args=arguments)
+        self._browser = self._playwright.chromium.launch(
+            executable_path=chromium(), args=arguments, timeout=1000 * PATIENCE
+        )
         return self
 
     def __exit__(self, *_: object) -> None:

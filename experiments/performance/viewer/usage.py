@@ -25,8 +25,6 @@ from mitsuba_irrcache.view.picture import KINDS
 #: Maximum number of windows.
 MOST_WINDOWS = 3
 SIZE = (800, 400)
-#: Timeout in seconds for an expected event, on a machine with other load.
-PATIENCE = 240
 
 
 @dataclass
@@ -58,7 +56,7 @@ class User:
         self._browser, self._address, self._rng = browser, address, rng
         self.usage = Usage()
         self.windows = [browser.open(address, SIZE)]
-        self.windows[0].wait_for("per pixel", PATIENCE)
+        self.windows[0].wait_for("per pixel")
         self._actions = {
             self.drag: 8, self.zoom: 4, self.opacity: 4, self.density: 2, self.sun: 2,
             self.undo: 2, self.turn_sun: 2, self.kind: 2, self.compare: 1, self.preset: 1,
@@ -78,7 +76,7 @@ class User:
         steps = int(self._rng.integers(3, 20))
         window.orbit(steps, float(self._rng.uniform(-4, 4)), 0.02, 200)
         if self._rng.random() < 0.3:
-            window.wait_for("at rest|final", PATIENCE)
+            window.wait_for("at rest|final")
 
     def zoom(self, window: Window) -> None:
         """Zoom in or out, at most into the medium."""
@@ -134,20 +132,18 @@ class User:
         if not button.is_visible():
             window.unfold("Save")
         button.click()
-        window.page.get_by_text(re.compile("^(saved|downloaded) ")).first.wait_for(
-            timeout=1000 * PATIENCE
-        )
+        window.page.get_by_text(re.compile("^(saved|downloaded) ")).first.wait_for()
 
     def reload(self, window: Window) -> None:
         """Reload the page."""
         window.page.reload()
-        window.wait_for("per pixel", PATIENCE)
+        window.wait_for("per pixel")
 
     def open(self, _: Window) -> None:
         """Open another window."""
         if len(self.windows) < MOST_WINDOWS:
             self.windows.append(self._browser.open(self._address, SIZE))
-            self.windows[-1].wait_for("per pixel", PATIENCE)
+            self.windows[-1].wait_for("per pixel")
 
     def close(self, window: Window) -> None:
         """Close a window unless it is the last one."""

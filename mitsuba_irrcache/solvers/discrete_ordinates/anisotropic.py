@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
+from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet

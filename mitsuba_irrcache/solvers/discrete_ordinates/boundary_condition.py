@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.core.jit import Divisor, symbolic
+from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, random_stream
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -35,7 +35,6 @@ from mitsuba_irrcache.solvers.discrete_ordinates.crossings import (
     SurfaceVoxels,
     voxel_at,
 )
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks

@@ -16,12 +16,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.jit import concatenated, symbolic
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import first_surface
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated, layer_and_index
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import layer_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackCrossings, TrackGeometry
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_solid

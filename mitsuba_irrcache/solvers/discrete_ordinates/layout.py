@@ -1,5 +1,5 @@
 """Memory layouts of the arrays of the sweep: x fastest, or slice by slice across an axis; channels
-next to each other; several arrays one after the other.
+next to each other.
 """
 
 from __future__ import annotations
@@ -44,21 +44,6 @@ def flat_index(coordinates: Sequence[mi.UInt32], strides: tuple[int, ...]) -> mi
     """Flat indices of coordinates along x, y, z."""
     x, y, z = (p * dr.opaque(mi.UInt32, n) for p, n in zip(coordinates, strides, strict=True))
     return x + y + z
-
-
-def concatenated(parts: Sequence[mi.Float | mi.UInt32]) -> mi.Float | mi.UInt32:
-    """Arrays one after the other, by kernels that do not depend on their widths, as those of
-    ``dr.concat`` do.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    result = dr.empty(type(parts[0]), sum(dr.width(part) for part in parts))
-    start = 0
-    for part in parts:
-        dr.scatter(result, part, dr.arange(mi.UInt32, dr.width(part)) + dr.opaque(mi.UInt32, start))
-        start += dr.width(part)
-    dr.eval(result)
-    return result
 
 
 def interleaved_channels(channels: Sequence[mi.Float]) -> mi.Float:

@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import concatenated, layer_and_index
+from mitsuba_irrcache.core.jit import concatenated, symbolic
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import layer_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     BoundaryOrdinateSet,
@@ -153,11 +153,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
         scattered = None if phi is None else self._scattered(phi)
 
         def source(group: PairGroup) -> mi.Float:
-            values = dr.opaque(mi.Float, 0, 2 * len(group) * voxels)
-            if scattered is not None:
-                _write_source(moments, values, scattered, group, active, voxels)
-                dr.eval(values)
-            return values
+            return self.source_along(scattered, group)
 
         for _, group, copies in self.tracks.sweep_separately(table, source):
             found = _add_collided(moments, received, lost, depth, copies, group, active, voxels)
@@ -172,6 +168,17 @@ class AnisotropicMultigridLevel(MultigridLevel):
         pairs = zip(collided, received, strict=True)
         collided = [self.collided_irradiance(depth, mean, other) for mean, other in pairs]
         return concatenated(received), concatenated(collided)
+
+    def source_along(self, scattered: mi.Float | None, group: PairGroup) -> mi.Float:
+        """Radiance that ``scattered`` moments (None for 0) have along both ways of all pairs of a
+        group, pair by pair.
+        """
+        voxels = self.grid.voxel_count
+        values = dr.opaque(mi.Float, 0, 2 * len(group) * voxels)
+        if scattered is not None:
+            _write_source(self.moments, values, scattered, group, self.tracks.active, voxels)
+            dr.eval(values)
+        return values
 
     def scattered_radiance(
         self, phi: mi.Float, index: mi.UInt32, direction: mi.Vector3f | None

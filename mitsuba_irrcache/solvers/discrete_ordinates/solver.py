@@ -133,6 +133,7 @@ class Sweep:
         #: irradiance of all channels in units of the first one's
         self._colour = np.ones(cache.channels)
         self._boundary: SurfaceBoundary | None = None
+        self._emitter_sampling: EmitterSampling | None = None
         if medium.is_isolated:
             known = cache.direct_lights
             points = self._illumination.point_irradiance(medium, self._sample_points, known)
@@ -186,6 +187,13 @@ class Sweep:
                 enclosed = dr.gather(mi.Bool, cache.voxel_classes.enclosed, cache.active)
                 self._albedo = [dr.select(enclosed, 0, albedo) for albedo in self._albedo]
                 dr.eval(self._albedo)
+
+    def use(self, scene: mi.Scene | None) -> None:
+        """Trace rays in this ``scene`` from now on, see `Solver.use`."""
+        if self.cache.active_count:
+            for part in (self._surfaces, self._boundary, self._emitter_sampling):
+                if part is not None:
+                    part.scene = scene
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Adds ``samples`` ordinates per voxel, a multiple of the cache's batch.

@@ -30,6 +30,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.discrete_ordinates.crossings import SurfaceVoxels
 from mitsuba_irrcache.solvers.discrete_ordinates.empty_space import EmptySpace
@@ -42,7 +43,6 @@ from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     STANDARD,
-    concatenated,
     flat_index,
     layer_and_index,
     slicewise,

@@ -28,6 +28,13 @@ pytestmark = pytest.mark.usefixtures("rgb")
 SMALL = {"size": "8", "max_depth": "3"}
 
 
+@pytest.fixture(autouse=True)
+def _nothing_is_kept(monkeypatch):
+    """Free what jobs leave for the next ones: kernels of later tests would differ with it."""
+    for name in ("_SCENES", "_CACHES"):
+        monkeypatch.setattr(work, name, work._Kept())
+
+
 @pytest.fixture
 def environment():
     """Return the environment of jobs of this process."""

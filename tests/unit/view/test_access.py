@@ -44,7 +44,7 @@ def page(port: int, path: str = "/", **headers: str) -> tuple[int, str]:
     """Return status and cookie of a page."""
     request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
     try:
-        with urllib.request.urlopen(request, timeout=10) as response:
+        with urllib.request.urlopen(request, timeout=60) as response:
             return response.status, response.headers.get("Set-Cookie", "")
     except urllib.error.HTTPError as error:
         return error.code, error.headers.get("Set-Cookie", "")
@@ -70,7 +70,7 @@ def _connects(port: int, path: str, protocol: list | None, host: str, headers: d
             max_size=None,
             sock=socket.create_connection(("127.0.0.1", port)),
         ) as connection:
-            connection.recv(timeout=5)
+            connection.recv(timeout=60)
             return True
     except InvalidStatus as refused:
         assert refused.response.status_code == 403

@@ -31,7 +31,7 @@ def open_channel(server: Server, **options):
 
 
 def received(connection) -> dict:
-    return json.loads(connection.recv(timeout=10))
+    return json.loads(connection.recv(timeout=60))
 
 
 def test_windows_receive_the_newest_messages_to_them(server):
@@ -48,7 +48,7 @@ def test_windows_receive_the_newest_messages_to_them(server):
         assert received(connection) == {"kind": "note", "value": "yours"}
         channel.send("note", "for another", other)
         channel.send("picture", b"\x00\xff", own)
-        assert connection.recv(timeout=10) == b"picture\0\x00\xff"
+        assert connection.recv(timeout=60) == b"picture\0\x00\xff"
     channel.close(own)
     channel.send("note", "nobody is there", own)
 
@@ -78,14 +78,14 @@ def test_messages_of_windows(server):
             connection.send(text)
         for value in (1, "x", 2, "last"):
             connection.send(json.dumps({"kind": "number", "value": value}))
-        assert arrived.wait(10)
+        assert arrived.wait(60)
     assert values == [1, 2]
 
 
 def test_pages_of_other_sites_are_refused(server):
     with open_channel(server, origin="http://example.org") as connection:
         with pytest.raises(ConnectionClosed):
-            connection.recv(timeout=10)
+            connection.recv(timeout=60)
 
 
 def test_edits_by_a_browser():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import re
-import time
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
@@ -21,7 +20,7 @@ from mitsuba_irrcache.view.light import Light
 from mitsuba_irrcache.view.reference import Reference
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
-from tests.support.viewer_session import SCENE, SIZE, Screen, front, turned
+from tests.support.viewer_session import SCENE, SIZE, Screen, drag, front
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -117,7 +116,7 @@ def test_reference_is_displayed_until_something_changes(document, monkeypatch):
         window = session.open(screen.show)
         view = View(front(session), SIZE, compared="swipe")
         session.look(window, view)
-        picture = screen.wait(lambda p: "RMSE" in _text(p) and _samples(p) >= 16, 60)
+        picture = screen.wait(lambda p: "RMSE" in _text(p) and _samples(p) >= 16)
         ours = picture.pixels.astype(float)
         theirs = picture.compared.reference.astype(float)
         assert ours.shape == theirs.shape  # the window is small: pixel by pixel
@@ -129,15 +128,9 @@ def test_reference_is_displayed_until_something_changes(document, monkeypatch):
         assert np.array_equal(picture.pixels, picture.compared.error)
         session.look(window, view)
         count = len(screen.pictures)
-        moving: list[Picture] = []
-        for degrees in range(1, 200):  # like a mouse
-            session.look(window, replace(view, camera=turned(front(session), degrees)))
-            time.sleep(0.02)
-            moving = [p for p in screen.pictures[count:] if p.moving]
-            if moving:
-                break
+        drag(session, window, view, lambda: any(p.moving for p in screen.pictures[count:]))
         screen.wait(lambda p: p.view.camera != view.camera and "RMSE" in _text(p))
-        assert moving and moving[0].compared is None
+        assert next(p for p in screen.pictures[count:] if p.moving).compared is None
         other = [p for p in screen.pictures[count:] if p.view.camera != view.camera]
         assert _samples(next(p for p in other if _samples(p))) < 8
         count = len(screen.pictures)
