@@ -198,10 +198,10 @@ class CachedMedium:
             f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {dr.width(active)} "
             f"of {grid.voxel_count} see the medium",
         )
-        if medium.refracts and solver.name == "path":
+        if medium.refracts and solver.finds_refracted_by_chance:
             mi.Log(
                 mi.LogLevel.Info,
-                f"irrcache: {self.label}behind glass the solver path finds emitters by chance, as "
+                f"irrcache: {self.label}behind glass this solver finds emitters by chance, as "
                 "volpath does, which is faster for a single small image.",
             )
         samples = settings.samples or solver.default_samples(

@@ -12,6 +12,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import Incom
 class NoSurroundings:
     """Surroundings of a medium without emitters and surfaces."""
 
+    refracts, carries_refracted = False, True
+
     has_sources, angular_basis = False, None
 
     @staticmethod

@@ -64,6 +64,7 @@ class PathSolver(Solver):
         among_surfaces=SizeAmongSurfaces(32, 64, target_error=0.25),
     )
     has_preview = True
+    finds_refracted_by_chance = True
 
     @classmethod
     def why_not(
