@@ -79,6 +79,10 @@ class Case:
     filter: str = "box"
     pixels: str = "rgb"
     emissive: bool = False
+    #: mean cosine of a Henyey-Greenstein phase function; None: isotropic scattering
+    g: float | None = None
+    #: directions of the cache; 0: the default
+    directions: int = 0
     parameters: tuple[str, ...] = ("sigma_t", "albedo")
 
     def sigma_t(self) -> np.ndarray:
@@ -107,6 +111,7 @@ class Case:
             "solver": "sweep",
             "resolution": self.cache,
             "max_depth": self.max_depth,
+            "cache_spp": self.directions,
         }
         if self.emissive:
             integrator["emission"] = _volume(self.emission(), place)
@@ -138,6 +143,10 @@ class Case:
         )
 
     def _medium(self, place: np.ndarray) -> dict:
+        phase = {} if self.g is None else {"phase": {"type": "hg", "g": self.g}}
+        return self._volumes(place) | phase
+
+    def _volumes(self, place: np.ndarray) -> dict:
         if self.homogeneous:
             peak = self.depth * self.cache / EDGE
             extinction = [float(e) * peak for e in self.extinction]
@@ -182,6 +191,54 @@ def _constant(values: list[float]) -> dict:
 
 def _under(**emitters: dict) -> Callable[[], dict]:
     return lambda: emitters
+
+
+def anisotropic() -> dict[str, Case]:
+    """Cases with Henyey-Greenstein phase functions."""
+    found = {}
+    for label, emitters in (
+        ("sky", _under(sky=WHITE)),
+        ("sun", _under(sun=SUN)),
+        ("envmap", lambda: {"sky": sky_with_sun()}),
+    ):
+        for g in (-0.4, 0.3):
+            found[f"hg {g}, {label}, single"] = Case(g=g, emitters=emitters, max_depth=2)
+        for g in (-0.4, 0.3, 0.6, 0.85):
+            found[f"hg {g}, {label}"] = Case(g=g, emitters=emitters)
+        found[f"hg 0.85, {label}, 512 directions"] = Case(g=0.85, emitters=emitters, directions=512)
+    both, by_g = _under(sky=SKY, sun=SUN), {"parameters": ("g",)}
+    empty = {"empty_beyond": 0.5, "changed": (0.75, 0.85)}
+    return found | {
+        "hg 0.3, point": Case(g=0.3, emitters=_under(point=POINT)),
+        "hg 0.3, point in the medium": Case(g=0.3, emitters=_under(point=LAMP)),
+        "hg 0.6, spot": Case(g=0.6, emitters=lambda: {"spot": spot()}),
+        "hg 0.6, coloured albedo": Case(g=0.6, emitters=both, albedo=(0.6, 0.75, 0.85)),
+        "hg 0.3, coloured extinction": Case(g=0.3, extinction=(0.5, 0.8, 1.0), **COLOURED),
+        "hg 0.6, voxel depth 1.2, sun": Case(g=0.6, depth=1.2, emitters=_under(sun=SUN)),
+        "hg 0.3, empty voxels": Case(g=0.3, **empty),
+        "hg 0.85, empty voxels": Case(g=0.85, **empty),
+        "hg 0.6, no matter": Case(g=0.6, empty_beyond=0.0, parameters=("sigma_t",)),
+        "hg 0.6, data finer than the cache": Case(data=24, cache=12, depth=0.2, g=0.6),
+        "hg 0.3, sphere": Case(shape="sphere", g=0.3),
+        "hg 0.6, homogeneous": Case(homogeneous=True, depth=0.1, g=0.6, emitters=both),
+        "hg 0.54, sun, single": Case(g=0.54, emitters=_under(sun=SUN), max_depth=2, **by_g),
+        "hg 0.54, envmap": Case(g=0.54, emitters=lambda: {"sky": sky_with_sun()}, **by_g),
+        "hg -0.45, sun": Case(g=-0.45, emitters=_under(sun=SUN), **by_g),
+        "hg 0.65, sun": Case(g=0.65, emitters=_under(sun=SUN), **by_g),
+        "hg 0.65, coloured albedo": Case(g=0.65, emitters=both, albedo=(0.6, 0.75, 0.85), **by_g),
+        "hg 0.65, spot": Case(g=0.65, emitters=lambda: {"spot": spot()}, **by_g),
+        "hg 0.82, sun, 512 directions": Case(
+            g=0.823, emitters=_under(sun=SUN), directions=512, **by_g
+        ),
+        "hg 0.6, radiance of sky and sun": Case(g=0.6, emitters=both, parameters=("sky", "sun")),
+        "hg 0.3, intensity of a point": Case(
+            g=0.3, emitters=_under(point=POINT), parameters=("point",)
+        ),
+        "hg 0.6, texels of an envmap": Case(
+            g=0.6, emitters=lambda: {"sky": sky_with_sun()}, parameters=("sky",)
+        ),
+        "hg 0.6, emission": Case(g=0.6, emissive=True, empty_beyond=0.5, parameters=("emission",)),
+    }
 
 
 COLOURED = {"albedo": (0.6, 0.75, 0.85), "emitters": _under(sky=SKY)}
@@ -240,4 +297,5 @@ CASES = {
         emissive=True, empty_beyond=0.5, parameters=("emission",), max_depth=2
     ),
     "alpha": Case(pixels="rgba", emitters=_under(sun=SUN)),
+    **anisotropic(),
 }

@@ -17,6 +17,7 @@ interpolated in the same way, so that voxels with little irradiance have little 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from itertools import count, islice
 
 import drjit as dr
@@ -108,6 +109,10 @@ class Source:
         total = sum(row[i] for i, row in enumerate(self._covariance))
         return dr.maximum(total - along_view * inverse, 0) * inverse
 
+    def is_same(self, other: Source) -> bool:
+        """Whether ``other`` is at the same place, or in the same direction."""
+        return self.far == other.far and np.array_equal(self._direction, other._direction)
+
     def covers(self, directions: np.ndarray) -> np.ndarray:
         """Whether ``directions`` (..., 3) point to this source; False unless it is ``far``."""
         return (directions @ self._direction >= self._cosine) & self.far
@@ -129,7 +134,7 @@ class AngularBasis:
         camera rays evaluate their irradiance in closed form. ``order`` is by default that which
         the phase function requires.
         """
-        self.phase, self.sources, self._others = phase, sources, others
+        self.phase, self.sources, self.others = phase, sources, others
         self.order = phase.order if order is None else order
         self._factors = [
             dr.opaque(mi.Float, float(4 * np.pi * phase.moments[degree]))
@@ -181,7 +186,7 @@ class AngularBasis:
     ) -> mi.Bool:
         """Whether rays that hit something ``far``, or an emitter ``near``, hit a narrow source."""
         found = mi.Bool(False)
-        for source in (*self.sources, *self._others):
+        for source in (*self.sources, *self.others):
             towards, cosine = source.seen_from(origin)
             found |= (far if source.far else near) & (dr.dot(direction, towards) >= cosine)
         return found
@@ -318,6 +323,12 @@ class AngularField:
         rows += [mi.Float(0)] * (self._loads * WIDTH - len(rows))
         self.data = interleaved(rows, grid.voxel_count)
         dr.eval(self.data)
+
+    def in_basis(self, directional: AngularBasis) -> AngularField:
+        """The same moments with another phase function."""
+        field = copy(self)
+        field.directional = directional
+        return field
 
     def factor(
         self,

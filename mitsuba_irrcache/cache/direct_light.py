@@ -312,15 +312,20 @@ class DirectLightAlongRays:
         return dr.maximum(smooth + light.mean_rest(basis, p, direction), 0)
 
     def at(
-        self, p: mi.Point3f, active: mi.Bool, direction: mi.Vector3f | None = None
+        self,
+        p: mi.Point3f,
+        active: mi.Bool,
+        direction: mi.Vector3f | None = None,
+        with_peak: bool = False,
     ) -> mi.Spectrum:
         """Evaluate the irradiance at world positions, for anisotropic scattering times 4 pi times
-        the phase function for scattering into ``direction``, without a forward peak.
+        the phase function for scattering into ``direction``; ``with_peak`` as in
+        `AngularBasis.gain`.
         """
         light = self._light
         passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
         if self._basis is not None:
-            passed = passed * self._gain(p, direction, with_peak=False)
+            passed = passed * self._gain(p, direction, with_peak)
         return mi.Spectrum(passed) * light.unobstructed(p, active)
 
     def mean_extinction(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:

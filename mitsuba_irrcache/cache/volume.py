@@ -277,13 +277,17 @@ class IrradianceCache:
         """
         if not self.moments:
             return None
-        n, phi = mi.Float(self._batch_count), self._interpolated_means()
-        means = [mi.Float(0) if m is None else m / n for m in self._moments]
         scattered = []
-        for values in (phi, means):
+        for values in (self._interpolated_means(), self.moment_means()):
             chosen = [v for i, v in enumerate(values) if i % self.channels < channels]
             scattered.append([self._tensor([v]).array for v in chosen])
         return AngularField(self.directional, self.grid, *scattered)
+
+    @_consistent
+    def moment_means(self) -> list[mi.Float]:
+        """Angular moments at the active voxels, all channels of each in turn."""
+        n = mi.Float(self._batch_count)
+        return [mi.Float(0) if m is None else m / n for m in self._moments]
 
     def _interpolated_means(self) -> list[mi.Float]:
         """Phi of the active voxels in each channel, without `direct_lights`."""

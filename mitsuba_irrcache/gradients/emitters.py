@@ -14,10 +14,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.gradients.resampling import volume_of
-from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives, repeated
+from mitsuba_irrcache.gradients.scattering import Layers, OrdinatePart
+from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import environment_radiance
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 
 
 class EmitterAdjoint:
@@ -40,9 +41,9 @@ class EmitterAdjoint:
 
     def add_transport(self, transport: AdjointTransport, found: Derivatives) -> None:
         """Add what emitters send to the voxels, each of which is worth ``found.direct``."""
-        for emitter, irradiance in zip(transport.point_lights, transport.from_points, strict=True):
+        for light, emitter in enumerate(transport.point_lights):
             if emitter in self._wanted:
-                _add_point(emitter, transport, irradiance, found)
+                _add_point(light, transport, found)
         suns = [
             emitter for emitter in self._scene.emitters() if kind_of(emitter) is EmitterKind.SUN
         ]
@@ -73,33 +74,43 @@ class EmitterAdjoint:
 
     def _worth_of_ordinates(self, transport: AdjointTransport, found: Derivatives) -> np.ndarray:
         """Derivatives (n, 2, channels) by the irradiance that enters along both ways of pairs."""
-        worth = [np.zeros(0)] * transport.channels
-        for tracks, channels in transport.tracks:
-            weights = [found.direct[c] for c in channels]
-            for c, values in zip(channels, _received(tracks, transport, weights), strict=True):
-                worth[c] = values
-        return np.stack(worth, axis=-1)
+        worth = np.zeros((len(transport.ordinates.directions), 2, transport.channels))
+        for number, part in enumerate(transport.parts):
+            for level, channels in transport.levels:
+                scattered = [found.direct[c][number] for c in channels]
+                for c, values in zip(
+                    channels, _received(level, transport, part, scattered), strict=True
+                ):
+                    own = worth[part.rows, :, c]
+                    worth[part.rows, :, c] = np.where(part.mask, values, own)
+        return worth
 
 
 def _received(
-    tracks: Tracks, transport: AdjointTransport, weights: list[mi.Float]
+    level: MultigridLevel, transport: AdjointTransport, part: OrdinatePart, scattered: list[Layers]
 ) -> list[np.ndarray]:
-    """For each of ``weights`` of the voxels, integrals (n, 2) over the voxels of the transmittance
-    from where each ordinate enters.
+    """For each channel, integrals (n, 2) over the voxels of the transmittance from where each
+    ordinate of a ``part`` enters, times the importance that is ``scattered`` along it.
     """
     # docs/primer, eq. (8.10)
-    directions, _, unused, offsets = transport.ordinates
+    directions, _, unused, offsets = part.ordinates
+    tracks, scattering = level.tracks, transport.scattering
     count, voxels = len(directions), transport.grid.voxel_count
+    found = [np.zeros((count, 2)) for _ in scattered]
+    if not count:
+        return found
     table = tracks.table(directions, np.ones((count, 2)), 0 * unused, offsets)
-    none, found = dr.zeros(mi.Float, voxels), [np.zeros((count, 2)) for _ in weights]
-    forward = table.geometry.forward
+    none, forward = [dr.zeros(mi.Float, voxels)] * scattering.count, table.geometry.forward
     for _, group, copies in tracks.sweep_separately(
-        table, lambda group: repeated(none, group, voxels)
+        table, lambda group: scattering.along(level, none, group)
     ):
         place = dr.arange(mi.UInt32, 2 * len(group) * voxels)
-        light, voxel = dr.gather(mi.Float, copies, place * 4 + 1), place % voxels
-        for weight, result in zip(weights, found, strict=True):
-            sums = dr.block_sum(light * dr.gather(mi.Float, weight, voxel), voxels)
+        light = dr.gather(mi.Float, copies, place * 4 + 1)
+        for layers, result in zip(scattered, found, strict=True):
+            # The importance travels against the radiance.
+            opposite = place + (1 - 2 * (place // voxels % 2)) * voxels
+            worth = dr.gather(mi.Float, scattering.along(level, layers, group), opposite)
+            sums = dr.block_sum(light * worth, voxels)
             ways = np.array(sums, dtype=np.float64).reshape(-1, 2)
             rows = np.array(group.rows)
             # A table holds the way along the dominant axis first.
@@ -116,19 +127,15 @@ def _solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarra
     return np.where(known, angle, most)
 
 
-def _add_point(
-    emitter: mi.Emitter,
-    transport: AdjointTransport,
-    irradiance: mi.Spectrum,
-    found: Derivatives,
-) -> None:
+def _add_point(light: int, transport: AdjointTransport, found: Derivatives) -> None:
+    emitter, irradiance = transport.point_lights[light], transport.from_points[light]
     at = dr.zeros(mi.Interaction3f, transport.grid.voxel_count)
     at.p = transport.positions
     _, unattenuated = emitter.sample_direction(at, mi.Point2f(0.5))
     lit = unattenuated > 0
     passed = dr.select(lit, irradiance / dr.select(lit, unattenuated, 1), 0)
     share = dr.opaque(mi.Float, volume_of(transport.grid))
-    adjoint = passed * mi.Spectrum(*found.direct) * share
+    adjoint = passed * transport.worth_of_point(light, found) * share
     dr.eval(at, adjoint)
     with dr.resume_grad():
         _, value = emitter.sample_direction(at, mi.Point2f(0.5))

@@ -19,6 +19,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import graph_variables
 from mitsuba_irrcache.gradients.backward import ParameterAdjoint
 from mitsuba_irrcache.gradients.film import FilmAdjoint
+from mitsuba_irrcache.gradients.medium import values_per_voxel
 from mitsuba_irrcache.gradients.parameters import enabled
 
 
@@ -63,7 +64,9 @@ class SceneState:
         self._identity, self._revision = _variables(params), integrator.revision(scene)
         cache = next(iter(integrator.caches.values()), None)
         #: values of the irradiance in each channel
-        self.voxels = cache.grid.voxel_count if cache is not None else 1
+        self.voxels = 1
+        if cache is not None:
+            self.voxels = cache.grid.voxel_count * values_per_voxel(cache)
         self._adjoint: ParameterAdjoint | None = None
         # Dr.Jit forgets edges of its graph once it has followed them.
         self._is_solved = alone

@@ -11,7 +11,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.media.bake import children
 
 #: What a parameter can be of a medium.
-SIGMA_T, ALBEDO, EMISSION = "sigma_t", "albedo", "emission"
+SIGMA_T, ALBEDO, EMISSION, MEAN_COSINE = "sigma_t", "albedo", "emission", "g"
 #: Textures of emitters on which their radiance depends linearly.
 RADIANCE = ("radiance", "irradiance", "intensity")
 
@@ -42,8 +42,9 @@ def roles_of(
     scene: mi.Scene,
     emission: object = None,
 ) -> dict[str, str | mi.Emitter]:
-    """What each of the parameters ``keys`` is: `SIGMA_T` or `ALBEDO` of ``medium``, its `EMISSION`
-    if it belongs to that volume of the integrator, or the emitter whose radiance it is.
+    """What each of the parameters ``keys`` is: `SIGMA_T` or `ALBEDO` of ``medium``, the
+    `MEAN_COSINE` of its phase function ``hg``, its `EMISSION` if it belongs to that volume of the
+    integrator, or the emitter whose radiance it is.
 
     Raises IrrcacheError for any other parameter.
     """
@@ -69,6 +70,9 @@ def roles_of(
         is_texels = node.class_name() == "EnvironmentMapEmitter" and last == "data"
         if isinstance(node, mi.Emitter) and not is_texels:
             refuse(key, f'"{last}" is not the radiance of the {node.class_name()}')
+        if node == medium.phase_function() and node.class_name() == "HGPhaseFunction":
+            roles[key] = MEAN_COSINE
+            continue
         if node not in nodes or last not in ("data", "value"):
             refuse(key, f"it belongs to a {node.class_name()}")
         roles[key] = nodes[node]

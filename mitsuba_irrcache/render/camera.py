@@ -46,8 +46,9 @@ from mitsuba_irrcache.transport.path import (
 PLACEMENT_RAYS = 1 << 16
 #: Samples of an image from which on irradiance is cached on surfaces: a smaller one has less work.
 FEWEST_SAMPLES = 1 << 15
-#: Transmittance below which surfaces are path traced with Russian roulette.
-ROULETTE_BELOW = 0.1
+#: Transmittance below which surfaces are traced with Russian roulette: where paths are long, and
+#: where they end in cached irradiance, so that roulette would be most of the noise.
+ROULETTE_BELOW, CACHED_ROULETTE_BELOW = 0.1, 0.01
 
 
 def camera_rays_of(
@@ -279,7 +280,8 @@ class TracedCameraRays:
         *marched, unscattered = self._march_to_surface(scene, ray, pointer, offset, active)
         scattered, background, transmittance, gathered, end, pointer, stopped, escaped = marched
         # Path trace surfaces of low transmittance with Russian roulette.
-        chance = dr.minimum(dr.max(transmittance) * (1 / ROULETTE_BELOW), 1)
+        least = CACHED_ROULETTE_BELOW if self.caches_surfaces else ROULETTE_BELOW
+        chance = dr.minimum(dr.max(transmittance) * (1 / least), 1)
         traced = stopped & (rng.next_float32(stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
         if self.caches_surfaces:

@@ -7,6 +7,7 @@ developed and filtered before they are put on the film.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from threading import Lock, RLock
@@ -19,13 +20,13 @@ from mitsuba_irrcache.core.sequences import kronecker, kronecker_words, unit_flo
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import require_memory
-from mitsuba_irrcache.render.pixel_filter import pixel_of, reconstructed
+from mitsuba_irrcache.render.pixel_filter import FurtherSamples, pixel_of, reconstructed
 
 #: Maximum number of camera samples per kernel launch, to limit the memory of samples and sampler.
 LANES = 1 << 22
-#: Pixels are refined whose standard deviation exceeds the mean of all by this factor: by at most so
-#: many new samples for each one, and with at most this share of all samples.
-OUTLIER, MOST_FURTHER, FURTHER_SHARE = 4.0, 64, 0.5
+#: Pixels are refined whose variance exceeds the mean of all by this factor: by at most so many new
+#: samples for each one, and with at most this share of all samples.
+OUTLIER, MOST_FURTHER, FURTHER_SHARE = 2.0, 64, 0.5
 #: Fewest samples of a pixel from which its variance is estimated.
 FEWEST_SAMPLES = 4
 #: Decorrelates new samples from others, and from those of other passes.
@@ -88,10 +89,11 @@ def render_film(
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
         samples = _sampled(sensor, sampler, spread, frame, spp, radiance)
+        further = None
         if refine and per_pass >= FEWEST_SAMPLES:
             stream = REFINEMENT ^ (done * PASS & 0xFFFFFFFF)
-            samples = _refined(sensor, sampler, seed, stream, per_pass, radiance, *samples)
-        found = reconstructed(film, border, per_pass, *samples)
+            samples, further = _refined(sensor, sampler, seed, stream, frame, radiance, *samples)
+        found = reconstructed(film, border, per_pass, *samples, further)
         sums = found if sums is None else [a + b for a, b in zip(sums, found, strict=True)]
         if per_pass < spp:
             sampler.advance()
@@ -201,9 +203,12 @@ class SampledFilm:
         these.
         """
         index, sample = Divisor(self.per_pass).split(dr.arange(mi.UInt32, self.lanes))
-        pixel = mi.Vector2f(pixel_of(index, self.width) - self.border)
-        pixel += mi.Vector2f(self.film.crop_offset())
-        return pixel + spread.next(index, sample), index, sample
+        return self.corner(index) + spread.next(index, sample), index, sample
+
+    def corner(self, pixel: mi.UInt32) -> mi.Point2f:
+        """Position on the film of the upper left corner of a pixel."""
+        place = mi.Point2f(pixel_of(pixel, self.width) - self.border)
+        return place + mi.Vector2f(self.film.crop_offset())
 
 
 class PixelPositions:
@@ -337,54 +342,73 @@ def _refined(
     sampler: mi.Sampler,
     seed: int,
     stream: int,
-    per_pass: int,
+    frame: SampledFilm,
     radiance: RadianceFunction,
     position: mi.Point2f,
     values: list[mi.Float],
-) -> tuple[mi.Point2f, list[mi.Float]]:
-    """Replace the samples of those few pixels whose standard deviation is far above the mean of
-    all, such as those at the edge of a lamp, by means of new samples around them.
+) -> tuple[tuple[mi.Point2f, list[mi.Float]], FurtherSamples | None]:
+    """Take new samples of the pixels whose variance is above the mean of all, such as those at the
+    edge of a lamp, in place of those that were taken; return all samples, evaluated, and the new
+    ones, if there are any.
 
     The new samples do not depend on those by which pixels are chosen, so there is no bias. The
     ``stream`` differs between the passes of an image, whose samples are independent.
     """
-    count = dr.width(position)
+    count, per_pass = dr.width(position), frame.per_pass
     everywhere = dr.zeros(mi.Float, count)
     values = [value + everywhere for value in values]
     dr.eval(position, values)
     brightness = values[0] + values[1] + values[2]
     mean = dr.block_sum(brightness, per_pass) / per_pass
     square = dr.block_sum(dr.square(brightness), per_pass) / per_pass
-    deviation = dr.sqrt(dr.maximum(square - dr.square(mean), 0))
-    chosen = dr.compress(deviation > OUTLIER * dr.mean(deviation))
+    variance = square - dr.square(mean)
+    chosen = dr.compress(variance > OUTLIER * dr.mean(variance))
     pixels = dr.width(chosen)
     further = min(MOST_FURTHER, int(FURTHER_SHARE * count / max(pixels * per_pass, 1)))
     if not pixels or further < FEWEST_SAMPLES:
-        return position, values
+        return (position, values), None
     # A number of samples that differs between images must not be a constant of the kernel.
     each = dr.opaque(mi.UInt32, further)
     lane, k = Divisor(further).split(dr.arange(mi.UInt32, pixels * per_pass * further))
-    pixel, sample = Divisor(per_pass).split(lane)
-    source = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
-    words = mi.sample_tea_32(source, dr.opaque(mi.UInt32, stream))
-    within = dr.gather(mi.Point2f, mi.Point2f(position), source)
-    corner = dr.floor(within)
-    step = mi.Point2f(kronecker(k, 2, unit_floats(words))) - 0.5
-    within += step * dr.rsqrt(float(per_pass)) - corner
-    within -= dr.floor(within)
-    shift = unit_floats(mi.sample_tea_32(source - sample, dr.opaque(mi.UInt32, stream)))
-    on_emitter = mi.Point2f(kronecker(sample * each + k, 2, shift))
+    pixel, cell = Divisor(per_pass).split(lane)
+    pixel = dr.gather(mi.UInt32, chosen, pixel)
+    source = pixel * per_pass
+    words = mi.sample_tea_32(source + cell, dr.opaque(mi.UInt32, stream))
+    within = mi.Point2f(kronecker(k, 2, unit_floats(words)))
+    place = frame.corner(pixel) + PixelCells(per_pass).position(cell, within)
+    shift = unit_floats(mi.sample_tea_32(source, dr.opaque(mi.UInt32, stream)))
+    on_emitter = mi.Point2f(kronecker(cell * each + k, 2, shift))
     own = sampler.clone()
     own.seed(seed ^ stream, pixels * per_pass * further)
     spp = mi.Float(each * per_pass)
-    found = _values(sensor, own, corner + within, lambda: on_emitter, spp, radiance)
-    place = dr.arange(mi.UInt32, pixels * per_pass)
-    pixel, sample = Divisor(per_pass).split(place)
-    place = dr.gather(mi.UInt32, chosen, pixel) * per_pass + sample
+    found = _values(sensor, own, place, lambda: on_emitter, spp, radiance)
     everywhere = dr.zeros(mi.Float, pixels * per_pass * further)
     found = [value + everywhere for value in found]
-    dr.eval(found)
-    for target, value in zip(values, found, strict=True):
-        dr.scatter(target, dr.block_sum(value, further) / mi.Float(each), place)
-    dr.eval(values)
-    return position, values
+    dr.eval(found, place)
+    return (position, values), FurtherSamples(chosen, per_pass * further, further, place, found)
+
+
+class PixelCells:
+    """Cells of a pixel of equal area, which stratify its samples: ``count`` of them in rows that
+    differ by one cell at most.
+    """
+
+    def __init__(self, count: int) -> None:
+        rows = math.isqrt(count)
+        narrow, longer = divmod(count, rows)  # cells of a row, and rows with one cell more
+        self._longer_end = dr.opaque(mi.UInt32, longer * (narrow + 1))
+        self._columns = [Divisor(narrow + 1), Divisor(narrow)]
+        self._widths = [dr.opaque(mi.Float, 1 / n) for n in (narrow + 1, narrow)]
+        self._area = dr.opaque(mi.Float, 1 / count)
+
+    def position(self, cell: mi.UInt32, within: mi.Point2f) -> mi.Point2f:
+        """Position in the pixel, in [0, 1)^2, of a point ``within`` a cell."""
+        is_longer = cell < self._longer_end
+        begin = dr.select(is_longer, 0, self._longer_end)
+        columns = [each.split(cell - begin)[1] for each in self._columns]
+        column, width = (dr.select(is_longer, *pair) for pair in (columns, self._widths))
+        # The area of all rows before, and that of the row's part: width times height is the area.
+        before = mi.Float(cell - column) * self._area
+        return mi.Point2f(
+            (mi.Float(column) + within.x) * width, before + within.y * self._area / width
+        )

@@ -33,20 +33,51 @@ class Samples:
         self.channels = len(values)
         width, height = (int(n) + 2 * border for n in film.crop_size())
         index = dr.arange(mi.UInt32, width * height * per_pixel)
-        numbers = [*position, *values]
-        numbers += [mi.Float(0)] * (-len(numbers) % 4)
-        self.packets = []
-        for start in range(0, len(numbers), 4):
-            packet = dr.zeros(mi.Float, 4 * dr.width(index))
-            dr.scatter(packet, mi.Vector4f(numbers[start : start + 4]), index)
-            self.packets.append(packet)
-        dr.eval(self.packets)
+        self._packets = _packed([*position, *values], index)
 
     def read(self, index: mi.UInt32, active: mi.Bool) -> list[mi.Float]:
         """Load position and values of samples."""
-        packets = [dr.gather(mi.Vector4f, packet, index, active) for packet in self.packets]
-        numbers = [number for packet in packets for number in packet]
-        return numbers[: self.channels + 2]
+        return _read(self._packets, index, active)[: self.channels + 2]
+
+
+class FurtherSamples:
+    """Samples of some ``pixels`` in place of those that all pixels have: ``count`` consecutive ones
+    for each, every ``further`` of which replace one. Pixels are numbered in the crop window and its
+    margin.
+    """
+
+    def __init__(
+        self,
+        pixels: mi.UInt32,
+        count: int,
+        further: int,
+        position: mi.Point2f,
+        values: Sequence[mi.Float],
+    ) -> None:
+        self.pixels, self.position, self.values = pixels, position, list(values)
+        self.count, self.weight = count, dr.opaque(mi.Float, 1 / further)
+
+    def sums(self) -> list[mi.Float]:
+        """Sums of the values of each pixel, with the weight of the samples that are replaced."""
+        return [dr.block_sum(value, self.count) * self.weight for value in self.values]
+
+
+def _packed(numbers: list[mi.Float], index: mi.UInt32) -> list[mi.Float]:
+    """Arrays as packets of four, at places ``index``."""
+    numbers = numbers + [mi.Float(0)] * (-len(numbers) % 4)
+    packets = []
+    for start in range(0, len(numbers), 4):
+        packet = dr.zeros(mi.Float, 4 * dr.width(index))
+        dr.scatter(packet, mi.Vector4f(numbers[start : start + 4]), index)
+        packets.append(packet)
+    dr.eval(packets)
+    return packets
+
+
+def _read(packets: list[mi.Float], index: mi.UInt32, active: mi.Bool) -> list[mi.Float]:
+    """Load the numbers of `_packed` at ``index``."""
+    found = [dr.gather(mi.Vector4f, packet, index, active) for packet in packets]
+    return [number for packet in found for number in packet]
 
 
 def reconstructed(
@@ -55,14 +86,19 @@ def reconstructed(
     per_pixel: int,
     position: mi.Point2f,
     values: Sequence[mi.Float],
+    further: FurtherSamples | None = None,
 ) -> list[mi.Float]:
     """Sum the samples around each pixel of the crop window, weighted by the reconstruction filter.
 
     Returns one array for each channel, and the sums of the weights. The arguments are those of
-    `Samples`.
+    `Samples`; the ``further`` samples replace those of their pixels.
     """
     if not film.rfilter().is_box_filter():
-        return _gathered(Samples(film, border, per_pixel, position, values))
+        if further is None:
+            return _gathered(Samples(film, border, per_pixel, position, values))
+        elsewhere = _without(further.pixels, per_pixel, position)
+        sums = _gathered(Samples(film, border, per_pixel, elsewhere, values))
+        return [a + b for a, b in zip(sums, _further_gathered(film, border, further), strict=True)]
     # Assign samples to their own pixel, whatever the rounding of their positions.
     pixels = int(film.crop_size().x) * int(film.crop_size().y)
     everywhere = dr.zeros(mi.Float, pixels * per_pixel)
@@ -70,6 +106,11 @@ def reconstructed(
     dr.eval(sums)
     if per_pixel > 1:
         sums = [dr.block_sum(value, per_pixel) for value in sums]
+    if further is not None:
+        dr.eval(sums)
+        for target, value in zip(sums, further.sums(), strict=True):
+            dr.scatter(target, value, further.pixels)
+        dr.eval(sums)
     return [*sums, dr.opaque(mi.Float, per_pixel, pixels)]
 
 
@@ -140,4 +181,80 @@ def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
         k += 1
         ended = k == count
         k, dx = dr.select(ended, 0, k), dr.select(ended, dx + 1, dx)
+    return sums
+
+
+def _without(pixels: mi.UInt32, per_pixel: int, position: mi.Point2f) -> mi.Point2f:
+    """Positions of samples, those of some ``pixels`` out of reach of all filters."""
+    x = position.x + dr.zeros(mi.Float, dr.width(position))
+    dr.eval(x)
+    pixel, sample = Divisor(per_pixel).split(dr.arange(mi.UInt32, dr.width(pixels) * per_pixel))
+    place = dr.gather(mi.UInt32, pixels, pixel) * per_pixel + sample
+    dr.scatter(x, mi.Float(dr.inf), place)
+    dr.eval(x)
+    return mi.Point2f(x, position.y)
+
+
+def _further_gathered(film: mi.Film, border: int, further: FurtherSamples) -> list[mi.Float]:
+    """The sums of `reconstructed` over ``further`` samples."""
+    reach = int(film.rfilter().border_size())
+    parts = _around(film, border, reach, further)
+    width, height = (int(n) for n in film.crop_size())
+    framed_width, framed_height = width + 2 * border, height + 2 * border
+    # The number plus 1 of each pixel with further samples, 0 for others.
+    numbers = dr.zeros(mi.UInt32, framed_width * framed_height)
+    dr.scatter(numbers, dr.arange(mi.UInt32, dr.width(further.pixels)) + 1, further.pixels)
+    dr.eval(parts, numbers)
+    column, row = pixel_of(dr.arange(mi.UInt32, width * height), width)
+    return _collected(parts, numbers, mi.Vector2i(column, row) + border, reach, framed_width)
+
+
+@symbolic
+def _around(film: mi.Film, border: int, reach: int, further: FurtherSamples) -> list[mi.Float]:
+    """Sums of values and weights of each pixel's ``further`` samples at the (2 ``reach`` + 1)^2
+    pixels around it, row by row.
+    """
+    filter_, side = film.rfilter(), 2 * reach + 1
+    radius, count = filter_.radius(), dr.opaque(mi.UInt32, further.count)
+    packets = _packed(
+        [*further.position, *further.values], dr.arange(mi.UInt32, dr.width(further.position))
+    )
+    lane = dr.arange(mi.UInt32, dr.width(further.pixels) * side * side)
+    number, around = Divisor(side * side).split(lane)
+    pixel = pixel_of(
+        dr.gather(mi.UInt32, further.pixels, number), int(film.crop_size().x) + 2 * border
+    )
+    step = pixel_of(around, side) - reach
+    centre = mi.Point2f(pixel + step - border + mi.Vector2i(film.crop_offset())) + 0.5
+    sums = [dr.zeros(mi.Float, dr.width(lane)) for _ in range(len(further.values) + 1)]
+    k = dr.zeros(mi.UInt32, dr.width(lane))
+    while dr.hint(k < count, label="further samples of a pixel"):
+        x, y, *values = _read(packets, number * count + k, mi.Bool(True))
+        x, y = x - centre.x, y - centre.y
+        inside = (dr.abs(x) <= radius) & (dr.abs(y) <= radius)
+        weight = dr.select(inside, filter_.eval(x) * filter_.eval(y), 0)
+        for i in range(len(further.values)):
+            sums[i] = dr.fma(values[i], weight, sums[i])
+        sums[-1] += weight
+        k += 1
+    return [total * further.weight for total in sums]
+
+
+@symbolic
+def _collected(parts: list, numbers, pixel, reach: int, width: int) -> list[mi.Float]:
+    """Sums at each ``pixel`` of the ``parts`` of all pixels around it."""
+    side = 2 * reach + 1
+    count, columns = dr.opaque(mi.UInt32, side * side), dr.opaque(mi.Int32, width)
+    rows = dr.opaque(mi.Int32, dr.width(numbers) // width)
+    sums = [mi.Float(0) for _ in parts]
+    k = mi.UInt32(0)
+    while dr.hint(k < count, label="pixels with further samples"):
+        step = pixel_of(k, side) - reach
+        at = pixel - step
+        inside = (at.x >= 0) & (at.x < columns) & (at.y >= 0) & (at.y < rows)
+        number = dr.gather(mi.UInt32, numbers, mi.UInt32(at.y * columns + at.x), inside)
+        place = (number - 1) * count + k
+        for i in range(len(parts)):
+            sums[i] += dr.gather(mi.Float, parts[i], place, inside & (number > 0))
+        k += 1
     return sums

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.gradients.cases import Case
+from experiments.gradients.cases import SUN, Case
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.fit import Result, Settings, View, _roughness, fit
@@ -75,6 +75,16 @@ def test_a_fit_may_start_without_matter_and_find_the_albedo_too(rgb):
     # The scene has the values that are returned.
     (key,) = [k for k in mi.traverse(scene).keys() if ".albedo.data" in k]
     np.testing.assert_array_equal(np.array(mi.traverse(scene)[key]), albedo)
+
+
+def test_a_fit_of_a_medium_that_scatters_forwards(mono):
+    case = replace(CASE, data=6, g=0.7, emitters=lambda: {"sun": SUN})
+    seen, settings = views(case), Settings(steps=10)
+    scene = started(case, sigma_t=0.2)
+    result = fit(scene, seen[:3], ["sigma_t"], settings, seen[3:], every=1)
+    losses, errors = np.array(result.history)[:, 1:].T
+    assert losses[-1] < 0.1 * losses[0]
+    assert errors[-1] < 0.5 * errors[0]
 
 
 def test_a_fit_continues_where_it_stopped(mono, tmp_path):

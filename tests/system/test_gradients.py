@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.gradients.cases import CASES, POINT, SKY, SUN, Case, sky_with_sun
+from experiments.gradients.cases import CASES, LAMP, POINT, SKY, SUN, Case, sky_with_sun
 from experiments.gradients.differences import compare, gradients, key_of, pixel_weights
 from mitsuba_irrcache.errors import IrrcacheError
 
@@ -58,6 +58,15 @@ def test_emission_has_gradients_with_single_scattering(rgb):
     check(CASES["emission, single"])
 
 
+@pytest.mark.parametrize("name", ["hg 0.3, sun, single", "hg 0.6, envmap", "hg 0.3, point"])
+def test_gradients_of_anisotropic_media_are_those_of_the_image(mono, name):
+    check(CASES[name])
+
+
+def test_empty_voxels_of_anisotropic_media_have_gradients(mono):
+    check(CASES["hg 0.85, empty voxels"], EMPTY_ERROR)
+
+
 EMITTERS = {
     "sky": (lambda: {"sky": SKY, "sun": SUN}, "sky.radiance.value"),
     "sun": (lambda: {"sky": SKY, "sun": SUN}, "sun.irradiance.value"),
@@ -94,8 +103,8 @@ def test_images_are_linear_in_the_radiance_of_emitters(rgb, name, max_depth):
 # Interface
 
 
-def small(**properties) -> tuple[mi.Scene, mi.SceneParameters, str]:
-    scene = Case(data=8, cache=8).load(**properties)
+def small(g=None, **properties) -> tuple[mi.Scene, mi.SceneParameters, str]:
+    scene = Case(data=8, cache=8, g=g).load(**properties)
     params = mi.traverse(scene)
     return scene, params, key_of(params, "sigma_t")
 
@@ -108,8 +117,9 @@ def gradient_of(scene, params, key, **options) -> np.ndarray:
     return np.array(dr.grad(params[key]))
 
 
-def test_the_same_seed_gives_the_same_bits(rgb):
-    scene, params, key = small()
+@pytest.mark.parametrize("g", [None, 0.6])
+def test_the_same_seed_gives_the_same_bits(rgb, g):
+    scene, params, key = small(g)
     first, again, other = (gradient_of(scene, params, key, seed=s) for s in (1, 1, 2))
     assert first.tobytes() == again.tobytes()
     assert first.tobytes() != other.tobytes()
@@ -396,12 +406,18 @@ def test_scenes_without_gradients_are_refused(rgb, scenes):
     ball = {"type": "sphere", "radius": 0.1, "center": [0, -3, 0]}
     shape = scenes.boundary(scenes.medium(density, 0.8, place), place)
     assert "there are surfaces" in refused(scenes.load(ours, shape, 8, ball=ball), "sigma_t.data")
-    phase = {"type": "hg", "g": 0.3}
+    parts = {"a": {"type": "hg", "g": 0.3}, "b": {"type": "isotropic"}}
+    phase = {"type": "blendphase", "weight": 0.5} | parts
     shape = scenes.boundary(scenes.medium(density, 0.8, place, phase=phase), place)
-    assert "is not isotropic" in refused(scenes.load(ours, shape, 8), "sigma_t.data")
+    assert "it belongs to a HGPhaseFunction" in refused(scenes.load(ours, shape, 8), ".g")
     shape = scenes.boundary(scenes.medium(500.0, 0.8, place), place)
     opaque = scenes.load(ours | {"resolution": 0}, shape, 8)
     assert "has no cache" in refused(opaque, "sigma_t.value.value")
+
+
+def test_points_in_sharply_scattering_matter_are_refused(rgb):
+    scene = Case(data=8, cache=8, g=0.6, emitters=lambda: {"lamp": LAMP}).load()
+    assert 'emitter "lamp" is in medium' in refused(scene, "sigma_t.data")
 
 
 def test_emission_of_zero_is_refused(rgb):

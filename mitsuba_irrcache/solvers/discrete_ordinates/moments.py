@@ -135,10 +135,13 @@ class AnisotropicMultigridLevel(MultigridLevel):
     def prolong(self, values: mi.Float) -> mi.Float:
         """As `MultigridLevel.prolong`; moments that the coarser level does not have are 0."""
         moments, count = self.coarser.moments, self.coarser.tracks.active_count
-        moment, place = layer_and_index(self.tracks.active_count, self.moments.count)
-        known = moment < dr.opaque(mi.UInt32, moments.count)
-        begin = dr.select(known, moment, 0) * dr.opaque(mi.UInt32, count)
-        return dr.select(known, self._interpolated(values, place, 1, begin), 0)
+        moment, place = layer_and_index(self.tracks.active_count, moments.count)
+        begin = moment * dr.opaque(mi.UInt32, count)
+        known = self._interpolated(values, place, 1, begin)
+        result = dr.opaque(mi.Float, 0, self.moments.count * self.tracks.active_count)
+        dr.scatter(result, known, dr.arange(mi.UInt32, dr.width(known)))
+        dr.eval(result)
+        return result
 
     def sweep(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
         """As `MultigridLevel.sweep`, for all moments."""
@@ -150,11 +153,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
         scattered = None if phi is None else self._scattered(phi)
 
         def source(group: PairGroup) -> mi.Float:
-            values = dr.opaque(mi.Float, 0, 2 * len(group) * voxels)
-            if scattered is not None:
-                _write_source(moments, values, scattered, group, active, voxels)
-                dr.eval(values)
-            return values
+            return self.source_along(scattered, group)
 
         for _, group, copies in self.tracks.sweep_separately(table, source):
             found = _add_collided(moments, received, lost, depth, copies, group, active, voxels)
@@ -169,6 +168,17 @@ class AnisotropicMultigridLevel(MultigridLevel):
         pairs = zip(collided, received, strict=True)
         collided = [self.collided_irradiance(depth, mean, other) for mean, other in pairs]
         return concatenated(received), concatenated(collided)
+
+    def source_along(self, scattered: mi.Float | None, group: PairGroup) -> mi.Float:
+        """Radiance that ``scattered`` moments (None for 0) have along both ways of all pairs of a
+        group, pair by pair.
+        """
+        voxels = self.grid.voxel_count
+        values = dr.opaque(mi.Float, 0, 2 * len(group) * voxels)
+        if scattered is not None:
+            _write_source(self.moments, values, scattered, group, self.tracks.active, voxels)
+            dr.eval(values)
+        return values
 
     def scattered_radiance(
         self, phi: mi.Float, index: mi.UInt32, direction: mi.Vector3f | None

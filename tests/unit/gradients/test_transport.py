@@ -1,4 +1,4 @@
-"""The sweep is its own transpose, and resampling has an exact one."""
+"""The sweep is its own transpose; resampling and delta-M scaling have exact ones."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from experiments.gradients.cases import Case
+from mitsuba_irrcache.gradients.forward_peak import with_forward_peak
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature
 from mitsuba_irrcache.gradients.splatting import GridSplat
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
+from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.delta_m import without_forward_peak
 from mitsuba_irrcache.scene.compile import compile_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -30,7 +33,7 @@ def test_a_sweep_is_its_own_transpose():
     transport = AdjointTransport(
         scene, medium, Grid.near_cubic(medium.frame, 20), (0, 1), 64, False, ()
     )
-    ((level, own),) = transport._levels
+    ((level, own),) = transport.levels
     table = level.tracks.table(*transport.ordinates.scattering().without_incoming())
     z, y, x = np.mgrid[:20, :20, :20] / 20
     pair = (1 + np.sin(3 * x + y), 1 + np.cos(2 * z - 4 * y))
@@ -39,6 +42,58 @@ def test_a_sweep_is_its_own_transpose():
     first = level._scattered_sums(fields[0] * swept[1])
     second = level._scattered_sums(fields[1] * swept[0])
     np.testing.assert_allclose(first, second, rtol=2e-3)
+
+
+def test_a_sweep_of_moments_is_its_own_transpose(mono):
+    """What is scattered into each direction is weighted by what comes from the opposite one."""
+    case = Case(data=20, cache=20, g=0.4)
+    scene, medium = medium_of(case)
+    grid = Grid.near_cubic(medium.frame, 20)
+    transport = AdjointTransport(scene, medium, grid, (0, 1), 64, False, ())
+    ((level, _),), scattering = transport.levels, transport.scattering
+    table = level.tracks.table(*transport.ordinates.scattering().without_incoming())
+    z, y, x = np.mgrid[:20, :20, :20] / 20
+    pair = []
+    for phase in (0.3, 1.1):
+        waves = [
+            1 + np.sin(3 * x + phase * y),
+            *(0.2 * np.cos(k * y - 2 * z + phase) for k in range(1, scattering.count)),
+        ]
+        pair.append([mi.Float(wave.ravel().tolist()) for wave in waves])
+    swept = [
+        scattering.apart(level.sweep(scattering.joined([layers]), table)[1], 1)[0]
+        for layers in pair
+    ]
+    weight = level.sigma_t * transport.albedo[0]
+    sums = [float(dr.sum(weight * scattering.product(pair[i], swept[1 - i]))[0]) for i in (0, 1)]
+    assert sums[0] == pytest.approx(sums[1], rel=2e-3)
+
+
+@pytest.mark.parametrize("count", [8, 5])
+def test_delta_m_scaling_has_an_exact_transpose(mono, count):
+    """For an albedo on the grid of the extinction, and on another one."""
+    _, scaled = medium_of(Case(data=8, cache=8, g=0.7))
+    original, rng = scaled.original, np.random.default_rng(5)
+    grids = {"sigma_t": original.sigma_t.grid, "albedo": Grid((count,) * 3, scaled.frame)}
+    data = {name: rng.uniform(0.3, 0.9, grid.voxel_count) for name, grid in grids.items()}
+
+    def medium(data: dict):
+        fields = {n: GridField(grids[n], mi.Float(np.float32(v)), 1) for n, v in data.items()}
+        return without_forward_peak(original.replaced(**fields))
+
+    scaled = medium(data)
+    worth = {name: rng.uniform(-1, 1, grid.voxel_count) for name, grid in grids.items()}
+    found = {name: mi.Float(np.float32(values)) for name, values in worth.items()}
+    found = with_forward_peak(scaled, found, 1, {"sigma_t": 1, "albedo": 1})
+    for name, values in data.items():
+        step = 0.02 * rng.uniform(-1, 1, len(values))
+        ends = [medium(data | {name: values + sign * step}) for sign in (1, -1)]
+        above, below = (
+            sum(np.array(getattr(end, n).data, dtype=np.float64) @ worth[n] for n in worth)
+            for end in ends
+        )
+        expected = np.array(found[name], dtype=np.float64) @ step
+        assert expected == pytest.approx(0.5 * (above - below), rel=2e-3)
 
 
 @pytest.mark.parametrize(

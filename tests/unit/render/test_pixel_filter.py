@@ -49,3 +49,53 @@ def test_sums_are_those_of_mitsuba(name, crop, per_pixel):
     colours = developed.shape[-1] - 2
     np.testing.assert_allclose(developed[..., :colours], means[..., :colours], atol=1e-5)
     np.testing.assert_allclose(developed[..., colours:], means[..., 4:], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["box", "gaussian", "lanczos"])
+@pytest.mark.parametrize("crop", [{}, CROP | {"sample_border": True}], ids=str)
+def test_further_samples_replace_those_of_their_pixels(name, crop):
+    """Samples given again as further ones, each twice, do not change the sums; others replace those
+    of their pixels.
+    """
+    from mitsuba_irrcache.render.pixel_filter import FurtherSamples, reconstructed
+
+    film, per_pixel = film_of(name, **crop), 3
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    width, height = (int(n) + 2 * border for n in film.crop_size())
+    rng = np.random.default_rng(8)
+    corner = np.array(film.crop_offset(), int) - border
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 1, 2)
+    places = corner + pixels + rng.uniform(0.01, 0.99, (len(pixels), per_pixel, 2))
+    values = rng.uniform(0.5, 2, (4, len(pixels), per_pixel))
+
+    def of(array: np.ndarray) -> mi.Float:
+        return mi.Float(np.float32(array.ravel()))
+
+    def sums(places, values, further=None):
+        position = mi.Point2f(of(places[..., 0]), of(places[..., 1]))
+        found = reconstructed(film, border, per_pixel, position, [of(v) for v in values], further)
+        return np.array([np.array(s) for s in found])
+
+    chosen = np.sort(rng.choice(len(pixels), len(pixels) // 3, replace=False))
+    twice = np.repeat(places[chosen], 2, axis=1)
+    position = mi.Point2f(of(twice[..., 0]), of(twice[..., 1]))
+    again = [of(np.repeat(v[chosen], 2, axis=1)) for v in values]
+    further = FurtherSamples(mi.UInt32(chosen), 2 * per_pixel, 2, position, again)
+
+    expected = sums(places, values)
+    np.testing.assert_allclose(sums(places, values, further), expected, atol=2e-5)
+    other = values.copy()
+    other[:, chosen] = 1e3
+    np.testing.assert_allclose(sums(places, other, further), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 12, 16, 30])
+def test_cells_of_a_pixel(count):
+    """Cells have the same area and are disjoint; together they are the pixel."""
+    from mitsuba_irrcache.render.film import PixelCells
+
+    cells, index = PixelCells(count), dr.arange(mi.UInt32, count)
+    lower, upper = (np.array(cells.position(index, mi.Point2f(at))).T for at in (0, 1))
+    np.testing.assert_allclose(np.prod(upper - lower, axis=1), 1 / count, rtol=1e-5)
+    points = np.random.default_rng(9).random((5000, 1, 2))
+    assert (((lower <= points) & (points < upper)).all(axis=-1).sum(axis=1) == 1).all()

@@ -1,0 +1,93 @@
+"""The transpose of delta-M scaling: from derivatives by the medium without the forward peak of its
+phase function (`media/delta_m`) to those by the medium of the scene.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.gradients.parameters import ALBEDO, MEAN_COSINE, SIGMA_T
+from mitsuba_irrcache.gradients.splatting import GridSplat
+from mitsuba_irrcache.grids.fields import Field
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+
+
+def with_forward_peak(
+    medium: MediumGrid,
+    found: dict[str, mi.Float],
+    channels: int,
+    wanted: dict[str, int],
+    change: float = 0.0,
+) -> dict[str, mi.Float]:
+    """Derivatives by the extinction and albedo of ``medium.original``, of those that are
+    ``wanted``, in so many channels, from those by ``medium`` in ``channels``; and that by the mean
+    cosine of the phase function, by which the share of the peak has the derivative ``change``.
+    """
+    # docs/primer, eq. (8.14)
+    share, field = medium.phase.forward, medium.sigma_t
+    p = _positions(field.grid)
+    by_sigma_t = _channels(found[SIGMA_T], channels)
+    sigma_t, albedo = (
+        list(mi.Spectrum(f.at_world(p))) for f in (medium.original.sigma_t, medium.original.albedo)
+    )
+    result = {role: values for role, values in found.items() if role in wanted}
+    if SIGMA_T in wanted:
+        values = [(1 - share * a) * d for a, d in zip(albedo, by_sigma_t, strict=False)]
+        result[SIGMA_T] = _at_data(medium.original.sigma_t, p, values, wanted[SIGMA_T])
+    by_share = 0.0
+    if MEAN_COSINE in wanted:
+        triples = zip(albedo, sigma_t, by_sigma_t, strict=False)
+        by_share -= sum(_total(a * s * d) for a, s, d in triples)
+    if ALBEDO in wanted:
+        values = [-share * s * d for s, d in zip(sigma_t, by_sigma_t, strict=False)]
+        result[ALBEDO] = _at_data(medium.original.albedo, p, values, wanted[ALBEDO])
+    if ALBEDO not in found:
+        return result
+    p = _positions(medium.albedo.grid)
+    albedo = list(mi.Spectrum(medium.original.albedo.at_world(p)))
+    by_albedo = [
+        (a, d / dr.square(1 - share * a))
+        for a, d in zip(albedo, _channels(found[ALBEDO], channels), strict=False)
+    ]
+    if ALBEDO in wanted:
+        values = [d * (1 - share) for _, d in by_albedo]
+        result[ALBEDO] += _at_data(medium.original.albedo, p, values, wanted[ALBEDO])
+    if MEAN_COSINE in wanted:
+        by_share += sum(_total(a * (a - 1) * d) for a, d in by_albedo)
+        result[MEAN_COSINE] = found[MEAN_COSINE] + mi.Float(change * by_share)
+    dr.eval(result)
+    return result
+
+
+def _positions(grid: Grid | None) -> mi.Point3f:
+    """The voxel centres; any position without a grid."""
+    if grid is None:
+        return mi.Point3f(0)
+    return grid.centers(dr.arange(mi.UInt32, grid.voxel_count))
+
+
+def _channels(values: mi.Float, count: int) -> list[mi.Float]:
+    """So many interleaved channels, each as an array."""
+    index = dr.arange(mi.UInt32, dr.width(values) // count) * count
+    return [dr.gather(mi.Float, values, index + c) for c in range(count)]
+
+
+def _total(values: mi.Float) -> float:
+    return float(np.array(values, dtype=np.float64).sum())
+
+
+def _at_data(field: Field, p: mi.Point3f, values: list[mi.Float], channels: int) -> mi.Float:
+    """Derivatives by the data of ``field`` in so many channels, from those by its ``values`` at
+    positions.
+    """
+    values = [sum(values)] if channels == 1 else values
+    if field.grid is None:
+        return mi.Float([np.array(v, dtype=np.float64).sum() for v in values])
+    dr.eval(values)
+    largest = max(float(dr.max(dr.abs(v))[0]) for v in values)
+    splat = GridSplat(field.grid, channels, largest * dr.width(p))
+    splat.add(p, values, mi.Bool(True))
+    return splat.values()
