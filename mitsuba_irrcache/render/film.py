@@ -223,7 +223,9 @@ class AntitheticPairs:
         self._paired = dr.opaque(mi.UInt32, count - count % 2)
         pairs = max(count // 2, 1)
         # Multiples of a number without common divisors are all pairs in another order.
-        stride = next(n for n in range(int(0.618 * pairs), 0, -1) if math.gcd(n, pairs) == 1)
+        stride = next(
+            n for n in range(max(1, int(0.618 * pairs)), 0, -1) if math.gcd(n, pairs) == 1
+        )
         self._stride = dr.opaque(mi.UInt32, stride if pairs < 1 << 16 else 1)
         self._pairs = Divisor(pairs)
 
