@@ -176,9 +176,15 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     solver ``sweep`` supports media in boxes or spheres without other media among their voxels; with
     surfaces, it requires ``max_depth`` 2 or -1, and where these reach into a medium, isotropic
     scattering without emission.
+    Media may also be bounded by ``dielectric``, ``roughdielectric``, ``thindielectric`` and other
+    BSDFs that transmit, such as milk in a ball of glass, if ``max_depth`` is -1 and their phase
+    function is broad: ``sweep`` supports boxes and spheres (with anisotropic scattering, boxes
+    under a constant environment), ``path`` all other shapes. Camera paths are split into what glass
+    reflects and what it transmits. As in ``volpath``, suns and points contribute nothing through
+    smooth glass.
     Unbounded media and sharp phase functions are rejected with an error that names them, and so are
-    boundaries that overlap or contradict each other. Scenes without media, or with dielectric
-    boundaries around all of them, are rendered by ``volpath`` or, if the extinction differs
+    boundaries that overlap or contradict each other. Scenes without media, or whose media are all
+    behind glass that no cache supports, are rendered by ``volpath`` or, if the extinction differs
     strongly between the channels, ``volpathmis``.
 
     Phase functions may be ``isotropic``, ``hg`` with :math:`|g|` up to 0.58, ``rayleigh``, or

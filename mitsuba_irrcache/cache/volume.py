@@ -280,6 +280,9 @@ class IrradianceCache:
         scattered = []
         for values in (self._interpolated_means(), self.moment_means()):
             chosen = [v for i, v in enumerate(values) if i % self.channels < channels]
+            if self.voxel_classes is not None and self.voxel_classes.inside is not None:
+                inside = dr.gather(mi.Bool, self.voxel_classes.inside, self.active)
+                chosen = [dr.select(inside, v, 0) for v in chosen]
             scattered.append([self._tensor([v]).array for v in chosen])
         return AngularField(self.directional, self.grid, *scattered)
 

@@ -23,6 +23,9 @@ MAX_VERTICES = 256
 #: rays that hit a back face, which occurs at edges.
 ORIENTATION_RAYS, MAX_CROSSINGS, MAX_INWARD_SHARE = 256, 256, 0.02
 
+#: Radius at which positions lie that are moved into the boundary, in units of its own.
+INSIDE = 0.999
+
 
 class Boundary:
     """Image of the cube [-1, 1]^3 ("box") or of the unit sphere ("sphere") under ``to_world``."""
@@ -54,6 +57,12 @@ class Boundary:
         if self.kind == "box":
             return dr.max(dr.abs(local)) <= 1
         return dr.squared_norm(local) <= 1
+
+    def drawn_inside(self, p: mi.Point3f) -> mi.Point3f:
+        """Move world positions that lie outside towards the centre, to just inside the boundary."""
+        local = self._to_local.point(p)
+        size = dr.max(dr.abs(local)) if self.kind == "box" else dr.norm(local)
+        return Affine(self.to_world).point(local * dr.minimum(1, INSIDE / dr.maximum(size, 1e-6)))
 
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Intersect the line of a ray: whether it hits, and the distances of entry and exit.

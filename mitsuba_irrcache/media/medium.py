@@ -30,6 +30,7 @@ class MediumGrid(Immutable):
         others: the other media of the scene in the order of that list, before delta-M scaling.
         is_isolated: whether this medium in its boundary is all there is beside emitters.
         has_exact_boundary: whether the medium fills ``boundary``, which otherwise encloses it.
+        refracts: whether radiance passes its boundary other than straight.
         unscattered_exponent: power of the transmittance that gives the share of light that is not
             scattered at all, where light scattered into a forward peak counts as transmitted (see
             `delta_m`).
@@ -52,6 +53,7 @@ class MediumGrid(Immutable):
         others: tuple[MediumGrid, ...] = (),
         is_isolated: bool = True,
         has_exact_boundary: bool = True,
+        refracts: bool = False,
         unscattered_exponent: float = 1.0,
         original: MediumGrid | None = None,
         macrocells: Macrocells | None = None,
@@ -61,6 +63,7 @@ class MediumGrid(Immutable):
         self.name, self.pointer = name, pointer
         self.number, self.others = number, others
         self.is_isolated, self.has_exact_boundary = is_isolated, has_exact_boundary
+        self.refracts = refracts
         self.unscattered_exponent, self.original = unscattered_exponent, original
         self.macrocells = macrocells or Macrocells.build(sigma_t, boundary)
         if bbox is not None:

@@ -126,7 +126,7 @@ class CacheBuilder:
             grids = _grids(self.parts) if edited and snapshot.carries_gradients else {}
             self.parts, self._snapshot = [], None
             self.revision += 1
-            description = compile_scene(scene, self._baked_emission())
+            description = compile_scene(scene, self._baked_emission(), self.settings.max_depth)
             media = description.visible
             wanted = (self.settings.solver, self.settings.max_depth, self.settings.resolution)
             settings = replace(self.settings, samples=self._wanted)

@@ -11,6 +11,7 @@ from threading import Lock
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_irrcache.cache.angular import (
     AngularBasis,
@@ -24,6 +25,7 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, marked
+from mitsuba_irrcache.lights.emitters import position_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.machine.memory import release_unused_memory, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -196,6 +198,12 @@ class CachedMedium:
             f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {dr.width(active)} "
             f"of {grid.voxel_count} see the medium",
         )
+        if medium.refracts and solver.name == "path":
+            mi.Log(
+                mi.LogLevel.Info,
+                f"irrcache: {self.label}behind glass the solver path finds emitters by chance, as "
+                "volpath does, which is faster for a single small image.",
+            )
         samples = settings.samples or solver.default_samples(
             medium, settings.max_depth, dr.width(active)
         )
@@ -205,6 +213,8 @@ class CachedMedium:
             dense = border_error(medium, grid) > SMALL_BORDER_ERROR
             direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes)
             direct_lights += area_lights_of(scene, medium, grid, active, classes)
+        if medium.refracts:  # others reach no voxel straight
+            direct_lights = [d for d in direct_lights if _is_within(medium, d.emitter)]
         known = [light.emitter for light in direct_lights]
         falloff = InverseSquareFactor.of(scene, grid, known)
         if known:
@@ -411,6 +421,15 @@ def _angular_basis(
     if medium.phase.is_isotropic:
         return None
     return AngularBasis(medium.phase, *sources_of(scene, known))
+
+
+def _is_within(medium: MediumGrid, emitter: mi.Emitter) -> bool:
+    """Whether an emitter lies in the boundary of a medium, by the centre of its shape if any."""
+    shape = emitter.get_shape()
+    if shape is None:
+        return medium.boundary.contains(position_of(emitter))
+    box = shape.bbox()
+    return medium.boundary.contains(0.5 * (np.array(box.min) + np.array(box.max)))
 
 
 def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> None:

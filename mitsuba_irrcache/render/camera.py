@@ -239,6 +239,7 @@ class TracedCameraRays:
         if max_depth < 0 and all_visible and description.has_surfaces:
             self._emitters = SampledEmitters(description.emitters)
         self._surfaces: SurfaceIrradiance | None = None
+        self._refracts = description.refracts
         #: whether the current image uses irradiance on surfaces
         self.caches_surfaces = False
 
@@ -248,9 +249,8 @@ class TracedCameraRays:
             self._surfaces = earlier._surfaces.renewed(self._paths(earlier._surfaces.nodes))
 
     def _paths(self, nodes: SurfaceNodes | None = None) -> SurfacePaths:
-        return SurfacePaths(
-            self.media, self.projections, self._emitters, self.brightest, self.rr_depth, nodes
-        )
+        rest = self.brightest, self.rr_depth, nodes, self._refracts
+        return SurfacePaths(self.media, self.projections, self._emitters, *rest)
 
     def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int = 0) -> None:
         """Cache the irradiance on the surfaces that ``sensor`` sees, if it is used for an image of
@@ -259,7 +259,7 @@ class TracedCameraRays:
         width, height = (int(n) for n in sensor.film().crop_size())
         samples = width * height * (spp or sensor.sampler().sample_count())
         self.caches_surfaces = False
-        if self._emitters is None or samples < FEWEST_SAMPLES:
+        if self._emitters is None or (samples < FEWEST_SAMPLES and not self._refracts):
             return
         if self._surfaces is None:
             self._surfaces = SurfaceIrradiance(self._paths(), seed)

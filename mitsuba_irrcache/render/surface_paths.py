@@ -19,6 +19,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import kronecker
 from mitsuba_irrcache.core.spectrum import luminance
 from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
+from mitsuba_irrcache.render.path_splitting import no_waiting, resumed, split
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.transport.path import (
     MAX_SURVIVAL,
@@ -150,8 +151,10 @@ class SurfacePaths:
         brightest: mi.Float,
         rr_depth: mi.UInt32,
         nodes: SurfaceNodes | None = None,
+        splits: bool = False,
     ) -> None:
-        """Use these ``nodes``, or none yet."""
+        """Use these ``nodes``, or none yet; ``splits``: split camera paths at glass."""
+        self.splits = splits
         self.media, self.projections, self.emitters = media, projections, emitters
         self.brightest, self.rr_depth = brightest, rr_depth
         if nodes is None:
@@ -184,6 +187,7 @@ class SurfacePaths:
         (only for rays from nodes; else it is included).
         """
         from_node = on_emitter is None
+        splits = self.splits and not from_node
         camera_sample = on_emitter or EmitterSample(mi.Point2f(0))
         emitted, radiance = mi.Spectrum(0), mi.Spectrum(0)
         throughput, eta = mi.Spectrum(1), mi.Float(1)
@@ -194,6 +198,7 @@ class SurfacePaths:
         clear = mi.Bool(not from_node)
         end_number, end_factor = mi.UInt32(0), mi.Spectrum(0)
         depth, crossings = mi.UInt32(0), mi.UInt32(0)
+        waiting = no_waiting(ray, pointer) if splits else []
         active = mi.Bool(active)
         while dr.hint(active, label="surface paths"):
             survival = dr.minimum(dr.max(throughput) * dr.square(eta), MAX_SURVIVAL)
@@ -266,7 +271,13 @@ class SurfacePaths:
             vertex = vertex_at(si)
             choice = rng.next_float32(scatters)
             sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
-            direction, f, scale, is_vertex, density = sample_bsdf(si, choice, sample, scatters)
+            if dr.hint(splits, mode="scalar"):
+                sample = dr.select(first, camera_sample.u, sample)
+                state = pointer, throughput, eta, vertex
+                waiting, found = split(waiting, si, state, (choice, sample), scatters)
+            else:
+                found = sample_bsdf(si, choice, sample, scatters)
+            direction, f, scale, is_vertex, density = found
             throughput = dr.select(scatters, throughput * f, throughput)
             eta = dr.select(scatters, eta * scale, eta)
             pdf = dr.select(is_vertex, density, pdf)
@@ -279,6 +290,12 @@ class SurfacePaths:
             ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
             crossings += 1
             active &= (crosses | scatters) & (crossings < MOST_CROSSINGS)
+            if dr.hint(splits, mode="scalar"):
+                state = [ray, pointer, throughput, eta, last, pdf]
+                waiting, state, new = resumed(waiting, state, active)
+                ray, pointer, throughput, eta, last, pdf = state
+                depth = dr.select(new, 1, depth)
+                active |= new
         return emitted, radiance, interacted, end_number, end_factor
 
     @symbolic

@@ -21,7 +21,7 @@ from mitsuba_irrcache.media.bake import bake, children
 from mitsuba_irrcache.media.delta_m import without_forward_peak
 from mitsuba_irrcache.media.emission import Emission, check_emission_is_within
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.media.phase import refuse_sharp
+from mitsuba_irrcache.media.phase import Phase, refuse_sharp
 from mitsuba_irrcache.scene.consistency import (
     RAY_OFFSET,
     check_media_agree,
@@ -29,7 +29,7 @@ from mitsuba_irrcache.scene.consistency import (
     described,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, transmits
 
 #: The offset of Mitsuba's secondary rays from a surface should not exceed this part of the shortest
 #: side of a medium.
@@ -38,8 +38,10 @@ LARGEST_OFFSET = 0.002
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
 
 
-def compile_scene(scene: mi.Scene, emission: Emission | None = None) -> SceneDescription:
-    """Create the description of ``scene``, whose media emit ``emission``.
+def compile_scene(
+    scene: mi.Scene, emission: Emission | None = None, max_depth: int = -1
+) -> SceneDescription:
+    """Create the description of ``scene``, whose media emit ``emission``, for images of this depth.
 
     Raises UnsupportedSceneError, naming the object, for scenes that would be rendered incorrectly.
     """
@@ -69,14 +71,14 @@ def compile_scene(scene: mi.Scene, emission: Emission | None = None) -> SceneDes
     else:
         if not is_isolated:
             _check_general(scene, media)
-        unscaled, names = _baked(scene, media, emission, is_isolated)
+        unscaled, names, reason = _baked(scene, media, emission, is_isolated, max_depth)
         brightest = dr.opaque(mi.Float, _brightest(scene))
         if emission is not None:
             check_emission_is_within(emission, [grid.frame for grid in unscaled])
         grids = tuple(_among_others(unscaled, number, names) for number in range(len(unscaled)))
         visible = tuple(grid for grid in grids if grid.name in names)
         if not visible:
-            _warn_that_none_is_visible(emission)
+            _warn_that_none_is_visible(emission, reason)
         _warn_of_scale(scene, grids)
     for grid in visible:
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
@@ -108,10 +110,13 @@ def _baked(
     media: dict[mi.Medium, list[mi.Shape]],
     emission: Emission | None,
     is_isolated: bool,
-) -> tuple[list[MediumGrid], set[str]]:
-    """Convert all media to grids, without delta-M scaling; also return the visible ones' names."""
+    max_depth: int,
+) -> tuple[list[MediumGrid], set[str], str]:
+    """Convert all media to grids, without delta-M scaling; also return the visible ones' names, and
+    why one is not visible, if there is any.
+    """
     grids: list[MediumGrid] = []
-    visible = set()
+    visible, reason = set(), ""
     for medium, filled in media.items():
         exact = _exact_boundary(scene, filled)
         pointer = mi.MediumPtr(medium)
@@ -123,21 +128,52 @@ def _baked(
             emission=emission,
             is_isolated=is_isolated,
             has_exact_boundary=exact is not None,
+            refracts=any(_refracts(shape) for shape in filled),
         )
         grids.append(grid)
         if _is_visible(scene, medium):
             visible.add(grid.name)
             if not grid.phase.has_peak:
                 refuse_sharp(grid.phase, f'medium "{medium.id()}" ({medium.class_name()})')
-    return grids, visible
+            continue
+        why = _why_not_through_glass(scene, medium, grid.phase, max_depth)
+        if why is None:
+            visible.add(grid.name)
+        reason = why or reason
+    return grids, visible, reason
 
 
 def _is_visible(scene: mi.Scene, medium: mi.Medium) -> bool:
     """Whether a camera ray can reach a medium without crossing a surface other than a null one."""
-    around = [s for s in scene.shapes() if medium in (s.interior_medium(), s.exterior_medium())]
-    return any(is_null(_flags(s)) for s in around) or any(
+    return any(is_null(_flags(s)) for s in _around(scene, medium)) or any(
         sensor.get_medium() == medium for sensor in scene.sensors()
     )
+
+
+def _refracts(shape: mi.Shape) -> bool:
+    """Whether radiance passes a shape other than straight, or is reflected by it as well."""
+    return transmits(_flags(shape)) and not is_null(_flags(shape))
+
+
+def _around(scene: mi.Scene, medium: mi.Medium) -> list[mi.Shape]:
+    return [s for s in scene.shapes() if medium in (s.interior_medium(), s.exterior_medium())]
+
+
+def _why_not_through_glass(
+    scene: mi.Scene, medium: mi.Medium, phase: Phase, max_depth: int
+) -> str | None:
+    """Return why a ``medium`` behind surfaces gets no cache; None if it is seen through them.
+
+    Camera paths through glass end where they enter the medium, with the sum of all orders there.
+    """
+    name = f'medium "{medium.id()}" ({medium.class_name()})'
+    if not any(transmits(_flags(s)) for s in _around(scene, medium)):
+        return f"{name} is behind surfaces that transmit nothing"
+    if max_depth >= 0:
+        return f"behind glass only the sum of all orders is known, not max_depth {max_depth}"
+    if phase.order is None:
+        return f"{name} scatters too sharply for a cache behind glass"
+    return None
 
 
 def _among_others(grids: list[MediumGrid], number: int, visible: set[str]) -> MediumGrid:
@@ -151,13 +187,13 @@ def _among_others(grids: list[MediumGrid], number: int, visible: set[str]) -> Me
     return medium.replaced(others=others) if others else medium
 
 
-def _warn_that_none_is_visible(emission: Emission | None) -> None:
+def _warn_that_none_is_visible(emission: Emission | None, reason: str) -> None:
     if emission is not None:
-        _refuse("all media are behind surfaces, and the emission in them is unknown to volpath")
+        _refuse(f"{reason}, and emission of media is unknown to volpath")
     mi.Log(
         mi.LogLevel.Warn,
-        "irrcache: all media are behind surfaces, so this scene is rendered as volpath does. A "
-        'shape that only bounds a medium needs <bsdf type="null"/>.',
+        f"irrcache: {reason}, so this scene is rendered as volpath does. A shape that only bounds "
+        'a medium needs <bsdf type="null"/>.',
     )
 
 

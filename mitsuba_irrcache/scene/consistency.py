@@ -22,7 +22,7 @@ import numpy as np
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import orientation
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, transmits
 
 #: Number of walks from outside: minimum, per shape, and maximum; number from each sensor.
 WALKS, WALKS_PER_SHAPE, MOST_WALKS, SENSOR_WALKS = 2048, 256, 1 << 16, 1024
@@ -246,7 +246,7 @@ def _walk(
         anywhere = mi.warp.square_to_uniform_sphere(sample)
         flags = si.bsdf().flags()
         null = is_null(flags)
-        through = null | _lets_through(flags) & (rng.next_float32(active) < 0.5)
+        through = null | transmits(flags) & (rng.next_float32(active) < 0.5)
         side = dr.dot(si.n, ray.d)
         back = dr.select(dr.dot(anywhere, si.n) * side > 0, -anywhere, anywhere)
         direction = dr.select(through, ray.d, back)
@@ -263,11 +263,6 @@ def _walk(
         event += 1
         active &= hit & ~now & (event < events)
     return wrong, met, lost, place, contradicts, before
-
-
-def _lets_through(flags: mi.UInt32) -> mi.Bool:
-    """Whether a BSDF with these flags transmits."""
-    return (flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)) != 0
 
 
 def _examine(
@@ -312,7 +307,7 @@ def _claims(scene: mi.Scene, ray: mi.Ray3f):
         code = dr.select(claims, _CLAIM, code)
         medium = dr.select(claims, si.target_medium(-ray.d), medium)
         shape = dr.select(claims, si.shape, shape)
-        active &= hit & ~claims & _lets_through(si.bsdf().flags())
+        active &= hit & ~claims & transmits(si.bsdf().flags())
         ray = si.spawn_ray(ray.d)
         event += 1
         active &= event < MOST_CROSSINGS

@@ -32,9 +32,13 @@ EDGE = 0.9
 
 
 class CutCells:
-    """The cells of a cache over ``grid`` that surfaces intersect, and their planes, one or two."""
+    """The cells of a cache over ``grid`` that surfaces intersect, and their planes, one or two.
 
-    def __init__(self, scene: mi.Scene, grid: Grid) -> None:
+    Surfaces that bound ``medium``, if given, do not count.
+    """
+
+    def __init__(self, scene: mi.Scene, grid: Grid, medium: mi.MediumPtr | None = None) -> None:
+        self._medium = medium
         self.grid = Extension(grid).grid  #: the grid that lookups interpolate on
         self.cells = tuple(n - 1 for n in self.grid.sides)
         count = int((self.grid.resolution - 1).prod())
@@ -81,6 +85,8 @@ class CutCells:
             ray.maxt = length
             si = scene.ray_intersect(ray)
             solid = is_solid(si) & (dr.abs(dr.dot(si.n, known)) < EDGE)
+            if dr.hint(self._medium is not None, mode="scalar"):
+                solid &= si.shape.interior_medium() != self._medium
             distance = dr.norm(si.p - middle)
             nearer = si.is_valid() & solid & (distance < nearest)
             nearest = dr.select(nearer, distance, nearest)

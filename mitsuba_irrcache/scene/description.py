@@ -31,6 +31,11 @@ class SceneDescription:
     has_surfaces: bool = False
 
     @property
+    def refracts(self) -> bool:
+        """Whether the boundary of any visible medium refracts."""
+        return any(grid.refracts for grid in self.visible)
+
+    @property
     def emits(self) -> bool:
         """Whether there is any source of radiance."""
         return bool(self.emitters) or self.media.is_emissive

@@ -46,9 +46,7 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
 
 
 def _is_solid(shape: mi.Shape) -> bool:
-    bsdf = shape.bsdf()
-    null = is_null(int(bsdf.flags()) if bsdf is not None else 0)
-    return not null or shape.is_emitter() or shape.is_sensor()
+    return not is_null(_flags(shape)) or shape.is_emitter() or shape.is_sensor()
 
 
 def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
@@ -185,3 +183,7 @@ def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str 
         if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
             return described(shape)
     return None
+
+
+def _flags(shape: mi.Shape) -> int:
+    return int(shape.bsdf().flags()) if shape.bsdf() is not None else 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,7 +16,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.scene.occluders import first_surface, hole_in
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, transmits
 
 #: Number of rays from each voxel that determine its medium.
 RAYS = 16
@@ -32,16 +34,28 @@ class VoxelClasses(Immutable):
         cut_cells: cells between voxels that surfaces cut; None where there are none.
         separated: for x, y, z, whether a surface lies between the centre of a voxel and that of the
             next one along this axis; None where there are no cut cells.
+        inside: the voxels whose centres are in the medium, where its boundary refracts: values on
+            both sides have nothing to do with each other, and lookups extrapolate from inside. None
+            for other boundaries.
     """
 
-    def __init__(self, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        media: Media,
+        medium: MediumGrid,
+        grid: Grid,
+        by_centre: bool = False,
+    ) -> None:
+        """``by_centre``: values are those of the centres of voxels, not means over them."""
         self.grid = grid
         index = dr.arange(mi.UInt32, grid.voxel_count)
         box = np.zeros(3, int), grid.resolution
         # Rays can miss a boundary that nearly coincides with walls; its closed form cannot.
         exact = medium.has_exact_boundary and not medium.others
         exact = exact and hole_in(scene, medium, grid, box) is None
-        *votes, within, backs = _probed(scene, media, medium, grid, index, exact)
+        glass = any(_is_glass(shape) for shape in scene.shapes())
+        *votes, within, backs = _probed(scene, media, medium, grid, index, exact, glass)
         within, enclosed = within > 0, backs == RAYS
         dr.eval(votes, within, enclosed)
         best, number = mi.UInt32(0), mi.UInt32(0)
@@ -49,7 +63,11 @@ class VoxelClasses(Immutable):
             number = dr.select(count > best, i, number)
             best = dr.maximum(best, count)
         dr.eval(number)
-        cut_cells = CutCells(scene, grid)
+        self.inside = None
+        if medium.refracts:
+            self.inside = number == medium.number + 1
+            dr.eval(self.inside)
+        cut_cells = CutCells(scene, grid, None if self.inside is None else medium.pointer)
         self.medium_number, self.enclosed = number, enclosed
         self.cut_cells = cut_cells if cut_cells.count else None
         self.separated = None
@@ -57,14 +75,19 @@ class VoxelClasses(Immutable):
             self.separated = tuple(_separated(scene, grid, axis) for axis in range(3))
         total, _ = neighbourhood(grid, dr.select(within, mi.Float(1), 0), within)
         self.readable = within | (total > 0)
+        if self.inside is not None:
+            self.readable &= self.inside | (within & (not by_centre))
         dr.eval(self.readable)
 
     def filled(self, values: mi.Float, channels: int) -> mi.Float:
-        """Replace zeros of enclosed voxels in ``values`` by the means of their neighbours.
+        """Replace zeros of enclosed voxels in ``values`` by the means of their neighbours, and
+        values outside of a boundary that refracts by extrapolation.
 
         Near a curved surface, lookups that `cut_cells` restrict to one side still read some of
         these voxels.
         """
+        if self.inside is not None:
+            values = extended(self.grid, values, self.inside, channels)
         voxel = dr.arange(mi.UInt32, self.grid.voxel_count)
         positive = mi.Bool(False)
         for c in range(channels):
@@ -81,12 +104,19 @@ class VoxelClasses(Immutable):
 
 @symbolic
 def _probed(
-    scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, index: mi.UInt32, exact: bool
+    scene: mi.Scene,
+    media: Media,
+    medium: MediumGrid,
+    grid: Grid,
+    index: mi.UInt32,
+    exact: bool,
+    glass: bool,
 ):
     """Numbers of rays from each voxel: those whose origin, the voxel's centre, is in no medium and
     in each medium; those whose origin, a random position in the voxel, is in ``medium``; those that
     hit the back of a surface first. ``exact``: positions within the medium's boundary, and only
-    these, are in it, whatever the rays meet.
+    these, are in it, whatever the rays meet. ``glass``: there are shapes that transmit, whose backs
+    do not count for positions in ``medium``.
     """
     corner = mi.Point3f(*grid.voxel_indices(index))
     votes = [mi.UInt32(0) for _ in range(len(media.grids) + 1)]
@@ -95,7 +125,11 @@ def _probed(
     while dr.hint(k < count, label="voxel classes"):
         u, direction = kronecker(k, 3), fibonacci_direction(k, RAYS, azimuth=0.4)
         pointer = _medium_at(scene, medium, grid.world.point(corner + 0.5), direction, exact)
-        meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction)
+        is_medium = mi.Bool(False)
+        if dr.hint(glass, mode="scalar"):
+            there = probe(scene, grid.world.point(corner + 0.5), direction)
+            is_medium = there == medium.pointer
+        meets_back = _meets_back(scene, grid.world.point(corner + 0.5), direction, is_medium)
         backs += dr.select(meets_back, mi.UInt32(1), 0)
         votes[0] += dr.select(pointer == None, mi.UInt32(1), 0)  # noqa: E711
         for i in range(len(media.grids)):
@@ -105,6 +139,11 @@ def _probed(
         within += dr.select(pointer == medium.pointer, mi.UInt32(1), 0)
         k += 1
     return [*votes, within, backs]
+
+
+def _is_glass(shape: mi.Shape) -> bool:
+    flags = int(shape.bsdf().flags()) if shape.bsdf() is not None else 0
+    return bool(transmits(flags)) and not is_null(flags)
 
 
 def _medium_at(
@@ -118,15 +157,18 @@ def _medium_at(
 
 
 @symbolic
-def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
-    """Whether rays hit the first surface that is not null from behind."""
+def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f, is_medium: mi.Bool):
+    """Whether rays hit the first surface that is not null from behind; not if it transmits and
+    ``p`` is in the medium.
+    """
     ray, back = mi.Ray3f(p, direction), mi.Bool(False)
     crossings, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="backs"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         solid = active & ~is_null(si.bsdf().flags())
-        back |= solid & (dr.dot(si.n, direction) > 0)
+        encloses = ~(is_medium & transmits(si.bsdf().flags()))
+        back |= solid & encloses & (dr.dot(si.n, direction) > 0)
         ray = si.spawn_ray(direction)
         crossings += 1
         active &= ~solid & (crossings < MOST_CROSSINGS)
@@ -148,6 +190,55 @@ def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
     return found
 
 
+def extended(grid: Grid, values: mi.Float, valid: mi.Bool, channels: int = 1) -> mi.Float:
+    """Extrapolate ``values``, which are not negative, from valid voxels to two layers around these.
+
+    The result is the mean over all straight lines through two valid neighbours, or one.
+    """
+    index = dr.arange(mi.UInt32, grid.voxel_count * channels)
+    voxel = index // channels
+    for _ in range(2):
+        dr.eval(values, valid)
+        total, weights = mi.Float(0), mi.Float(0)
+        for offset, squared in _directions():
+            (one, there), (two, beyond) = (
+                _neighbour(grid, voxel, [n * o for o in offset]) for n in (1, 2)
+            )
+            there &= dr.gather(mi.Bool, valid, one, there)
+            beyond &= there & dr.gather(mi.Bool, valid, two, beyond)
+            channel = index - voxel * channels
+            near = dr.gather(mi.Float, values, one * channels + channel, there)
+            far = dr.gather(mi.Float, values, two * channels + channel, beyond)
+            change = dr.select(beyond, dr.clip(near - far, -0.5 * near, 0.5 * near), 0)
+            total += dr.select(there, (near + change) / squared, 0)
+            weights += dr.select(there, mi.Float(1 / squared), 0)
+        own = dr.gather(mi.Bool, valid, voxel)
+        mean = total / dr.select(weights > 0, weights, 1)
+        values = dr.select(own, values, dr.select(weights > 0, mean, 0))
+        every = dr.arange(mi.UInt32, grid.voxel_count) * channels
+        valid = valid | (dr.gather(mi.Float, weights + dr.zeros(mi.Float, len(index)), every) > 0)
+    dr.eval(values)
+    return values
+
+
+def _directions() -> Iterator[tuple[list[int], int]]:
+    """Yield the offsets of the 26 neighbours of a voxel, and their squared lengths."""
+    for step in np.ndindex(3, 3, 3):
+        offset = [s - 1 for s in step]
+        if any(offset):
+            yield offset, sum(o * o for o in offset)
+
+
+def _neighbour(grid: Grid, voxel: mi.UInt32, offset: list[int]) -> tuple[mi.UInt32, mi.Bool]:
+    """The voxels so many along each axis away, and whether they exist."""
+    at = [mi.Int32(p) + o for p, o in zip(grid.voxel_indices(voxel), offset, strict=True)]
+    inside = mi.Bool(True)
+    for a, side in zip(at, grid.sides, strict=True):
+        inside &= (a >= 0) & (a < mi.Int32(side))
+    nx, ny, _ = grid.sides
+    return mi.UInt32((at[2] * mi.Int32(ny) + at[1]) * mi.Int32(nx) + at[0]), inside
+
+
 def neighbourhood(
     grid: Grid, values: mi.Float, valid: mi.Bool, channels: int = 1
 ) -> tuple[mi.Float, mi.Float]:
@@ -157,19 +248,9 @@ def neighbourhood(
     index = dr.arange(mi.UInt32, grid.voxel_count * channels)
     voxel = index // channels
     channel = index - voxel * channels
-    places = [mi.Int32(p) for p in grid.voxel_indices(voxel)]
-    nx, ny, _ = grid.sides
     total, weights = mi.Float(0), mi.Float(0)
-    for step in np.ndindex(3, 3, 3):
-        offset = [s - 1 for s in step]
-        squared = sum(o * o for o in offset)
-        if not squared:
-            continue
-        at = [p + o for p, o in zip(places, offset, strict=True)]
-        inside = mi.Bool(True)
-        for a, side in zip(at, grid.sides, strict=True):
-            inside &= (a >= 0) & (a < side)
-        there = mi.UInt32((at[2] * ny + at[1]) * nx + at[0])
+    for offset, squared in _directions():
+        there, inside = _neighbour(grid, voxel, offset)
         inside &= dr.gather(mi.Bool, valid, there, inside)
         value = dr.gather(mi.Float, values, there * channels + channel, inside)
         total += dr.select(inside, value / squared, 0)

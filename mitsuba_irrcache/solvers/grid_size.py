@@ -34,6 +34,10 @@ RESOLVED, OPAQUE, OPAQUE_POWER, MOST_PER_DATA_VOXEL = 0.7, 1.2, 0.45, 6.0
 #: The error [%] of a medium that is dense at its boundary is about BORDER_ERROR d^BORDER_ORDER,
 #: where d is the optical depth of a cache voxel at the boundary.
 BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
+#: Maximum number of voxels along the longest side that a boundary of glass can require: glass
+#: reflects most of the radiance inside, which varies less towards the boundary, and voxels are more
+#: work there. At an optical depth of 40 the error is 0.5 % (ball) and 0.7 % (cube) with so many.
+MOST_IN_GLASS = 64
 #: Maximum number of voxels of a cache that is finer than its data: all orders of scattering then
 #: take half a minute on two cores.
 MOST_REFINED = 8_000_000
@@ -125,10 +129,13 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
         dense = "finer than those of the medium, which is dense"
         wanted[dense if ratio.max() > 1 else "of the medium"] = data.resolution * ratio
     edge = _edge_of_error(rule.target_error)
+    most_by_border = rule.most_by_border
+    if medium.refracts:
+        most_by_border = min(most_by_border, MOST_IN_GLASS)
     per_path = f"{1 / edge:.0f} per mean free path"
     for reason, extinction, most in (
         (per_path, mean, rule.most_by_contrast),
-        (f"{per_path} at the boundary, which cuts the medium", border, rule.most_by_border),
+        (f"{per_path} at the boundary, which cuts the medium", border, most_by_border),
     ):
         counts = extinction * lengths / edge
         wanted[reason] = counts * min(1, most / max(counts.max(), 1))

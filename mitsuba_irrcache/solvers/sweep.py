@@ -16,6 +16,7 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Progress, Solver, SolverTask, register
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
 from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import AnisotropicSweep, minimum_batch
+from mitsuba_irrcache.solvers.discrete_ordinates.refracted_light import is_needed
 from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.grid_size import TARGET_ERROR, SizeRule, choose_grid
 from mitsuba_irrcache.transport.path import Media
@@ -84,6 +85,11 @@ class SweepSolver(Solver):
             return f"{hole} is a hole in {name}, or bounds another medium in it"
         if medium.phase.is_isotropic and medium.emission is None:
             return None
+        if medium.refracts and not medium.phase.is_isotropic and is_needed(scene):
+            return (
+                f"{name} scatters anisotropically behind glass, where it finds the radiance of a "
+                "constant environment only"
+            )
         # Emission without extinction must not be occluded either.
         box = box if medium.emission is None else (np.zeros(3, int), grid.resolution)
         found = obstacle(scene, grid, *box)

@@ -130,6 +130,11 @@ def is_null(flags: mi.UInt32) -> mi.Bool:
     return (flags & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
 
 
+def transmits(flags: mi.UInt32) -> mi.Bool:
+    """Whether a BSDF with these flags lets radiance through, refracted, scattered or straight."""
+    return (flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)) != 0
+
+
 def is_solid(si: mi.SurfaceInteraction3f) -> mi.Bool:
     """Whether a surface is more than the boundary of a medium: it scatters or emits."""
     return ~is_null(si.bsdf().flags()) | (si.shape.emitter() != None)  # noqa: E711
@@ -423,15 +428,22 @@ def trace(
 
 
 def sample_bsdf(
-    si: mi.SurfaceInteraction3f, choice: mi.Float, sample: mi.Point2f, active: mi.Bool
+    si: mi.SurfaceInteraction3f,
+    choice: mi.Float,
+    sample: mi.Point2f,
+    active: mi.Bool,
+    lobes: int | None = None,
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool, mi.Float]:
-    """Sample a direction from the BSDF at ``si``.
+    """Sample a direction from the BSDF at ``si``, from all its lobes or those with these flags.
 
     Returns the direction in the world, the BSDF over its density, the factor of the relative
     refractive index, whether the path has a vertex here (not where it passes a null interface), and
     the density [1/sr], 0 for mirrors and smooth refraction.
     """
-    found, value = si.bsdf().sample(mi.BSDFContext(), si, choice, sample, active)
+    context = mi.BSDFContext()
+    if lobes is not None:
+        context.type_mask = lobes
+    found, value = si.bsdf().sample(context, si, choice, sample, active)
     is_vertex = active & ~mi.has_flag(found.sampled_type, mi.BSDFFlags.Null)
     delta = mi.has_flag(found.sampled_type, mi.BSDFFlags.Delta)
     density = dr.select(delta, 0, found.pdf)

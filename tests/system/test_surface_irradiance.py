@@ -233,7 +233,8 @@ def test_limited_depths_and_unknown_media_are_path_traced(scenes):
     scenes.image(scene, spp=1)
     assert nodes_of(scene) is None
     del scene
-    glass = ball((-1.5, 0.5, 0), 0.4, bsdf={"type": "dielectric"}, interior=fog((2, 2, 2)))
+    sharp = fog((2, 2, 2)) | {"phase": {"type": "hg", "g": 0.9}}
+    glass = ball((-1.5, 0.5, 0), 0.4, bsdf={"type": "dielectric"}, interior=sharp)
     scene = scene_of(scenes, within() | {"jar": glass})
     scenes.image(scene, spp=1)
     assert nodes_of(scene) is None

@@ -257,6 +257,33 @@ def bumpy_ball(rows: int = 96, columns: int = 192) -> tuple[np.ndarray, np.ndarr
     return vertices.astype(np.float32), np.concatenate(strips + caps).astype(np.uint32)
 
 
+def in_glass(radius: float, interior: dict, bsdf: dict | None = None) -> dict:
+    """Return a ball of glass that is filled with a medium."""
+    glass = bsdf or {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+    return {"type": "sphere", "radius": radius, "bsdf": glass, "interior": interior}
+
+
+def kind_globe() -> dict:
+    """Return smoke in a hollow ball of glass."""
+    hollow = {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.5}
+    outer = {"type": "sphere", "radius": 1.0} | {"bsdf": in_glass(1.0, {})["bsdf"]}
+    return {"outer": outer, "inner": in_glass(0.93, smoke(), hollow), "sky": sky()}
+
+
+def kind_milk() -> dict:
+    """Return milk in a ball of glass."""
+    milk = {"type": "homogeneous", "sigma_t": 10.0, "albedo": 0.99}
+    return {"ball": in_glass(1.0, milk), "sky": sky()}
+
+
+def kind_jade() -> dict:
+    """Return jade behind a rough boundary, under a lamp."""
+    jade = {"type": "homogeneous", "sigma_t": 8.0, "albedo": colour(0.9, 0.98, 0.93)}
+    rough = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.6, "ext_ior": 1.0}
+    lamp = wall((1.5, 2.5, -2), (0, 0, 0), 0.7) | {"emitter": {"type": "area", "radiance": 12.0}}
+    return {"ball": in_glass(1.0, jade, rough), "sky": sky(), "lamp": lamp}
+
+
 KINDS: dict[str, Callable[[], dict]] = {
     "cloud, environment": kind_cloud,
     "chromatic extinction 1 : 4 : 10, environment": kind_chromatic,
@@ -272,6 +299,9 @@ KINDS: dict[str, Callable[[], dict]] = {
     "camera in fog, before a ball": kind_fog,
     "two media, environment and sun": kind_two,
     "nested media": kind_nested,
+    "smoke in a hollow globe of glass": kind_globe,
+    "milk in a ball of glass": kind_milk,
+    "jade behind rough glass, lamp": kind_jade,
     "medium in a mesh": kind_mesh,
 }
 

@@ -74,11 +74,15 @@ class SurfaceBoundary:
         surfaces: SurfaceVoxels | None = None,
     ) -> None:
         self.surfaces = surfaces
-        self.scene, self.media = scene, Media.around(medium)
+        self.scene, self.medium, self.media = scene, medium, Media.around(medium)
         self.pointer, self.area_emitters = medium.pointer, list(area_emitters)
         #: without this medium, which is convex: a ray that leaves it straight never meets it again
         self.other_media = self.media.without(medium)
         self.angular_basis = angular_basis
+        #: whether radiance enters the medium refracted, and is reflected within it
+        self.refracts = medium.refracts
+        #: whether tracks carry what glass refracts from emitters; else see `refracted_light`
+        self.carries_refracted = True
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
 
@@ -129,6 +133,8 @@ class IncomingRadiance:
         #: not depend on phi; factors of phi. And the voxels of phi, and the directions in which
         #: radiance leaves these (None for isotropic scattering).
         self.unscattered, self.emitted, self.reflected, self.voxel, self._direction = found
+        if boundary.refracts and not _any_positive(self.unscattered):
+            self.has_emitters = [np.zeros_like(each) for each in self.has_emitters]
         self._voxels: dict[tuple, mi.UInt32] = {tracks.grid.shape: self.voxel}
 
     @property
@@ -173,7 +179,7 @@ class IncomingRadiance:
         cells[:, 0] -= start
         here = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
         first_crossing = None
-        if self.crossings is not None and tracks is self.tracks:
+        if self.crossings is not None and tracks.surfaces is not None:
             # Coarser levels, which only correct the solution, do without surfaces among the voxels.
             table.crossings = self.crossings.of_table(numbers)
             begin, end = (int(2 * self.crossings.starts[n]) for n in (numbers[0], numbers[-1] + 1))
@@ -363,6 +369,13 @@ def _coarse_voxels(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
     return result
 
 
+def _any_positive(spectra: list[list]) -> bool:
+    """Whether any value of any spectrum is positive."""
+    largest = [dr.max(channel) for spectrum in spectra for channel in spectrum]
+    dr.eval(largest)
+    return any(each[0] > 0 for each in largest)
+
+
 def _trace_cells(
     boundary: SurfaceBoundary,
     incoming: IncomingRadiance,
@@ -427,6 +440,37 @@ def _trace(
     paths: bool,
 ) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
     """Radiance along rays with these numbers of the ways, weights, and media."""
+    if not boundary.refracts:
+        return _trace_all(boundary, incoming, rays, distant, paths)
+    # Half of the rays begin outside of the glass, from where nothing enters straight.
+    _, _, hit, ray, *_ = rays
+    index = dr.compress(hit & boundary.medium.contains(ray.o))
+    if not dr.width(index):
+        index = mi.UInt32(0)
+    rays = tuple(dr.gather(type(each), each, index) for each in rays)
+    return _expanded(_trace_all(boundary, incoming, rays, distant, paths), index, dr.width(hit))
+
+
+def _expanded(found: object, index: mi.UInt32, count: int) -> object:
+    """Put values, or those in a structure of lists, at these places of so many, 0 elsewhere."""
+    if found is None:
+        return None
+    if isinstance(found, (list, tuple)):
+        return type(found)(_expanded(each, index, count) for each in found)
+    result = dr.zeros(type(found), count)
+    dr.scatter(result, found, index)
+    dr.eval(result)
+    return result
+
+
+def _trace_all(
+    boundary: SurfaceBoundary,
+    incoming: IncomingRadiance,
+    rays: tuple,
+    distant: list[mi.Float],
+    paths: bool,
+) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
+    """As `_trace`, for all of the rays."""
     way, weight, hit, ray, rng, pointer = rays
     parts = [dr.gather(mi.Spectrum, each, way) for each in distant]
     visible = hit & (dr.max(sum(parts)) > 0)
@@ -446,7 +490,8 @@ def _trace(
             boundary.scene, boundary.media, begin, boundary.max_depth, boundary.rr_depth, False,
             rng, hit & (weight > 0), lambda medium: medium == boundary.pointer,
         )  # fmt: skip
-        emitted = emitted + weight * scattered
+        if boundary.carries_refracted:
+            emitted = emitted + weight * scattered
         direction = end.direction
         reflected = weight * end.weight * dr.inv_four_pi
         if boundary.surfaces is None:

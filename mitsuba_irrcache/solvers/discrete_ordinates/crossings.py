@@ -18,6 +18,8 @@ import numpy as np
 
 from mitsuba_irrcache.core.jit import concatenated, symbolic
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import marked
+from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import first_surface
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import layer_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
@@ -40,14 +42,26 @@ BEYOND = 2.0
 class SurfaceVoxels:
     """The voxels near surfaces, in the box of ``grid`` between ``lower`` and ``upper`` (x, y, z).
 
+    ``medium`` is given if its boundary refracts, with the ``active`` voxels. Then those that it
+    cuts are voxels of the medium, wherever their centres are: nothing outside counts.
+
     Attributes:
         voxels: flat indices of the voxels that surfaces cut and of their neighbours, ascending.
         number: for each voxel of the grid, 1 + its place in ``voxels``; 0 for others.
         is_cut: for each voxel of the grid, whether a surface cuts it.
     """
 
-    def __init__(self, scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        grid: Grid,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        medium: MediumGrid | None = None,
+        active: mi.UInt32 | None = None,
+    ) -> None:
         self.scene, self.grid, self.lower, self.upper = scene, grid, lower, upper
+        self.medium = medium
         marks = dr.zeros(mi.UInt32, grid.voxel_count)
         for axis in range(3):
             start, direction, length = _lattice(grid, lower, upper, axis)
@@ -55,6 +69,12 @@ class SurfaceVoxels:
             dr.eval(marks)
         self.is_cut = self._within(marks > 0)
         dr.eval(self.is_cut)
+        #: voxels of the medium whose centres are beyond its boundary
+        self._beyond = mi.Bool(False)
+        if medium is not None:
+            centre = grid.centers(dr.arange(mi.UInt32, grid.voxel_count))
+            self._beyond = self.is_cut & marked(grid, active) & ~medium.contains(centre)
+            dr.eval(self._beyond)
         self.voxels = dr.compress(self._within(_dilated(grid, self.is_cut)))
         self.count = dr.width(self.voxels)
         self.number = dr.zeros(mi.UInt32, grid.voxel_count)
@@ -66,6 +86,12 @@ class SurfaceVoxels:
         """Whether surfaces cut these voxels of the grid."""
         return dr.gather(mi.Bool, self.is_cut, voxel)
 
+    def is_beyond(self, voxel: mi.UInt32, active: mi.Bool = True) -> mi.Bool:
+        """Whether these are voxels of a medium whose centres are beyond its boundary."""
+        if self.medium is None:
+            return mi.Bool(False)
+        return dr.gather(mi.Bool, self._beyond, voxel, active)
+
     @symbolic
     def nearest(self, p: mi.Point3f, active: mi.Bool):
         """The voxel whose value applies at world positions: that which contains them, or the
@@ -75,6 +101,7 @@ class SurfaceVoxels:
         own = voxel_at(self.grid, p)
         voxel = mi.UInt32(own)
         active = mi.Bool(active) & dr.gather(mi.Bool, self.is_cut, own, active)
+        active &= ~self.is_beyond(own, active)
         best, k = mi.Float(dr.inf), mi.UInt32(0)
         while dr.hint(active & (k < 27), label="nearest voxel"):
             at, there = _neighbour(self.grid, u, k)
@@ -256,6 +283,9 @@ def _side(
     """
     surfaces, p = crossings.surfaces, segment.at(position)
     _, normal, hidden = first_surface(surfaces.scene, segment.centre, p, active)
+    if surfaces.medium is not None:
+        beyond = surfaces.is_beyond(segment.voxel)
+        hidden = dr.select(beyond, ~surfaces.medium.contains(p), hidden)
     normal = dr.select(dr.dot(normal, p - segment.centre) > 0, normal, -normal)
     step = surfaces.grid.coordinates.vector(mi.Vector3f(normal))
     step /= dr.maximum(dr.max(dr.abs(step)), 1e-30)

@@ -189,6 +189,9 @@ class MultigridLevel:
         source, phi, lost, depth = dr.gather(mi.Vector4f, volume, slot)
         # Radiance of collisions times 4 pi, the integral of 1 over directions.
         collided = 4 * dr.pi * (source + lost / dr.select(depth > 0, depth, 1))
+        if self._is_cut is not None and tracks.surfaces.medium is not None:
+            # Their centres may be outside, where no irradiance is known.
+            phi = dr.select(self._is_cut & (depth > 0), collided, phi)
         collided = self.collided_irradiance(depth, collided, phi)
         if self._is_cut is not None:
             # The middles of tracks may lie behind the surface: the mean over their parts.

@@ -33,6 +33,9 @@ from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 #: Ordinates of a pass along which radiance enters among surfaces: it varies more from one direction
 #: to the next than the radiance between voxels.
 BOUNDARY_ORDINATES = 64
+#: The same in boxes of glass, where all tracks of an ordinate meet a face at the same angle and are
+#: reflected totally or not: with 64 the mean irradiance under a lamp has a noise of 1.3 %.
+BOUNDARY_ORDINATES_IN_GLASS = 256
 
 
 class OrdinateSet:
@@ -153,6 +156,8 @@ class BoundaryOrdinateSet:
 
     def uncollided_collisions(self, level: MultigridLevel) -> mi.Float:
         """The mean irradiance of collisions due to radiance straight from emitters."""
+        if not any(part.any() for part in self.incoming.has_emitters):
+            return dr.zeros(mi.Float, level.tracks.active_count * level.channels)
         table = level.tracks.table(*self.ordinates)
         source = self.incoming.emitter_source(self.channels, table, self.numbers)
         table.boundary_source = source
@@ -182,14 +187,22 @@ class BoundaryOrdinateSet:
 
 
 class JointOrdinateSet(BoundaryOrdinateSet):
-    """For anisotropic scattering: radiance that enters and radiance of voxels use the same
-    ordinates, so that quadrature errors of both cancel where their sum is isotropic.
+    """Radiance that enters and radiance of voxels use the same ordinates, so that quadrature errors
+    of both cancel where their sum is isotropic: for anisotropic scattering, and behind glass, which
+    reflects most of the radiance inside and so multiplies such errors.
     """
 
     def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
         table = self._table(level)
         if phi is None:
             table.boundary_source.update(phi)
+        return level.sweep(phi, table)
+
+    def exchanged(self, level: MultigridLevel, phi: mi.Float) -> tuple[mi.Float, mi.Float]:
+        if self._crossings is not None or self.incoming.crossings is None:
+            return super().exchanged(level, phi)
+        table = level.tracks.table(*self.scattering)
+        table.crossings = self.incoming.crossings.of_table(self.numbers)
         return level.sweep(phi, table)
 
 
@@ -206,8 +219,11 @@ def boundary_ordinate_sets(
     together; and all spectra that may differ between channels. If there are several passes, the
     first one can solve for all orders. ``pairs`` are those of scattering ordinates.
     """
-    several, joint = passes > 1, boundary.angular_basis is not None
-    many = max(BOUNDARY_ORDINATES // 2, pairs) if several else pairs
+    several = passes > 1
+    joint = boundary.angular_basis is not None or boundary.refracts
+    flat = boundary.refracts and boundary.surfaces is None
+    many = BOUNDARY_ORDINATES_IN_GLASS if flat else BOUNDARY_ORDINATES
+    many = max(many // 2, pairs) if several else pairs
     # The first one is independent, the union of the others is even.
     sets = illumination.ordinates(1, many, rng)
     if several:
@@ -218,7 +234,10 @@ def boundary_ordinate_sets(
         scattering = _scattering_ordinates(passes, pairs, rng)
     incoming = IncomingRadiance(boundary, tracks, merged(sets), several, (*seed, 0))
     reflected, crossings = None, [None] * passes
-    if several:
+    if several and boundary.refracts:
+        # The same paths: what they find of emitters and of voxels adds up without noise.
+        reflected = incoming
+    elif several:
         reflected = IncomingRadiance(boundary, tracks, scattering[0], several, (*seed, 1))
         rest = (boundary.crossings(tracks, each) for each in scattering[1:])
         crossings = [reflected.crossings, *rest]

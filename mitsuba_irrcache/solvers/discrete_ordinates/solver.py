@@ -25,6 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
+from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -44,6 +45,10 @@ from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     BoundaryOrdinateSet,
     OrdinateSet,
     boundary_ordinate_sets,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.refracted_light import (
+    is_needed,
+    refracted_irradiance,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
     collision_albedo,
@@ -105,9 +110,12 @@ class Sweep:
         self._medium = medium
         # The tracks come first: `occupied_box` evaluates the coordinates of all voxels, which the
         # sample points would otherwise share and store.
-        self._surfaces = _surfaces_among(scene, cache)
+        self._surfaces = _surfaces_among(scene, cache, medium if medium.refracts else None)
         self._prepare_tracks(pause)
         self._sample_points = VoxelSamplePoints(scene, cache.grid).of(cache.active)
+        if medium.refracts:
+            self._sample_points = medium.boundary.drawn_inside(self._sample_points)
+            dr.eval(self._sample_points)
         #: mean of 1/r^2 over a voxel, over its value at the sample point, in multiple scattering:
         #: what is scattered near a light is the mean over the voxel
         self._inverse_square_mean = mi.Float(1)
@@ -141,6 +149,10 @@ class Sweep:
         self._boundary = SurfaceBoundary(
             scene, medium, large, rr_depth, cache.directional, self._surfaces
         )
+        # What refracted radiance scatters first counts as a third order.
+        isotropic, all_orders = medium.phase.is_isotropic, cache.max_depth < 0
+        if medium.refracts and isotropic and all_orders and is_needed(scene):
+            self._boundary.carries_refracted = False
         emitters = small, self._illumination.point_lights
         self._emitter_sampling = EmitterSampling(
             scene, medium, *emitters, self._sample_points, cache.directional
@@ -149,6 +161,9 @@ class Sweep:
     def _prepare_tracks(self, pause: Callable[[], None]) -> None:
         """The tracks of each channel of the extinction, and what multiple scattering needs."""
         medium, cache, grid = self._medium, self.cache, self.cache.grid
+        if medium.refracts:
+            # Tracks end at the glass: voxels that it cuts are not thinner for that.
+            medium = medium.replaced(boundary=Boundary("box", medium.boundary.to_world))
         detail = extinction_grid(medium, grid)
         extinction = resampled(medium, medium.sigma_t, detail)
         box = occupied_box(grid, cache.active)
@@ -247,6 +262,9 @@ class Sweep:
         surroundings = self._boundary, self._illumination, self._tracks[0]
         sets, spectra = boundary_ordinate_sets(*surroundings, passes, pairs, rng, seed)
         self._direct = self._with_known_lights(self._emitter_sampling.irradiance(seed))
+        if not self._boundary.carries_refracted:
+            arguments = self._boundary, cache.grid, cache.active, seed
+            self._direct.append([refracted_irradiance(*arguments)])
         grey = grey_media and is_grey([*spectra, *chain(*self._direct, *self._emission)])
         return sets, grey, np.ones(cache.channels)
 
@@ -477,11 +495,17 @@ class Sweep:
         return [place + c for c in range(len(channels))]
 
 
-def _surfaces_among(scene: mi.Scene, cache: IrradianceCache) -> SurfaceVoxels | None:
-    """The voxels near surfaces, None where there are none in the box of the active voxels."""
+def _surfaces_among(
+    scene: mi.Scene, cache: IrradianceCache, medium: MediumGrid | None
+) -> SurfaceVoxels | None:
+    """The voxels near surfaces, None where there are none in the box of the active voxels.
+
+    ``medium`` is given if its boundary refracts.
+    """
     if cache.voxel_classes is None:
         return None
-    surfaces = SurfaceVoxels(scene, cache.grid, *occupied_box(cache.grid, cache.active))
+    box = occupied_box(cache.grid, cache.active)
+    surfaces = SurfaceVoxels(scene, cache.grid, *box, medium, cache.active)
     return surfaces if surfaces.count else None
 
 

@@ -38,9 +38,10 @@ from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 #: bytes each).
 LANES = 1 << 21
 
-#: Samples of all voxels together by default, without and among surfaces, where each is more work;
-#: and samples per voxel, at least and at most.
-PATHS, PATHS_AMONG_SURFACES = 2**24, 2**22
+#: Samples of all voxels together by default, without and among surfaces, where each is more work,
+#: and behind glass, where emitters are found by chance: with 2^22 the error of jade under an
+#: environment map was 2.4 %. And samples per voxel, at least and at most.
+PATHS, PATHS_AMONG_SURFACES, PATHS_BEHIND_GLASS = 2**24, 2**22, 2**23
 FEWEST_SAMPLES, MOST_SAMPLES = 16, 256
 
 
@@ -77,6 +78,7 @@ class PathSolver(Solver):
     @classmethod
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
         paths = PATHS_AMONG_SURFACES if medium.is_traced else PATHS
+        paths = PATHS_BEHIND_GLASS if medium.refracts else paths
         return int(np.clip(paths // max(active_count, 1), FEWEST_SAMPLES, MOST_SAMPLES))
 
     @classmethod
@@ -96,7 +98,9 @@ class PathSolver(Solver):
     def voxel_classes(
         cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> VoxelClasses | None:
-        return VoxelClasses(scene, media, medium, grid) if medium.is_traced else None
+        if not medium.is_traced:
+            return None
+        return VoxelClasses(scene, media, medium, grid, by_centre=True)
 
     @classmethod
     def knows_direct_lights(
@@ -105,7 +109,7 @@ class PathSolver(Solver):
         """Whether straight lines within the boundary of ``medium`` stay in it up to a surface."""
         if medium.is_isolated or not dr.width(active):
             return medium.is_isolated
-        if not medium.has_exact_boundary or medium.others:
+        if not medium.has_exact_boundary or medium.others or medium.refracts:
             return False
         return hole_in(scene, medium, grid, occupied_box(grid, active)) is None
 

@@ -11,7 +11,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.cut_cells import CutCells
-from mitsuba_irrcache.scene.voxel_classes import VoxelClasses, neighbourhood
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses, extended, neighbourhood
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -121,3 +121,17 @@ def test_voxels_are_classified(scenes):
     deep = np.linalg.norm(centers - [[-0.5], [0], [0]], axis=0) < 0.4 - 2 * 3**0.5 * 0.125
     assert not np.array(classes.readable)[deep].any()
     assert np.array(classes.readable)[~in_sphere].all()
+
+
+def test_values_are_extrapolated_linearly():
+    """Two layers beyond valid voxels continue a linear field, apart from the ends of the grid."""
+    n = 8
+    grid = Grid((n, n, n), np.eye(4))
+    z, y, x = np.indices((n, n, n))
+    field = (20.0 + x + 0.5 * y - 0.25 * z).astype(np.float32)
+    valid = x < 5
+    values = mi.Float(np.where(valid, field, 0).ravel())
+    found = extended(grid, values, mi.Bool(valid.ravel())).numpy().reshape(n, n, n)
+    np.testing.assert_array_equal(found[valid], field[valid])
+    np.testing.assert_allclose(found[3:5, 3:5, 5:7], field[3:5, 3:5, 5:7], rtol=1e-5)
+    assert not found[..., 7].any()

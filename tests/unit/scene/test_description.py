@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def several(scenes) -> mi.Scene:
-    """Three cubes beside each other, the last within glass and so not visible."""
+    """Three cubes beside each other, the last within glass."""
     boxes = {
         name: scenes.boundary(
             scenes.medium(1.0 + i, 0.5), scenes.placement((1, 1, 1), center=(3 * i, 0, 0))
@@ -28,12 +28,14 @@ def several(scenes) -> mi.Scene:
     return scenes.load({"type": "volpath"}, None, **boxes)
 
 
-def test_several_media(scenes):
-    description = compile_scene(several(scenes))
+@pytest.mark.parametrize(("max_depth", "visible"), [(-1, 3), (5, 2)])
+def test_several_media(scenes, max_depth, visible):
+    """A medium in glass has a cache if that holds all orders, with which paths can end."""
+    description = compile_scene(several(scenes), max_depth=max_depth)
     grids = description.media.grids
     assert [grid.number for grid in grids] == [0, 1, 2]
     assert len({grid.name for grid in grids}) == 3
-    assert [grid in description.visible for grid in grids].count(True) == 2
+    assert len(description.visible) == visible and description.refracts == (visible == 3)
     for grid in grids:
         assert grid.is_traced and not grid.is_isolated and grid.has_exact_boundary
         around = Media.around(grid).grids

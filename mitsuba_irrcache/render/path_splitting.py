@@ -1,0 +1,95 @@
+"""Splitting of paths at glass: both what it reflects and what it transmits are followed.
+
+A path that chose one of them would be noisy, although both are known without noise where they end
+in media that are ray marched. Paths are split at the first vertices, as long as a place is free in
+which the reflected one can wait until the other has ended.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.transport.path import medium_after, sample_bsdf
+
+#: Reflected paths that can wait.
+PLACES = 2
+#: Throughput of a reflected path below which a path is not split, but chooses.
+NEGLIGIBLE = 2e-3
+
+
+def no_waiting(ray: mi.Ray3f, pointer: mi.MediumPtr) -> list[list]:
+    """Return the places in which paths wait, all free: for each whether one does, its ray, medium,
+    throughput, relative refractive index, last vertex, and the density of its direction.
+    """
+    last = dr.zeros(mi.Interaction3f)
+    last.p = ray.o
+    path = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Spectrum(0), mi.Float(1), last, mi.Float(0)
+    return [[mi.Bool(False), *path] for _ in range(PLACES)]
+
+
+def split(
+    waiting: list[list],
+    si: mi.SurfaceInteraction3f,
+    state: tuple,
+    samples: tuple[mi.Float, mi.Point2f],
+    active: mi.Bool,
+) -> tuple[list[list], list]:
+    """Sample the BSDF as `sample_bsdf`, and split paths at surfaces that reflect and transmit, and
+    scatter nothing diffusely.
+
+    ``state`` is the medium, throughput, relative refractive index and vertex of a path. Returns the
+    places, and the result of `sample_bsdf`, of the transmitted part where a path was split.
+    """
+    found = sample_bsdf(si, *samples, active)
+    pointer, throughput, eta, vertex = state
+    kinds = mi.BSDFFlags
+    mirror = int(kinds.DeltaReflection | kinds.GlossyReflection)
+    clear = int(kinds.DeltaTransmission | kinds.GlossyTransmission | kinds.Null)
+    flags = si.bsdf().flags()
+    both = active & ((flags & mirror) != 0) & ((flags & clear) != 0)
+    both &= (flags & int(kinds.Diffuse)) == 0
+    transmitted = _lobe(si, samples, both, clear)
+    direction, f, scale, _, pdf = _lobe(si, samples, both, mirror)
+    f = throughput * f
+    both &= (dr.max(transmitted[1]) > 0) & (dr.max(f) > NEGLIGIBLE)
+    reflected = si.spawn_ray(direction), medium_after(si, direction, pointer), f, eta * scale
+    placed, result = mi.Bool(False), []
+    for taken, *path in waiting:
+        here = both & ~placed & ~taken
+        new = *reflected, vertex, pdf
+        path = [dr.select(here, a, b) for a, b in zip(new, path, strict=True)]
+        result.append([taken | here, *path])
+        placed |= here
+    return result, [dr.select(placed, a, b) for a, b in zip(transmitted, found, strict=True)]
+
+
+def _lobe(
+    si: mi.SurfaceInteraction3f,
+    samples: tuple[mi.Float, mi.Point2f],
+    active: mi.Bool,
+    lobes: int,
+) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool, mi.Float]:
+    """Sample some ``lobes`` as `sample_bsdf`, with the density of all: emitters are sampled for all
+    lobes, and the weights of both ways add up to 1.
+    """
+    direction, f, scale, is_vertex, density = sample_bsdf(si, *samples, active, lobes)
+    wo = si.to_local(direction)
+    glossy = active & (density > 0)
+    density = dr.select(glossy, si.bsdf().pdf(mi.BSDFContext(), si, wo, glossy), 0)
+    return direction, f, scale, is_vertex, density
+
+
+def resumed(waiting: list[list], state: list, active: mi.Bool) -> tuple[list[list], list, mi.Bool]:
+    """Replace paths that are not ``active`` any more by waiting ones.
+
+    ``state`` is the ray, medium, throughput, relative refractive index, last vertex and density.
+    Returns the places, the state, and which paths are new.
+    """
+    new, result = mi.Bool(False), []
+    for taken, *path in waiting:
+        here = taken & ~active & ~new
+        state = [dr.select(here, a, b) for a, b in zip(path, state, strict=True)]
+        result.append([taken & ~here, *path])
+        new |= here
+    return result, state, new

@@ -1,0 +1,92 @@
+"""Irradiance from emitters that glass around a medium refracts, voxel by voxel.
+
+Lamps and bright regions of an environment are seen through glass in few directions, which a set of
+ordinates would miss or exaggerate everywhere alike (ray effects). Their radiance is therefore found
+along paths from the voxels, which end at the first collision in the medium.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.jit import Divisor
+from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream, unit_floats
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
+from mitsuba_irrcache.transport.path import PathStart, trace
+
+#: Paths of a batch for all voxels together, and for each one, at least and at most; of a launch.
+PATHS, FEWEST, MOST, LANES = 1 << 24, 16, 1024, 1 << 21
+#: Weight of positions outside of the medium, which are moved to its boundary.
+OUTSIDE = 1e-4
+#: Number that is added to that of the random stream.
+STREAM = 0x6A00
+
+
+def is_needed(scene: mi.Scene) -> bool:
+    """Whether glass refracts anything but a constant environment. Suns and points contribute
+    nothing through smooth glass, which no path can hit them through.
+    """
+    rough = int(mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission)
+    scatters = any(
+        shape.bsdf() is not None and int(shape.bsdf().flags()) & rough for shape in scene.shapes()
+    )
+    kinds = (kind_of(emitter) for emitter in scene.emitters())
+    return any(
+        scatters or not (kind.has_one_direction or kind.is_point_like)
+        for kind in kinds
+        if kind is not EmitterKind.CONSTANT_ENVIRONMENT
+    )
+
+
+def refracted_irradiance(
+    boundary: SurfaceBoundary, grid: Grid, voxels: mi.UInt32, seed: tuple[int, int]
+) -> mi.Spectrum:
+    """Estimate the mean irradiance over ``voxels`` that reaches them without collisions from
+    emitters, refracted or reflected on the way.
+    """
+    count = dr.width(voxels)
+    samples = int(np.clip(PATHS // count, FEWEST, MOST))
+    block, found = max(1, LANES // samples), []
+    for begin in range(0, count, block):
+        index = dr.arange(mi.UInt32, min(block, count - begin)) + dr.opaque(mi.UInt32, begin)
+        own = dr.gather(mi.UInt32, voxels, index)
+        found.append(_mean(boundary, grid, own, samples, seed))
+    return mi.Spectrum(*(dr.concat([part[c] for part in found]) for c in range(len(found[0]))))
+
+
+def _mean(
+    boundary: SurfaceBoundary,
+    grid: Grid,
+    voxels: mi.UInt32,
+    samples: int,
+    seed: tuple[int, int],
+) -> list[mi.Float]:
+    """Average so many ``samples`` of each voxel."""
+    lane, k = Divisor(samples).split(dr.arange(mi.UInt32, dr.width(voxels) * samples))
+    voxel = dr.gather(mi.UInt32, voxels, lane)
+    words = mi.sample_tea_32(voxel, hashed_seed(seed)[0] + dr.opaque(mi.UInt32, STREAM))
+    shift = unit_floats([*words, *mi.sample_tea_32(words[1], words[0])])
+    rng = random_stream(mi.sample_tea_32(words[0] ^ k, words[1]))
+    u = kronecker(k, 4, shift)
+    within = mi.Point3f(u[2], u[3], rng.next_float32())
+    p = grid.world.point(mi.Point3f(*grid.voxel_indices(voxel)) + within)
+    # Only positions in the medium count, unless there are none.
+    weight = dr.select(boundary.medium.contains(p), 1, OUTSIDE)
+    p = boundary.medium.boundary.drawn_inside(p)
+    direction = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
+    pointer = dr.select(mi.Bool(True), boundary.pointer, dr.zeros(mi.MediumPtr, dr.width(lane)))
+    start = PathStart(mi.Ray3f(p, direction), pointer, depth=1, pdf=0.0)
+    _, scattered, *_ = trace(
+        boundary.scene, boundary.media, start, boundary.max_depth, boundary.rr_depth, False, rng,
+        mi.Bool(True), lambda medium: medium == boundary.pointer,
+    )  # fmt: skip
+    values = [c * weight * (4 * dr.pi) for c in scattered]
+    dr.eval(values, weight)
+    total = dr.block_sum(weight, samples)
+    means = [dr.block_sum(value, samples) / total for value in values]
+    dr.eval(means)
+    return means
