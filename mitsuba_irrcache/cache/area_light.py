@@ -25,6 +25,7 @@ from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_
 from mitsuba_irrcache.cache.direct_light import POINTS, DirectLight, spread
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
+from mitsuba_irrcache.core.spectrum import channel_mean
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
@@ -199,7 +200,7 @@ class AreaLight(DirectLight):
         first, second = (dr.reinterpret_array(mi.UInt32, v) for v in (p.x + p.y, p.z))
         rng = random_stream(mi.sample_tea_32(first, second))
         length, depth = self._closest_length(p), self.depth(p)
-        depth = depth if isinstance(depth, mi.Float) else dr.mean(depth)
+        depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
         return self._mean_rest(basis, p, direction, mean, self._phase_samples, rng)
 

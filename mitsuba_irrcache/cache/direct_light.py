@@ -23,6 +23,7 @@ from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_
 from mitsuba_irrcache.cache.conservative import unbiased
 from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.core.spectrum import channel_mean
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
@@ -386,7 +387,7 @@ class DirectLightAlongRays:
 
         Three parts absorb equal shares; one of them is divided at the kink.
         """
-        depth = depth if isinstance(depth, mi.Float) else dr.mean(depth)
+        depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
         absorbed, thin = absorptance(depth), depth < 1e-3
         thirds = [
             dr.select(thin, k, -dr.log(1 - k * absorbed) / dr.select(thin, 1, depth))

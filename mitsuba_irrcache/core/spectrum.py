@@ -19,6 +19,11 @@ def interleaved(planes: mi.Spectrum | list[mi.Float], width: int = 0) -> mi.Floa
     return flat
 
 
+def channel_mean(values: mi.Color3f) -> mi.Float:
+    """Mean over the channels; kernels with ``dr.mean`` would depend on the number of lanes."""
+    return dr.sum(values) * (1 / len(values))
+
+
 def luminance(spectrum: mi.Spectrum) -> mi.Float:
     """Return the luminance of a colour, or the value itself in monochromatic variants."""
     return spectrum[0] if mi.is_monochromatic else mi.luminance(mi.Color3f(spectrum))

@@ -29,7 +29,11 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.film import CameraSampler, scattered_rays
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance
-from mitsuba_irrcache.render.surface_paths import SampledEmitters, SurfacePaths
+from mitsuba_irrcache.render.surface_paths import (
+    EmitterSample,
+    SampledEmitters,
+    SurfacePaths,
+)
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import (
@@ -286,7 +290,10 @@ class TracedCameraRays:
         weight = dr.select(traced, transmittance / chance, 0)
         if self.caches_surfaces:
             is_stratified = isinstance(sampler, CameraSampler)
-            on_emitter = sampler.emitter_sample() if is_stratified else sampler.next_2d(traced)
+            if is_stratified:
+                on_emitter = sampler.emitter_sample()
+            else:
+                on_emitter = EmitterSample(sampler.next_2d(traced))
             direct, reflected, interacted, *_ = self._surfaces.paths.follow(
                 scene, end, pointer, rng, traced, on_emitter, self.hide_emitters
             )

@@ -21,6 +21,7 @@ from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.render.pixel_filter import FurtherSamples, pixel_of, reconstructed
+from mitsuba_irrcache.render.surface_paths import EmitterSample
 
 #: Maximum number of camera samples per kernel launch, to limit the memory of samples and sampler.
 LANES = 1 << 22
@@ -211,15 +212,45 @@ class SampledFilm:
         return place + mi.Vector2f(self.film.crop_offset())
 
 
+class AntitheticPairs:
+    """Two-dimensional golden-ratio sequences in antithetic pairs: symmetric about the centre, so
+    that they integrate linear functions exactly. Each point of a pair is uniformly distributed.
+
+    A sequence has ``count`` points; the last one of an odd number is single.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._paired = dr.opaque(mi.UInt32, count - count % 2)
+        pairs = max(count // 2, 1)
+        # Multiples of a number without common divisors are all pairs in another order.
+        stride = next(
+            n for n in range(max(1, int(0.618 * pairs)), 0, -1) if math.gcd(n, pairs) == 1
+        )
+        self._stride = dr.opaque(mi.UInt32, stride if pairs < 1 << 16 else 1)
+        self._pairs = Divisor(pairs)
+
+    def words(
+        self, number: mi.UInt32, shifts: Sequence[mi.UInt32], permuted: bool = False
+    ) -> tuple[list[mi.UInt32], mi.Bool, mi.Bool]:
+        """Coordinates times 2^32 of a point of the sequence with these ``shifts``; whether it is
+        the second one of a pair; and whether it belongs to a pair. Sequences of one pixel are
+        independent of each other if one of them has a ``permuted`` order of pairs.
+        """
+        pair, is_second, is_paired = number // 2, number % 2 == 1, number < self._paired
+        if permuted:
+            _, other = self._pairs.split(pair * self._stride)
+            pair = dr.select(is_paired, other, pair)
+        words = kronecker_words(pair, shifts)
+        return [dr.select(is_second, ~word, word) for word in words], is_second, is_paired
+
+
 class PixelPositions:
     """Positions of the camera samples within their pixels.
 
     Mitsuba's ``independent`` sampler does not stratify the samples of a pixel. If the radiance is
-    free of noise, this dominates the noise of the image. Positions therefore form a two-dimensional
-    golden-ratio sequence with a random shift per pixel, in antithetic pairs that are symmetric
-    about the pixel's centre, which integrate linear functions exactly. Each sample of a pair is
-    uniformly distributed. The last sample of an odd number is at the centre, so that images with
-    one sample per pixel do not depend on the seed. Other samplers are used unchanged.
+    free of noise, this dominates the noise of the image. Positions therefore are `AntitheticPairs`
+    with a random shift per pixel. The last sample of an odd number is at the centre, so that images
+    with one sample per pixel do not depend on the seed. Other samplers are used unchanged.
     """
 
     def __init__(self, sampler: mi.Sampler, seed: int, spp: int) -> None:
@@ -229,28 +260,23 @@ class PixelPositions:
         given = isinstance(seed, mi.UInt32)
         self.seed = seed if given else dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self.first = dr.opaque(mi.UInt32, 0)
-        self.paired = dr.opaque(mi.UInt32, spp - spp % 2)
+        self._sequence = AntitheticPairs(spp)
 
     def next(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
         """Position in [0, 1)^2 of a ``sample`` of this pass."""
         if not self.independent:
             return self.sampler.next_2d()
         shifts = mi.sample_tea_32(pixel, self.seed, 8)
-        number = self.first + sample
-        pair = number // 2
-        bits = kronecker_words(pair, shifts)
-        bits = [dr.select(number % 2 == 1, ~b, b) for b in bits]
-        bits = [dr.select(number < self.paired, b, 1 << 31) for b in bits]
-        return mi.Point2f(unit_floats(bits))
+        words, _, is_paired = self._sequence.words(self.first + sample, shifts)
+        return mi.Point2f(unit_floats([dr.select(is_paired, word, 1 << 31) for word in words]))
 
-    def emitter_sample(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
-        """Position in [0, 1)^2 on emitters for a ``sample`` of this pass: further coordinates of
-        the sequence.
-        """
+    def emitter_sample(self, pixel: mi.UInt32, sample: mi.UInt32) -> EmitterSample:
+        """Position on emitters for a ``sample`` of this pass."""
         if not self.independent:
-            return self.sampler.next_2d()
-        shifts = (*mi.sample_tea_32(pixel, self.seed, 8), *mi.sample_tea_32(self.seed, pixel, 8))
-        return mi.Point2f(unit_floats(kronecker_words(self.first + sample, shifts)[2:]))
+            return EmitterSample(self.sampler.next_2d())
+        shifts = mi.sample_tea_32(self.seed, pixel, 8)
+        words, is_second, _ = self._sequence.words(self.first + sample, shifts, permuted=True)
+        return EmitterSample(mi.Point2f(unit_floats(words)), dr.select(is_second, mi.Float(-1), 1))
 
 
 class CameraSampler:
@@ -258,7 +284,7 @@ class CameraSampler:
     camera sample.
     """
 
-    def __init__(self, sampler: mi.Sampler, emitter_sample: Callable[[], mi.Point2f]) -> None:
+    def __init__(self, sampler: mi.Sampler, emitter_sample: Callable[[], EmitterSample]) -> None:
         self._sampler, self.emitter_sample = sampler, emitter_sample
 
     def next_1d(self, active: mi.Bool = True) -> mi.Float:
@@ -312,7 +338,7 @@ def _sampled(
     """Trace the samples of a pass; return their film positions and the values of all channels."""
     position, index, sample = frame.positions(spread)
 
-    def on_emitter() -> mi.Point2f:
+    def on_emitter() -> EmitterSample:
         return spread.emitter_sample(index, sample)
 
     return position, _values(sensor, sampler, position, on_emitter, spp, radiance)
@@ -322,7 +348,7 @@ def _values(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
     position: mi.Point2f,
-    on_emitter: Callable[[], mi.Point2f],
+    on_emitter: Callable[[], EmitterSample],
     spp: int | mi.Float,
     radiance: RadianceFunction,
 ) -> list[mi.Float]:
@@ -376,8 +402,12 @@ def _refined(
     words = mi.sample_tea_32(source + cell, dr.opaque(mi.UInt32, stream))
     within = mi.Point2f(kronecker(k, 2, unit_floats(words)))
     place = frame.corner(pixel) + PixelCells(per_pass).position(cell, within)
-    shift = unit_floats(mi.sample_tea_32(source, dr.opaque(mi.UInt32, stream)))
-    on_emitter = mi.Point2f(kronecker(cell * each + k, 2, shift))
+    shifts = mi.sample_tea_32(source, dr.opaque(mi.UInt32, stream))
+    sequence = AntitheticPairs(per_pass * further)
+    words, is_second, _ = sequence.words(cell * each + k, shifts, permuted=True)
+    on_emitter = EmitterSample(
+        mi.Point2f(unit_floats(words)), dr.select(is_second, mi.Float(-1), 1)
+    )
     own = sampler.clone()
     own.seed(seed ^ stream, pixels * per_pass * further)
     spp = mi.Float(each * per_pass)

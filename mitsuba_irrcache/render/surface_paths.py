@@ -110,6 +110,20 @@ class SampledEmitters:
         return record, value * share * self.excess(emitter, value * record.pdf)
 
 
+class EmitterSample:
+    """Position in [0, 1)^2 on the first sampled emitter at a vertex, shifted by a golden-ratio
+    sequence for further ones: backwards for the second one of an antithetic pair (``sign`` -1).
+    """
+
+    def __init__(self, u: mi.Point2f, sign: mi.Float | float = 1.0) -> None:
+        self.u, self.sign = u, mi.Float(sign)
+
+    def of(self, number: mi.UInt32) -> mi.Point2f:
+        """Return the position on the emitter with this number."""
+        u = self.u + self.sign * mi.Point2f(kronecker(number, 2))
+        return u - dr.floor(u)
+
+
 def peak_threshold(environment: mi.Emitter) -> float:
     """The luminance beyond which an environment counts as a peak; infinite without peaks."""
     u = np.random.default_rng(1).random((2, 1 << 14), dtype=np.float32)
@@ -162,7 +176,7 @@ class SurfacePaths:
         pointer: mi.MediumPtr,
         rng: mi.PCG32,
         active: mi.Bool,
-        on_emitter: mi.Point2f | None = None,
+        on_emitter: EmitterSample | None = None,
         hide_emitters: bool = False,
     ):
         """Follow paths that begin with ``ray`` in the medium ``pointer``: at a node or, if samples
@@ -174,6 +188,7 @@ class SurfacePaths:
         """
         from_node = on_emitter is None
         splits = self.splits and not from_node
+        camera_sample = on_emitter or EmitterSample(mi.Point2f(0))
         emitted, radiance = mi.Spectrum(0), mi.Spectrum(0)
         throughput, eta = mi.Spectrum(1), mi.Float(1)
         ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
@@ -247,14 +262,17 @@ class SurfacePaths:
             smooth = surface & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             u = mi.Point2f(rng.next_float32(smooth), rng.next_float32(smooth))
             if dr.hint(not from_node, mode="scalar"):
-                u = dr.select(first, on_emitter, u)
-            direct, rng = self.direct(scene, si, pointer, u, rng, smooth, ends, not from_node)
+                u = dr.select(first, camera_sample.u, u)
+            on_emitters = EmitterSample(u, dr.select(first, camera_sample.sign, 1))
+            direct, rng = self.direct(
+                scene, si, pointer, on_emitters, rng, smooth, ends, not from_node
+            )
             radiance += dr.select(smooth, throughput * direct, 0)
             vertex = vertex_at(si)
             choice = rng.next_float32(scatters)
             sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
             if dr.hint(splits, mode="scalar"):
-                sample = dr.select(first, on_emitter, sample)
+                sample = dr.select(first, camera_sample.u, sample)
                 state = pointer, throughput, eta, vertex
                 waiting, found = split(waiting, si, state, (choice, sample), scatters)
             else:
@@ -281,19 +299,17 @@ class SurfacePaths:
         return emitted, radiance, interacted, end_number, end_factor
 
     @symbolic
-    def direct(self, scene, si, pointer, u, rng, active, ends, exact: bool):
+    def direct(self, scene, si, pointer, sample, rng, active, ends, exact: bool):
         """Return the radiance reflected at ``si`` that comes straight from the sampled emitters.
 
-        The sample ``u`` is shifted by a golden-ratio sequence for each of them. With multiple
-        importance sampling: where the path ``ends``, a ray is sampled from the BSDF for it here.
-        The transmittance has no noise if it is to be ``exact``.
+        With multiple importance sampling: where the path ``ends``, a ray is sampled from the BSDF
+        for it here. The transmittance has no noise if it is to be ``exact``.
         """
         result, number, context = mi.Spectrum(0), mi.UInt32(0), mi.BSDFContext()
         vertex, active = vertex_at(si), mi.Bool(active) & (self.emitters.count > 0)
         while dr.hint(active, label="sampled emitters"):
-            shifted = mi.Point2f(*kronecker(number, 2, (u.x, u.y)))
             chosen_by = mi.Float(number) + rng.next_float32(active)
-            record, value = self.emitters.sample(chosen_by, vertex, shifted, active)
+            record, value = self.emitters.sample(chosen_by, vertex, sample.of(number), active)
             f, density = si.bsdf().eval_pdf(context, si, si.to_local(record.d), active)
             value *= f
             reflects = active & (record.pdf > 0) & (dr.max(value) > 0)

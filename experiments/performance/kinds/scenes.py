@@ -171,7 +171,7 @@ def kind_fog_room() -> dict:
     """Return a Cornell box that is full of fog, with two objects in it."""
     fog = {"type": "homogeneous", "sigma_t": 0.4, "albedo": 0.9, "id": "fog"}
     room = {k: v for k, v in kind_room().items() if k != "box"}
-    filled = box({"type": "ref", "id": "fog"}, scale=(1.5, 1.5, 1.5))
+    filled = box({"type": "ref", "id": "fog"}, scale=(1.499, 1.499, 1.499))
     block = {
         "type": "cube", "to_world": placed((0.6, -1.0, 0.5), (0.4, 0.5, 0.4)),
         "bsdf": diffuse(0.7, 0.7, 0.7),

@@ -77,16 +77,16 @@ SURFACES = (
     ),
     Mutant(
         "refined pixels have half the radiance",
-        "render/film.py",
-        "dr.block_sum(value, further) / mi.Float(each)",
-        "dr.block_sum(value, further) * 0.5 / mi.Float(each)",
-        (IMAGES,),
+        "render/pixel_filter.py",
+        "dr.opaque(mi.Float, 1 / further)",
+        "dr.opaque(mi.Float, 0.5 / further)",
+        ("tests/unit/render/test_pixel_filter.py",),
     ),
     Mutant(
         "the number of refined samples is a constant of the kernel",
         "render/film.py",
-        "kronecker(sample * each + k, 2, shift)",
-        "kronecker(sample * further + k, 2, shift)",
+        "sequence.words(cell * each + k, shifts",
+        "sequence.words(cell * further + k, shifts",
         (IMAGES,),
     ),
     Mutant(

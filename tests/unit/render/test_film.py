@@ -168,3 +168,26 @@ def test_each_sample_of_a_pair_is_uniform(rgb):
         assert np.abs(sample.mean(axis=0) - 1 / 2).max() < 4 * np.sqrt(1 / 12 / 4096)
         assert np.abs((sample**2).mean(axis=0) - 1 / 3).max() < 4 * np.sqrt(4 / 45 / 4096)
     assert np.abs(positions(2, seed=3) - positions(2, seed=4)).mean() > 0.2
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 16, 37, 64])
+def test_permuted_pairs_are_the_same_points(count):
+    """A permuted order of pairs has the same points; each pair is symmetric about the centre."""
+    from mitsuba_irrcache.render.film import AntitheticPairs
+
+    sequence, number = AntitheticPairs(count), dr.arange(mi.UInt32, count)
+    shifts = mi.UInt32(123456789), mi.UInt32(987654321)
+
+    def points(permuted):
+        words, is_second, is_paired = sequence.words(number, shifts, permuted)
+        assert np.array(is_paired).sum() == count - count % 2
+        assert (np.array(is_second) == (np.arange(count) % 2 == 1)).all()
+        return np.array(words).T.astype(np.int64)
+
+    plain, permuted = points(False), points(True)
+    assert sorted(map(tuple, plain)) == sorted(map(tuple, permuted))
+    for found in (plain, permuted):
+        even = count - count % 2
+        assert (found[0:even:2] + found[1:even:2] == 2**32 - 1).all()
+    if count >= 16:
+        assert (plain != permuted).any()
