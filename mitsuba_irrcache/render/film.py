@@ -28,8 +28,11 @@ LANES = 1 << 22
 #: Pixels are refined whose variance exceeds the mean of all by this factor: by at most so many new
 #: samples for each one, and with at most this share of all samples.
 OUTLIER, MOST_FURTHER, FURTHER_SHARE = 2.0, 64, 0.5
-#: Fewest samples of a pixel from which its variance is estimated.
-FEWEST_SAMPLES = 4
+#: Fewest new samples in place of one.
+FEWEST_FURTHER = 4
+#: Where pixels are refined, the samples of each in a launch are a multiple of this number, so that
+#: each half consists of pairs.
+MULTIPLE = 4
 #: Decorrelates new samples from others, and from those of other passes.
 REFINEMENT, PASS = 0x9E3779B9, 0x85EBCA6B
 #: The sampler stores the number of samples per pixel in 32 bits.
@@ -91,7 +94,7 @@ def render_film(
         spread.first = dr.opaque(mi.UInt32, done)
         samples = _sampled(sensor, sampler, spread, frame, spp, radiance)
         further = None
-        if refine and per_pass >= FEWEST_SAMPLES:
+        if refine and per_pass % MULTIPLE == 0:
             stream = REFINEMENT ^ (done * PASS & 0xFFFFFFFF)
             samples, further = _refined(sensor, sampler, seed, stream, frame, radiance, *samples)
         found = reconstructed(film, border, per_pass, *samples, further)
@@ -373,49 +376,51 @@ def _refined(
     position: mi.Point2f,
     values: list[mi.Float],
 ) -> tuple[tuple[mi.Point2f, list[mi.Float]], FurtherSamples | None]:
-    """Take new samples of the pixels whose variance is above the mean of all, such as those at the
-    edge of a lamp, in place of those that were taken; return all samples, evaluated, and the new
-    ones, if there are any.
+    """Take new samples where the variance of a pixel is above the mean of all, such as at the edge
+    of a lamp, in place of those that were taken; return all samples, evaluated, and the new ones,
+    if there are any.
 
-    The new samples do not depend on those by which pixels are chosen, so there is no bias. The
-    ``stream`` differs between the passes of an image, whose samples are independent.
+    The variance of either half of a pixel's samples decides about the other half. If a half decided
+    about itself, the image would be too dark: samples that miss rare bright paths would remain.
+    The ``stream`` differs between the passes of an image, whose samples are independent.
     """
-    count, per_pass = dr.width(position), frame.per_pass
+    count, half = dr.width(position), frame.per_pass // 2
     everywhere = dr.zeros(mi.Float, count)
     values = [value + everywhere for value in values]
     dr.eval(position, values)
     brightness = values[0] + values[1] + values[2]
-    mean = dr.block_sum(brightness, per_pass) / per_pass
-    square = dr.block_sum(dr.square(brightness), per_pass) / per_pass
+    mean = dr.block_sum(brightness, half) / half
+    square = dr.block_sum(dr.square(brightness), half) / half
     variance = square - dr.square(mean)
-    chosen = dr.compress(variance > OUTLIER * dr.mean(variance))
-    pixels = dr.width(chosen)
-    further = min(MOST_FURTHER, int(FURTHER_SHARE * count / max(pixels * per_pass, 1)))
-    if not pixels or further < FEWEST_SAMPLES:
+    dr.eval(variance)
+    halves = dr.arange(mi.UInt32, dr.width(variance))
+    chosen = dr.gather(mi.Float, variance, halves ^ 1) > OUTLIER * dr.mean(variance)
+    chosen = dr.compress(chosen)
+    further = min(MOST_FURTHER, int(FURTHER_SHARE * count / max(dr.width(chosen) * half, 1)))
+    if not dr.width(chosen) or further < FEWEST_FURTHER:
         return (position, values), None
     # A number of samples that differs between images must not be a constant of the kernel.
-    each = dr.opaque(mi.UInt32, further)
-    lane, k = Divisor(further).split(dr.arange(mi.UInt32, pixels * per_pass * further))
-    pixel, cell = Divisor(per_pass).split(lane)
-    pixel = dr.gather(mi.UInt32, chosen, pixel)
-    source = pixel * per_pass
+    each, lanes = dr.opaque(mi.UInt32, further), dr.width(chosen) * half * further
+    lane, k = Divisor(further).split(dr.arange(mi.UInt32, lanes))
+    number, cell = Divisor(half).split(lane)
+    number = dr.gather(mi.UInt32, chosen, number)
+    source = number * half
     words = mi.sample_tea_32(source + cell, dr.opaque(mi.UInt32, stream))
     within = mi.Point2f(kronecker(k, 2, unit_floats(words)))
-    place = frame.corner(pixel) + PixelCells(per_pass).position(cell, within)
+    place = frame.corner(number // 2) + PixelCells(half).position(cell, within)
     shifts = mi.sample_tea_32(source, dr.opaque(mi.UInt32, stream))
-    sequence = AntitheticPairs(per_pass * further)
+    sequence = AntitheticPairs(half * further)
     words, is_second, _ = sequence.words(cell * each + k, shifts, permuted=True)
-    on_emitter = EmitterSample(
-        mi.Point2f(unit_floats(words)), dr.select(is_second, mi.Float(-1), 1)
-    )
+    sign = dr.select(is_second, mi.Float(-1), 1)
+    on_emitter = EmitterSample(mi.Point2f(unit_floats(words)), sign)
     own = sampler.clone()
-    own.seed(seed ^ stream, pixels * per_pass * further)
-    spp = mi.Float(each * per_pass)
+    own.seed(seed ^ stream, lanes)
+    spp = mi.Float(each * frame.per_pass)
     found = _values(sensor, own, place, lambda: on_emitter, spp, radiance)
-    everywhere = dr.zeros(mi.Float, pixels * per_pass * further)
+    everywhere = dr.zeros(mi.Float, lanes)
     found = [value + everywhere for value in found]
     dr.eval(found, place)
-    return (position, values), FurtherSamples(chosen, per_pass * further, further, place, found)
+    return (position, values), FurtherSamples(chosen, half * further, further, place, found)
 
 
 class PixelCells:

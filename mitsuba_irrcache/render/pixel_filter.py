@@ -41,24 +41,24 @@ class Samples:
 
 
 class FurtherSamples:
-    """Samples of some ``pixels`` in place of those that all pixels have: ``count`` consecutive ones
-    for each, every ``further`` of which replace one. Pixels are numbered in the crop window and its
-    margin.
+    """Samples in place of one or both halves of those that all pixels have: ``count`` consecutive
+    ones for each of the ``halves``, every ``further`` of which replace one. A pixel's halves have
+    twice its number in the crop window and its margin, and that plus 1.
     """
 
     def __init__(
         self,
-        pixels: mi.UInt32,
+        halves: mi.UInt32,
         count: int,
         further: int,
         position: mi.Point2f,
         values: Sequence[mi.Float],
     ) -> None:
-        self.pixels, self.position, self.values = pixels, position, list(values)
+        self.halves, self.position, self.values = halves, position, list(values)
         self.count, self.weight = count, dr.opaque(mi.Float, 1 / further)
 
     def sums(self) -> list[mi.Float]:
-        """Sums of the values of each pixel, with the weight of the samples that are replaced."""
+        """Sums of the values of each half, with the weight of the samples that are replaced."""
         return [dr.block_sum(value, self.count) * self.weight for value in self.values]
 
 
@@ -91,12 +91,12 @@ def reconstructed(
     """Sum the samples around each pixel of the crop window, weighted by the reconstruction filter.
 
     Returns one array for each channel, and the sums of the weights. The arguments are those of
-    `Samples`; the ``further`` samples replace those of their pixels.
+    `Samples`; the ``further`` samples replace halves of them.
     """
     if not film.rfilter().is_box_filter():
         if further is None:
             return _gathered(Samples(film, border, per_pixel, position, values))
-        elsewhere = _without(further.pixels, per_pixel, position)
+        elsewhere = _without(further.halves, per_pixel // 2, position)
         sums = _gathered(Samples(film, border, per_pixel, elsewhere, values))
         return [a + b for a, b in zip(sums, _further_gathered(film, border, further), strict=True)]
     # Assign samples to their own pixel, whatever the rounding of their positions.
@@ -104,13 +104,17 @@ def reconstructed(
     everywhere = dr.zeros(mi.Float, pixels * per_pixel)
     sums = [value + everywhere for value in values]
     dr.eval(sums)
-    if per_pixel > 1:
-        sums = [dr.block_sum(value, per_pixel) for value in sums]
     if further is not None:
+        sums = [dr.block_sum(value, per_pixel // 2) for value in sums]
         dr.eval(sums)
         for target, value in zip(sums, further.sums(), strict=True):
-            dr.scatter(target, value, further.pixels)
+            dr.scatter(target, value, further.halves)
         dr.eval(sums)
+        per_sum = 2
+    else:
+        per_sum = per_pixel
+    if per_sum > 1:
+        sums = [dr.block_sum(value, per_sum) for value in sums]
     return [*sums, dr.opaque(mi.Float, per_pixel, pixels)]
 
 
@@ -184,12 +188,12 @@ def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
     return sums
 
 
-def _without(pixels: mi.UInt32, per_pixel: int, position: mi.Point2f) -> mi.Point2f:
-    """Positions of samples, those of some ``pixels`` out of reach of all filters."""
+def _without(halves: mi.UInt32, per_half: int, position: mi.Point2f) -> mi.Point2f:
+    """Positions of samples, those of some ``halves`` out of reach of all filters."""
     x = position.x + dr.zeros(mi.Float, dr.width(position))
     dr.eval(x)
-    pixel, sample = Divisor(per_pixel).split(dr.arange(mi.UInt32, dr.width(pixels) * per_pixel))
-    place = dr.gather(mi.UInt32, pixels, pixel) * per_pixel + sample
+    half, sample = Divisor(per_half).split(dr.arange(mi.UInt32, dr.width(halves) * per_half))
+    place = dr.gather(mi.UInt32, halves, half) * per_half + sample
     dr.scatter(x, mi.Float(dr.inf), place)
     dr.eval(x)
     return mi.Point2f(x, position.y)
@@ -201,29 +205,28 @@ def _further_gathered(film: mi.Film, border: int, further: FurtherSamples) -> li
     parts = _around(film, border, reach, further)
     width, height = (int(n) for n in film.crop_size())
     framed_width, framed_height = width + 2 * border, height + 2 * border
-    # The number plus 1 of each pixel with further samples, 0 for others.
-    numbers = dr.zeros(mi.UInt32, framed_width * framed_height)
-    dr.scatter(numbers, dr.arange(mi.UInt32, dr.width(further.pixels)) + 1, further.pixels)
+    # The number plus 1 of each half with further samples, 0 for others.
+    numbers = dr.zeros(mi.UInt32, 2 * framed_width * framed_height)
+    dr.scatter(numbers, dr.arange(mi.UInt32, dr.width(further.halves)) + 1, further.halves)
     dr.eval(parts, numbers)
     column, row = pixel_of(dr.arange(mi.UInt32, width * height), width)
-    return _collected(parts, numbers, mi.Vector2i(column, row) + border, reach, framed_width)
+    frame = framed_width, framed_height
+    return _collected(parts, numbers, mi.Vector2i(column, row) + border, reach, frame)
 
 
 @symbolic
 def _around(film: mi.Film, border: int, reach: int, further: FurtherSamples) -> list[mi.Float]:
-    """Sums of values and weights of each pixel's ``further`` samples at the (2 ``reach`` + 1)^2
-    pixels around it, row by row.
+    """Sums of values and weights of each half's ``further`` samples at the (2 ``reach`` + 1)^2
+    pixels around, row by row.
     """
     filter_, side = film.rfilter(), 2 * reach + 1
     radius, count = filter_.radius(), dr.opaque(mi.UInt32, further.count)
-    packets = _packed(
-        [*further.position, *further.values], dr.arange(mi.UInt32, dr.width(further.position))
-    )
-    lane = dr.arange(mi.UInt32, dr.width(further.pixels) * side * side)
+    index = dr.arange(mi.UInt32, dr.width(further.position))
+    packets = _packed([*further.position, *further.values], index)
+    lane = dr.arange(mi.UInt32, dr.width(further.halves) * side * side)
     number, around = Divisor(side * side).split(lane)
-    pixel = pixel_of(
-        dr.gather(mi.UInt32, further.pixels, number), int(film.crop_size().x) + 2 * border
-    )
+    width = int(film.crop_size().x) + 2 * border
+    pixel = pixel_of(dr.gather(mi.UInt32, further.halves, number) // 2, width)
     step = pixel_of(around, side) - reach
     centre = mi.Point2f(pixel + step - border + mi.Vector2i(film.crop_offset())) + 0.5
     sums = [dr.zeros(mi.Float, dr.width(lane)) for _ in range(len(further.values) + 1)]
@@ -241,19 +244,20 @@ def _around(film: mi.Film, border: int, reach: int, further: FurtherSamples) -> 
 
 
 @symbolic
-def _collected(parts: list, numbers, pixel, reach: int, width: int) -> list[mi.Float]:
-    """Sums at each ``pixel`` of the ``parts`` of all pixels around it."""
+def _collected(parts: list, numbers, pixel, reach: int, frame: tuple[int, int]) -> list[mi.Float]:
+    """Sums at each ``pixel`` of the ``parts`` of all pixels around it, two for each."""
     side = 2 * reach + 1
-    count, columns = dr.opaque(mi.UInt32, side * side), dr.opaque(mi.Int32, width)
-    rows = dr.opaque(mi.Int32, dr.width(numbers) // width)
+    count = dr.opaque(mi.UInt32, side * side)
+    columns, rows = (dr.opaque(mi.Int32, n) for n in frame)
     sums = [mi.Float(0) for _ in parts]
     k = mi.UInt32(0)
-    while dr.hint(k < count, label="pixels with further samples"):
-        step = pixel_of(k, side) - reach
-        at = pixel - step
+    while dr.hint(k < 2 * count, label="halves with further samples"):
+        around = k // 2
+        at = pixel - (pixel_of(around, side) - reach)
         inside = (at.x >= 0) & (at.x < columns) & (at.y >= 0) & (at.y < rows)
-        number = dr.gather(mi.UInt32, numbers, mi.UInt32(at.y * columns + at.x), inside)
-        place = (number - 1) * count + k
+        half = mi.UInt32(at.y * columns + at.x) * 2 + (k & 1)
+        number = dr.gather(mi.UInt32, numbers, half, inside)
+        place = (number - 1) * count + around
         for i in range(len(parts)):
             sums[i] += dr.gather(mi.Float, parts[i], place, inside & (number > 0))
         k += 1

@@ -83,6 +83,13 @@ SURFACES = (
         ("tests/unit/render/test_pixel_filter.py",),
     ),
     Mutant(
+        "samples decide themselves whether they are replaced",
+        "render/film.py",
+        "variance, halves ^ 1)",
+        "variance, halves)",
+        ("tests/unit/render/test_film.py",),
+    ),
+    Mutant(
         "the number of refined samples is a constant of the kernel",
         "render/film.py",
         "sequence.words(cell * each + k, shifts",

@@ -191,3 +191,24 @@ def test_permuted_pairs_are_the_same_points(count):
         assert (found[0:even:2] + found[1:even:2] == 2**32 - 1).all()
     if count >= 16:
         assert (plain != permuted).any()
+
+
+@pytest.mark.parametrize("filter_name", ["box", "gaussian"])
+def test_refined_pixels_do_not_lose_rare_bright_samples(rgb, filter_name):
+    """The mean of an image whose samples are rarely bright is right, although pixels with bright
+    samples are refined: otherwise only those without any would remain as they are.
+    """
+    share, bright, dark, size = 1e-3, 100.0, 0.1, 128
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": filter_name}}
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+
+    def radiance(sampler, ray, weight, active):
+        value = dr.select(sampler.next_1d() < share, bright, mi.Float(dark))
+        return mi.Spectrum(value), mi.Float(1), []
+
+    rendered = rendering().render_film(sensor, radiance, seed=3, spp=16, refine=True)
+    mean = np.array(rendered.develop())[..., :3].mean()
+    expected = dark + share * (bright - dark)
+    noise = (bright - dark) * np.sqrt(share / (16 * size**2))
+    assert abs(mean - expected) < 4 * noise
+    assert 4 * noise < 0.15 * expected

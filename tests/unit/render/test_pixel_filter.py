@@ -53,13 +53,13 @@ def test_sums_are_those_of_mitsuba(name, crop, per_pixel):
 
 @pytest.mark.parametrize("name", ["box", "gaussian", "lanczos"])
 @pytest.mark.parametrize("crop", [{}, CROP | {"sample_border": True}], ids=str)
-def test_further_samples_replace_those_of_their_pixels(name, crop):
+def test_further_samples_replace_halves_of_pixels(name, crop):
     """Samples given again as further ones, each twice, do not change the sums; others replace those
-    of their pixels.
+    of their half of a pixel.
     """
     from mitsuba_irrcache.render.pixel_filter import FurtherSamples, reconstructed
 
-    film, per_pixel = film_of(name, **crop), 3
+    film, per_pixel = film_of(name, **crop), 6
     border = film.rfilter().border_size() if film.sample_border() else 0
     width, height = (int(n) + 2 * border for n in film.crop_size())
     rng = np.random.default_rng(8)
@@ -76,17 +76,18 @@ def test_further_samples_replace_those_of_their_pixels(name, crop):
         found = reconstructed(film, border, per_pixel, position, [of(v) for v in values], further)
         return np.array([np.array(s) for s in found])
 
-    chosen = np.sort(rng.choice(len(pixels), len(pixels) // 3, replace=False))
-    twice = np.repeat(places[chosen], 2, axis=1)
+    halves = (2 * len(pixels), per_pixel // 2)
+    chosen = np.sort(rng.choice(halves[0], len(pixels) // 2, replace=False))
+    twice = np.repeat(places.reshape(*halves, 2)[chosen], 2, axis=1)
     position = mi.Point2f(of(twice[..., 0]), of(twice[..., 1]))
-    again = [of(np.repeat(v[chosen], 2, axis=1)) for v in values]
-    further = FurtherSamples(mi.UInt32(chosen), 2 * per_pixel, 2, position, again)
+    again = [of(np.repeat(v.reshape(halves)[chosen], 2, axis=1)) for v in values]
+    further = FurtherSamples(mi.UInt32(chosen), per_pixel, 2, position, again)
 
     expected = sums(places, values)
-    np.testing.assert_allclose(sums(places, values, further), expected, atol=2e-5)
+    np.testing.assert_allclose(sums(places, values, further), expected, atol=5e-5)
     other = values.copy()
-    other[:, chosen] = 1e3
-    np.testing.assert_allclose(sums(places, other, further), expected, atol=2e-5)
+    other.reshape(-1, *halves)[:, chosen] = 1e3
+    np.testing.assert_allclose(sums(places, other, further), expected, atol=5e-5)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 12, 16, 30])
