@@ -28,8 +28,9 @@ LANES = 1 << 22
 #: Pixels are refined whose variance exceeds the mean of all by this factor: by at most so many new
 #: samples for each one, and with at most this share of all samples.
 OUTLIER, MOST_FURTHER, FURTHER_SHARE = 2.0, 64, 0.5
-#: Fewest new samples in place of one.
-FEWEST_FURTHER = 4
+#: Fewest new samples in place of one; if there were less, the threshold of the variance is raised
+#: by this factor.
+FEWEST_FURTHER, RAISED = 4, 1.5
 #: Where pixels are refined, the samples of each in a launch are a multiple of this number, so that
 #: each half consists of pairs.
 MULTIPLE = 4
@@ -209,6 +210,19 @@ class SampledFilm:
         index, sample = Divisor(self.per_pass).split(dr.arange(mi.UInt32, self.lanes))
         return self.corner(index) + spread.next(index, sample), index, sample
 
+    def around(self, values: mi.Float) -> mi.Float:
+        """For both halves of each pixel, half the mean ``values`` of the pixels around it."""
+        dr.eval(values)
+        pixel = dr.arange(mi.UInt32, 2 * self.pixels) // 2
+        place, height = pixel_of(pixel, self.width), self.pixels // self.width
+        total, count = mi.Float(0), mi.Float(0)
+        for step in ((-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)):
+            x, y = place.x + step[0], place.y + step[1]
+            inside = (x >= 0) & (y >= 0) & (x < self.width) & (y < height)
+            total += dr.gather(mi.Float, values, mi.UInt32(y * self.width + x), inside)
+            count += dr.select(inside, 1.0, 0.0)
+        return total / dr.maximum(2 * count, 1)
+
     def corner(self, pixel: mi.UInt32) -> mi.Point2f:
         """Position on the film of the upper left corner of a pixel."""
         place = mi.Point2f(pixel_of(pixel, self.width) - self.border)
@@ -380,8 +394,9 @@ def _refined(
     of a lamp, in place of those that were taken; return all samples, evaluated, and the new ones,
     if there are any.
 
-    The variance of either half of a pixel's samples decides about the other half. If a half decided
-    about itself, the image would be too dark: samples that miss rare bright paths would remain.
+    About a half of a pixel's samples decides the variance of the other half and of the pixels
+    around. If it decided itself, the image would be too dark: samples that miss rare bright paths
+    would remain.
     The ``stream`` differs between the passes of an image, whose samples are independent.
     """
     count, half = dr.width(position), frame.per_pass // 2
@@ -394,10 +409,9 @@ def _refined(
     variance = square - dr.square(mean)
     dr.eval(variance)
     halves = dr.arange(mi.UInt32, dr.width(variance))
-    chosen = dr.gather(mi.Float, variance, halves ^ 1) > OUTLIER * dr.mean(variance)
-    chosen = dr.compress(chosen)
-    further = min(MOST_FURTHER, int(FURTHER_SHARE * count / max(dr.width(chosen) * half, 1)))
-    if not dr.width(chosen) or further < FEWEST_FURTHER:
+    others = dr.gather(mi.Float, variance, halves ^ 1) + frame.around(dr.block_sum(variance, 2))
+    chosen, further = _most_needed(others, OUTLIER * dr.mean(variance))
+    if not dr.width(chosen):
         return (position, values), None
     # A number of samples that differs between images must not be a constant of the kernel.
     each, lanes = dr.opaque(mi.UInt32, further), dr.width(chosen) * half * further
@@ -421,6 +435,21 @@ def _refined(
     found = [value + everywhere for value in found]
     dr.eval(found, place)
     return (position, values), FurtherSamples(chosen, half * further, further, place, found)
+
+
+def _most_needed(variance: mi.Float, threshold: mi.Float) -> tuple[mi.UInt32, int]:
+    """The numbers of the parts of pixels whose ``variance`` is above the ``threshold``, or above
+    one so much larger that enough new samples are left for each; and how many these are in place of
+    one.
+    """
+    dr.eval(variance, threshold)
+    while True:
+        chosen = dr.compress(variance > threshold)
+        share = FURTHER_SHARE * dr.width(variance) / max(dr.width(chosen), 1)
+        if share >= FEWEST_FURTHER:
+            return chosen, min(MOST_FURTHER, int(share))
+        threshold = threshold * RAISED
+        dr.eval(threshold)
 
 
 class PixelCells:
