@@ -80,7 +80,7 @@ def test_xml(page, tmp_path):
         path.write_text(f'<scene version="3.0.0">{snippet}</scene>')
         scene = mi.load_file(str(path))
         assert type(scene.integrator()).__name__ == "IrradianceCachingIntegrator"
-        ElementTree.fromstring(snippet)
+        ElementTree.parse(path)
 
 
 def test_properties_are_those_of_the_integrator():
