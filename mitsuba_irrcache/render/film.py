@@ -399,6 +399,7 @@ def _refined(
     would remain.
     The ``stream`` differs between the passes of an image, whose samples are independent.
     """
+    # docs/primer, eq. (5.10)
     count, half = dr.width(position), frame.per_pass // 2
     everywhere = dr.zeros(mi.Float, count)
     values = [value + everywhere for value in values]
