@@ -34,8 +34,8 @@ FEWEST_FURTHER, RAISED = 4, 1.5
 #: Where pixels are refined, the samples of each in a launch are a multiple of this number, so that
 #: each half consists of pairs.
 MULTIPLE = 4
-#: Decorrelates new samples from others, and from those of other passes.
-REFINEMENT, PASS = 0x9E3779B9, 0x85EBCA6B
+#: Decorrelates new samples from others, from those of other passes, and parts of a pixel's samples.
+REFINEMENT, PASS, PART = 0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35
 #: The sampler stores the number of samples per pixel in 32 bits.
 SPP_LIMIT = 1 << 32
 
@@ -90,14 +90,16 @@ def render_film(
     border, per_pass = frame.border, frame.per_pass
     sampler.set_samples_per_wavefront(per_pass)
     sampler.seed(seed, frame.lanes)
-    spread, sums = PixelPositions(sampler, seed, spp), None
+    refine = refine and per_pass % MULTIPLE == 0
+    spread, sums = PixelPositions(sampler, seed, per_pass // 2 if refine else spp), None
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
         samples = _sampled(sensor, sampler, spread, frame, spp, radiance)
         further = None
-        if refine and per_pass % MULTIPLE == 0:
+        if refine:
             stream = REFINEMENT ^ (done * PASS & 0xFFFFFFFF)
-            samples, further = _refined(sensor, sampler, seed, stream, frame, radiance, *samples)
+            seeds = seed ^ stream, spread.seed ^ dr.opaque(mi.UInt32, stream)
+            samples, further = _refined(sensor, sampler, seeds, frame, radiance, *samples)
         found = reconstructed(film, border, per_pass, *samples, further)
         sums = found if sums is None else [a + b for a, b in zip(sums, found, strict=True)]
         if per_pass < spp:
@@ -270,29 +272,32 @@ class PixelPositions:
     with one sample per pixel do not depend on the seed. Other samplers are used unchanged.
     """
 
-    def __init__(self, sampler: mi.Sampler, seed: int, spp: int) -> None:
+    def __init__(self, sampler: mi.Sampler, seed: int, count: int) -> None:
+        """Each ``count`` samples of a pixel are a sequence that is independent of the others."""
         self.sampler = sampler
         self.independent = sampler.class_name() == "IndependentSampler"
         # Wrapping integrators pass the seed as an array.
         given = isinstance(seed, mi.UInt32)
         self.seed = seed if given else dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         self.first = dr.opaque(mi.UInt32, 0)
-        self._sequence = AntitheticPairs(spp)
+        self._sequence, self._count = AntitheticPairs(count), Divisor(count)
 
     def next(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
         """Position in [0, 1)^2 of a ``sample`` of this pass."""
         if not self.independent:
             return self.sampler.next_2d()
-        shifts = mi.sample_tea_32(pixel, self.seed, 8)
-        words, _, is_paired = self._sequence.words(self.first + sample, shifts)
+        part, number = self._count.split(self.first + sample)
+        shifts = mi.sample_tea_32(pixel ^ part * PART, self.seed, 8)
+        words, _, is_paired = self._sequence.words(number, shifts)
         return mi.Point2f(unit_floats([dr.select(is_paired, word, 1 << 31) for word in words]))
 
     def emitter_sample(self, pixel: mi.UInt32, sample: mi.UInt32) -> EmitterSample:
         """Position on emitters for a ``sample`` of this pass."""
         if not self.independent:
             return EmitterSample(self.sampler.next_2d())
-        shifts = mi.sample_tea_32(self.seed, pixel, 8)
-        words, is_second, _ = self._sequence.words(self.first + sample, shifts, permuted=True)
+        part, number = self._count.split(self.first + sample)
+        shifts = mi.sample_tea_32(self.seed, pixel ^ part * PART, 8)
+        words, is_second, _ = self._sequence.words(number, shifts, permuted=True)
         return EmitterSample(mi.Point2f(unit_floats(words)), dr.select(is_second, mi.Float(-1), 1))
 
 
@@ -383,8 +388,7 @@ def _values(
 def _refined(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
-    seed: int,
-    stream: int,
+    seeds: tuple[int, mi.UInt32],
     frame: SampledFilm,
     radiance: RadianceFunction,
     position: mi.Point2f,
@@ -397,7 +401,8 @@ def _refined(
     About a half of a pixel's samples decides the variance of the other half and of the pixels
     around. If it decided itself, the image would be too dark: samples that miss rare bright paths
     would remain.
-    The ``stream`` differs between the passes of an image, whose samples are independent.
+    The ``seeds``, of the sampler and of positions, differ between the passes of an image, whose
+    samples are independent.
     """
     # docs/primer, eq. (5.10)
     count, half = dr.width(position), frame.per_pass // 2
@@ -420,16 +425,16 @@ def _refined(
     number, cell = Divisor(half).split(lane)
     number = dr.gather(mi.UInt32, chosen, number)
     source = number * half
-    words = mi.sample_tea_32(source + cell, dr.opaque(mi.UInt32, stream))
+    words = mi.sample_tea_32(source + cell, seeds[1])
     within = mi.Point2f(kronecker(k, 2, unit_floats(words)))
     place = frame.corner(number // 2) + PixelCells(half).position(cell, within)
-    shifts = mi.sample_tea_32(source, dr.opaque(mi.UInt32, stream))
+    shifts = mi.sample_tea_32(seeds[1], source)
     sequence = AntitheticPairs(half * further)
     words, is_second, _ = sequence.words(cell * each + k, shifts, permuted=True)
     sign = dr.select(is_second, mi.Float(-1), 1)
     on_emitter = EmitterSample(mi.Point2f(unit_floats(words)), sign)
     own = sampler.clone()
-    own.seed(seed ^ stream, lanes)
+    own.seed(seeds[0], lanes)
     spp = mi.Float(each * frame.per_pass)
     found = _values(sensor, own, place, lambda: on_emitter, spp, radiance)
     everywhere = dr.zeros(mi.Float, lanes)

@@ -212,3 +212,24 @@ def test_refined_pixels_do_not_lose_rare_bright_samples(rgb, filter_name):
     noise = (bright - dark) * np.sqrt(share / (16 * size**2))
     assert abs(mean - expected) < 4 * noise
     assert 4 * noise < 0.15 * expected
+
+
+def test_new_samples_of_refined_pixels_depend_on_the_seed(rgb):
+    """At an edge, images with different seeds have independent errors."""
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+
+    def radiance(sampler, ray, weight, active):
+        value = dr.select(ray.d.x > 0.3 * ray.d.y + 0.01, mi.Float(1), 0)
+        return mi.Spectrum(value), mi.Float(1), []
+
+    images = []
+    for seed in range(4):
+        rendered = rendering().render_film(sensor, radiance, seed, spp=16, refine=True)
+        images.append(np.array(rendered.develop())[..., 0])
+    images = np.array(images)
+    edge = (images.min(axis=0) < 1) & (images.max(axis=0) > 0)
+    assert edge.sum() > 30
+    errors = (images - images.mean(axis=0))[:, edge]
+    assert (np.ptp(images[:, edge], axis=0) > 0).mean() > 0.7
+    assert np.abs(np.corrcoef(errors) + 1 / 3)[~np.eye(4, dtype=bool)].max() < 0.5
