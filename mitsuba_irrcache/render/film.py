@@ -28,6 +28,8 @@ LANES = 1 << 22
 #: Pixels are refined whose variance exceeds the mean of all by this factor: by at most so many new
 #: samples for each one, and with at most this share of all samples.
 OUTLIER, MOST_FURTHER, FURTHER_SHARE = 2.0, 64, 0.5
+#: Variance below which samples are alike; it must be positive for the threshold to be raised.
+LEAST_VARIANCE = 1e-30
 #: Fewest new samples in place of one; if there were less, the threshold of the variance is raised
 #: by this factor.
 FEWEST_FURTHER, RAISED = 4, 1.5
@@ -412,11 +414,11 @@ def _refined(
     brightness = values[0] + values[1] + values[2]
     mean = dr.block_sum(brightness, half) / half
     square = dr.block_sum(dr.square(brightness), half) / half
-    variance = square - dr.square(mean)
+    variance = dr.maximum(square - dr.square(mean), 0)
     dr.eval(variance)
     halves = dr.arange(mi.UInt32, dr.width(variance))
     others = dr.gather(mi.Float, variance, halves ^ 1) + frame.around(dr.block_sum(variance, 2))
-    chosen, further = _most_needed(others, OUTLIER * dr.mean(variance))
+    chosen, further = _most_needed(others, dr.maximum(OUTLIER * dr.mean(variance), LEAST_VARIANCE))
     if not dr.width(chosen):
         return (position, values), None
     # A number of samples that differs between images must not be a constant of the kernel.

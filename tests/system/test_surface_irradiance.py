@@ -301,7 +301,8 @@ def test_passes_of_an_image_have_independent_new_samples(scenes, monkeypatch):
     scene, streams, refined = scene_of(scenes, objects), [], film._refined
 
     def recorded(*args):
-        streams.append(args[3])
+        sampler_seed, position_seed = args[2]
+        streams.append((sampler_seed, int(position_seed[0])))
         return refined(*args)
 
     monkeypatch.setattr(film, "_refined", recorded)

@@ -233,3 +233,17 @@ def test_new_samples_of_refined_pixels_depend_on_the_seed(rgb):
     errors = (images - images.mean(axis=0))[:, edge]
     assert (np.ptp(images[:, edge], axis=0) > 0).mean() > 0.7
     assert np.abs(np.corrcoef(errors) + 1 / 3)[~np.eye(4, dtype=bool)].max() < 0.5
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 0.3, 1e15])
+def test_images_without_noise_need_no_new_samples(rgb, scale):
+    """Variances that consist of rounding errors end the choice of pixels, at any scale."""
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+
+    def radiance(sampler, ray, weight, active):
+        value = scale * (1 + ray.d.x * 1e-7)
+        return mi.Spectrum(value), mi.Float(1), []
+
+    rendered = rendering().render_film(sensor, radiance, seed=1, spp=16, refine=True)
+    np.testing.assert_allclose(np.array(rendered.develop())[..., :3], scale, rtol=1e-5)
