@@ -29,7 +29,15 @@ from mitsuba_irrcache.scene.consistency import (
     described,
 )
 from mitsuba_irrcache.scene.description import SceneDescription
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, transmits
+from mitsuba_irrcache.transport.path import (
+    MOST_CROSSINGS,
+    Media,
+    flags_of,
+    is_null,
+    is_surface,
+    refracts,
+    transmits,
+)
 
 #: The offset of Mitsuba's secondary rays from a surface should not exceed this part of the shortest
 #: side of a medium.
@@ -128,7 +136,7 @@ def _baked(
             emission=emission,
             is_isolated=is_isolated,
             has_exact_boundary=exact is not None,
-            refracts=any(_refracts(shape) for shape in filled),
+            refracts=any(refracts(shape) for shape in filled),
         )
         grids.append(grid)
         if _is_visible(scene, medium):
@@ -145,14 +153,9 @@ def _baked(
 
 def _is_visible(scene: mi.Scene, medium: mi.Medium) -> bool:
     """Whether a camera ray can reach a medium without crossing a surface other than a null one."""
-    return any(is_null(_flags(s)) for s in _around(scene, medium)) or any(
+    return any(is_null(flags_of(s)) for s in _around(scene, medium)) or any(
         sensor.get_medium() == medium for sensor in scene.sensors()
     )
-
-
-def _refracts(shape: mi.Shape) -> bool:
-    """Whether radiance passes a shape other than straight, or is reflected by it as well."""
-    return transmits(_flags(shape)) and not is_null(_flags(shape))
 
 
 def _around(scene: mi.Scene, medium: mi.Medium) -> list[mi.Shape]:
@@ -167,7 +170,7 @@ def _why_not_through_glass(
     Camera paths through glass end where they enter the medium, with the sum of all orders there.
     """
     name = f'medium "{medium.id()}" ({medium.class_name()})'
-    if not any(transmits(_flags(s)) for s in _around(scene, medium)):
+    if not any(transmits(flags_of(s)) for s in _around(scene, medium)):
         return f"{name} is behind surfaces that transmit nothing"
     if max_depth >= 0:
         return f"behind glass only the sum of all orders is known, not max_depth {max_depth}"
@@ -227,11 +230,6 @@ def media_of(scene: mi.Scene) -> dict[mi.Medium, list[mi.Shape]]:
     return found
 
 
-def _flags(shape: mi.Shape) -> int:
-    bsdf = shape.bsdf()
-    return int(bsdf.flags()) if bsdf is not None else 0
-
-
 def _boundary_without_surfaces(
     scene: mi.Scene, media: dict[mi.Medium, list[mi.Shape]]
 ) -> Boundary | None:
@@ -240,8 +238,7 @@ def _boundary_without_surfaces(
     if len(media) != 1 or len(bounded) != 1:
         return None
     for shape in scene.shapes():
-        surface = not is_null(_flags(shape)) or shape.is_emitter() or shape.is_sensor()
-        if surface or shape.exterior_medium() is not None:
+        if is_surface(shape) or shape.exterior_medium() is not None:
             return None
     try:
         return boundary_of(scene, bounded[0])

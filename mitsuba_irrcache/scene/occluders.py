@@ -13,7 +13,7 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.consistency import described
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null, is_solid
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, flags_of, is_null, is_solid, is_surface
 
 #: Offsets of the rays along each axis that detect surfaces: through the corners and the centre of
 #: each voxel's face.
@@ -32,7 +32,7 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
     Exact for shapes whose bounds do not meet the box, for vertices, and for shapes within the box;
     of other shapes, rays find parts about as large as a voxel.
     """
-    near = [s for s in scene.shapes() if _is_solid(s) and _may_meet(s, grid, lower, upper)]
+    near = [s for s in scene.shapes() if is_surface(s) and _may_meet(s, grid, lower, upper)]
     for shape in near:
         if _is_partly_within(shape, grid, lower, upper):
             return described(shape)
@@ -43,10 +43,6 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
                 if found is not None:
                     return described(found)
     return None
-
-
-def _is_solid(shape: mi.Shape) -> bool:
-    return not is_null(_flags(shape)) or shape.is_emitter() or shape.is_sensor()
 
 
 def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
@@ -175,7 +171,7 @@ def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str 
     """
     for shape in scene.shapes():
         outer = shape.exterior_medium()
-        null = shape.bsdf() is not None and is_null(int(shape.bsdf().flags()))
+        null = is_null(flags_of(shape))
         if outer is None or not null or not dr.all(mi.MediumPtr(outer) == medium.pointer):
             continue
         ends = np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64)
@@ -183,7 +179,3 @@ def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str 
         if not np.isfinite(ends).all() or boxes_meet(grid, *box, corners):
             return described(shape)
     return None
-
-
-def _flags(shape: mi.Shape) -> int:
-    return int(shape.bsdf().flags()) if shape.bsdf() is not None else 0

@@ -16,7 +16,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.scene.medium_probe import probe
 from mitsuba_irrcache.scene.occluders import first_surface, hole_in
-from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, transmits
+from mitsuba_irrcache.transport.path import MOST_CROSSINGS, Media, is_null, refracts, transmits
 
 #: Number of rays from each voxel that determine its medium.
 RAYS = 16
@@ -54,7 +54,7 @@ class VoxelClasses(Immutable):
         # Rays can miss a boundary that nearly coincides with walls; its closed form cannot.
         exact = medium.has_exact_boundary and not medium.others
         exact = exact and hole_in(scene, medium, grid, box) is None
-        glass = any(_is_glass(shape) for shape in scene.shapes())
+        glass = any(refracts(shape) for shape in scene.shapes())
         *votes, within, backs = _probed(scene, media, medium, grid, index, exact, glass)
         within, enclosed = within > 0, backs == RAYS
         dr.eval(votes, within, enclosed)
@@ -139,11 +139,6 @@ def _probed(
         within += dr.select(pointer == medium.pointer, mi.UInt32(1), 0)
         k += 1
     return [*votes, within, backs]
-
-
-def _is_glass(shape: mi.Shape) -> bool:
-    flags = int(shape.bsdf().flags()) if shape.bsdf() is not None else 0
-    return bool(transmits(flags)) and not is_null(flags)
 
 
 def _medium_at(

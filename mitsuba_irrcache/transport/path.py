@@ -135,6 +135,22 @@ def transmits(flags: mi.UInt32) -> mi.Bool:
     return (flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)) != 0
 
 
+def flags_of(shape: mi.Shape) -> int:
+    """Return the flags of the BSDF of a shape, 0 without one."""
+    return int(shape.bsdf().flags()) if shape.bsdf() is not None else 0
+
+
+def refracts(shape: mi.Shape) -> bool:
+    """Whether radiance passes a shape other than straight, or is reflected by it as well."""
+    flags = flags_of(shape)
+    return bool(transmits(flags)) and not is_null(flags)
+
+
+def is_surface(shape: mi.Shape) -> bool:
+    """Whether a shape is more than the boundary of a medium: it scatters, emits or measures."""
+    return not is_null(flags_of(shape)) or shape.is_emitter() or shape.is_sensor()
+
+
 def is_solid(si: mi.SurfaceInteraction3f) -> mi.Bool:
     """Whether a surface is more than the boundary of a medium: it scatters or emits."""
     return ~is_null(si.bsdf().flags()) | (si.shape.emitter() != None)  # noqa: E711

@@ -16,7 +16,7 @@ from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_strea
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
-from mitsuba_irrcache.transport.path import PathStart, trace
+from mitsuba_irrcache.transport.path import PathStart, flags_of, trace
 
 #: Paths of a batch for all voxels together, and for each one, at least and at most; of a launch.
 PATHS, FEWEST, MOST, LANES = 1 << 24, 16, 1024, 1 << 21
@@ -31,9 +31,7 @@ def is_needed(scene: mi.Scene) -> bool:
     nothing through smooth glass, which no path can hit them through.
     """
     rough = int(mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission)
-    scatters = any(
-        shape.bsdf() is not None and int(shape.bsdf().flags()) & rough for shape in scene.shapes()
-    )
+    scatters = any(flags_of(shape) & rough for shape in scene.shapes())
     kinds = (kind_of(emitter) for emitter in scene.emitters())
     return any(
         scatters or not (kind.has_one_direction or kind.is_point_like)
