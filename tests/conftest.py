@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 from types import SimpleNamespace
 
+from tests.support.compilation import shorten_compilation  # isort: skip (before Dr.Jit)
+
 import drjit as dr
 import mitsuba as mi
 import pytest
@@ -22,6 +24,8 @@ from tests.support.scenes import (
     texture,
     volume,
 )
+
+shorten_compilation()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -23,7 +23,7 @@ from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_
 from mitsuba_irrcache.cache.conservative import unbiased
 from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.core.spectrum import channel_mean
+from mitsuba_irrcache.core.spectrum import channel_mean, scatter_channels
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.root_field import RootField
@@ -266,11 +266,10 @@ def spread(
     grid: Grid, voxels: mi.UInt32, channels: list[mi.Float], survey: VoxelClasses | None
 ) -> mi.Float:
     """Expand values to all voxels of the grid, 0 except at ``voxels`` and inside of surfaces."""
-    values, count = dr.zeros(mi.Float, grid.voxel_count * len(channels)), len(channels)
-    for c, value in enumerate(channels):
-        dr.scatter(values, value, voxels * count + c)
+    values = dr.zeros(mi.Float, grid.voxel_count * len(channels))
+    scatter_channels(values, channels, voxels)
     dr.eval(values)
-    return values if survey is None else survey.filled(values, count)
+    return values if survey is None else survey.filled(values, len(channels))
 
 
 def _past_others(

@@ -31,6 +31,7 @@ from mitsuba_irrcache.cache.storage import (
     samples_by_seed,
     unreadable,
 )
+from mitsuba_irrcache.core.spectrum import scatter_channels
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
@@ -328,12 +329,10 @@ class IrradianceCache:
         return dr.opaque(self.real, max(self.samples // self.batch, 1))
 
     def _tensor(self, values: list[mi.Float]) -> mi.TensorXf:
-        count = len(values)
-        flat = dr.zeros(mi.Float, self.grid.voxel_count * count)
+        flat = dr.zeros(mi.Float, self.grid.voxel_count * len(values))
         if self.active_count:
-            for c, value in enumerate(values):
-                dr.scatter(flat, value, self.active * count + c)
-        return mi.TensorXf(flat, (*self.grid.shape, count))
+            scatter_channels(flat, values, self.active)
+        return mi.TensorXf(flat, (*self.grid.shape, len(values)))
 
     # ------------------------------------------------------------------ growing
 

@@ -13,10 +13,19 @@ def interleaved(planes: mi.Spectrum | list[mi.Float], width: int = 0) -> mi.Floa
     """
     values, width = list(planes), width or max(map(dr.width, planes))
     flat = dr.zeros(mi.Float, width * len(values))
-    index = dr.arange(mi.UInt32, width) * len(values)
-    for i, value in enumerate(values):
-        dr.scatter(flat, value, index + i)
+    scatter_channels(flat, values, dr.arange(mi.UInt32, width))
     return flat
+
+
+def scatter_channels(flat: mi.Float, channels: list[mi.Float], items: mi.UInt32) -> None:
+    """Write the channels of ``items`` into the interleaved array ``flat``.
+
+    Each channel has a launch of its own; all of them, and arrays with other numbers of channels,
+    share one kernel.
+    """
+    first = items * dr.opaque(mi.UInt32, len(channels))
+    for i, value in enumerate(channels):
+        dr.scatter(flat, value, first + dr.opaque(mi.UInt32, i))
 
 
 def channel_mean(values: mi.Color3f) -> mi.Float:

@@ -58,7 +58,7 @@ class Moments:
     def moment(self, values: mi.Float, number: int) -> mi.Float:
         """One of the moments at all positions."""
         width = dr.width(values) // self.count
-        index = dr.arange(mi.UInt32, width) + number * dr.opaque(mi.UInt32, width)
+        index = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, number * width)
         return dr.gather(mi.Float, values, index)
 
     def sweep_uncollided(
