@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -33,45 +34,52 @@ def scene(scenes, name: str, sigma_t: float, shape: str) -> mi.Scene:
     return scenes.load(integrator, boundary, SIZE, emitter=light(name), sun=None)
 
 
-def exits(o: np.ndarray, d: np.ndarray, shape: str) -> np.ndarray:
-    """Return the distances (2, n) at which rays enter and leave the cube or the sphere."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if shape == "cube":
-            ends = np.sort((np.array([[[-1.0]], [[1.0]]]) - o) / d, axis=0)
-            ends = np.where(d == 0, np.array([[[-np.inf]], [[np.inf]]]), ends)
-            return np.array([ends[0].max(axis=0), ends[1].min(axis=0)])
-        middle = -(o * d).sum(axis=0)
-        half = np.sqrt(1 - ((o + middle * d) ** 2).sum(axis=0))
-        return np.array([middle - half, middle + half])
+def exits(o, d, shape: str) -> tuple:
+    """Return the distances at which rays enter and leave the cube or the sphere; NaN, or in the
+    wrong order, if they miss it.
+    """
+    if shape == "cube":
+        ends = [dr.select(d == 0, side * dr.inf, (side - o) / d) for side in (-1.0, 1.0)]
+        return dr.max(dr.minimum(*ends)), dr.min(dr.maximum(*ends))
+    middle = -dr.dot(o, d)
+    half = dr.sqrt(1 - dr.squared_norm(o + middle * d))
+    return middle - half, middle + half
 
 
 def quadrature(loaded: mi.Scene, name: str, sigma_t: float, shape: str) -> np.ndarray:
     """Return the radiance of single scattering, means over `PER_SIDE`^2 rays of each pixel.
 
-    The midpoint rule is applied in the transmittance of camera rays.
+    The midpoint rule is applied in the transmittance of camera rays, in double precision.
     """
-    at = (np.arange(SIZE * PER_SIDE) + 0.5) / (SIZE * PER_SIDE)
-    x, y = (np.float32(c.ravel()) for c in np.meshgrid(at, at))
-    ray, _ = loaded.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
-    o, d = (np.array(v, dtype=np.float64) for v in (ray.o, ray.d))
-    near, far = exits(o, d, shape)
-    hit = near < far
-    o, d, near, far = o[:, hit], d[:, hit], near[hit], far[hit]
-    absorbed, total = 1 - np.exp(-sigma_t * (far - near)), 0
-    for u in (np.arange(POINTS) + 0.5) / POINTS:
-        p = o + (near - np.log1p(-u * absorbed) / sigma_t) * d
-        if name in SUNS:
-            direction = -np.array(SUNS[name])[:, None] / np.linalg.norm(SUNS[name])
-            irradiance, distance = 3.0, np.inf
-        else:
-            way = np.array(LIGHTS[name])[:, None] - p
-            distance = np.linalg.norm(way, axis=0)
-            direction, irradiance = way / distance, 8.0 / distance**2
-        leave = exits(p, np.broadcast_to(direction, p.shape), shape)[1]
-        total += irradiance * np.exp(-sigma_t * np.clip(np.minimum(leave, distance), 0, None))
-    image = np.zeros(hit.shape)
-    image[hit] = total / POINTS * absorbed * ALBEDO / (4 * np.pi)
+    side = SIZE * PER_SIDE
+    index = dr.arange(mi.UInt32, side * side)
+    film = (mi.Point2f(index % side, index // side) + 0.5) / side
+    ray, _ = loaded.sensors()[0].sample_ray(0.0, 0.5, film, mi.Point2f(0.5))
+    total = _integral(mi.Vector3d(ray.o), mi.Vector3d(ray.d), name, sigma_t, shape)
+    image = np.array(total) * ALBEDO / (4 * np.pi)
     return image.reshape(SIZE, PER_SIDE, SIZE, PER_SIDE).mean(axis=(1, 3))
+
+
+@dr.syntax
+def _integral(o, d, name: str, sigma_t: float, shape: str):
+    """Return the irradiance along rays, integrated over their transmittance."""
+    extinction = dr.opaque(mi.Float64, sigma_t)
+    near, far = exits(o, d, shape)
+    absorbed = 1 - dr.exp(-extinction * (far - near))
+    place = dr.opaque(mi.Vector3d, SUNS.get(name) or LIGHTS[name])
+    k, total = mi.UInt32(0), mi.Float64(0)
+    while k < POINTS:
+        u = (mi.Float64(k) + 0.5) / POINTS
+        p = o + (near - dr.log(1 - u * absorbed) / extinction) * d
+        direction, distance, irradiance = dr.normalize(-place), mi.Float64(dr.inf), mi.Float64(3)
+        if dr.hint(name in LIGHTS, mode="scalar"):
+            distance = dr.norm(place - p)
+            direction, irradiance = (place - p) / distance, 8 / dr.square(distance)
+        _, leave = exits(p, direction, shape)
+        way = dr.maximum(dr.minimum(leave, distance), 0)
+        total += irradiance * dr.exp(-extinction * way)
+        k += 1
+    return dr.select(near < far, total / POINTS * absorbed, 0)
 
 
 @pytest.mark.usefixtures("mono")
