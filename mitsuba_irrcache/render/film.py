@@ -96,7 +96,7 @@ def render_film(
     spread, sums = PixelPositions(sampler, seed, per_pass // 2 if refine else spp), None
     for done in range(0, spp, per_pass):
         spread.first = dr.opaque(mi.UInt32, done)
-        samples = _sampled(sensor, sampler, spread, frame, spp, radiance)
+        samples = _sampled(sensor, sampler, spread, frame, spp, radiance, refine)
         further = None
         if refine:
             stream = REFINEMENT ^ (done * PASS & 0xFFFFFFFF)
@@ -358,6 +358,7 @@ def _sampled(
     frame: SampledFilm,
     spp: int,
     radiance: RadianceFunction,
+    refine: bool,
 ) -> tuple[mi.Point2f, list[mi.Float]]:
     """Trace the samples of a pass; return their film positions and the values of all channels."""
     position, index, sample = frame.positions(spread)
@@ -365,7 +366,19 @@ def _sampled(
     def on_emitter() -> EmitterSample:
         return spread.emitter_sample(index, sample)
 
+    if refine and spread.independent:
+        found = _known(sampler, position, on_emitter())
+        return position, _values(sensor, sampler, position, lambda: found, spp, radiance)
     return position, _values(sensor, sampler, position, on_emitter, spp, radiance)
+
+
+def _known(sampler: mi.Sampler, position: mi.Point2f, sample: EmitterSample) -> EmitterSample:
+    """Evaluate what differs between the first samples of a pixel and further ones, so that one
+    kernel traces both: those of scenes with surfaces take many seconds to compile.
+    """
+    sampler.schedule_state()
+    dr.eval(position, sample.u, sample.sign)
+    return sample
 
 
 def _values(
@@ -373,13 +386,13 @@ def _values(
     sampler: mi.Sampler,
     position: mi.Point2f,
     on_emitter: Callable[[], EmitterSample],
-    spp: int | mi.Float,
+    spp: int,
     radiance: RadianceFunction,
 ) -> list[mi.Float]:
     """Trace samples at these positions on the film; return the values of all channels."""
     film = sensor.film()
     ray, weight = camera_ray(sensor, sampler, position)
-    ray.scale_differential(dr.rsqrt(mi.Float(spp)))
+    ray.scale_differential(dr.rsqrt(dr.opaque(mi.Float, spp)))
     camera_sampler = CameraSampler(sampler, on_emitter)
     value, alpha, further = radiance(camera_sampler, ray, weight, mi.Bool(True))
     rgb = mi.Color3f(value.x) if mi.is_monochromatic else mi.Color3f(value)
@@ -437,7 +450,8 @@ def _refined(
     on_emitter = EmitterSample(mi.Point2f(unit_floats(words)), sign)
     own = sampler.clone()
     own.seed(seeds[0], lanes)
-    spp = mi.Float(each * frame.per_pass)
+    _known(own, place, on_emitter)
+    spp = further * frame.per_pass
     found = _values(sensor, own, place, lambda: on_emitter, spp, radiance)
     everywhere = dr.zeros(mi.Float, lanes)
     found = [value + everywhere for value in found]
