@@ -1,9 +1,170 @@
-"""Sums over batches of samples, and the bias of square roots of noisy means."""
+"""Sums over batches of samples, the means and errors that follow from them, and the bias of square
+roots of noisy means.
+"""
 
 from __future__ import annotations
 
+from copy import copy
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
+
+from mitsuba_irrcache.core.immutable import Immutable
+
+#: Samples per batch, unless voxels share their samples.
+BATCH = 8
+#: Layers of a cache: irradiance directly from emitters, and scattered radiance.
+LAYERS = ("uncollided", "scattered")
+
+
+class BatchSums(Immutable):
+    """Sums of the means of batches of samples at the active voxels.
+
+    The samples of a batch are stratified and hence not independent, but batches are: means and
+    errors are statistics of batch means. More samples make other sums, so that whoever holds some
+    has consistent ones.
+
+    Attributes:
+        voxels: number of active voxels.
+        channels: of the irradiance.
+        batch: samples per batch.
+        moment_count: angular moments per channel, 0 for isotropic scattering.
+        is_correlated: whether all voxels share their samples, and hence their errors.
+        real: type of the sums: float32 if they are correlated, since there are few batches then,
+            otherwise float64.
+        streams: samples taken per voxel from each random stream.
+        totals: sums of batch means for each layer and channel.
+        spreads: for each channel, the sum of squared deviations of the batches' irradiance (both
+            layers) from its mean.
+        moments: sums of batch means for each angular moment and channel, float32.
+
+    An array that is None stands for 0.
+    """
+
+    def __init__(
+        self, voxels: int, channels: int, batch: int, moments: int, is_correlated: bool
+    ) -> None:
+        """Create sums of no samples; ``moments`` is the number of them per channel."""
+        self.voxels, self.channels, self.batch = voxels, channels, batch
+        self.moment_count, self.is_correlated = moments, is_correlated
+        self.real = mi.Float if is_correlated else dr.float64_array_t(mi.Float)
+        self.streams: dict[int, int] = {}
+        self.totals: list = [None] * (len(LAYERS) * channels)
+        self.spreads: list = [None] * channels
+        self.moments: list = [None] * (moments * channels)
+
+    def _with(self, **changes: Any) -> BatchSums:
+        """Return a copy with other attributes."""
+        changed = copy(self)
+        changed.__dict__.update(changes)
+        return changed
+
+    # ------------------------------------------------------------------ estimates
+
+    @property
+    def samples(self) -> int:
+        """Samples per active voxel."""
+        return sum(self.streams.values())
+
+    def means(self, layer: int) -> list[mi.Float]:
+        """Irradiance of one of the `LAYERS` at the active voxels, in each channel."""
+        n, first = self._batch_count, layer * self.channels
+        totals = self.totals[first : first + self.channels]
+        return [mi.Float(self.zeros if t is None else t / n) for t in totals]
+
+    def irradiance(self) -> list[mi.Float]:
+        """Irradiance of both layers at the active voxels, in each channel."""
+        return [a + b for a, b in zip(self.means(0), self.means(1), strict=True)]
+
+    def moment_means(self) -> list[mi.Float]:
+        """Angular moments at the active voxels, all channels of each in turn."""
+        n = mi.Float(self._batch_count)
+        return [mi.Float(0) if m is None else m / n for m in self.moments]
+
+    def variance(self, channel: int):
+        """Squared standard error of the irradiance; None with fewer than two batches."""
+        if self.samples < 2 * self.batch:
+            return None
+        n, spread = self._batch_count, self.spreads[channel]
+        return self.zeros if spread is None else spread / (n * (n - 1))
+
+    def relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
+        """Variance of the voxels over their squared mean, at most 1; 0 if unknown."""
+        variance = self.variance(channel)
+        if variance is None:
+            return dr.zeros(mi.Float, dr.width(mean))
+        # Do not divide squares: they underflow for values below 1e-19.
+        error = mi.Float(dr.sqrt(variance)) / dr.select(mean > 0, mean, 1)
+        return dr.minimum(dr.square(error), 1)
+
+    @property
+    def zeros(self):
+        """Zero at all active voxels."""
+        return dr.zeros(self.real, max(self.voxels, 1))
+
+    @property
+    def _batch_count(self):
+        """Number of batches per voxel, at least 1; opaque, because it changes from pass to pass."""
+        return dr.opaque(self.real, max(self.samples // self.batch, 1))
+
+    # ------------------------------------------------------------------ more samples
+
+    def with_blocks(self, seed: int, samples: int, blocks: list[tuple]) -> BatchSums:
+        """Add ``samples`` per voxel of the stream ``seed``, evaluated; see `IrradianceCache.add`
+        for the ``blocks``.
+        """
+        totals, spreads, *moments = (
+            [concatenated(part) for part in zip(*parts, strict=True)]
+            for parts in zip(*blocks, strict=True)
+        )
+        merged = self._merged(totals, spreads, samples // self.batch)
+        moments = totals_of_pairs(self.moments, *moments) if moments else self.moments
+        return self._evaluated(merged, moments, {seed: samples})
+
+    def with_sums(self, other: BatchSums) -> BatchSums:
+        """Add all samples of ``other`` sums, evaluated."""
+        merged = self._merged(other.totals, other.spreads, other.samples // other.batch)
+        moments = totals_of_pairs(self.moments, other.moments)
+        return self._evaluated(merged, moments, other.streams)
+
+    def with_count(self, seed: int, samples: int) -> BatchSums:
+        """Count samples whose contribution is contained already, or is exactly zero."""
+        return self._with(streams=self._counted({seed: samples}))
+
+    def empty(self) -> BatchSums:
+        """Return sums of no samples at the same voxels."""
+        return BatchSums(
+            self.voxels, self.channels, self.batch, self.moment_count, self.is_correlated
+        )
+
+    def filled(
+        self, streams: dict[int, int], totals: list, spreads: list, moments: list
+    ) -> BatchSums:
+        """Return these sums at the same voxels."""
+        return self._with(streams=streams, totals=totals, spreads=spreads, moments=moments)
+
+    def _evaluated(self, merged: tuple[list, list], moments: list, streams: dict) -> BatchSums:
+        dr.eval(merged, moments)
+        return self.filled(self._counted(streams), *merged, moments)
+
+    def _counted(self, streams: dict[int, int]) -> dict[int, int]:
+        more = {seed: self.streams.get(seed, 0) + n for seed, n in streams.items()}
+        return self.streams | more
+
+    def _merged(self, totals: list, spreads: list, count: int) -> tuple[list, list]:
+        """Combine the sums with those of ``count`` more batches (Chan et al. 1979)."""
+        # docs/primer, eq. (3.5)
+        known = self.samples // self.batch
+        result = []
+        for c, spread in enumerate(spreads):
+            old, new = (total(t[c :: self.channels]) for t in (self.totals, totals))
+            if known and (old is not None or new is not None):
+                n, more = (dr.opaque(self.real, k) for k in (known, count))
+                difference = (0 if old is None else old / n) - (0 if new is None else new / more)
+                spread = total([spread, dr.square(difference) * (n * more / (n + more))])
+            result.append(total([self.spreads[c], spread]))
+        return totals_of_pairs(self.totals, totals), result
 
 
 def concatenated(pieces: tuple):

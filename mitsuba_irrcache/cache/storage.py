@@ -5,11 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.cache.statistics import BATCH, LAYERS, BatchSums
 from mitsuba_irrcache.errors import CacheFileError
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.io.files import atomic_write
 
 FORMAT = "mitsuba_irrcache 6"
 
@@ -22,6 +27,150 @@ ARRAYS = ("active", "totals", "spreads")  # arrays of a file in addition to the 
 
 #: Upper limits for values read from a file: samples of a stream, and samples of a batch.
 MAX_SAMPLES, MAX_BATCH = 1 << 31, 1 << 16
+
+
+@dataclass(frozen=True)
+class StoredCache:
+    """Contents of a file; see `IrradianceCache`, and for the sums `BatchSums`."""
+
+    grid: Grid
+    active: mi.UInt32
+    max_depth: int
+    fingerprint: dict[str, str]
+    sums: BatchSums
+
+
+def write_cache(path: str | Path, stored: StoredCache) -> None:
+    """Write a cache with all its statistics; the file appears whole or not at all."""
+    sums, grid = stored.sums, stored.grid
+    moments = sums.moment_count
+    description = {
+        "format": WITH_MOMENTS if moments else FORMAT,
+        "shape": grid.shape,
+        "to_world": grid.to_world.tolist(),
+        "channels": sums.channels,
+        "batch": sums.batch,
+        "correlated": sums.is_correlated,
+        **({"moments": moments} if moments else {}),
+        "max_depth": stored.max_depth,
+        "streams": {str(seed): n for seed, n in sums.streams.items()},
+        "fingerprint": stored.fingerprint,
+    }
+
+    def plain(values: list, kind: type | None = None) -> np.ndarray:
+        return np.array([np.array(sums.zeros if v is None else v, kind) for v in values])
+
+    arrays = {
+        "active": np.array(stored.active),
+        "totals": plain(sums.totals),
+        "spreads": plain(sums.spreads),
+        **({"moments": plain(sums.moments, np.float32)} if moments else {}),
+    }
+    description["values"] = digest_of_arrays(arrays)
+    description["digest"] = digest_of_description(description)
+    encoded = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
+    with atomic_write(path) as file:
+        np.savez(file, description=encoded, **arrays)
+
+
+def read_cache(path: str | Path) -> StoredCache:
+    """Read what `write_cache` wrote. Raises CacheFileError, naming the file, for anything else."""
+    path = Path(path)
+    try:
+        arrays = read_arrays(path)
+        description = json.loads(arrays["description"].tobytes())
+        if description["format"] not in (FORMAT, WITH_MOMENTS):
+            raise CacheFileError(
+                f'"{path}" has the format {description["format"]!r}, this version reads '
+                f"{FORMAT!r} and {WITH_MOMENTS!r}."
+            )
+        return _restored(description, arrays)
+    except CacheFileError:
+        raise
+    except Exception as error:  # a damaged file may cause any exception
+        raise unreadable(path, error) from error
+
+
+def read_description(path: str | Path) -> tuple[dict[str, str], int]:
+    """Return the fingerprint of a file and its samples per voxel, without reading the arrays.
+
+    Raises the same errors as `read_cache`.
+    """
+    try:
+        description = json.loads(read_arrays(Path(path), ())["description"].tobytes())
+        check_digest(description)
+        return dict(description["fingerprint"]), sum(samples_by_seed(description).values())
+    except Exception as error:  # as in `read_cache`
+        raise unreadable(path, error) from error
+
+
+def _restored(description: dict, arrays: dict[str, np.ndarray]) -> StoredCache:
+    """Check the contents of a file; raise any exception if they are not those of a cache."""
+    grid = Grid(tuple(int(n) for n in description["shape"]), np.array(description["to_world"]))
+    active, totals, spreads = (arrays[name] for name in ARRAYS)
+    _check_active(active, grid.voxel_count)
+    channels, correlated = int(description["channels"]), bool(description["correlated"])
+    width, count = max(active.size, 1), int(description.get("moments", 0))
+    moments = arrays["moments"] if count else np.zeros((0, width), np.float32)
+    _check_sums(totals, spreads, (channels, width), np.float32 if correlated else np.float64)
+    _check_moments(moments, (count * channels, width))
+    _check_values(totals, spreads, moments)
+    streams, batch = samples_by_seed(description), int(description["batch"])
+    smallest, largest = (1, MAX_BATCH) if correlated else (BATCH, BATCH)
+    if not smallest <= batch <= largest or any(n % batch for n in streams.values()):
+        raise ValueError(f"samples {streams} in batches of {batch}")
+    batches = sum(streams.values()) // batch
+    if (batches < 1 and totals.any()) or (batches < 2 and spreads.any()):
+        raise ValueError(f"non-zero sums, but only {batches} batches of samples")
+    check_digest(description)
+    if digest_of_arrays(arrays) != description["values"]:
+        raise ValueError("its values are not those that were saved")
+    sums = BatchSums(active.size, channels, batch, count, correlated)
+    sums = sums.filled(
+        streams,
+        *(
+            _known(values, kind)
+            for values, kind in ((totals, sums.real), (spreads, sums.real), (moments, mi.Float))
+        ),
+    )
+    max_depth, fingerprint = int(description["max_depth"]), dict(description["fingerprint"])
+    return StoredCache(grid, mi.UInt32(active), max_depth, fingerprint, sums)
+
+
+def _known(values: np.ndarray, kind: type) -> list:
+    """Rows as arrays of Dr.Jit, None for zeros."""
+    return [kind(row) if row.any() else None for row in values]
+
+
+def _check_active(active: np.ndarray, voxels: int) -> None:
+    if active.dtype != np.uint32 or active.ndim != 1 or active.size > voxels:
+        raise ValueError("its list of voxels does not fit its grid")
+    if active.size and (int(active[-1]) >= voxels or (np.diff(active.astype(np.int64)) <= 0).any()):
+        raise ValueError("its list of voxels is out of order")
+
+
+def _check_sums(
+    totals: np.ndarray, spreads: np.ndarray, shape: tuple[int, int], real: type
+) -> None:
+    channels, width = shape
+    expected = (len(LAYERS) * channels, width), shape
+    if channels not in (1, 3) or (totals.shape, spreads.shape) != expected:
+        raise ValueError(f"sums of shape {totals.shape} where {expected[0]} is expected")
+    if totals.dtype != real or spreads.dtype != real:
+        raise ValueError(f"sums of type {totals.dtype}")
+
+
+def _check_moments(moments: np.ndarray, shape: tuple[int, int]) -> None:
+    if (moments.shape, moments.dtype) != (shape, np.float32):
+        raise ValueError(f"moments of shape {moments.shape} and type {moments.dtype}")
+
+
+def _check_values(totals: np.ndarray, spreads: np.ndarray, moments: np.ndarray) -> None:
+    largest = np.max([np.abs(v).max(initial=0) for v in (totals, spreads, moments)])
+    if not largest < float(np.finfo(np.float32).max):  # NaN too
+        raise ValueError("it contains values that are not finite")
+    if min(values.min(initial=0) for values in (totals, spreads)) < 0:
+        raise ValueError("it contains negative values")
 
 
 def unreadable(path: str | Path, error: Exception) -> CacheFileError:

@@ -1,8 +1,11 @@
-"""The irradiance cache: a camera-independent field with statistics, merging and files."""
+"""The irradiance cache: a camera-independent field that grows, is merged, saved and looked up.
+
+Its sums and what follows from them are in `statistics`, the fields for lookups in `lookups`, its
+files in `storage`.
+"""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -14,39 +17,18 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
-from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.cache.display import as_html, as_text
 from mitsuba_irrcache.cache.interpolation import PLAIN, Interpolation
-from mitsuba_irrcache.cache.statistics import concatenated, root_correction, total, totals_of_pairs
-from mitsuba_irrcache.cache.storage import (
-    ARRAYS,
-    FORMAT,
-    MAX_BATCH,
-    WITH_MOMENTS,
-    check_digest,
-    digest_of_arrays,
-    digest_of_description,
-    read_arrays,
-    samples_by_seed,
-    unreadable,
-)
-from mitsuba_irrcache.core.spectrum import scatter_channels
-from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
+from mitsuba_irrcache.cache.lookups import irradiance_field, moment_field, on_grid
+from mitsuba_irrcache.cache.statistics import BATCH, BatchSums
+from mitsuba_irrcache.cache.storage import StoredCache, read_cache, read_description, write_cache
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.grids.root_field import RootField
-from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.scene.fingerprint import differing
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
-
-#: Samples per batch. The samples of a batch are stratified and hence not independent, but batches
-#: are: means and errors are statistics of batch means.
-BATCH = 8
-
-
-LAYERS = ("uncollided", "scattered")
 
 
 def _consistent(method: Callable) -> Callable:
@@ -87,7 +69,7 @@ class IrradianceCache:
 
         ``moments`` is the number of angular moments per channel (see `angular`), 0 for isotropic
         scattering. ``correlated`` states that all voxels share their samples, and hence their
-        errors. Sums are then float32, because there are few batches, otherwise float64.
+        errors.
         """
         self._lock = RLock()
         self.grid = grid
@@ -99,16 +81,8 @@ class IrradianceCache:
         self.fingerprint = fingerprint or {}
         self.moments = moments
         self.interpolation = interpolation
-        #: samples taken per voxel from each random stream
-        self.streams: dict[int, int] = {}
         self.correlated = correlated
-        self.real = mi.Float if correlated else dr.float64_array_t(mi.Float)
-        # Sums of batch means for each layer and channel; for each channel the sum of squared
-        # deviations of the batches' irradiance (both layers) from its mean. None stands for 0.
-        self._totals: list = [None] * (len(LAYERS) * channels)
-        self._spreads: list = [None] * channels
-        # Sums of batch means for each moment and channel, in float32.
-        self._moments: list = [None] * (moments * channels)
+        self._sums = BatchSums(self.active_count, channels, batch, moments, correlated)
 
     @_consistent
     def __repr__(self) -> str:
@@ -157,33 +131,43 @@ class IrradianceCache:
     # ------------------------------------------------------------------ statistics
 
     @property
+    def real(self) -> type:
+        """Type of the sums; see `BatchSums`."""
+        return self._sums.real
+
+    @property
+    def streams(self) -> dict[int, int]:
+        """Samples taken per voxel from each random stream."""
+        return self._sums.streams
+
+    @property
     def samples(self) -> int:
         """Samples per active voxel."""
-        return sum(self.streams.values())
+        return self._sums.samples
 
     @property
     @_consistent
     def irradiance(self) -> mi.TensorXf:
         """Phi, both layers, (z, y, x, channel)."""
-        return self._tensor(self._both_layers())
+        return self._tensor(self._sums.irradiance())
 
     @property
     @_consistent
     def uncollided(self) -> mi.TensorXf:
         """Phi of scattering order 0, (z, y, x, channel)."""
-        return self._tensor(self._means(0))
+        return self._tensor(self._sums.means(0))
 
     @property
     @_consistent
     def scattered(self) -> mi.TensorXf:
         """Phi of the scattering orders 1 and above, (z, y, x, channel)."""
-        return self._tensor(self._means(1))
+        return self._tensor(self._sums.means(1))
 
     @property
     @_consistent
     def standard_error(self) -> mi.TensorXf:
         """Standard error of ``irradiance``, (z, y, x, channel); NaN with fewer than two batches."""
-        variances = [self._variance(c) for c in range(self.channels)]
+        variances = [self._sums.variance(c) for c in range(self.channels)]
         return self._tensor(
             [
                 dr.full(mi.Float, dr.nan, self.active_count) if v is None else mi.Float(dr.sqrt(v))
@@ -198,8 +182,8 @@ class IrradianceCache:
         Channels share their samples, so their errors add. The error is 0 with fewer than two
         batches.
         """
-        means = self._both_layers()
-        variances = [self._variance(c) for c in range(self.channels)]
+        means = self._sums.irradiance()
+        variances = [self._sums.variance(c) for c in range(self.channels)]
         errors = [mi.Float(0 if v is None else dr.sqrt(v)) for v in variances]
         return sum(means) / self.channels, sum(errors) / self.channels
 
@@ -222,17 +206,14 @@ class IrradianceCache:
     @_consistent
     def is_finite(self) -> bool:
         """Whether all values are finite in single precision."""
-        pairs = zip(self._means(0), self._means(1), strict=True)
-        finite = [dr.all(dr.isfinite(a + b)) for a, b in pairs]
+        finite = [dr.all(dr.isfinite(values)) for values in self._sums.irradiance()]
         dr.eval(finite)
         return all(f[0] for f in finite)
 
-    def _variance(self, channel: int):
-        """Squared standard error of the irradiance; None with fewer than two batches."""
-        if self.samples < 2 * self.batch:
-            return None
-        n, spread = self._batch_count, self._spreads[channel]
-        return self._zeros if spread is None else spread / (n * (n - 1))
+    def _tensor(self, values: list[mi.Float]) -> mi.TensorXf:
+        return on_grid(self.grid, self.active, values)
+
+    # ------------------------------------------------------------------ lookups
 
     @_consistent
     def field(self) -> RootField:
@@ -241,34 +222,7 @@ class IrradianceCache:
         It excludes `direct_lights` and is divided by the `falloff`, if any. It has one channel if
         all channels are identical. Its ``maximum`` is an upper bound of Phi.
         """
-        brightest = [dr.max(m)[0] for m in self._both_layers()] if self.direct_lights else []
-        brightest += [light.maximum for light in self.direct_lights]
-        means = self._interpolated_means()
-        known, roots = marked(self.grid, self.active), [dr.sqrt(m) for m in means]
-        variance = share = None
-        if not self.correlated:  # errors shared by neighbours do not bias interpolation
-            noise = [self._relative_variance(m, c) for c, m in enumerate(means)]
-            share = share_of_noise(self.grid, self._tensor([sum(noise) / len(noise)]).array, known)
-            rest = 1 - dr.gather(mi.Float, share, self.active)
-            roots = [r * root_correction(v * rest) for r, v in zip(roots, noise, strict=True)]
-        if all(dr.all(r == roots[0])[0] for r in roots[1:]):
-            roots = roots[:1]
-        channels = len(roots)
-        if self.falloff is not None:
-            smooth = dr.rsqrt(self.falloff.of_voxels(self.active))
-            roots = [r * smooth for r in roots]
-        values = self._tensor(roots).array
-        if not self.correlated:
-            variance = self._tensor(noise[:channels]).array
-        separated = None if self.voxel_classes is None else self.voxel_classes.separated
-        values = conserving(self.grid, values, known, channels, share, separated)
-        if self.voxel_classes is not None:
-            values = self.voxel_classes.filled(values, channels)
-        field = RootField(self.grid, values, channels, variance)
-        if self.falloff is not None:
-            field.maximum *= self.falloff.maximum(self.active)
-        field.maximum = max(field.maximum, *brightest, 0.0)
-        return field
+        return irradiance_field(self.grid, self.active, self._sums, self.interpolation)
 
     @_consistent
     def directional_field(self, channels: int) -> AngularField | None:
@@ -278,61 +232,12 @@ class IrradianceCache:
         """
         if not self.moments:
             return None
-        scattered = []
-        for values in (self._interpolated_means(), self.moment_means()):
-            chosen = [v for i, v in enumerate(values) if i % self.channels < channels]
-            if self.voxel_classes is not None and self.voxel_classes.inside is not None:
-                inside = dr.gather(mi.Bool, self.voxel_classes.inside, self.active)
-                chosen = [dr.select(inside, v, 0) for v in chosen]
-            scattered.append([self._tensor([v]).array for v in chosen])
-        return AngularField(self.directional, self.grid, *scattered)
+        return moment_field(self.grid, self.active, self._sums, self.interpolation, channels)
 
     @_consistent
     def moment_means(self) -> list[mi.Float]:
         """Angular moments at the active voxels, all channels of each in turn."""
-        n = mi.Float(self._batch_count)
-        return [mi.Float(0) if m is None else m / n for m in self._moments]
-
-    def _interpolated_means(self) -> list[mi.Float]:
-        """Phi of the active voxels in each channel, without `direct_lights`."""
-        means = self._both_layers()
-        for light in self.direct_lights:
-            means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]
-        return means
-
-    def _relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
-        """Variance of the voxels over their squared mean, at most 1; 0 if unknown."""
-        variance = self._variance(channel)
-        if variance is None:
-            return dr.zeros(mi.Float, dr.width(mean))
-        # Do not divide squares: they underflow for values below 1e-19.
-        error = mi.Float(dr.sqrt(variance)) / dr.select(mean > 0, mean, 1)
-        return dr.minimum(dr.square(error), 1)
-
-    def _both_layers(self) -> list[mi.Float]:
-        """Phi of the active voxels in each channel."""
-        return [a + b for a, b in zip(self._means(0), self._means(1), strict=True)]
-
-    def _means(self, layer: int) -> list[mi.Float]:
-        n, first = self._batch_count, layer * self.channels
-        totals = self._totals[first : first + self.channels]
-        return [mi.Float(self._zeros if t is None else t / n) for t in totals]
-
-    @property
-    def _zeros(self):
-        """Zero at all active voxels."""
-        return dr.zeros(self.real, max(self.active_count, 1))
-
-    @property
-    def _batch_count(self):
-        """Number of batches per voxel, at least 1; opaque, because it changes from pass to pass."""
-        return dr.opaque(self.real, max(self.samples // self.batch, 1))
-
-    def _tensor(self, values: list[mi.Float]) -> mi.TensorXf:
-        flat = dr.zeros(mi.Float, self.grid.voxel_count * len(values))
-        if self.active_count:
-            scatter_channels(flat, values, self.active)
-        return mi.TensorXf(flat, (*self.grid.shape, len(values)))
+        return self._sums.moment_means()
 
     # ------------------------------------------------------------------ growing
 
@@ -344,41 +249,13 @@ class IrradianceCache:
         squared deviations of the batches' irradiance from their mean for each channel (None, in all
         blocks, stands for 0), and, if any, the sums of batch means for each moment and channel.
         """
-        totals, spreads, *moments = (
-            [concatenated(part) for part in zip(*parts, strict=True)]
-            for parts in zip(*blocks, strict=True)
-        )
-        merged = self._merged(totals, spreads, samples // self.batch)
-        moments = totals_of_pairs(self._moments, *moments) if moments else self._moments
-        dr.eval(merged, moments)
-        # Assign in one statement, so that an interrupt cannot leave inconsistent sums.
-        self._totals, self._spreads, self._moments, self.streams = (
-            *merged,
-            moments,
-            self._streams_with(seed, samples),
-        )
-
-    def _merged(self, totals: list, spreads: list, count: int) -> tuple[list, list]:
-        """Combine the sums with those of ``count`` more batches (Chan et al. 1979)."""
-        # docs/primer, eq. (3.5)
-        known = self.samples // self.batch
-        result = []
-        for c, spread in enumerate(spreads):
-            old, new = (total(t[c :: self.channels]) for t in (self._totals, totals))
-            if known and (old is not None or new is not None):
-                n, more = (dr.opaque(self.real, k) for k in (known, count))
-                difference = (0 if old is None else old / n) - (0 if new is None else new / more)
-                spread = total([spread, dr.square(difference) * (n * more / (n + more))])
-            result.append(total([self._spreads[c], spread]))
-        return totals_of_pairs(self._totals, totals), result
+        # One assignment: an interrupt cannot leave inconsistent sums.
+        self._sums = self._sums.with_blocks(seed, samples, blocks)
 
     @_consistent
     def note_samples(self, seed: int, samples: int) -> None:
         """Count samples whose contribution has been added already or is exactly zero."""
-        self.streams = self._streams_with(seed, samples)
-
-    def _streams_with(self, seed: int, samples: int) -> dict[int, int]:
-        return self.streams | {seed: self.streams.get(seed, 0) + samples}
+        self._sums = self._sums.with_count(seed, samples)
 
     def merge(self, other: IrradianceCache) -> None:
         """Add the samples of ``other``, computed with other seeds.
@@ -432,18 +309,9 @@ class IrradianceCache:
     def _take(self, other: IrradianceCache) -> None:
         """Add all samples of ``other``."""
         with other._lock:  # never hold both locks: two threads may merge two caches into each other
-            totals, spreads, moments = other._totals, other._spreads, other._moments
-            streams = other.streams
+            sums = other._sums
         with self._lock:
-            count = sum(streams.values()) // other.batch
-            merged = self._merged(totals, spreads, count)
-            moments = totals_of_pairs(self._moments, moments)
-            dr.eval(merged, moments)
-            self._totals, self._spreads, self._moments, self.streams = (
-                *merged,
-                moments,
-                self.streams | {s: self.streams.get(s, 0) + n for s, n in streams.items()},
-            )
+            self._sums = self._sums.with_sums(sums)
 
     # ------------------------------------------------------------------ files
 
@@ -452,52 +320,30 @@ class IrradianceCache:
         """Writes the cache with all its statistics; the file appears whole or not at all.
         ``fingerprint`` takes the place of the cache's own.
         """
-        description = {
-            "format": WITH_MOMENTS if self.moments else FORMAT,
-            "shape": self.grid.shape,
-            "to_world": self.grid.to_world.tolist(),
-            "channels": self.channels,
-            "batch": self.batch,
-            "correlated": self.correlated,
-            **({"moments": self.moments} if self.moments else {}),
-            "max_depth": self.max_depth,
-            "streams": {str(seed): n for seed, n in self.streams.items()},
-            "fingerprint": self.fingerprint if fingerprint is None else fingerprint,
-        }
-        arrays = {
-            "active": np.array(self.active),
-            "totals": self._plain(self._totals),
-            "spreads": self._plain(self._spreads),
-            **({"moments": self._plain(self._moments, np.float32)} if self.moments else {}),
-        }
-        description["values"] = digest_of_arrays(arrays)
-        description["digest"] = digest_of_description(description)
-        encoded = np.frombuffer(json.dumps(description).encode(), dtype=np.uint8)
-        with atomic_write(path) as file:
-            np.savez(file, description=encoded, **arrays)
-
-    def _plain(self, values: list, kind: type | None = None) -> np.ndarray:
-        return np.array([np.array(self._zeros if v is None else v, kind) for v in values])
+        fingerprint = self.fingerprint if fingerprint is None else fingerprint
+        stored = StoredCache(self.grid, self.active, self.max_depth, fingerprint, self._sums)
+        write_cache(path, stored)
 
     @classmethod
     def load(cls, path: str | Path, interpolation: Interpolation = PLAIN) -> IrradianceCache:
         """Reads a cache that ``save`` wrote; a file does not hold its ``interpolation``. Raises
         CacheFileError, naming the file, for anything else.
         """
-        path = Path(path)
-        try:
-            arrays = read_arrays(path)
-            description = json.loads(arrays["description"].tobytes())
-            if description["format"] not in (FORMAT, WITH_MOMENTS):
-                raise CacheFileError(
-                    f'"{path}" has the format {description["format"]!r}, this version reads '
-                    f"{FORMAT!r} and {WITH_MOMENTS!r}."
-                )
-            return cls._restore(description, arrays, interpolation)
-        except CacheFileError:
-            raise
-        except Exception as error:  # a damaged file may cause any exception
-            raise unreadable(path, error) from error
+        stored = read_cache(path)
+        sums = stored.sums
+        cache = cls(
+            stored.grid,
+            stored.active,
+            sums.channels,
+            stored.max_depth,
+            stored.fingerprint,
+            sums.batch,
+            sums.is_correlated,
+            sums.moment_count,
+            interpolation,
+        )
+        cache._sums = sums
+        return cache
 
     @staticmethod
     def description_of(path: str | Path) -> tuple[dict[str, str], int]:
@@ -505,69 +351,7 @@ class IrradianceCache:
 
         Raises the same errors as `load`.
         """
-        try:
-            description = json.loads(read_arrays(Path(path), ())["description"].tobytes())
-            check_digest(description)
-            return dict(description["fingerprint"]), sum(samples_by_seed(description).values())
-        except Exception as error:  # as in `load`
-            raise unreadable(path, error) from error
-
-    @classmethod
-    def _restore(
-        cls, description: dict, arrays: dict[str, np.ndarray], interpolation: Interpolation
-    ) -> IrradianceCache:
-        grid = Grid(tuple(int(n) for n in description["shape"]), np.array(description["to_world"]))
-        active, totals, spreads = (arrays[name] for name in ARRAYS)
-        channels = int(description["channels"])
-        if active.dtype != np.uint32 or active.ndim != 1 or active.size > grid.voxel_count:
-            raise ValueError("its list of voxels does not fit its grid")
-        if active.size and (
-            int(active[-1]) >= grid.voxel_count or (np.diff(active.astype(np.int64)) <= 0).any()
-        ):
-            raise ValueError("its list of voxels is out of order")
-        width = max(active.size, 1)
-        expected = (len(LAYERS) * channels, width), (channels, width)
-        if channels not in (1, 3) or (totals.shape, spreads.shape) != expected:
-            raise ValueError(f"sums of shape {totals.shape} where {expected[0]} is expected")
-        correlated = bool(description["correlated"])
-        real = np.float32 if correlated else np.float64
-        if totals.dtype != real or spreads.dtype != real:
-            raise ValueError(f"sums of type {totals.dtype}")
-        count = int(description.get("moments", 0))
-        moments = arrays["moments"] if count else np.zeros((0, width), np.float32)
-        if (moments.shape, moments.dtype) != ((count * channels, width), np.float32):
-            raise ValueError(f"moments of shape {moments.shape} and type {moments.dtype}")
-        largest = np.max([np.abs(v).max(initial=0) for v in (totals, spreads, moments)])
-        if not largest < float(np.finfo(np.float32).max):  # NaN too
-            raise ValueError("it contains values that are not finite")
-        if min(values.min(initial=0) for values in (totals, spreads)) < 0:
-            raise ValueError("it contains negative values")
-        streams, batch = samples_by_seed(description), int(description["batch"])
-        smallest, largest = (1, MAX_BATCH) if correlated else (BATCH, BATCH)
-        if not smallest <= batch <= largest or any(n % batch for n in streams.values()):
-            raise ValueError(f"samples {streams} in batches of {batch}")
-        batches = sum(streams.values()) // batch
-        if (batches < 1 and totals.any()) or (batches < 2 and spreads.any()):
-            raise ValueError(f"non-zero sums, but only {batches} batches of samples")
-        check_digest(description)
-        if digest_of_arrays(arrays) != description["values"]:
-            raise ValueError("its values are not those that were saved")
-        cache = cls(
-            grid,
-            mi.UInt32(active),
-            channels,
-            int(description["max_depth"]),
-            dict(description["fingerprint"]),
-            batch,
-            correlated,
-            count,
-            interpolation,
-        )
-        cache._moments = [mi.Float(t) if t.any() else None for t in moments]
-        cache.streams = streams
-        cache._totals = [cache.real(t) if t.any() else None for t in totals]
-        cache._spreads = [cache.real(t) if t.any() else None for t in spreads]
-        return cache
+        return read_description(path)
 
     def export_vol(self, path: str | Path) -> None:
         """Write ``irradiance`` as a Mitsuba ``.vol`` file (float32, bounding box of the grid).

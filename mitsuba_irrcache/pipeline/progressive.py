@@ -17,7 +17,7 @@ from time import perf_counter
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.volume import BATCH
+from mitsuba_irrcache.cache.statistics import BATCH
 from mitsuba_irrcache.core.cancellation import Stopped
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, Progress, Stage

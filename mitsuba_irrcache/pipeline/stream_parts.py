@@ -37,7 +37,8 @@ class _Collector(IrradianceCache):
 
     def begin(self, seed: int, batches: int) -> None:
         """Forget what was collected; the stream ``seed`` has so many ``batches``."""
-        self.streams, self.found = {seed: batches * self.batch}, self.empty_copy()
+        self._sums = self._sums.empty().with_count(seed, batches * self.batch)
+        self.found = self.empty_copy()
 
     def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
         self.found.add(seed, samples, blocks)

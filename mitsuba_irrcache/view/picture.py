@@ -17,16 +17,6 @@ from mitsuba_irrcache.render.pixel_filter import pixel_of
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Seen
 
-#: Quantities that a window can display.
-KINDS = (
-    "image",
-    "image, errors marked",
-    "colour",
-    "illumination",
-    "error bar",
-    "transmittance",
-    "depth",
-)
 #: The kind of image in which pixels with too large an error bar are marked, the colour of the
 #: marks, and the share of the brightest pixels below which an error is not relative any more.
 MARKED, MARK, FLOOR = "image, errors marked", (1.0, 0.0, 0.8), 0.02

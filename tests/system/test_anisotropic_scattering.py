@@ -157,9 +157,9 @@ def test_files(scenes, tmp_path):
     other = loaded(scenes, hg(0.4), cache_seed=1, cache_file=str(tmp_path / "other.npz"))
     other.integrator().prepare(other)
     cache, more = first.integrator().cache, other.integrator().cache
-    means = [np.array(m) for m in (cache._moments[3], more._moments[3])]
+    means = [np.array(m) for m in (cache._sums.moments[3], more._sums.moments[3])]
     cache.merge(more)
-    np.testing.assert_allclose(np.array(cache._moments[3]), sum(means), rtol=1e-5)
+    np.testing.assert_allclose(np.array(cache._sums.moments[3]), sum(means), rtol=1e-5)
     foreign = loaded(scenes, hg(0.3), cache_file=file)
     with pytest.raises(CacheFileError, match="medium"):
         foreign.integrator().prepare(foreign)

@@ -16,7 +16,7 @@ from experiments.support.methods import specify
 from experiments.support.options import FULL, Options, parse
 from experiments.support.recording import Subject
 from experiments.support.store import Store
-from mitsuba_irrcache.cache.volume import BATCH
+from mitsuba_irrcache.cache.statistics import BATCH
 
 QUICK_RESOLUTIONS = (16, 32, 64, 96)
 FULL_RESOLUTIONS = (16, 32, 64, 96, 128)

@@ -216,7 +216,7 @@ MUTANTS = (
     ),
     Mutant(
         "standard errors of samples, not of batches",
-        "cache/volume.py",
+        "cache/statistics.py",
         "spread / (n * (n - 1))",
         "spread / (n * (n * self.batch - 1))",
         (CACHE,),
@@ -230,7 +230,7 @@ MUTANTS = (
     ),
     Mutant(
         "means of two caches not weighted by their samples",
-        "cache/volume.py",
+        "cache/statistics.py",
         "(n * more / (n + more))",
         "(n * more / (n + more + 1))",
         (CACHE,),
@@ -322,8 +322,8 @@ MUTANTS = (
     ),
     Mutant(
         "interpolated roots do not keep the light",
-        "cache/volume.py",
-        "values = conserving(self.grid, values, known, channels, share, separated)",
+        "cache/lookups.py",
+        "values = conserving(grid, values, known, channels, share, separated)",
         "values = values + 0",
         ("tests/system/test_point_lights.py",),
     ),

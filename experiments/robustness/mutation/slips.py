@@ -302,8 +302,8 @@ SLIPS = (
     ),
     Mutant(
         "the brightest light of a cache without what lamps add (cache)",
-        "cache/volume.py",
-        "field.maximum *= self.falloff.maximum(self.active)",
+        "cache/lookups.py",
+        "field.maximum *= falloff.maximum(active)",
         "field.maximum *= 1",
         ("tests/unit/cache/test_field_maximum.py",),
     ),

@@ -24,7 +24,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.volume import LAYERS, IrradianceCache
+from mitsuba_irrcache.cache.statistics import LAYERS
+from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.occupancy import occupied_box
 from mitsuba_irrcache.lights.falloff import VoxelSamplePoints

@@ -19,7 +19,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.cache.volume import BATCH, LAYERS, IrradianceCache
+from mitsuba_irrcache.cache.statistics import BATCH, LAYERS
+from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream
 from mitsuba_irrcache.grids.grid import Grid

@@ -8,7 +8,7 @@ import random
 
 import pytest
 
-from mitsuba_irrcache.cache.volume import BATCH
+from mitsuba_irrcache.cache.statistics import BATCH
 from mitsuba_irrcache.pipeline.progressive import (
     EARLY_FRAMES,
     FIRST,

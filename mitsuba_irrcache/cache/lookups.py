@@ -1,0 +1,82 @@
+"""Fields from which camera rays and paths look up the irradiance of a cache and its moments."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.cache.angular import AngularField
+from mitsuba_irrcache.cache.conservative import conserving, share_of_noise
+from mitsuba_irrcache.cache.interpolation import Interpolation
+from mitsuba_irrcache.cache.statistics import BatchSums, root_correction
+from mitsuba_irrcache.core.spectrum import scatter_channels
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.grids.occupancy import marked
+from mitsuba_irrcache.grids.root_field import RootField
+
+
+def on_grid(grid: Grid, active: mi.UInt32, values: list[mi.Float]) -> mi.TensorXf:
+    """Return a tensor (z, y, x, channel) of the channels of the ``active`` voxels, 0 elsewhere."""
+    flat = dr.zeros(mi.Float, grid.voxel_count * len(values))
+    if dr.width(active):
+        scatter_channels(flat, values, active)
+    return mi.TensorXf(flat, (*grid.shape, len(values)))
+
+
+def irradiance_field(
+    grid: Grid, active: mi.UInt32, sums: BatchSums, interpolation: Interpolation
+) -> RootField:
+    """Create the field of `IrradianceCache.field`."""
+    falloff, classes = interpolation.falloff, interpolation.voxel_classes
+    lights = interpolation.direct_lights
+    brightest = [dr.max(m)[0] for m in sums.irradiance()] if lights else []
+    brightest += [light.maximum for light in lights]
+    means = _interpolated_means(sums, interpolation)
+    known, roots = marked(grid, active), [dr.sqrt(m) for m in means]
+    variance = share = None
+    if not sums.is_correlated:  # errors shared by neighbours do not bias interpolation
+        noise = [sums.relative_variance(m, c) for c, m in enumerate(means)]
+        mean = on_grid(grid, active, [sum(noise) / len(noise)]).array
+        share = share_of_noise(grid, mean, known)
+        rest = 1 - dr.gather(mi.Float, share, active)
+        roots = [r * root_correction(v * rest) for r, v in zip(roots, noise, strict=True)]
+    if all(dr.all(r == roots[0])[0] for r in roots[1:]):
+        roots = roots[:1]
+    channels = len(roots)
+    if falloff is not None:
+        smooth = dr.rsqrt(falloff.of_voxels(active))
+        roots = [r * smooth for r in roots]
+    values = on_grid(grid, active, roots).array
+    if not sums.is_correlated:
+        variance = on_grid(grid, active, noise[:channels]).array
+    separated = None if classes is None else classes.separated
+    values = conserving(grid, values, known, channels, share, separated)
+    if classes is not None:
+        values = classes.filled(values, channels)
+    field = RootField(grid, values, channels, variance)
+    if falloff is not None:
+        field.maximum *= falloff.maximum(active)
+    field.maximum = max(field.maximum, *brightest, 0.0)
+    return field
+
+
+def moment_field(
+    grid: Grid, active: mi.UInt32, sums: BatchSums, interpolation: Interpolation, channels: int
+) -> AngularField:
+    """Create the field of `IrradianceCache.directional_field`."""
+    classes, scattered = interpolation.voxel_classes, []
+    for values in (_interpolated_means(sums, interpolation), sums.moment_means()):
+        chosen = [v for i, v in enumerate(values) if i % sums.channels < channels]
+        if classes is not None and classes.inside is not None:
+            inside = dr.gather(mi.Bool, classes.inside, active)
+            chosen = [dr.select(inside, v, 0) for v in chosen]
+        scattered.append([on_grid(grid, active, [v]).array for v in chosen])
+    return AngularField(interpolation.directional, grid, *scattered)
+
+
+def _interpolated_means(sums: BatchSums, interpolation: Interpolation) -> list[mi.Float]:
+    """Phi of the active voxels in each channel, without the direct lights."""
+    means = sums.irradiance()
+    for light in interpolation.direct_lights:
+        means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]
+    return means
