@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 from types import SimpleNamespace
 
 from tests.support.compilation import shorten_compilation  # isort: skip (before Dr.Jit)
@@ -26,6 +27,9 @@ from tests.support.scenes import (
 )
 
 shorten_compilation()
+# Idle threads of Dr.Jit wait actively: with more than cores, they take a quarter of the time.
+workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+dr.set_thread_count(max(1, (os.cpu_count() or 1) // workers))
 
 
 @pytest.fixture(scope="session", autouse=True)
