@@ -9,6 +9,7 @@ import html
 from collections.abc import Iterator
 from contextlib import contextmanager
 from time import perf_counter
+from typing import TYPE_CHECKING
 from weakref import ref
 
 import drjit as dr
@@ -19,8 +20,6 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core import properties
 from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.gradients import operations
-from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check
 from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
@@ -37,6 +36,10 @@ from mitsuba_irrcache.render.quadrature import QUADRATURES
 from mitsuba_irrcache.render.tolerance import SCALES, Certificate, ToleranceSearch
 from mitsuba_irrcache.scene.consistency import check_sensor
 from mitsuba_irrcache.solvers.base import registered
+
+if TYPE_CHECKING:  # most programs compute no gradients: their modules are imported on use
+    from mitsuba_irrcache.gradients.backward import ParameterAdjoint
+    from mitsuba_irrcache.gradients.operations import SharedIrradiance
 
 SOLVERS = ("auto", *sorted(solver.name for solver in registered()))
 
@@ -271,7 +274,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         #: duration [s] of those stages of the last image that are measured
         self.seconds: dict[str, float] = {}
         # Held by the images that share it: they hold the integrator.
-        self._shared: ref[operations.SharedIrradiance] | None = None
+        self._shared: ref[SharedIrradiance] | None = None
         #: called with (stage, done, total) while the cache is built; exceptions end the build
         self.progress = None
 
@@ -577,10 +580,10 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         if enabled(params):
+            from mitsuba_irrcache.gradients.operations import SceneState
+
             # Without a graph: the irradiance is not shared with other images.
-            operations.SceneState(self, scene, params, alone=True).add_image(
-                grad_in, sensor, seed, spp
-            )
+            SceneState(self, scene, params, alone=True).add_image(grad_in, sensor, seed, spp)
 
     def render_shared(
         self,
@@ -595,6 +598,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """`mi.render` for ``params`` that carry gradients: images of the same state of the scene
         share one adjoint solve in ``dr.backward``.
         """
+        from mitsuba_irrcache.gradients import operations
+
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         seeds = seed, seed_grad or mi.sample_tea_32(seed, 1)[0]
@@ -621,6 +626,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self, scene: mi.Scene, params: mi.SceneParameters, keys: list[str], seed: int
     ) -> ParameterAdjoint:
         """Return the derivatives of images of ``scene`` by the parameters ``keys``."""
+        from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check
+
         self._refuse_tolerance("an objective would jump with the resolution")
         camera_rays = self._prepared(scene)
         check(self._builder.parts, keys, self._layered)
