@@ -23,7 +23,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
-from mitsuba_irrcache.machine.versions import check_versions
+from mitsuba_irrcache.machine.versions import require_versions
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.defaults import choose_stock
@@ -224,7 +224,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._variant = mi.variant()
         require_variant(self._variant)
         require_llvm()
-        check_versions()
+        require_versions()
         super().__init__(props)
         props = self._properties = properties.RecordedProperties(props)
         max_depth = properties.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0")

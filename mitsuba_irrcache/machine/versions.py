@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import lru_cache
 from importlib import metadata
 
 from packaging.requirements import Requirement
@@ -91,6 +92,12 @@ def check_versions() -> None:
         raise PackageVersionError(
             f"{found}. Remedy: {sys.executable} -m pip install --upgrade {wanted}"
         )
+
+
+@lru_cache(maxsize=1)
+def require_versions() -> None:
+    """As `check_versions`, which reads files for 10 ms: once in a process, if it succeeds."""
+    check_versions()
 
 
 def _is_wanted(requirement: Requirement, extra: str) -> bool:
