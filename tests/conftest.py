@@ -32,27 +32,42 @@ workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 dr.set_thread_count(max(1, (os.cpu_count() or 1) // workers))
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _modules_are_not_searched():
-    """Exclude what the modules hold from garbage collection, which is fast then."""
+    """Exclude what exists before a file's tests from garbage collection, which is fast then."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _everything_is_collected():
+    """Undo `_modules_are_not_searched` at the end."""
     yield
     gc.unfreeze()
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Tell `mono` about the next test."""
+    item.next_fixtures = () if nextitem is None else nextitem.fixturenames
+
+
 @pytest.fixture
-def rgb():
+def rgb(request):
     """Select the variant ``llvm_ad_rgb`` and silence the log."""
-    _set_variant("llvm_ad_rgb")
+    if "mono" not in request.fixturenames:
+        _set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture
-def mono():
-    """Select the variant ``llvm_ad_mono`` for one test."""
+def mono(request):
+    """Select the variant ``llvm_ad_mono`` for one test, and leave it to the next one if that
+    selects it, too: each change takes a tenth of a second.
+    """
     _set_variant("llvm_ad_mono")
     yield
-    _set_variant("llvm_ad_rgb")
+    if "mono" not in request.node.next_fixtures:
+        _set_variant("llvm_ad_rgb")
 
 
 def _set_variant(name: str) -> None:
