@@ -19,7 +19,7 @@ from mitsuba_irrcache.cache.angular import (
     sources_of,
 )
 from mitsuba_irrcache.cache.area_light import area_lights_of
-from mitsuba_irrcache.cache.direct_light import direct_lights_of
+from mitsuba_irrcache.cache.direct_light import DirectLight, direct_lights_of
 from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
@@ -32,6 +32,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.fingerprint import differing, digests
+from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask
 from mitsuba_irrcache.solvers.grid_size import (
     SMALL_BORDER_ERROR,
@@ -172,49 +173,18 @@ class CachedMedium:
 
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
         """Load the cache from its file if that exists, else create an empty one."""
-        settings, medium, solver, media = (
-            self.settings,
-            self.medium,
-            self.solver,
-            self.description.media,
-        )
-        if self._grid is not None:
-            grid, size_reason = self._grid, "as before, since parameters carry gradients"
-            grid = grid.shared(medium.sigma_t.grid, medium.albedo.grid)
-        else:
-            grid, size_reason = choose_grid(medium, settings.resolution, solver.size_rule)
+        settings, medium, solver = self.settings, self.medium, self.solver
+        grid, size_reason = self._choose_grid()
         basis = _angular_basis(scene, medium)
         self._check_memory(grid, basis.count if basis is not None else 0)
         warn_of_dense_border(medium, grid)
-        active = active_voxels(medium, grid)
-        classes = solver.voxel_classes(scene, media, medium, grid, active)
-        if classes is not None:
-            active = dr.compress(classes.readable & marked(grid, active))
-        if medium.albedo.maximum == 0 or not self._is_lit:
-            active = mi.UInt32()
-        mi.Log(
-            mi.LogLevel.Info,
-            f"irrcache: {self.label}solver {solver.name} ({self._reason}); cache of "
-            f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {dr.width(active)} "
-            f"of {grid.voxel_count} see the medium",
-        )
-        if medium.refracts and solver.finds_refracted_by_chance:
-            mi.Log(
-                mi.LogLevel.Info,
-                f"irrcache: {self.label}behind glass this solver finds emitters by chance, as "
-                "volpath does, which is faster for a single small image.",
-            )
+        active, classes = self._active_voxels(scene, grid)
+        self._log_choices(grid, size_reason, dr.width(active))
         samples = settings.samples or solver.default_samples(
             medium, settings.max_depth, dr.width(active)
         )
         samples = -(-samples // 2) if settings.with_error else samples
-        direct_lights = []
-        if solver.knows_direct_lights(scene, medium, grid, active):
-            dense = border_error(medium, grid) > SMALL_BORDER_ERROR
-            direct_lights = direct_lights_of(scene, medium, grid, active, dense, classes)
-            direct_lights += area_lights_of(scene, medium, grid, active, classes)
-        if medium.refracts:  # others reach no voxel straight
-            direct_lights = [d for d in direct_lights if _is_within(medium, d.emitter)]
+        direct_lights = self._direct_lights(scene, grid, active, classes)
         known = [light.emitter for light in direct_lights]
         falloff = InverseSquareFactor.of(scene, grid, known)
         if known:
@@ -239,6 +209,53 @@ class CachedMedium:
         if not self.file:
             return empty({})
         return self._resume(empty(self._fingerprint(scene, grid, moments)), edited) or empty({})
+
+    def _choose_grid(self) -> tuple[Grid, str]:
+        """Return the grid of the cache, and why it has its size."""
+        if self._grid is None:
+            return choose_grid(self.medium, self.settings.resolution, self.solver.size_rule)
+        grid = self._grid.shared(self.medium.sigma_t.grid, self.medium.albedo.grid)
+        return grid, "as before, since parameters carry gradients"
+
+    def _active_voxels(self, scene: mi.Scene, grid: Grid) -> tuple[mi.UInt32, VoxelClasses | None]:
+        """Return the voxels whose irradiance is needed and not 0, and their classes among surfaces
+        and media.
+        """
+        medium = self.medium
+        active = active_voxels(medium, grid)
+        classes = self.solver.voxel_classes(scene, self.description.media, medium, grid, active)
+        if classes is not None:
+            active = dr.compress(classes.readable & marked(grid, active))
+        if medium.albedo.maximum == 0 or not self._is_lit:
+            active = mi.UInt32()
+        return active, classes
+
+    def _log_choices(self, grid: Grid, size_reason: str, active: int) -> None:
+        mi.Log(
+            mi.LogLevel.Info,
+            f"irrcache: {self.label}solver {self.solver.name} ({self._reason}); cache of "
+            f"{' x '.join(map(str, grid.shape[::-1]))} voxels ({size_reason}), {active} "
+            f"of {grid.voxel_count} see the medium",
+        )
+        if self.medium.refracts and self.solver.finds_refracted_by_chance:
+            mi.Log(
+                mi.LogLevel.Info,
+                f"irrcache: {self.label}behind glass this solver finds emitters by chance, as "
+                "volpath does, which is faster for a single small image.",
+            )
+
+    def _direct_lights(
+        self, scene: mi.Scene, grid: Grid, active: mi.UInt32, classes: VoxelClasses | None
+    ) -> list[DirectLight]:
+        """Return the emitters whose irradiance camera rays evaluate themselves."""
+        medium, lights = self.medium, []
+        if self.solver.knows_direct_lights(scene, medium, grid, active):
+            dense = border_error(medium, grid) > SMALL_BORDER_ERROR
+            lights = direct_lights_of(scene, medium, grid, active, dense, classes)
+            lights += area_lights_of(scene, medium, grid, active, classes)
+        if medium.refracts:  # others reach no voxel straight
+            lights = [light for light in lights if _is_within(medium, light.emitter)]
+        return lights
 
     def fingerprint(self, scene: mi.Scene) -> dict[str, str]:
         """Return the digests of all that the cache depends on, see `IrradianceCache`."""
