@@ -258,9 +258,9 @@ MUTANTS = (
     ),
     Mutant(
         "what lines lose not per depth (moments)",
-        "solvers/discrete_ordinates/moments.py",
-        "dr.select(v.w > 0, v.z / v.w, 0)",
-        "v.z",
+        "solvers/discrete_ordinates/kernel.py",
+        "dr.select(t.w > 0, t.z / t.w, t.y)",
+        "t.z",
         (PHASE,),
     ),
     Mutant(
