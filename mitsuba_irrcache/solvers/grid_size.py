@@ -87,7 +87,7 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
     With ``resolution`` 0 the voxels are those of the medium, since larger ones lose detail, or
     smaller if the medium is dense, within the limits of the ``rule``.
     """
-    data, frame = medium.sigma_t.grid, medium.frame
+    data, frame = (medium.original or medium).sigma_t.grid, medium.frame
     voxels = MOST_VOXELS if medium.phase.is_isotropic else MOST_DIRECTIONAL
     if resolution:
         grid, reason = Grid.near_cubic(frame, resolution), REQUESTED
@@ -114,7 +114,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
     ``voxels``; also return the reason for its size.
     """
     # docs/primer, eq. (7.2)
-    data, frame = medium.sigma_t.grid, medium.frame
+    data, frame = (medium.original or medium).sigma_t.grid, medium.frame
     lengths = np.linalg.norm(frame[:3, :3], axis=0)
     mean, border = _colliding_extinction(medium), _border_extinction(medium)
     # Number of voxels along x, y, z that each criterion requires.
