@@ -41,14 +41,15 @@ def without_forward_peak(medium: MediumGrid) -> MediumGrid:
     """
     # docs/primer, eq. (4.12)
     phase = medium.phase.without_peak()
-    sigma_t = medium.sigma_t
     scaled, albedo = _scaled(medium, phase.forward)
-    remaining = _mean(scaled)
+    exponent = None
+    if medium.albedo.grid is None:
+        exponent = 1 / (1 - phase.forward * np.array(medium.albedo.value, np.float64).ravel())
     return medium.replaced(
         sigma_t=scaled,
         albedo=albedo,
         phase=phase,
-        unscattered_exponent=_mean(sigma_t) / remaining if remaining else 1.0,
+        unscattered_exponent=exponent,
         original=medium,
     )
 
@@ -118,12 +119,6 @@ def _error_of_interpolation(
         apart, total = np.abs(np.array(value) - np.array(exact)).sum(), np.array(exact).sum()
         errors.append(float(apart / total) if total > 0 else 0.0)
     return max(errors)
-
-
-def _mean(field: Field) -> float:
-    if field.grid is None:
-        return 0.5 * (field.minimum + field.maximum)
-    return float(dr.mean(field.data)[0] * field.scale[0])
 
 
 def _combined(function: Callable, grid: Grid | None, *fields: Field) -> Field:
