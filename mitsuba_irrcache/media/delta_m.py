@@ -65,7 +65,9 @@ def _scaled(medium: MediumGrid, share: float) -> tuple[Field, Field]:
         grids = [f.grid and _divided(f.grid, albedo.grid, parts) for f in (sigma_t, albedo)]
         if parts > 1 and max(g.voxel_count for g in grids if g is not None) > MOST_VOXELS:
             break
-        remaining = _combined(lambda s, a: s * (1 - share * a), grids[0] or grids[1], sigma_t, albedo)
+        remaining = _combined(
+            lambda s, a: s * (1 - share * a), grids[0] or grids[1], sigma_t, albedo
+        )
         scattering = _combined(lambda a: a * (1 - share) / (1 - share * a), grids[1], albedo)
         error = _error_of_interpolation(medium, share, remaining, scattering)
         if error < SMALL_ERROR:
@@ -75,8 +77,8 @@ def _scaled(medium: MediumGrid, share: float) -> tuple[Field, Field]:
             mi.LogLevel.Warn,
             f'irrcache: the albedo of medium "{medium.name}" differs so much between neighbouring '
             f"voxels that scattering between them is wrong by about {100 * error:.1f} % once the "
-            "forward peak of its phase function is truncated. Interpolate the data to finer voxels, "
-            "or use a phase function without a sharp peak.",
+            "forward peak of its phase function is truncated. Interpolate the data to finer "
+            "voxels, or use a phase function without a sharp peak.",
         )
     return remaining, scattering
 
@@ -109,7 +111,10 @@ def _error_of_interpolation(
     rng = mi.PCG32(CHECKS)
     u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
     p = Grid((1, 1, 1), medium.frame).world.point(u)
-    sigma_t, albedo = mi.Spectrum(medium.sigma_t.at_world(p)), mi.Spectrum(medium.albedo.at_world(p))
+    sigma_t, albedo = (
+        mi.Spectrum(medium.sigma_t.at_world(p)),
+        mi.Spectrum(medium.albedo.at_world(p)),
+    )
     new, found = mi.Spectrum(remaining.at_world(p)), mi.Spectrum(scattering.at_world(p))
     errors = []
     for value, exact in (
