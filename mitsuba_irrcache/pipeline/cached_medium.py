@@ -17,6 +17,7 @@ from mitsuba_irrcache.cache.angular import (
     AngularBasis,
     order_of_direct_light,
     sources_of,
+    warn_of_noise,
 )
 from mitsuba_irrcache.cache.area_light import area_lights_of
 from mitsuba_irrcache.cache.direct_light import direct_lights_of
@@ -207,6 +208,8 @@ class CachedMedium:
         samples = settings.samples or solver.default_samples(
             medium, settings.max_depth, dr.width(active)
         )
+        if basis is not None:
+            warn_of_noise(basis, samples, self.label + f'medium "{medium.name}"')
         samples = -(-samples // 2) if settings.with_error else samples
         direct_lights = []
         if solver.knows_direct_lights(scene, medium, grid, active):
