@@ -39,6 +39,7 @@ from mitsuba_irrcache.solvers.grid_size import (
     border_error,
     choose_grid,
     warn_of_dense_border,
+    warn_of_opaque_voxels,
 )
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 
@@ -187,6 +188,7 @@ class CachedMedium:
         basis = _angular_basis(scene, medium)
         self._check_memory(grid, basis.count if basis is not None else 0)
         warn_of_dense_border(medium, grid)
+        warn_of_opaque_voxels(medium, grid, settings.max_depth)
         active = active_voxels(medium, grid)
         classes = solver.voxel_classes(scene, media, medium, grid, active)
         if classes is not None:
