@@ -161,19 +161,20 @@ class MediumAdjoint:
         """
         splats = None
         for each in film.passes():
-            span, behind, hit, offset = self._rays(each, film.medium)
+            span, behind, weights, hit, offset = self._rays(each, film.medium)
             march = each.ray, span, each.radiance
             ahead, passed = self._march.radiance(*march, offset, hit)
-            narrow, passed = self._attenuation(each.ray.d, passed)
-            ahead, unscattered = ahead + passed * behind, mi.Spectrum(0)
-            if narrow is not None:
-                unscattered = dr.select(narrow, passed * behind, 0)
-                ahead = ahead - unscattered
-            dr.eval(ahead, passed, unscattered)
-            if self._camera_rays.background(self._scene, each.ray, mi.Bool(True))[0]:
-                self._emitters.add_background(each.ray, passed * each.radiance)
+            straight = passed
+            if self._is_scaled:
+                projection = self._camera_rays.projection
+                straight = projection.unscattered(passed, each.ray, *span, hit)
+            ahead, unscattered = ahead + passed * behind[0], straight * behind[1]
+            seen = (passed * weights[0] + straight * weights[1]) * each.radiance
+            dr.eval(ahead, seen, unscattered)
+            if self._scene.environment() is not None:
+                self._emitters.add_background(each.ray, seen)
             if splats is None:
-                splats = self._camera_splats(ahead + unscattered, film)
+                splats = self._camera_splats(dr.abs(ahead) + dr.abs(unscattered), film)
             self._march.replay(*march, ahead, offset, hit, splats, unscattered)
             dr.eval()
         found = self._at_data({role: getattr(splats, role).values() for role in self._sums})
@@ -188,19 +189,6 @@ class MediumAdjoint:
         """Whether a forward peak of the phase function counts as unscattered (see `delta_m`)."""
         return self._medium.original is not None and self._fluence is not None
 
-    def _attenuation(
-        self, direction: mi.Vector3f, transmittance: mi.Spectrum
-    ) -> tuple[mi.Bool | None, mi.Spectrum]:
-        """Whether rays along ``direction`` meet a narrow source behind the medium (None: none is
-        attenuated in another way), and what reaches them of the radiance behind it.
-        """
-        if not self._is_scaled:
-            return None, transmittance
-        basis = self._transport.scattering.basis
-        narrow = basis.hits_source(mi.Point3f(0), direction, mi.Bool(True), mi.Bool(False))
-        exponent = dr.opaque(mi.Float, self._medium.unscattered_exponent)
-        return narrow, dr.select(narrow, dr.power(transmittance, exponent), transmittance)
-
     def _at_data(self, found: dict[str, mi.Float]) -> dict[str, mi.Float]:
         """Derivatives by what is wanted of the scene's medium, from those of the medium that is
         rendered.
@@ -211,19 +199,24 @@ class MediumAdjoint:
         return with_forward_peak(self._medium, found, self._sums[SIGMA_T], self._wanted, change)
 
     def _rays(self, each: CameraPass, medium: mi.Medium | None) -> tuple:
-        """For camera rays the distances between which they are in the medium, the weighted radiance
-        behind it, whether there is any such, and the first step. ``medium`` is around the sensor.
+        """For camera rays the distances between which they are in the medium; the weighted radiance
+        behind it that its transmittance attenuates, and that which the transmittance of the medium
+        with its forward peak attenuates; the weights of an environment in these; whether rays hit
+        the medium, and the first step. ``medium`` is around the sensor.
         """
         ray, camera_rays = each.ray, self._camera_rays
-        visible, background = camera_rays.background(self._scene, ray, mi.Bool(True))
-        behind = each.radiance * background if visible else mi.Spectrum(0)
+        found = camera_rays.background(self._scene, ray, mi.Bool(True))
+        visible, background, *weights = found
+        behind = [each.radiance * background * weight for weight in weights]
+        if not (visible or self._is_scaled):
+            weights = [mi.Float(0), mi.Float(0)]
         if each.alpha is not None and not visible:
-            behind = behind - each.alpha / dr.size_v(mi.Spectrum)
+            behind[self._is_scaled] -= each.alpha / dr.size_v(mi.Spectrum)
         hit, near, far = camera_rays.span(ray, medium)
         offset = 1 - each.sampler.next_1d()
         span = mi.Float(near), mi.Float(far)
-        dr.eval(ray, span, behind, hit, offset, each.radiance)
-        return span, behind, hit, offset
+        dr.eval(ray, span, behind, weights, hit, offset, each.radiance)
+        return span, behind, weights, hit, offset
 
     def _camera_splats(self, ahead: mi.Spectrum, film: FilmAdjoint) -> CameraSplats:
         """Empty sums for the derivatives that are wanted."""

@@ -27,6 +27,13 @@ from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 
+#: Numbers of parts, along each axis, of a voxel of the albedo in which the scaled medium is
+#: evaluated, in the order in which they are tried; and the number of voxels that ends that.
+PARTS, MOST_VOXELS = (1, 3, 5, 9), 1 << 22
+#: Mean relative error of the interpolated extinction and scattering that suffices, and above which
+#: a warning is logged; and the number of random positions that estimate it.
+SMALL_ERROR, LARGE_ERROR, CHECKS = 0.002, 0.01, 4096
+
 
 def without_forward_peak(medium: MediumGrid) -> MediumGrid:
     """``medium``, whose phase function has a forward peak, scaled by delta-M: light scattered into
@@ -34,28 +41,96 @@ def without_forward_peak(medium: MediumGrid) -> MediumGrid:
     """
     # docs/primer, eq. (4.12)
     phase = medium.phase.without_peak()
-    share, sigma_t, albedo = phase.forward, medium.sigma_t, medium.albedo
-    scaled = _combined(lambda s, a: s * (1 - share * a), sigma_t, albedo)
-    remaining = _mean(scaled)
+    scaled, albedo = _scaled(medium, phase.forward)
+    exponent = None
+    if medium.albedo.grid is None:
+        exponent = 1 / (1 - phase.forward * np.array(medium.albedo.value, np.float64).ravel())
     return medium.replaced(
         sigma_t=scaled,
-        albedo=_combined(lambda a: a * (1 - share) / (1 - share * a), albedo),
+        albedo=albedo,
         phase=phase,
-        unscattered_exponent=_mean(sigma_t) / remaining if remaining else 1.0,
+        unscattered_exponent=exponent,
         original=medium,
     )
 
 
-def _mean(field: Field) -> float:
-    if field.grid is None:
-        return 0.5 * (field.minimum + field.maximum)
-    return float(dr.mean(field.data)[0] * field.scale[0])
+def _scaled(medium: MediumGrid, share: float) -> tuple[Field, Field]:
+    """Return the extinction and albedo without a peak of this ``share``.
+
+    They are not linear in those of ``medium``: where its albedo varies, they are evaluated on finer
+    voxels, until their interpolation preserves scattering and absorption.
+    """
+    sigma_t, albedo = medium.sigma_t, medium.albedo
+    for parts in PARTS:
+        grids = [f.grid and _divided(f.grid, albedo.grid, parts) for f in (sigma_t, albedo)]
+        if parts > 1 and max(g.voxel_count for g in grids if g is not None) > MOST_VOXELS:
+            break
+        remaining = _combined(
+            lambda s, a: s * (1 - share * a), grids[0] or grids[1], sigma_t, albedo
+        )
+        scattering = _combined(lambda a: a * (1 - share) / (1 - share * a), grids[1], albedo)
+        error = _error_of_interpolation(medium, share, remaining, scattering)
+        if error < SMALL_ERROR:
+            return remaining, scattering
+    if error > LARGE_ERROR:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'irrcache: the albedo of medium "{medium.name}" differs so much between neighbouring '
+            f"voxels that scattering between them is wrong by about {100 * error:.1f} % once the "
+            "forward peak of its phase function is truncated. Interpolate the data to finer "
+            "voxels, or use a phase function without a sharp peak.",
+        )
+    return remaining, scattering
 
 
-def _combined(function: Callable, *fields: Field) -> Field:
-    """Apply ``function`` to the values of ``fields`` on the first grid that one of them has."""
+def _divided(grid: Grid, albedo: Grid | None, parts: int) -> Grid:
+    """Return ``grid`` with voxels of at most a part of those of the ``albedo``, in this number of
+    ``parts`` along each axis.
+
+    Each voxel is divided by an odd number, so that fields that are linear between the voxels stay
+    the same.
+    """
+    if albedo is None or parts == 1:
+        return grid
+    ratio = grid.voxel_size / albedo.voxel_size
+    if grid is not albedo:
+        ratio = np.maximum(grid.voxel_size / albedo.voxel_size.min(), 1)
+    odd = 2 * np.ceil((parts * ratio - 1 - 1e-6) / 2).astype(int) + 1
+    odd = np.where(grid.resolution == 1, 1, odd) if grid is albedo else odd
+    return Grid(tuple(int(n) for n in (grid.resolution * odd)[::-1]), grid.to_world)
+
+
+def _error_of_interpolation(
+    medium: MediumGrid, share: float, remaining: Field, scattering: Field
+) -> float:
+    """Estimate the relative error of the extinction and of the scattering of the scaled fields by
+    their mean deviation at random positions in the medium.
+    """
+    if medium.albedo.grid is None:
+        return 0.0
+    rng = mi.PCG32(CHECKS)
+    u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+    p = Grid((1, 1, 1), medium.frame).world.point(u)
+    sigma_t, albedo = (
+        mi.Spectrum(medium.sigma_t.at_world(p)),
+        mi.Spectrum(medium.albedo.at_world(p)),
+    )
+    new, found = mi.Spectrum(remaining.at_world(p)), mi.Spectrum(scattering.at_world(p))
+    errors = []
+    for value, exact in (
+        (new, sigma_t * (1 - share * albedo)),
+        (new * found, sigma_t * albedo * (1 - share)),
+    ):
+        apart, total = np.abs(np.array(value) - np.array(exact)).sum(), np.array(exact).sum()
+        errors.append(float(apart / total) if total > 0 else 0.0)
+    return max(errors)
+
+
+def _combined(function: Callable, grid: Grid | None, *fields: Field) -> Field:
+    """Apply ``function`` to the values of ``fields`` at the voxels of ``grid``; without one, all of
+    them are constant.
+    """
     channels = max(field.channels for field in fields)
-    grid = next((field.grid for field in fields if field.grid is not None), None)
     index = dr.arange(mi.UInt32, 1 if grid is None else grid.voxel_count)
     known = [_channels(field, grid, index, channels) for field in fields]
     values = [function(*of_channel) for of_channel in zip(*known, strict=True)]

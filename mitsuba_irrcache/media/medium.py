@@ -31,9 +31,10 @@ class MediumGrid(Immutable):
         is_isolated: whether this medium in its boundary is all there is beside emitters.
         has_exact_boundary: whether the medium fills ``boundary``, which otherwise encloses it.
         refracts: whether radiance passes its boundary other than straight.
-        unscattered_exponent: power of the transmittance that gives the share of light that is not
-            scattered at all, where light scattered into a forward peak counts as transmitted (see
-            `delta_m`).
+        unscattered_exponent: power of the transmittance, for each channel of the albedo, that gives
+            the share of light that is not scattered at all, where light scattered into a forward
+            peak counts as transmitted (see `delta_m`). None where it is not the same everywhere, or
+            the medium is not scaled.
         original: the medium before delta-M scaling; None where it is not scaled.
         macrocells: local majorants of ``sigma_t``.
     """
@@ -54,7 +55,7 @@ class MediumGrid(Immutable):
         is_isolated: bool = True,
         has_exact_boundary: bool = True,
         refracts: bool = False,
-        unscattered_exponent: float = 1.0,
+        unscattered_exponent: np.ndarray | None = None,
         original: MediumGrid | None = None,
         macrocells: Macrocells | None = None,
     ) -> None:

@@ -17,6 +17,7 @@ from mitsuba_irrcache.cache.angular import (
     AngularBasis,
     order_of_direct_light,
     sources_of,
+    warn_of_noise,
 )
 from mitsuba_irrcache.cache.area_light import area_lights_of
 from mitsuba_irrcache.cache.direct_light import DirectLight, direct_lights_of
@@ -39,6 +40,7 @@ from mitsuba_irrcache.solvers.grid_size import (
     border_error,
     choose_grid,
     warn_of_dense_border,
+    warn_of_opaque_voxels,
 )
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 
@@ -178,11 +180,14 @@ class CachedMedium:
         basis = _angular_basis(scene, medium)
         self._check_memory(grid, basis.count if basis is not None else 0)
         warn_of_dense_border(medium, grid)
+        warn_of_opaque_voxels(medium, grid, settings.max_depth)
         active, classes = self._active_voxels(scene, grid)
         self._log_choices(grid, size_reason, dr.width(active))
         samples = settings.samples or solver.default_samples(
             medium, settings.max_depth, dr.width(active)
         )
+        if basis is not None:
+            warn_of_noise(basis, samples, self.label + f'medium "{medium.name}"')
         samples = -(-samples // 2) if settings.with_error else samples
         direct_lights = self._direct_lights(scene, grid, active, classes)
         known = [light.emitter for light in direct_lights]

@@ -155,36 +155,52 @@ class ClosedFormCameraRays:
         active: mi.Bool,
     ) -> RayResult:
         """Compute the radiance along ``ray``, which starts in ``medium``."""
-        visible, background = self.background(scene, ray, active)
+        visible, radiance, through, straight = self.background(scene, ray, active)
         hit, near, far = self.span(ray, medium)
+        hit &= active
         scattered, transmittance, gathered, emitted = self.projection.march(
-            ray, near, far, background, 1 - sampler.next_1d(active), active & hit
+            ray, near, far, radiance, 1 - sampler.next_1d(active), hit
         )
+        unscattered = self.projection.unscattered(transmittance, ray, near, far, hit)
         if self._half_space is not None:
             if medium is not None:
                 raise IrrcacheError(
                     f'irrcache: the sensor is inside of the opaque medium "{self.medium.name}", '
                     "whose radiance is known only outside; set resolution to build a cache."
                 )
-            scattered = self._half_space.radiance(ray, near, far, sampler, active & hit)
+            scattered = self._half_space.radiance(ray, near, far, sampler, hit)
         if self.shows_emitters:
-            background = self._attenuation(transmittance, ray.d) * background + emitted
+            background = (through * transmittance + straight * unscattered) * radiance + emitted
         alpha = mi.Float(1)
         if not visible:  # dr.mean would make the number of samples a constant of the kernel
-            alpha = 1 - dr.sum(transmittance) / dr.size_v(mi.Spectrum)
+            alpha = 1 - dr.sum(unscattered) / dr.size_v(mi.Spectrum)
         return RayResult(scattered, background, transmittance, alpha, gathered)
 
     def background(
         self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
-    ) -> tuple[bool, mi.Spectrum]:
-        """Whether an environment is visible behind the medium, and its radiance along ``ray``."""
-        environment = scene.environment()
-        if environment is None or self.hide_emitters or not self.shows_emitters:
-            return False, mi.Spectrum(0)
+    ) -> tuple[bool, mi.Spectrum, mi.Float, mi.Float]:
+        """Return whether an environment is visible behind the medium, its radiance along ``ray``,
+        and its weights for the transmittance of the medium and for that of the medium with the
+        forward peak of its phase function (see `delta_m`).
+
+        Narrow sources are attenuated by the latter, since what the peak scatters of them is part of
+        the scattered radiance. Of a hidden environment only what the peak scatters is left.
+        """
+        environment, truncates = scene.environment(), self.projection.truncates_peak
+        visible = environment is not None and not self.hide_emitters and self.shows_emitters
+        peak_shows = truncates and environment is not None and self.shows_emitters
+        through, straight = mi.Float(1), mi.Float(0)
+        if not (visible or peak_shows):
+            return False, mi.Spectrum(0), through, straight
         escaped = dr.zeros(mi.SurfaceInteraction3f)
         escaped.wi = -ray.d
         escaped.wavelengths = ray.wavelengths
-        return True, environment.eval(escaped, active)
+        if truncates:
+            lights = self.projection.directional.directional
+            narrow = lights.hits_source(mi.Point3f(0), ray.d, mi.Bool(True), mi.Bool(False))
+            through = dr.select(narrow, mi.Float(0), 1)
+            straight = 1 - through if visible else -through
+        return visible, environment.eval(escaped, active), through, straight
 
     def span(self, ray: mi.Ray3f, medium: mi.Medium | None) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether ``ray``, which starts in ``medium``, passes through the medium with a cache, and
@@ -197,14 +213,6 @@ class ClosedFormCameraRays:
         entered = entry > -1e-5 * (leave - entry)
         hit &= (far > 0) if medium is not None else entered
         return hit, dr.maximum(near, 0), far
-
-    def _attenuation(self, transmittance: mi.Spectrum, direction: mi.Vector3f) -> mi.Spectrum:
-        """Attenuation of the environment; by the original extinction for narrow sources."""
-        if not self.projection.truncates_peak:
-            return transmittance
-        lights = self.projection.directional.directional
-        narrow = lights.hits_source(mi.Point3f(0), direction, mi.Bool(True), mi.Bool(False))
-        return dr.select(narrow, self.projection.unscattered(transmittance), transmittance)
 
 
 class TracedCameraRays:
@@ -319,7 +327,10 @@ class TracedCameraRays:
         background += dr.select(traced, direct_weight * direct + weight * reflected, 0)
         alpha = mi.Float(1)
         if self.hide_emitters or scene.environment() is None:
-            transparency = dr.select(traced & ~interacted, weight, 0)
+            passed = weight
+            if self.narrow is not None:
+                passed, transmittance = dr.select(traced, unscattered / chance, 0), unscattered
+            transparency = dr.select(traced & ~interacted, passed, 0)
             transparency = dr.select(escaped, transmittance, transparency)
             alpha = 1 - dr.sum(transparency) / dr.size_v(mi.Spectrum)
         return RayResult(scattered, background, transmittance, alpha, gathered)
@@ -365,15 +376,20 @@ class TracedCameraRays:
                 gathered = _added(gathered, sums, transmittance, scale)
                 transmittance *= segment_transmittance
                 if dr.hint(self.narrow is not None, mode="scalar"):
-                    unscattered *= projection.unscattered(segment_transmittance)
+                    unscattered *= projection.unscattered(
+                        segment_transmittance, ray, entry, leave, hit & (entry < leave)
+                    )
             # Add emitters; if they are hidden, continue behind them.
             emitter = si.emitter(scene, active)
             hit_emitter = active & (emitter != None)  # noqa: E711
+            hidden = mi.Bool(False)
             null = is_null(si.bsdf().flags())
             crosses = valid & null
             if dr.hint(self.hide_emitters, mode="scalar"):
-                crosses |= hit_emitter & valid & (pointer == None)  # noqa: E711
-                hit_emitter = mi.Bool(False)
+                hidden = hit_emitter & (~valid | (pointer == None))  # noqa: E711
+                crosses |= hidden & valid
+                if dr.hint(self.narrow is None, mode="scalar"):
+                    hit_emitter = mi.Bool(False)
             hit_emitter &= crosses | ~valid
             radiance = emitter.eval(si, hit_emitter & shows_emitters)
             attenuation = mi.Spectrum(transmittance)
@@ -382,6 +398,9 @@ class TracedCameraRays:
                     ray.o, ray.d, hit_emitter & ~valid, hit_emitter & valid
                 )
                 attenuation = dr.select(narrow, unscattered, attenuation)
+                # Forward peaks scatter radiance of hidden emitters into the ray.
+                attenuation -= dr.select(hidden, unscattered, 0)
+                transmittance = dr.select(hidden, unscattered, transmittance)
             background += dr.select(hit_emitter & shows_emitters, attenuation * radiance, 0)
             stopped |= valid & ~crosses
             escaped |= active & ~valid

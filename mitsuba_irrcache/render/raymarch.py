@@ -34,6 +34,7 @@ from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.empty_space import Clearance
 from mitsuba_irrcache.render.quadrature import curved, emission_weights, segment
 from mitsuba_irrcache.scene.cut_cells import CutCells
+from mitsuba_irrcache.transport.tracking import optical_depth
 
 #: A ray ends once the remaining radiance, bounded by the largest in-scattered radiance and by the
 #: background, cannot change its radiance by more than this fraction.
@@ -66,7 +67,10 @@ class Projection:
         falloff: InverseSquareFactor | None = None,
         direct_lights: Sequence[DirectLightAlongRays] = (),
     ) -> None:
-        self.medium = medium
+        self.medium, self._exponent = medium, None
+        if medium.unscattered_exponent is not None:
+            opaque = [dr.opaque(mi.Float, float(e)) for e in medium.unscattered_exponent]
+            self._exponent = opaque[0] if len(opaque) == 1 else mi.Color3f(opaque)
         self.has_cache = irradiance is not None
         self._channels = irradiance.channels if irradiance else 1
         self.quadrature = quadrature
@@ -150,13 +154,24 @@ class Projection:
     @property
     def truncates_peak(self) -> bool:
         """Whether scattering into a forward peak is treated as unscattered (see `delta_m`)."""
-        return self.directional is not None and self.medium.unscattered_exponent != 1
+        return self.directional is not None and self.medium.original is not None
 
-    def unscattered(self, transmittance: mi.Spectrum) -> mi.Spectrum:
-        """Convert a ``transmittance`` to that of the original, untruncated medium."""
+    def unscattered(
+        self,
+        transmittance: mi.Spectrum,
+        ray: mi.Ray3f,
+        near: mi.Float,
+        far: mi.Float,
+        active: mi.Bool,
+    ) -> mi.Spectrum:
+        """Convert a ``transmittance`` between two distances along ``ray`` to that of the original,
+        untruncated medium.
+        """
         if not self.truncates_peak:
             return transmittance
-        return dr.power(transmittance, dr.opaque(mi.Float, self.medium.unscattered_exponent))
+        if self._exponent is None:
+            return dr.exp(-mi.Spectrum(optical_depth(self.medium.original, ray, near, far, active)))
+        return dr.power(transmittance, self._exponent)
 
     def _exclude_occluded(
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool

@@ -34,6 +34,9 @@ RESOLVED, OPAQUE, OPAQUE_POWER, MOST_PER_DATA_VOXEL = 0.7, 1.2, 0.45, 6.0
 #: The error [%] of a medium that is dense at its boundary is about BORDER_ERROR d^BORDER_ORDER,
 #: where d is the optical depth of a cache voxel at the boundary.
 BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
+#: Mean optical depth of a cache voxel above which a warning is logged, and the error that was
+#: measured there: opaque bone of 100 mean free paths per data voxel, 16 per cache voxel.
+OPAQUE_VOXEL, OPAQUE_ERROR = 10.0, "1 % of the mean, and up to 6 % of it in small regions,"
 #: Maximum number of voxels along the longest side that a boundary of glass can require: glass
 #: reflects most of the radiance inside, which varies less towards the boundary, and voxels are more
 #: work there. At an optical depth of 40 the error is 0.5 % (ball) and 0.7 % (cube) with so many.
@@ -87,7 +90,7 @@ def choose_grid(medium: MediumGrid, resolution: int, rule: SizeRule) -> tuple[Gr
     With ``resolution`` 0 the voxels are those of the medium, since larger ones lose detail, or
     smaller if the medium is dense, within the limits of the ``rule``.
     """
-    data, frame = medium.sigma_t.grid, medium.frame
+    data, frame = (medium.original or medium).sigma_t.grid, medium.frame
     voxels = MOST_VOXELS if medium.phase.is_isotropic else MOST_DIRECTIONAL
     if resolution:
         grid, reason = Grid.near_cubic(frame, resolution), REQUESTED
@@ -114,7 +117,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
     ``voxels``; also return the reason for its size.
     """
     # docs/primer, eq. (7.2)
-    data, frame = medium.sigma_t.grid, medium.frame
+    data, frame = (medium.original or medium).sigma_t.grid, medium.frame
     lengths = np.linalg.norm(frame[:3, :3], axis=0)
     mean, border = _colliding_extinction(medium), _border_extinction(medium)
     # Number of voxels along x, y, z that each criterion requires.
@@ -190,6 +193,17 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
             f"irrcache: dense matter reaches the boundary of the medium (optical depth {depth:.2g} "
             f"per cache voxel): errors of about {min(error, 100):.0f} % are expected there. Raise "
             "resolution, or leave two voxels of empty space around the matter.",
+        )
+
+
+def warn_of_opaque_voxels(medium: MediumGrid, grid: Grid, max_depth: int) -> None:
+    """Log a warning if voxels are too opaque for several orders of scattering."""
+    depth = _colliding_extinction(medium) * grid.voxel_size.max()
+    if max_depth != 2 and not medium.homogeneous and depth > OPAQUE_VOXEL:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"irrcache: voxels of the cache have a mean optical depth of {depth:.2g}: errors of "
+            f"about {OPAQUE_ERROR} are expected between dense structures. Raise resolution.",
         )
 
 

@@ -40,6 +40,10 @@ OFFSET, TRUSTED = 1.8e-4, 0.01
 def reference(objects: dict, depth: int, seconds: float) -> np.ndarray:
     """Render two independent images (2, y, x, channel) of volpath, of ``seconds`` together."""
     integrator = {"type": "volpath", "max_depth": depth, "rr_depth": 50}
+    shape = objects["shape"]
+    if shape["type"] == "cube" and shape["interior"]["type"] == "heterogeneous":
+        # The medium ends with its grid; volpath offsets rays at the boundary, not into matter.
+        objects = objects | {"shape": shape | {"to_world": mi.ScalarTransform4f().scale(1.002)}}
     loaded = mi.load_dict(scene(objects, integrator, PIXELS))
     halves, count, begun = [0.0, 0.0], 0, process_time()
     while count < 2 or count % 2 or process_time() - begun < seconds:
@@ -57,7 +61,7 @@ def measure(objects: dict, depth: int, seconds: float, file: Path) -> dict:
     begun = process_time()
     x = image(ours, SPP, 1)
     seconds, interior = process_time() - begun, objects["shape"]["interior"]
-    # The grids of `cases` are empty or thin where rays enter them.
+    # In grids the offset does not reach matter, see `reference`.
     offset = OFFSET * interior["scale"] if interior["type"] == "homogeneous" else 0.0
     row = {"seconds": seconds, "offset": offset}
     scale = 0.5 * (a.mean() + b.mean())

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import spots_of
+from mitsuba_irrcache.cache.angular import is_bright, spots_of
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.core.sequences import kronecker_steps, lattice_points
 from mitsuba_irrcache.errors import UnsupportedSceneError
@@ -163,7 +163,7 @@ class DistantIllumination:
         for (plain, weights), sampled in zip(even, chosen, strict=True):
             directions = np.concatenate([plain, sampled])
             uniform = len(plain) / (2 * np.pi)
-            angle = 1 / (uniform + count * self._density(directions))
+            angle = 1 / (uniform + count * self._densities(directions).sum(axis=1))
             angle[: len(plain)] *= weights * uniform
             incoming = self._both_ways(directions) * angle[:, None, None]
             sets.append((directions, np.concatenate([weights, np.zeros(count)]), incoming))
@@ -171,8 +171,12 @@ class DistantIllumination:
         return sets
 
     def _normalise_regions(self, sets: list[tuple]) -> None:
-        """Scales what enters from each bright region, and from outside all of them, to its exact
+        """Scale what enters from each bright region, and from outside all of them, to its exact
         irradiance: how many directions hit a region is random.
+
+        Outside of spots, what is bright is scaled apart from the rest, which would else make up for
+        the bright directions that are missing or too many. Where no direction is bright there, the
+        spots make up for it, which are most likely around.
         """
         if self._bright_regions is None:
             self._bright_regions = spots_of(self._environment)
@@ -183,7 +187,14 @@ class DistantIllumination:
             number = np.zeros(towards.shape[:2], int)
             for k, region in enumerate(regions, 1):
                 number[(number == 0) & region.covers(towards)] = k
+            number[(number == 0) & is_bright(self._densities(directions))] = 1 + len(regions)
             numbers.append(number)
+        if not any((number == 1 + len(regions)).any() for number in numbers):
+            first = 1 if regions else 0
+            remaining, others = irradiance[-1], irradiance[first:-1]
+            total = others.sum(axis=0)
+            irradiance = irradiance[:-1].copy()
+            irradiance[first:] *= 1 + remaining / np.where(total > 0, total, np.inf)
         for k, exact in enumerate(irradiance):
             own = [incoming[n == k] for (*_, incoming), n in zip(sets, numbers, strict=True)]
             found = np.concatenate(own).sum(axis=0) / len(sets)
@@ -210,15 +221,18 @@ class DistantIllumination:
         directions = -np.array(record.d, dtype=np.float64).T
         return [directions[own] for own in members]
 
-    def _density(self, directions: np.ndarray) -> np.ndarray:
-        """Density (n) with which the environment samples directions or their opposites [1/sr]."""
-        total = np.zeros(len(directions))
+    def _densities(self, directions: np.ndarray) -> np.ndarray:
+        """Densities (n, 2) with which the environment samples directions and their opposites
+        [1/sr].
+        """
+        found = []
         for sign in (1, -1):
             record = dr.zeros(mi.DirectionSample3f, len(directions))
             record.d = mi.Vector3f((-sign * directions).T.astype(np.float32))
             at = dr.zeros(mi.Interaction3f, len(directions))
-            total += np.array(self._environment.pdf_direction(at, record), dtype=np.float64)
-        return total
+            density = np.array(self._environment.pdf_direction(at, record), dtype=np.float64)
+            found.append(np.broadcast_to(density, len(directions)))
+        return np.stack(found, axis=1)
 
 
 def environment_radiance(environment: mi.Emitter, directions: np.ndarray) -> np.ndarray:

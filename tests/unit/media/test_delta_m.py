@@ -101,6 +101,37 @@ def test_absorption_is_preserved(scenes, sigma_t, albedo):
     )
 
 
+ALBEDOS = np.indices((4, 4, 4)).sum(axis=0)[..., None] % 2 * 1.0
+COARSE = {
+    "grids of the same voxels": RNG.uniform(0.1, 3, (4, 4, 4, 1)),
+    "one voxel of extinction": np.ones((1, 1, 1, 1)),
+    "constant extinction": 1.5,
+}
+
+
+@pytest.mark.parametrize("sigma_t", COARSE.values(), ids=COARSE)
+def test_scattering_is_preserved_between_voxels(scenes, sigma_t):
+    """Scaling preserves absorption and scattering also between voxels whose albedo differs.
+
+    The scaled albedo is not linear in the albedo.
+    """
+    extinction = grid(sigma_t) if np.ndim(sigma_t) else {"type": "constvolume", "value": sigma_t}
+    medium = {"type": "heterogeneous", "phase": hg(0.85), "sigma_t": extinction}
+    medium["albedo"] = grid(ALBEDOS)
+    scene = scenes.load({"type": "irrcache", "solver": "sweep"}, scenes.boundary(medium), 8)
+    found = compile_scene(scene).visible[0]
+    p = mi.Point3f(np.float32(RNG.uniform(-1, 1, (3, 4096))))
+
+    def scattering_and_absorption(of) -> np.ndarray:
+        sigma_t = np.array(mi.Color3f(of.sigma_t.at_world(p)))[0] + np.zeros(4096)
+        albedo = np.array(mi.Color3f(of.albedo.at_world(p)))[0]
+        return np.array([sigma_t * albedo, sigma_t * (1 - albedo)])
+
+    new, old = scattering_and_absorption(found), scattering_and_absorption(found.original)
+    old[0] *= 1 - found.phase.forward
+    assert (np.abs(new - old).mean(axis=1) < 0.004 * old.mean(axis=1)).all()
+
+
 REFUSED = {
     "path": ({"solver": "path"}, r"sharply.*0\.80.*path.*auto.*volpath"),
     "an order": ({"solver": "auto", "max_depth": 3}, r"sharply.*0\.80.*max_depth 3.*-1.*volpath"),

@@ -87,3 +87,22 @@ def test_uniform_part_of_an_environment_is_balanced(scenes):
     uu, vv, uv = of_passes(sky, 40, 16, value).T
     assert np.sqrt(np.mean(((uu - vv) / (uu + vv)) ** 2)) < 0.025
     assert np.sqrt(np.mean((2 * uv / (uu + vv)) ** 2)) < 0.025
+
+
+def test_a_bright_texel_does_not_change_the_rest_of_an_environment(scenes):
+    """What enters from all sides but those around a bright texel is right to 3 % in every pass.
+
+    The interpolated texel reaches further than the spot that it makes. If what is left of it were
+    normalised together with the rest, that would change by a half.
+    """
+    pixels = np.ones((32, 64))
+    pixels[9, 20] = 3e4
+    sky, directions, radiance = sky_of(scenes, pixels)
+    spot = directions[radiance > 1000].mean(axis=0)
+
+    def value(towards: np.ndarray) -> np.ndarray:
+        return (towards @ (spot / np.linalg.norm(spot)) < np.cos(np.deg2rad(16)))[..., None] * 1.0
+
+    expected = 4 * np.pi * (radiance * value(directions)[:, 0]).mean()
+    found = of_passes(sky, 20, 16, value)[:, 0]
+    assert np.abs(found / expected - 1).max() < 0.03
