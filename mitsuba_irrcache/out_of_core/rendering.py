@@ -1,0 +1,289 @@
+"""Media whose extinction stays in a file: which scenes are supported, and their camera rays."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core import properties
+from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
+from mitsuba_irrcache.grids.fields import ConstantField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.machine.memory import available_memory
+from mitsuba_irrcache.media.medium import MediumGrid, axis_aligned
+from mitsuba_irrcache.out_of_core.brick_file import BrickFile
+from mitsuba_irrcache.out_of_core.slab_march import MappedIrradiance, SlabProjection
+from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
+from mitsuba_irrcache.out_of_core.survey import MappedField
+from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
+from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
+from mitsuba_irrcache.render.camera import ClosedFormCameraRays
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.scene.fingerprint import Snapshot
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
+from mitsuba_irrcache.solvers.sweep import DIRECTIONS
+
+#: Emitters whose radiance enters along tracks.
+EMITTERS = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP, EmitterKind.SUN)
+#: Share of the free memory that is used if nothing else is said, and what Python, Mitsuba and its
+#: kernels take of it [bytes].
+SHARE, BASE = 0.5, 700 << 20
+#: Ordinates come in pairs, and batches in memory are multiples of this number.
+MULTIPLE = 32
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class VolumeSettings:
+    """Properties of the integrator for volumes larger than memory; see the plugin's documentation.
+
+    ``max_memory`` is in bytes, 0: half of what is free.
+    """
+
+    sigma_t: str = ""
+    albedo: str = ""
+    max_memory: int = 0
+    work_folder: str = ""
+
+    @staticmethod
+    def of(props: properties.RecordedProperties) -> VolumeSettings | None:
+        """Read the properties; None if no volume stays in a file.
+
+        Files are searched for as those of Mitsuba's plugins are: beside the scene, too.
+        """
+        names = "sigma_t_file", "albedo_file", "max_memory", "work_folder"
+        sigma_t, albedo, memory, folder = (properties.text(props, name) for name in names)
+        if not sigma_t:
+            given = [n for n, v in zip(names, ("", albedo, memory, folder), strict=True) if v]
+            if given:
+                raise IrrcacheError(f"irrcache: {given[0]} is set, but not sigma_t_file; set both.")
+            return None
+        found = [
+            str(mi.file_resolver().resolve(name)) if name else "" for name in (sigma_t, albedo)
+        ]
+        return VolumeSettings(*found, parse_memory(memory), folder)
+
+
+class MappedMedium:
+    """The medium of a scene, its extinction in a file, and the irradiance in it."""
+
+    def __init__(self, settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
+        """``whole``: nothing but the radiance is wanted, of a medium that emits nothing."""
+        _check_settings(settings, whole)
+        self._settings, self._files = settings, files
+        self._snapshot: Snapshot | None = None
+        self._folder: tempfile.TemporaryDirectory | None = None
+        self._medium: MediumGrid | None = None
+        self._irradiance: tuple[BrickFile, np.ndarray] | None = None
+        self._rays: ClosedFormCameraRays | None = None
+        #: increases with every new irradiance
+        self.revision = 0
+
+    def camera_rays(
+        self,
+        scene: mi.Scene,
+        hide_emitters: bool,
+        quadrature: str,
+        step: float,
+        progress: Progress | None = None,
+    ) -> ClosedFormCameraRays:
+        """Create the camera rays for ``scene``; the irradiance is computed if it is not known yet,
+        or if the scene has changed.
+        """
+        snapshot = Snapshot(scene, None, self._snapshot)
+        if self._rays is None or snapshot.changes(self._snapshot):
+            self._rays = None
+            self._compute(scene, progress)
+            field = MappedIrradiance(*self._irradiance, self._medium.sigma_t.grid)
+            arguments = self._medium, field, quadrature, step, self._memory
+            projection = SlabProjection(*arguments)
+            self._rays = ClosedFormCameraRays(projection, self._settings.max_depth, hide_emitters)
+            self._snapshot = snapshot
+        return self._rays
+
+    @property
+    def _memory(self) -> int:
+        wanted = self._files.max_memory or int(SHARE * available_memory())
+        return max(wanted - BASE, 64 << 20)
+
+    def _compute(self, scene: mi.Scene, progress: Progress | None) -> None:
+        """Find the irradiance of a scene."""
+        medium = _only_medium(scene)
+        grid, files = None, self._files
+        sigma_t_file = VolumeFile(files.sigma_t)
+        grid = Grid(sigma_t_file.shape, _placement(medium))
+        sigma_t = MappedField(
+            sigma_t_file, grid, _scale(medium), f'sigma_t of medium "{medium.name}"'
+        )
+        changes = {"sigma_t": sigma_t, "macrocells": sigma_t.macrocells()}
+        if files.albedo:
+            changes["albedo"] = _albedo(VolumeFile(files.albedo), grid, medium.name)
+        self._medium = medium.replaced(**changes)
+        _log_start(grid, sigma_t)
+        self._folder = _work_folder(files)
+        sweep = SlabSweep(sigma_t, Path(self._folder.name), self._memory)
+        (directions, incoming, offsets), colour = self._ordinates(scene)
+
+        def report(done: int, total: int) -> None:
+            if progress is not None:
+                progress("cache", done, total)
+
+        if self._irradiance is not None:
+            self._irradiance[0].close()
+        found = sweep.uncollided(directions, incoming, offsets, report)
+        sweep.close()
+        self._irradiance = found, colour
+        self.revision += 1
+
+    def _ordinates(self, scene: mi.Scene) -> tuple[tuple, np.ndarray]:
+        """The ordinates of the first batch of a cache in memory, and the factors of channels."""
+        samples = self._settings.samples or 2 * DIRECTIONS
+        pairs = -(-samples // MULTIPLE) * MULTIPLE // 2
+        rng = np.random.default_rng((self._settings.seed, 0))
+        channels = 1 if mi.is_monochromatic else 3
+        illumination = DistantIllumination(scene)
+        sets, colour = illumination.factored_ordinates(1, pairs, channels, rng)
+        shown = range(sets[0].incoming.shape[-1])
+        (arguments,) = OrdinateSet.uncollided([OrdinateSet(each, shown) for each in sets])
+        return arguments, colour
+
+
+def _check_settings(settings: CacheSettings, whole: bool) -> None:
+    """Raise IrrcacheError for settings that are not supported."""
+    wrong = ""
+    if settings.max_depth != 2:
+        wrong = f"max_depth {settings.max_depth}; set max_depth to 2 (single scattering)"
+    elif settings.solver not in ("auto", "sweep"):
+        wrong = f'the solver "{settings.solver}"; remove it, or set solver to "sweep"'
+    elif settings.resolution:
+        wrong = "another resolution than that of the file; remove resolution"
+    elif settings.file:
+        wrong = "cache_file; remove it"
+    elif not whole:
+        wrong = "aovs, filter, tolerance and emission; remove them"
+    if wrong:
+        raise IrrcacheError(f"irrcache: a medium in sigma_t_file does not support {wrong}.")
+
+
+def _only_medium(scene: mi.Scene) -> MediumGrid:
+    """Return the medium of a scene whose extinction can stay in a file.
+
+    Raises UnsupportedSceneError, naming the object, for all other scenes.
+    """
+    description = compile_scene(scene, max_depth=2)
+    if len(description.media.grids) != 1 or not description.visible:
+        _refuse(f"the scene has {len(description.media.grids)} media; it must have one")
+    (medium,) = description.visible
+    name = f'medium "{medium.name}"'
+    if not medium.is_isolated:
+        _refuse(f"there are surfaces or area emitters beside {name}, or it fills no box")
+    if not medium.phase.is_isotropic:
+        _refuse(f"{name} does not scatter isotropically")
+    if medium.boundary.kind != "box":
+        _refuse(f"{name} fills a {medium.boundary.kind} and not a box")
+    if medium.sigma_t.channels != 1:
+        _refuse(f"the extinction of {name} is coloured")
+    for emitter in scene.emitters():
+        kind = kind_of(emitter)
+        if kind not in EMITTERS:
+            _refuse(f'emitter "{emitter.id()}" ({emitter.class_name()}) is not far away')
+    return medium
+
+
+def _refuse(reason: str) -> None:
+    raise UnsupportedSceneError(
+        f"irrcache: {reason}, which is not supported for a medium in sigma_t_file. Such scenes "
+        "need one medium with isotropic scattering in a box, without surfaces, under environments "
+        "and suns; reduce the volume to one that fits into memory for all others."
+    )
+
+
+def _placement(medium: MediumGrid) -> np.ndarray:
+    """``to_world`` of the voxels: that of the scene's grid, else along the axes of the world."""
+    linear = medium.boundary.to_world[:3, :3]
+    ends = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
+    corners = medium.boundary.frame[:3, :3] @ ends + medium.boundary.frame[:3, 3:]
+    lower, upper = corners.min(axis=1), corners.max(axis=1)
+    if medium.sigma_t.grid is None:
+        if (np.count_nonzero(np.abs(linear) > 1e-6 * np.abs(linear).max(), axis=0) != 1).any():
+            _refuse(f'the box of medium "{medium.name}" is rotated')
+        return axis_aligned(lower, upper)
+    frame = medium.sigma_t.grid.to_world
+    own = frame[:3, :3] @ ends + frame[:3, 3:]
+    difference = max(np.abs(own.min(axis=1) - lower).max(), np.abs(own.max(axis=1) - upper).max())
+    if difference > 1e-5 * (upper - lower).max():
+        _refuse(f'the grid of medium "{medium.name}" is not its box')
+    return frame
+
+
+def _scale(medium: MediumGrid) -> float:
+    """The factor of the file's values: the scene's ``scale``, or the product of it and a constant
+    extinction.
+    """
+    sigma_t = medium.sigma_t
+    if isinstance(sigma_t, ConstantField):
+        return sigma_t.maximum
+    return float(sigma_t.scale[0])
+
+
+def _albedo(file: VolumeFile, grid: Grid, name: str) -> MappedField:
+    if file.shape != grid.shape:
+        raise IrrcacheError(
+            f'irrcache: albedo_file "{file.path}" has shape {file.shape}, and sigma_t_file '
+            f"{grid.shape} (z, y, x); they must have the same voxels."
+        )
+    field = MappedField(file, grid, 1.0, f'albedo of medium "{name}"')
+    if field.maximum > 1 + 1e-6:
+        raise IrrcacheError(
+            f'irrcache: the albedo in "{file.path}" reaches {field.maximum:g}; above 1 a medium '
+            "creates energy. Clip it to [0, 1]."
+        )
+    return field
+
+
+def _work_folder(files: VolumeSettings) -> tempfile.TemporaryDirectory:
+    """Make a folder for working files, which is deleted with the integrator."""
+    parent = files.work_folder or Path(files.sigma_t).resolve().parent
+    try:
+        return tempfile.TemporaryDirectory(prefix=".irrcache-", dir=parent)
+    except OSError as error:
+        raise IrrcacheError(
+            f'irrcache: no working files can be made in "{parent}" ({error.strerror}); set '
+            "work_folder to a folder with 10 bytes of free space for each voxel."
+        ) from None
+
+
+def _log_start(grid: Grid, sigma_t: MappedField) -> None:
+    depth = sigma_t.maximum * grid.voxel_size.max()
+    mi.Log(
+        mi.LogLevel.Info,
+        f"irrcache: {' x '.join(map(str, grid.shape[::-1]))} voxels, the densest of {depth:.2g} "
+        "optical depths, are read from a file slab by slab",
+    )
+
+
+def parse_memory(text: str) -> int:
+    """Convert a text such as ``8GB`` or ``500 MB`` to bytes; "" is 0.
+
+    Raises IrrcacheError for any other text.
+    """
+    units = {"": 1, "KB": 1 << 10, "MB": 1 << 20, "GB": 1 << 30, "TB": 1 << 40}
+    number = text.upper().replace("IB", "B").rstrip("KMGTB ")
+    unit = text.upper().replace("IB", "B")[len(number) :].strip()
+    try:
+        size = int(float(number) * units[unit]) if text else 0
+    except (ValueError, KeyError, OverflowError):
+        size = -1
+    if size < 0 or (text and not size):
+        raise IrrcacheError(
+            f'irrcache: max_memory is "{text}"; it must be a size such as 8GB or 500MB.'
+        )
+    return size
