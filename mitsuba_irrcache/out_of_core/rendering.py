@@ -55,16 +55,13 @@ class VolumeSettings:
 
     @staticmethod
     def of(props: properties.RecordedProperties) -> VolumeSettings | None:
-        """Read the properties; None if no volume stays in a file.
+        """Read the properties; None if none is set.
 
         Files are searched for as those of Mitsuba's plugins are: beside the scene, too.
         """
         names = "sigma_t_file", "albedo_file", "max_memory", "work_folder"
         sigma_t, albedo, memory, folder = (properties.text(props, name) for name in names)
-        if not sigma_t:
-            given = [n for n, v in zip(names, ("", albedo, memory, folder), strict=True) if v]
-            if given:
-                raise IrrcacheError(f"irrcache: {given[0]} is set, but not sigma_t_file; set both.")
+        if not any((sigma_t, albedo, memory, folder)):
             return None
         found = [
             str(mi.file_resolver().resolve(name)) if name else "" for name in (sigma_t, albedo)
@@ -77,8 +74,7 @@ class MappedMedium:
 
     def __init__(self, settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
         """``whole``: nothing but the radiance is wanted, of a medium that emits nothing."""
-        _check_settings(settings, whole)
-        self._settings, self._files = settings, files
+        self._settings, self._files, self._whole = settings, files, whole
         self._snapshot: Snapshot | None = None
         self._folder: tempfile.TemporaryDirectory | None = None
         self._medium: MediumGrid | None = None
@@ -98,6 +94,7 @@ class MappedMedium:
         """Create the camera rays for ``scene``; the irradiance is computed if it is not known yet,
         or if the scene has changed.
         """
+        _check_settings(self._settings, self._files, self._whole)
         snapshot = Snapshot(scene, None, self._snapshot)
         if self._rays is None or snapshot.changes(self._snapshot):
             self._rays = None
@@ -156,8 +153,13 @@ class MappedMedium:
         return arguments, colour
 
 
-def _check_settings(settings: CacheSettings, whole: bool) -> None:
+def _check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
     """Raise IrrcacheError for settings that are not supported."""
+    if not files.sigma_t:
+        raise IrrcacheError(
+            "irrcache: albedo_file, max_memory or work_folder is set, but not sigma_t_file; set "
+            "it, too, or remove them."
+        )
     wrong = ""
     if settings.max_depth != 2:
         wrong = f"max_depth {settings.max_depth}; set max_depth to 2 (single scattering)"
