@@ -179,6 +179,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
        - Folder on a disk with 10 bytes of free space for each voxel of ``sigma_t_file`` and
          channel, for working files. (Default: that of ``sigma_t_file``)
 
+     * - irradiance_file
+       - |string|
+       - File ``.npy`` to which the irradiance in the voxels of ``sigma_t_file`` is written: float32
+         (z, y, x, channel). (Default: none)
+
      * - timeout
        - |float|
        - Seconds after which no further batch of the cache and no further pass of camera samples is

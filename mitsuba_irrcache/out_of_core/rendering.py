@@ -17,9 +17,10 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.machine.memory import available_memory
 from mitsuba_irrcache.media.medium import MediumGrid, axis_aligned
-from mitsuba_irrcache.out_of_core.brick_file import BrickFile
+from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
 from mitsuba_irrcache.out_of_core.slab_march import MappedIrradiance, SlabProjection
 from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
+from mitsuba_irrcache.out_of_core.slabs import even_slabs
 from mitsuba_irrcache.out_of_core.survey import MappedField
 from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
 from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
@@ -52,6 +53,7 @@ class VolumeSettings:
     albedo: str = ""
     max_memory: int = 0
     work_folder: str = ""
+    irradiance: str = ""
 
     @staticmethod
     def of(props: properties.RecordedProperties) -> VolumeSettings | None:
@@ -59,14 +61,15 @@ class VolumeSettings:
 
         Files are searched for as those of Mitsuba's plugins are: beside the scene, too.
         """
-        names = "sigma_t_file", "albedo_file", "max_memory", "work_folder"
-        sigma_t, albedo, memory, folder = (properties.text(props, name) for name in names)
-        if not any((sigma_t, albedo, memory, folder)):
+        names = "sigma_t_file", "albedo_file", "max_memory", "work_folder", "irradiance_file"
+        given = [properties.text(props, name) for name in names]
+        if not any(given):
             return None
+        sigma_t, albedo, memory, folder, irradiance = given
         found = [
             str(mi.file_resolver().resolve(name)) if name else "" for name in (sigma_t, albedo)
         ]
-        return VolumeSettings(*found, parse_memory(memory), folder)
+        return VolumeSettings(*found, parse_memory(memory), folder, irradiance)
 
 
 class MappedMedium:
@@ -80,8 +83,6 @@ class MappedMedium:
         self._medium: MediumGrid | None = None
         self._irradiance: tuple[BrickFile, np.ndarray] | None = None
         self._rays: ClosedFormCameraRays | None = None
-        #: increases with every new irradiance
-        self.revision = 0
 
     def camera_rays(
         self,
@@ -138,7 +139,8 @@ class MappedMedium:
         found = sweep.uncollided(directions, incoming, offsets, report)
         sweep.close()
         self._irradiance = found, colour
-        self.revision += 1
+        if files.irradiance:
+            _write_irradiance(files.irradiance, found, colour)
 
     def _ordinates(self, scene: mi.Scene) -> tuple[tuple, np.ndarray]:
         """The ordinates of the first batch of a cache in memory, and the factors of channels."""
@@ -157,8 +159,12 @@ def _check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool)
     """Raise IrrcacheError for settings that are not supported."""
     if not files.sigma_t:
         raise IrrcacheError(
-            "irrcache: albedo_file, max_memory or work_folder is set, but not sigma_t_file; set "
-            "it, too, or remove them."
+            "irrcache: albedo_file, max_memory, work_folder or irradiance_file is set, but not "
+            "sigma_t_file; set it, too, or remove them."
+        )
+    if files.irradiance and not files.irradiance.endswith(".npy"):
+        raise IrrcacheError(
+            f'irrcache: irradiance_file is "{files.irradiance}"; its name must end with .npy.'
         )
     wrong = ""
     if settings.max_depth != 2:
@@ -260,6 +266,28 @@ def _work_folder(files: VolumeSettings) -> tempfile.TemporaryDirectory:
         raise IrrcacheError(
             f'irrcache: no working files can be made in "{parent}" ({error.strerror}); set '
             "work_folder to a folder with 10 bytes of free space for each voxel."
+        ) from None
+
+
+def _write_irradiance(name: str, irradiance: BrickFile, colour: np.ndarray) -> None:
+    """Write the irradiance, float32 (z, y, x, channel), slab by slab."""
+    path = Path(name)
+    partial = path.with_name(f".{path.name}.tmp")
+    shape, (slices, ny, nx) = (*irradiance.shape, len(colour)), irradiance.shape
+    try:
+        for first, last in even_slabs(slices, EDGE):
+            # Opened anew each time, as pages of a mapped file count as memory of the process.
+            mode = "r+" if first else "w+"
+            mapped = np.lib.format.open_memmap(partial, mode, np.float32, shape)
+            values = irradiance.read((first, 0, 0), (last, ny, nx))
+            values = values.reshape(last - first, ny, nx, -1)
+            mapped[first:last] = values * colour.astype(np.float32)
+            del mapped
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise IrrcacheError(
+            f'irrcache: irradiance_file "{path}" cannot be written: {error.strerror}.'
         ) from None
 
 

@@ -30,6 +30,7 @@ GIVEN = {
     "albedo_file": "albedo.npy",
     "max_memory": "8GB",
     "work_folder": "scratch",
+    "irradiance_file": "fluence.npy",
 }
 #: The same for those that cannot be combined with others.
 ALONE = {"tolerance": 0.0125, "tolerance_of": "volume"}

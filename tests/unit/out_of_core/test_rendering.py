@@ -57,6 +57,18 @@ def test_an_image_differs_by_rounding_alone_under_a_coloured_sky(density, tmp_pa
     np.testing.assert_allclose(image(parts, spp=2), image(whole, spp=2), rtol=1e-4)
 
 
+def test_the_irradiance_is_written_to_a_file(density, tmp_path):
+    whole = load(INTEGRATOR, boundary(medium(density, 0.9, PLACE), PLACE))
+    whole.integrator().prepare(whole)
+    file = tmp_path / "irradiance.npy"
+    parts = scene_of(
+        tmp_path, medium(density[:2, :2, :2], 0.9, PLACE), files={"irradiance_file": str(file)}
+    )
+    parts.integrator().prepare(parts)
+    expected = np.array(whole.integrator().cache.irradiance)
+    np.testing.assert_allclose(np.load(file), expected, rtol=1e-5)
+
+
 def test_an_edited_scene_is_rendered_anew(density, tmp_path):
     scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE), emitter=SUN)
     before = image(scene, spp=1)
