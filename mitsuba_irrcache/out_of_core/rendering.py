@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -18,6 +18,7 @@ from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.machine.memory import available_memory
 from mitsuba_irrcache.media.medium import MediumGrid, axis_aligned
 from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
+from mitsuba_irrcache.out_of_core.scattering import ScatteredIrradiance, add
 from mitsuba_irrcache.out_of_core.slab_march import MappedIrradiance, SlabProjection
 from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
 from mitsuba_irrcache.out_of_core.slabs import even_slabs
@@ -26,7 +27,9 @@ from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
 from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.fingerprint import Snapshot
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
 from mitsuba_irrcache.solvers.sweep import DIRECTIONS
@@ -114,8 +117,8 @@ class MappedMedium:
 
     def _compute(self, scene: mi.Scene, progress: Progress | None) -> None:
         """Find the irradiance of a scene."""
-        medium = _only_medium(scene)
-        grid, files = None, self._files
+        description = compile_scene(scene, max_depth=self._settings.max_depth)
+        medium, files = _only_medium(scene, description), self._files
         sigma_t_file = VolumeFile(files.sigma_t)
         grid = Grid(sigma_t_file.shape, _placement(medium))
         sigma_t = MappedField(
@@ -128,7 +131,7 @@ class MappedMedium:
         _log_start(grid, sigma_t)
         self._folder = _work_folder(files)
         sweep = SlabSweep(sigma_t, Path(self._folder.name), self._memory)
-        (directions, incoming, offsets), colour = self._ordinates(scene)
+        ordinates, colour = self._ordinates(scene)
 
         def report(done: int, total: int) -> None:
             if progress is not None:
@@ -136,23 +139,36 @@ class MappedMedium:
 
         if self._irradiance is not None:
             self._irradiance[0].close()
-        found = sweep.uncollided(directions, incoming, offsets, report)
+        shown = range(ordinates.incoming.shape[-1])
+        (arguments,) = OrdinateSet.uncollided([OrdinateSet(ordinates, shown)])
+        found = sweep.uncollided(*arguments, report)
+        if self._settings.max_depth < 0:
+            directions, _, weights, offsets = ordinates.scattering()
+            known = self._medium, found, colour, (directions, weights, offsets)
+            scattering = ScatteredIrradiance(sweep, *known)
+            scattering.solve(scene, description, replace(self._settings, samples=0))
+            scattered = scattering.find(report)
+            add(found, scattered)
+            scattered.close()
         sweep.close()
         self._irradiance = found, colour
         if files.irradiance:
             _write_irradiance(files.irradiance, found, colour)
 
-    def _ordinates(self, scene: mi.Scene) -> tuple[tuple, np.ndarray]:
-        """The ordinates of the first batch of a cache in memory, and the factors of channels."""
-        samples = self._settings.samples or 2 * DIRECTIONS
+    def _ordinates(self, scene: mi.Scene) -> tuple[Ordinates, np.ndarray]:
+        """The ordinates, for single scattering those of the first batch of a cache in memory, and
+        the factors of channels.
+        """
+        all_orders = self._settings.max_depth < 0
+        samples = self._settings.samples or (1 if all_orders else 2) * DIRECTIONS
         pairs = -(-samples // MULTIPLE) * MULTIPLE // 2
         rng = np.random.default_rng((self._settings.seed, 0))
         channels = 1 if mi.is_monochromatic else 3
         illumination = DistantIllumination(scene)
+        if all_orders and self._medium.albedo.channels > 1:
+            return illumination.ordinates(1, pairs, rng)[0], np.ones(channels)
         sets, colour = illumination.factored_ordinates(1, pairs, channels, rng)
-        shown = range(sets[0].incoming.shape[-1])
-        (arguments,) = OrdinateSet.uncollided([OrdinateSet(each, shown) for each in sets])
-        return arguments, colour
+        return sets[0], colour
 
 
 def _check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
@@ -167,8 +183,11 @@ def _check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool)
             f'irrcache: irradiance_file is "{files.irradiance}"; its name must end with .npy.'
         )
     wrong = ""
-    if settings.max_depth != 2:
-        wrong = f"max_depth {settings.max_depth}; set max_depth to 2 (single scattering)"
+    if settings.max_depth not in (-1, 2):
+        wrong = (
+            f"max_depth {settings.max_depth}; set max_depth to -1 (all orders of scattering) or 2 "
+            "(single scattering)"
+        )
     elif settings.solver not in ("auto", "sweep"):
         wrong = f'the solver "{settings.solver}"; remove it, or set solver to "sweep"'
     elif settings.resolution:
@@ -181,12 +200,11 @@ def _check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool)
         raise IrrcacheError(f"irrcache: a medium in sigma_t_file does not support {wrong}.")
 
 
-def _only_medium(scene: mi.Scene) -> MediumGrid:
+def _only_medium(scene: mi.Scene, description: SceneDescription) -> MediumGrid:
     """Return the medium of a scene whose extinction can stay in a file.
 
     Raises UnsupportedSceneError, naming the object, for all other scenes.
     """
-    description = compile_scene(scene, max_depth=2)
     if len(description.media.grids) != 1 or not description.visible:
         _refuse(f"the scene has {len(description.media.grids)} media; it must have one")
     (medium,) = description.visible

@@ -17,10 +17,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.out_of_core.brick_file import BrickFile, RecordFile
+from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile, RecordFile
 from mitsuba_irrcache.out_of_core.slab_tracks import (
     SlabTracks,
     by_slices,
+    from_slices,
     slice_place,
     swept_medium,
 )
@@ -38,15 +39,20 @@ from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import values_at_centres
 
-#: Bytes of a voxel of both slabs while they are swept: extinction and its parts, and for each
-#: channel the sums and copies of them.
-BYTES, BYTES_OF_CHANNEL = 16, 16
+#: Bytes of a voxel of both slabs while they are swept: extinction and its parts; and for each
+#: channel the sums, or these and the source, and copies of them.
+BYTES, BYTES_OF_CHANNEL, BYTES_OF_SOURCE = 16, 16, 56
+#: Most values of all channels of both slabs: kernels count them in 32 bits, four for each.
+MOST_VALUES = 1 << 30
 #: Most slices of a slab: more would not be faster.
 MOST_SLICES = 128
 #: Share of the memory for what tracks carry.
 SHARE_CARRIED = 0.4
 
 Progress = Callable[[int, int], None]
+#: returns the radiance that the voxels of a box emit or scatter, per optical depth: (z, y, x,
+#: channel), given its lower and upper end (z, y, x)
+Source = Callable[[list[int], list[int]], np.ndarray]
 
 
 class SlabSweep:
@@ -75,9 +81,33 @@ class SlabSweep:
         """Uncollided irradiance at the centres of all voxels, as `Tracks.uncollided` computes it:
         a file of float32 with the channels of ``incoming`` (n, 2, channels).
         """
-        channels = incoming.shape[2]
-        total = BrickFile(self._folder / "irradiance", self.grid.shape, np.float32, channels)
-        weights = np.zeros(len(directions))
+        ordinates = directions, np.zeros(len(directions)), offsets
+        return self._irradiance("uncollided", ordinates, incoming, None, progress)
+
+    def scattered(
+        self,
+        name: str,
+        ordinates: tuple[np.ndarray, np.ndarray, np.ndarray],
+        source: Source,
+        channels: int,
+        progress: Progress = lambda done, total: None,
+    ) -> BrickFile:
+        """Irradiance of what voxels emit or scatter, in a file called ``name``, along ordinates:
+        directions (n, 3), weights (n) and offsets (n, 2), as `Tracks.table` takes them.
+        """
+        incoming = np.zeros((len(ordinates[0]), 2, channels))
+        return self._irradiance(name, ordinates, incoming, source, progress)
+
+    def _irradiance(
+        self,
+        name: str,
+        all_ordinates: tuple[np.ndarray, np.ndarray, np.ndarray],
+        incoming: np.ndarray,
+        source: Source | None,
+        progress: Progress,
+    ) -> BrickFile:
+        directions, weights, offsets = all_ordinates
+        total = BrickFile(self._folder / name, self.grid.shape, np.float32, incoming.shape[2])
         _, axes, _ = self._tracks.record(directions, weights, offsets, by_slice=True)
         done = 0
         for axis in range(3):
@@ -85,7 +115,7 @@ class SlabSweep:
             if not len(rows):
                 continue
             ordinates = directions[rows], weights[rows], offsets[rows]
-            sweep = _AxisSweep(self._tracks, self._levels, axis, ordinates, incoming[rows])
+            sweep = _AxisSweep(self._tracks, self._levels, axis, ordinates, incoming[rows], source)
             groups = sweep.groups(self._memory)
             slabs = sweep.slabs(self._memory, max(len(group) for group in groups))
             records = RecordFile(self._folder / "sums")
@@ -97,6 +127,13 @@ class SlabSweep:
                     progress(int(done * 1000), 1000)
                 sweep.finish()
         return total
+
+    def stored(self, name: str, field: MappedField) -> BrickFile:
+        """Copy a field to a working file, boxes of which are read."""
+        file = BrickFile(self._folder / name, self.grid.shape, np.float32)
+        for first, last in even_slabs(self.grid.shape[0], EDGE):
+            file.write((first, 0, 0), field.file.read(first, last) * np.float32(field.factor))
+        return file
 
     def close(self) -> None:
         """Closes the working file of the extinction."""
@@ -113,9 +150,10 @@ class _AxisSweep:
         axis: int,
         ordinates: tuple[np.ndarray, np.ndarray, np.ndarray],
         incoming: np.ndarray,
+        source: Source | None,
     ) -> None:
         self._tracks, self._levels, self._axis = tracks, levels, axis
-        self._ordinates, self._incoming = ordinates, incoming
+        self._ordinates, self._incoming, self._source = ordinates, incoming, source
         self._channels = incoming.shape[2]
         self._track_count = int(np.prod(np.delete(tracks.size, axis)))
         self._track_index = dr.arange(mi.UInt32, self._track_count)
@@ -133,8 +171,10 @@ class _AxisSweep:
     def slabs(self, memory: int, pairs: int) -> list[Slab]:
         """Slabs of as many slices as fit beside what the tracks of so many ``pairs`` carry."""
         carried = (pairs + 1) * 2 * self._track_count * (self._channels + 1) * 4
-        each = 2 * self._track_count * (BYTES + BYTES_OF_CHANNEL * self._channels)
-        thickness = _thickness(memory - carried, each)
+        of_channel = BYTES_OF_CHANNEL if self._source is None else BYTES_OF_SOURCE
+        each = 2 * self._track_count * (BYTES + of_channel * self._channels)
+        most = MOST_VALUES // (2 * self._track_count * self._channels)
+        thickness = max(1, min(_thickness(memory - carried, each), most))
         return symmetric_slabs(int(self._tracks.size[self._axis]), thickness)
 
     def cross(
@@ -155,7 +195,8 @@ class _AxisSweep:
         medium = swept_medium([self._levels.read(*box) for box in boxes], self._axis)
         values = self._sums([records.read(number) for number in numbers], boxes)
         table = self._tracks.slab_table(self._ordinates, self._incoming, self._axis, pair)
-        volume = SweptVolume(values, None, dr.opaque(mi.UInt32, 0), self._channels)
+        source = None if self._source is None else values
+        volume = SweptVolume(values, source, dr.opaque(mi.UInt32, 0), self._channels)
         for i in group:
             carried = CarriedRadiance(self._carried.get(i))
             sweep_tracks(medium, volume, table, table.pair_index[i], self._track_index, carried)
@@ -176,9 +217,11 @@ class _AxisSweep:
         return lower, upper
 
     def _sums(self, parts: list[np.ndarray | None], boxes: list) -> mi.Float:
-        """The sums of one or two slabs as they were left, or 0, by slices."""
+        """The sums of one or two slabs as they were left, or 0, by slices; with the source, the
+        four values of `Tracks.sweep`.
+        """
         shapes = [by_slices(np.empty(_shape(box), bool), self._axis).shape for box in boxes]
-        if all(part is None for part in parts):
+        if self._source is None and all(part is None for part in parts):
             voxels = sum(int(np.prod(shape)) for shape in shapes)
             return dr.opaque(mi.Float, 0, voxels * self._channels)
         shapes = [(*shape, self._channels) for shape in shapes]
@@ -186,7 +229,13 @@ class _AxisSweep:
             np.zeros(shape, np.float32) if part is None else part.reshape(shape)
             for part, shape in zip(parts, shapes, strict=True)
         ]
-        joined = parts[0] if len(parts) == 1 else np.concatenate(parts, slice_place(self._axis))
+        place = slice_place(self._axis)
+        joined = parts[0] if len(parts) == 1 else np.concatenate(parts, place)
+        if self._source is not None:
+            sums, joined = joined, np.zeros((*joined.shape, 4), np.float32)
+            sources = [by_slices(self._source(*box), self._axis) for box in boxes]
+            joined[..., 0] = np.concatenate(sources, place)
+            joined[..., 1] = sums
         return mi.Float(joined.ravel())
 
     def _keep(
@@ -202,6 +251,10 @@ class _AxisSweep:
         shape = list(by_slices(np.empty(_shape(boxes[0]), bool), self._axis).shape)
         thickness = shape[place]
         shape[place] *= len(boxes)
+        if self._source is not None:
+            values = dr.gather(
+                mi.Float, values, 4 * dr.arange(mi.UInt32, dr.width(values) // 4) + 1
+            )
         sums = np.array(values).reshape(*shape, self._channels)
         for box, number in zip(boxes, numbers, strict=True):
             own = sums.take(range(first, first + thickness), place)
@@ -209,7 +262,10 @@ class _AxisSweep:
             if total is None:
                 records.write(number, own)
             else:
-                found = self._at_centres(mi.Float(own.ravel()), _shape(box))
+                if self._source is None:
+                    found = self._at_centres(mi.Float(own.ravel()), _shape(box))
+                else:
+                    found = from_slices(own, self._axis)
                 before = total.read(*box)
                 total.write(box[0], before + found.reshape(before.shape))
 

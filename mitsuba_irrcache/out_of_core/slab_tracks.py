@@ -110,8 +110,16 @@ def _moved(fields: TransverseFields, stride: int, first: int, last: int) -> Tran
 
 def by_slices(box: np.ndarray, axis: int) -> np.ndarray:
     """Transpose a box (z, y, x, ...) to the layout of a swept volume, the slowest axis first."""
-    order = [2 - k for k in slicewise(axis)[::-1]]
-    return box.transpose(*order, *range(3, box.ndim))
+    return box.transpose(*_order(axis), *range(3, box.ndim))
+
+
+def from_slices(values: np.ndarray, axis: int) -> np.ndarray:
+    """Transpose what `by_slices` returns back to (z, y, x, ...)."""
+    return values.transpose(*np.argsort(_order(axis)), *range(3, values.ndim))
+
+
+def _order(axis: int) -> list[int]:
+    return [2 - k for k in slicewise(axis)[::-1]]
 
 
 def slice_place(axis: int) -> int:

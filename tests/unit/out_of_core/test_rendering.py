@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.out_of_core import slab_march, slab_sweep
+from mitsuba_irrcache.out_of_core import scattering, slab_march, slab_sweep
 from mitsuba_irrcache.out_of_core.rendering import parse_memory
 from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
 from tests.support.scenes import SUN, boundary, image, load, medium, placement, texture
@@ -69,6 +69,28 @@ def test_the_irradiance_is_written_to_a_file(density, tmp_path):
     np.testing.assert_allclose(np.load(file), expected, rtol=1e-5)
 
 
+def test_all_orders_of_a_white_furnace_are_white(density, tmp_path, monkeypatch):
+    monkeypatch.setattr(scattering, "COARSE", 24)
+    file = tmp_path / "irradiance.npy"
+    files = {"irradiance_file": str(file), "max_depth": -1, "cache_spp": 32}
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    scene = scene_of(tmp_path, medium(8.0, 1.0, PLACE), files=files, emitter=sky)
+    scene.integrator().prepare(scene)
+    np.testing.assert_allclose(np.load(file), 4 * np.pi, rtol=0.02)
+
+
+def test_all_orders_are_those_of_a_solution_in_memory(density, tmp_path, monkeypatch):
+    monkeypatch.setattr(scattering, "COARSE", 24)
+    albedo = texture(SHAPE, 0.5, 1.0, 4)
+    np.save(tmp_path / "albedo.npy", albedo)
+    orders = {"max_depth": -1, "cache_spp": 32}
+    whole = load(INTEGRATOR | orders, boundary(medium(4 * density, albedo, PLACE), PLACE))
+    files = {"albedo_file": str(tmp_path / "albedo.npy"), **orders}
+    parts = scene_of(tmp_path, medium(4.0, 0.5, PLACE), files=files)
+    expected, found = image(whole, spp=2), image(parts, spp=2)
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 0.01 * expected.mean()
+
+
 def test_an_edited_scene_is_rendered_anew(density, tmp_path):
     scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE), emitter=SUN)
     before = image(scene, spp=1)
@@ -86,7 +108,7 @@ def test_an_edited_scene_is_rendered_anew(density, tmp_path):
         ({}, {"emitter": {"type": "point", "position": [0, 3, 0]}}, "PointLight"),
         ({"phase": {"type": "hg", "g": 0.3}}, {}, "isotropically"),
         ({}, {"wall": {"type": "rectangle"}}, "surfaces"),
-        ({}, {"files": {"max_depth": -1}}, "max_depth"),
+        ({}, {"files": {"max_depth": 3}}, "max_depth"),
         ({}, {"files": {"aovs": "depth"}}, "aovs"),
         ({}, {"files": {"sigma_t_file": ""}}, "sigma_t_file"),
         ({}, {"files": {"sigma_t_file": "none.npy"}}, "none.npy"),
