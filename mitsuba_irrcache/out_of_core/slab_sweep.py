@@ -257,10 +257,12 @@ class _AxisSweep:
             )
         sums = np.array(values).reshape(*shape, self._channels)
         for box, number in zip(boxes, numbers, strict=True):
-            own = sums.take(range(first, first + thickness), place)
+            within: list = [slice(None)] * sums.ndim
+            within[place] = slice(first, first + thickness)
+            own = sums[tuple(within)]
             first += thickness
             if total is None:
-                records.write(number, own)
+                records.write(number, np.ascontiguousarray(own))
             else:
                 if self._source is None:
                     found = self._at_centres(mi.Float(own.ravel()), _shape(box))

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.out_of_core.slabs import Slab
 from mitsuba_irrcache.solvers.discrete_ordinates.kernel import SweptMedium
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import slicewise, strides_of
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
+    coordinates_of,
+    flat_index,
+    slicewise,
+    strides_of,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
     FIXED_POINT_BITS,
     FIXED_POINT_ONE,
@@ -131,20 +137,20 @@ def swept_medium(parts: list[np.ndarray], axis: int) -> SweptMedium:
     """The extinction of one or two slabs as tracks along ``axis`` read it: for each voxel its
     quantised value and that of its neighbour (see `Extinction.corners`, by rows).
 
-    ``parts`` are boxes (z, y, x) of quantised values.
+    ``parts`` are boxes (z, y, x) of quantised values, uint16.
     """
-    parts = [by_slices(part, axis) for part in parts]
-    place = slice_place(axis)
-    shape = list(parts[0].shape)
-    shape[place] = sum(part.shape[place] for part in parts)
-    rows = np.empty((*shape, 2), np.uint16)
-    first = 0
-    for part in parts:
-        index: list = [slice(None)] * 3
-        index[place] = slice(first, first + part.shape[place])
-        own = rows[tuple(index)]
-        own[..., 0] = part
-        own[..., :-1, 1] = part[..., 1:]
-        own[..., -1, 1] = part[..., -1]
-        first += part.shape[place]
-    return SweptMedium(mi.UInt32(rows.view(np.uint32).ravel()), words=1)
+    box = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2 - axis)
+    sides = np.array(box.shape[::-1])
+    values = box.ravel()
+    words = mi.UInt32((np.append(values, np.uint16(0)) if values.size % 2 else values).view("u4"))
+    at = coordinates_of(sides, slicewise(axis))
+    k, strides = TRANSVERSE[axis, 0], strides_of(sides)
+    index, last = flat_index(at, strides), dr.opaque(mi.UInt32, int(sides[k]) - 1)
+    upper = index + dr.select(at[k] < last, dr.opaque(mi.UInt32, strides[k]), 0)
+
+    def level(i: mi.UInt32) -> mi.UInt32:
+        return (dr.gather(mi.UInt32, words, i >> 1) >> ((i & 1) << 4)) & 0xFFFF
+
+    rows = level(index) | level(upper) << 16
+    dr.eval(rows)
+    return SweptMedium(rows, words=1)
