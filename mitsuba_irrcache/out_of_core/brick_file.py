@@ -16,7 +16,8 @@ EDGE = 32
 
 
 class BrickFile:
-    """Values (z, y, x, channel) of one type in a file, 0 at first.
+    """Values (z, y, x, channel) of one type in a file without a name, 0 at first. The file vanishes
+    when it is closed, or with the process.
 
     Slabs across any axis are read and written in whole bricks, each of which is contiguous; slabs
     across x of an array with x fastest would touch every page of the file.
@@ -28,11 +29,19 @@ class BrickFile:
         self.shape, self.channels, self.dtype = shape, channels, np.dtype(dtype)
         self._counts = [-(-n // EDGE) for n in shape]
         self._bytes = EDGE**3 * channels * self.dtype.itemsize
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+        if not hasattr(os, "pread"):
+            raise IrrcacheError(
+                "irrcache: sigma_t_file needs Linux or macOS: working files of this system cannot "
+                "be read at a position; use a volume that fits into memory."
+            )
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        os.unlink(path)
+        size = int(np.prod(self._counts, dtype=object)) * self._bytes
         try:
-            size = int(np.prod(self._counts, dtype=object)) * self._bytes
-            # Reserved at once, so that a full disk shows now and not after hours.
-            os.posix_fallocate(self._file, 0, size)
+            os.ftruncate(self._file, size)
+            if hasattr(os, "posix_fallocate"):
+                # Reserved at once, so that a full disk shows now and not after hours.
+                os.posix_fallocate(self._file, 0, size)
         except OSError as error:
             self.close()
             raise IrrcacheError(

@@ -29,8 +29,8 @@ from mitsuba_irrcache.scene.description import SceneDescription
 
 #: Voxels along the longest side of the coarse copy, at most.
 COARSE = 128
-#: Passes over the whole volume, at most, and the relative change of the irradiance, in root mean
-#: square, up to which no other pass follows.
+#: Passes over the whole volume, at most, and the relative change of the irradiance of collisions,
+#: in root mean square, up to which no other pass follows.
 MOST_PASSES, NEGLIGIBLE = 3, 0.01
 
 Progress = Callable[[int, int], None]
@@ -168,15 +168,19 @@ class ScatteredIrradiance:
         return np.stack([np.array(c) for c in channels], axis=-1).reshape(*shape, -1)
 
     def _change(self, before: BrickFile | None, after: BrickFile) -> float:
-        """Root mean square of the change, relative to that of the whole irradiance."""
+        """Root mean square of the change, relative to that of the whole irradiance, weighted by
+        extinction.
+        """
         change = total = 0.0
         slices, ny, nx = self._grid.shape
         for first, last in even_slabs(slices, EDGE):
             box = [first, 0, 0], [last, ny, nx]
             new = self._scattered(*box, after)
-            change += float(np.square(new - self._scattered(*box, before), dtype=np.float64).sum())
+            weight = self._sweep.extinction(*box)[..., None].astype(np.float32)
+            difference = new - self._scattered(*box, before)
             whole = new + self._uncollided.read(*box).reshape(new.shape)
-            total += float(np.square(whole, dtype=np.float64).sum())
+            change += float((weight * np.square(difference)).sum(dtype=np.float64))
+            total += float((weight * np.square(whole)).sum(dtype=np.float64))
         return (change / max(total, 1e-300)) ** 0.5
 
 

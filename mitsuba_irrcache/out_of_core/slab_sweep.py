@@ -128,6 +128,10 @@ class SlabSweep:
                 sweep.finish()
         return total
 
+    def extinction(self, lower: list[int], upper: list[int]) -> np.ndarray:
+        """The extinction in a box (z, y, x), in units of its quantum."""
+        return self._levels.read(lower, upper)
+
     def stored(self, name: str, field: MappedField) -> BrickFile:
         """Copy a field to a working file, boxes of which are read."""
         file = BrickFile(self._folder / name, self.grid.shape, np.float32)
