@@ -433,8 +433,14 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             if self._mapped is not None:
                 options = self._hide_emitters, self._quadrature, self._step
                 progress = self._stopping.raising(self.progress)
-                with dr.suspend_grad():
-                    return self._mapped.camera_rays(scene, *options, progress)
+                try:
+                    with dr.suspend_grad():
+                        return self._mapped.camera_rays(scene, *options, progress)
+                except Stopped:
+                    raise IrrcacheError(
+                        "irrcache: stopped before the irradiance of the medium in sigma_t_file was "
+                        "complete, so there is no image; raise timeout, or lower cache_spp."
+                    ) from None
             try:
                 with dr.suspend_grad():
                     self._builder.update(scene, self._stopping.raising(self.progress))

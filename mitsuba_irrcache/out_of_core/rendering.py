@@ -30,6 +30,7 @@ from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.scene.fingerprint import Snapshot
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
+from mitsuba_irrcache.solvers.discrete_ordinates.extinction import DENSE
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
 from mitsuba_irrcache.solvers.sweep import DIRECTIONS
@@ -131,6 +132,12 @@ class MappedMedium:
         _log_start(grid, sigma_t)
         self._folder = _work_folder(files)
         sweep = SlabSweep(sigma_t, Path(self._folder.name), self._memory)
+        if sweep.is_dense:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'irrcache: voxels of medium "{medium.name}" have optical depths of more than '
+                f"{DENSE:g}: their irradiance is less accurate than that of a volume in memory.",
+            )
         ordinates, colour = self._ordinates(scene)
 
         def report(done: int, total: int) -> None:

@@ -62,7 +62,8 @@ class SlabSweep:
 
     def __init__(self, sigma_t: MappedField, folder: Path, memory: int) -> None:
         self.grid, self._folder, self._memory = sigma_t.grid, folder, memory
-        top, self.dense = largest_extinction(self.grid, sigma_t.largest)
+        #: whether sweeps with a source would distinguish the halves of voxels in memory
+        top, self.is_dense = largest_extinction(self.grid, sigma_t.largest)
         self._levels = BrickFile(folder / "extinction", self.grid.shape, np.uint16)
         slice_voxels = self.grid.voxel_count // self.grid.shape[0]
         for first, last in even_slabs(self.grid.shape[0], _thickness(memory, slice_voxels * 24)):

@@ -91,6 +91,12 @@ def test_all_orders_are_those_of_a_solution_in_memory(density, tmp_path, monkeyp
     assert np.sqrt(np.mean((found - expected) ** 2)) < 0.01 * expected.mean()
 
 
+def test_a_run_that_is_stopped_says_that_there_is_no_image(density, tmp_path):
+    scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE), files={"timeout": 1e-6})
+    with pytest.raises(RuntimeError, match="raise timeout"):
+        image(scene, spp=1)
+
+
 def test_an_edited_scene_is_rendered_anew(density, tmp_path):
     scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE), emitter=SUN)
     before = image(scene, spp=1)
