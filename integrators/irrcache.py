@@ -162,8 +162,9 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
          a time is read: ``.npy``, the folder of a Zarr array, or a raw file with a name like
          ``head_256x256x113_uint16.raw``, of shape (z, y, x). Its values replace those of a
          ``gridvolume`` in the scene, or are multiples of a constant extinction, and fill the box of
-         the medium; the medium's ``scale`` multiplies them. For single scattering in one isotropic
-         medium under environments and suns, without surfaces. (Default: none)
+         the medium; the medium's ``scale`` multiplies them. For ``max_depth`` 2 and -1 in one
+         medium with isotropic scattering under environments and suns, without surfaces.
+         (Default: none)
 
      * - albedo_file
        - |string|
@@ -176,8 +177,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - work_folder
        - |string|
-       - Folder on a disk with 10 bytes of free space for each voxel of ``sigma_t_file`` and
-         channel, for working files. (Default: that of ``sigma_t_file``)
+       - Folder for working files, on a disk with 10 bytes of free space for each voxel of
+         ``sigma_t_file`` and channel, 22 for all orders. (Default: that of ``sigma_t_file``)
 
      * - irradiance_file
        - |string|

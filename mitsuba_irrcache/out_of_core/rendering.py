@@ -290,7 +290,8 @@ def _work_folder(files: VolumeSettings) -> tempfile.TemporaryDirectory:
     except OSError as error:
         raise IrrcacheError(
             f'irrcache: no working files can be made in "{parent}" ({error.strerror}); set '
-            "work_folder to a folder with 10 bytes of free space for each voxel."
+            "work_folder to a folder with 10 bytes of free space for each voxel and channel, 22 for all "
+            "orders."
         ) from None
 
 
