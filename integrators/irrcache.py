@@ -25,7 +25,8 @@ from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
 from mitsuba_irrcache.machine.versions import check_versions
-from mitsuba_irrcache.out_of_core.rendering import MappedMedium, VolumeSettings
+from mitsuba_irrcache.out_of_core.rendering import MappedMedium
+from mitsuba_irrcache.out_of_core.volume_settings import VolumeSettings
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.defaults import choose_stock

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core import properties
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.grids.fields import ConstantField
 from mitsuba_irrcache.grids.grid import Grid
@@ -24,6 +23,7 @@ from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
 from mitsuba_irrcache.out_of_core.slabs import even_slabs
 from mitsuba_irrcache.out_of_core.survey import MappedField
 from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
+from mitsuba_irrcache.out_of_core.volume_settings import VolumeSettings, check_settings, work_folder
 from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import compile_scene
@@ -44,36 +44,6 @@ SHARE, BASE = 0.5, 700 << 20
 MULTIPLE = 32
 
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class VolumeSettings:
-    """Properties of the integrator for volumes larger than memory; see the plugin's documentation.
-
-    ``max_memory`` is in bytes, 0: half of what is free.
-    """
-
-    sigma_t: str = ""
-    albedo: str = ""
-    max_memory: int = 0
-    work_folder: str = ""
-    irradiance: str = ""
-
-    @staticmethod
-    def of(props: properties.RecordedProperties) -> VolumeSettings | None:
-        """Read the properties; None if none is set.
-
-        Files are searched for as those of Mitsuba's plugins are: beside the scene, too.
-        """
-        names = "sigma_t_file", "albedo_file", "max_memory", "work_folder", "irradiance_file"
-        given = [properties.text(props, name) for name in names]
-        if not any(given):
-            return None
-        sigma_t, albedo, memory, folder, irradiance = given
-        found = [
-            str(mi.file_resolver().resolve(name)) if name else "" for name in (sigma_t, albedo)
-        ]
-        return VolumeSettings(*found, parse_memory(memory), folder, irradiance)
 
 
 class MappedMedium:
@@ -99,7 +69,7 @@ class MappedMedium:
         """Create the camera rays for ``scene``; the irradiance is computed if it is not known yet,
         or if the scene has changed.
         """
-        _check_settings(self._settings, self._files, self._whole)
+        check_settings(self._settings, self._files, self._whole)
         snapshot = Snapshot(scene, None, self._snapshot)
         if self._rays is None or snapshot.changes(self._snapshot):
             self._rays = None
@@ -130,7 +100,7 @@ class MappedMedium:
             changes["albedo"] = _albedo(VolumeFile(files.albedo), grid, medium.name)
         self._medium = medium.replaced(**changes)
         _log_start(grid, sigma_t)
-        self._folder = _work_folder(files)
+        self._folder = work_folder(files)
         sweep = SlabSweep(sigma_t, Path(self._folder.name), self._memory)
         if sweep.is_dense:
             mi.Log(
@@ -176,35 +146,6 @@ class MappedMedium:
             return illumination.ordinates(1, pairs, rng)[0], np.ones(channels)
         sets, colour = illumination.factored_ordinates(1, pairs, channels, rng)
         return sets[0], colour
-
-
-def _check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
-    """Raise IrrcacheError for settings that are not supported."""
-    if not files.sigma_t:
-        raise IrrcacheError(
-            "irrcache: albedo_file, max_memory, work_folder or irradiance_file is set, but not "
-            "sigma_t_file; set it, too, or remove them."
-        )
-    if files.irradiance and not files.irradiance.endswith(".npy"):
-        raise IrrcacheError(
-            f'irrcache: irradiance_file is "{files.irradiance}"; its name must end with .npy.'
-        )
-    wrong = ""
-    if settings.max_depth not in (-1, 2):
-        wrong = (
-            f"max_depth {settings.max_depth}; set max_depth to -1 (all orders of scattering) or 2 "
-            "(single scattering)"
-        )
-    elif settings.solver not in ("auto", "sweep"):
-        wrong = f'the solver "{settings.solver}"; remove it, or set solver to "sweep"'
-    elif settings.resolution:
-        wrong = "another resolution than that of the file; remove resolution"
-    elif settings.file:
-        wrong = "cache_file; remove it"
-    elif not whole:
-        wrong = "aovs, filter, tolerance and emission; remove them"
-    if wrong:
-        raise IrrcacheError(f"irrcache: a medium in sigma_t_file does not support {wrong}.")
 
 
 def _only_medium(scene: mi.Scene, description: SceneDescription) -> MediumGrid:
@@ -282,19 +223,6 @@ def _albedo(file: VolumeFile, grid: Grid, name: str) -> MappedField:
     return field
 
 
-def _work_folder(files: VolumeSettings) -> tempfile.TemporaryDirectory:
-    """Make a folder for working files, which is deleted with the integrator."""
-    parent = files.work_folder or Path(files.sigma_t).resolve().parent
-    try:
-        return tempfile.TemporaryDirectory(prefix=".irrcache-", dir=parent)
-    except OSError as error:
-        raise IrrcacheError(
-            f'irrcache: no working files can be made in "{parent}" ({error.strerror}); set '
-            "work_folder to a folder with 10 bytes of free space for each voxel and channel, 22 for all "
-            "orders."
-        ) from None
-
-
 def _write_irradiance(name: str, irradiance: BrickFile, colour: np.ndarray) -> None:
     """Write the irradiance, float32 (z, y, x, channel), slab by slab."""
     path = Path(name)
@@ -324,22 +252,3 @@ def _log_start(grid: Grid, sigma_t: MappedField) -> None:
         f"irrcache: {' x '.join(map(str, grid.shape[::-1]))} voxels, the densest of {depth:.2g} "
         "optical depths, are read from a file slab by slab",
     )
-
-
-def parse_memory(text: str) -> int:
-    """Convert a text such as ``8GB`` or ``500 MB`` to bytes; "" is 0.
-
-    Raises IrrcacheError for any other text.
-    """
-    units = {"": 1, "KB": 1 << 10, "MB": 1 << 20, "GB": 1 << 30, "TB": 1 << 40}
-    number = text.upper().replace("IB", "B").rstrip("KMGTB ")
-    unit = text.upper().replace("IB", "B")[len(number) :].strip()
-    try:
-        size = int(float(number) * units[unit]) if text else 0
-    except (ValueError, KeyError, OverflowError):
-        size = -1
-    if size < 0 or (text and not size):
-        raise IrrcacheError(
-            f'irrcache: max_memory is "{text}"; it must be a size such as 8GB or 500MB.'
-        )
-    return size

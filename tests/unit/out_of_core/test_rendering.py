@@ -8,8 +8,8 @@ import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.out_of_core import scattering, slab_march, slab_sweep
-from mitsuba_irrcache.out_of_core.rendering import parse_memory
 from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
+from mitsuba_irrcache.out_of_core.volume_settings import parse_memory
 from tests.support.scenes import SUN, boundary, image, load, medium, placement, texture
 
 SHAPE, PLACE = (45, 42, 48), placement()
