@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import CacheFileError
+from mitsuba_irrcache.solvers.discrete_ordinates import solver
 from tests.support.surfaces import check, diffuse, fog, ground, images, lamp
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -145,6 +146,19 @@ def loaded(scenes, phase: dict, **settings) -> mi.Scene:
     integrator = {"type": "irrcache", "max_depth": 3, "resolution": 6, "cache_spp": 16} | settings
     shape = scenes.boundary(scenes.medium(1.0, 0.9) | {"phase": phase})
     return scenes.load(integrator, shape, 8, default_solver="path")
+
+
+@pytest.mark.parametrize("surfaces", [False, True])
+def test_channels_together_or_apart(scenes, monkeypatch, surfaces):
+    medium = scenes.medium(1.0, (0.9, 0.6, 0.8)) | {"phase": hg(0.5)}
+    objects = {"cloud": scenes.boundary(medium)} | ({"ground": ground()} if surfaces else {})
+    settings = {"type": "irrcache", "solver": "sweep", "resolution": 8, "cache_seed": 3}
+    found = []
+    for most in (1 << 24, 0):
+        monkeypatch.setattr(solver, "MOST_SWEPT_TOGETHER", most)
+        scene = scenes.load(settings, None, 8, emitter=scenes.sky, sun=scenes.sun, **objects)
+        found.append(scenes.image(scene, spp=4, seed=0))
+    np.testing.assert_allclose(*found, rtol=1e-3, atol=1e-4 * found[0].mean())
 
 
 def test_files(scenes, tmp_path):

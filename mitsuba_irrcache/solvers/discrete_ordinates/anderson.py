@@ -26,8 +26,8 @@ class AndersonAcceleration:
     decays, and so what remains of it.
     """
 
-    def __init__(self, sums: Callable[[mi.Float], np.ndarray]) -> None:
-        """``sums``: (weighted) sums over an array for each of its interleaved channels."""
+    def __init__(self, sums: Callable[..., np.ndarray]) -> None:
+        """``sums``: (weighted) sums of a function of some arrays for each interleaved channel."""
         self._sums = sums
         self._last: tuple[mi.Float, mi.Float] | None = None
 
@@ -39,8 +39,8 @@ class AndersonAcceleration:
         last, self._last = self._last, (residual, image)
         if last is None:
             return image
-        change = residual - last[0]
-        along, square = self._sums(residual * change), self._sums(change * change)
+        along = self._sums(lambda now, before: now * (now - before), residual, last[0])
+        square = self._sums(lambda now, before: dr.square(now - before), residual, last[0])
         with np.errstate(invalid="ignore", over="ignore"):
             share = -along / np.maximum(square, TINY)
         # Squares of very large radiance are not finite.

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import concatenated
 from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import separate_channels
 from mitsuba_irrcache.solvers.discrete_ordinates.moments import AnisotropicMultigridLevel, Moments
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
@@ -52,30 +55,45 @@ class AnisotropicSweep(Sweep):
         """As `Sweep._solve`; the moments of the uncollided radiance do not include narrow sources,
         whose irradiance is returned beside them.
         """
-        moments, several = self._moments, self.cache.max_depth != 2
-        tracks = self._tracks_of(channels)
+        several, count = self.cache.max_depth != 2, len(channels)
         used = sets[1:] if several else sets
         scale = dr.opaque(mi.Float, 1 / len(used))
-        smooth, own = moments.uncollided(used, tracks)
-        swept = sum((values for values in own if values is not None), smooth) * scale
-        smooth *= scale
+        found = self._moments.uncollided(used, self._tracks_of(channels), count)
+        smooth, *own = (None if values is None else values * scale for values in found)
+        swept = sum((values for values in own if values is not None), smooth)
+        scattered = self._swept(self._level(channels), sets, channels) - swept if several else None
+        parts = [
+            [None] * count if values is None else separate_channels(values, count)
+            for values in (smooth, swept, scattered, *own)
+        ]
+        return [self._of_channel(c, *each) for c, *each in zip(channels, *parts, strict=True)]
+
+    def _of_channel(
+        self,
+        channel: int,
+        smooth: mi.Float,
+        swept: mi.Float,
+        scattered: mi.Float | None,
+        *own: mi.Float | None,
+    ) -> tuple:
+        """The results of `_solve` for a channel, from moments: of the uncollided radiance without
+        that of narrow sources, with it, of what is scattered, and of each narrow source.
+        """
+        moments = self._moments
         # Found voxel by voxel: irradiance of known emitters, which their moments exclude, and of
         # point-like lights; moments of other sources.
         known, unknown = [], []
         for found in (*self._direct, *self._emission):
             (known if id(found[0]) in self._known_lights else unknown).append(
-                [m[channels[0]] for m in found]
+                [m[channel] for m in found]
             )
         points = unknown[: len(self._point_directions)]
         others = unknown[len(self._point_directions) :]
-        narrow = self._narrow_sources(own[: len(self._sources)], scale, points, others)
+        narrow = self._narrow_sources(own[: len(self._sources)], points, others)
         uncollided = moments.moment(swept, 0) + sum(values[0] for values in (*known, *unknown))
         if self._sun_irradiance:  # swept as the source of further orders only
-            suns = own[-1]
-            uncollided += self._from_suns(channels[0]) - moments.moment(suns, 0) * scale
-        scattered = None
-        if several:
-            scattered = self._swept(self._level(channels), sets, channels) - swept
+            uncollided += self._from_suns(channel) - moments.moment(own[-1], 0)
+        if scattered is not None:
             smooth = smooth + scattered
             scattered = dr.maximum(moments.moment(scattered, 0), 0)
         higher = [
@@ -83,10 +101,10 @@ class AnisotropicSweep(Sweep):
             for k in range(1, moments.count)
         ]
         dr.eval(uncollided, scattered, higher, narrow)
-        return [(uncollided, scattered, *higher, *narrow)]
+        return (uncollided, scattered, *higher, *narrow)
 
     def _narrow_sources(
-        self, swept: list[mi.Float | None], scale: mi.Float, points: list, others: list
+        self, swept: Sequence[mi.Float | None], points: list, others: list
     ) -> list[mi.Float]:
         """Irradiance of each narrow source: swept, from a point-like light, and its part of the
         ``others``.
@@ -95,7 +113,7 @@ class AnisotropicSweep(Sweep):
         for number, (source, values) in enumerate(zip(self._sources, swept, strict=True)):
             irradiance = dr.zeros(mi.Float, self.cache.active_count)
             if values is not None:
-                irradiance += self._moments.moment(values, 0) * scale
+                irradiance += self._moments.moment(values, 0)
             if source.sharp and not source.far:
                 irradiance += next(points)[0]
             found.append(irradiance + sum(more[self._moments.count + number] for more in others))

@@ -196,7 +196,8 @@ class IncomingRadiance:
         indices = concatenated([first + c for c in range(len(channels))])
         direction = None
         if self._direction is not None:
-            direction = mi.Vector3f(*(dr.gather(mi.Float, x, here) for x in self._direction))
+            own = (dr.gather(mi.Float, x, here) for x in self._direction)
+            direction = mi.Vector3f(*(concatenated([x] * len(channels)) for x in own))
         dr.eval(values, indices, direction)
         return ReflectedBoundarySource(
             level, len(channels), (transforms, cells, first_crossing), indices, direction, *values

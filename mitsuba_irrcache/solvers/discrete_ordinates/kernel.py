@@ -53,7 +53,9 @@ class SweptVolume:
     With ``begin_backward`` the two ways of a pair are separate: values of the ordinates against the
     axis are written from that voxel on and nothing is added; ``source`` has one value for each
     voxel and way in the same layout; optical depths are not multiplied by solid angles, and the
-    irradiance does not include what the voxel itself emits.
+    irradiance does not include what the voxel itself emits. With ``collisions`` there are two
+    values instead of four: the radiance of collisions, without what the voxel itself emits, and the
+    optical depth.
     """
 
     values: mi.Float
@@ -61,6 +63,7 @@ class SweptVolume:
     begin: mi.UInt32
     channels: int = 1
     begin_backward: mi.UInt32 | None = None
+    collisions: bool = False
 
 
 class CarriedRadiance:
@@ -560,7 +563,7 @@ class _PairSweep:
         if self.separate:
             for visit, tally, sent in zip(visits, tallies, sources, strict=True):
                 own = [t - mi.Vector4f(0, s, 0, 0) for t, s in zip(tally, sent, strict=True)]
-                visit.write(values, own)
+                visit.write(values, collisions(own) if self.volume.collisions else own)
         else:
             self._add_both(values, before, tallies, visits, middle)
         return radiance
@@ -740,6 +743,13 @@ def _transmittance(state: _TrackState, here: mi.Float, scale: mi.Float) -> mi.Fl
 
 
 # All channels of a voxel
+
+
+def collisions(tallies: list) -> list:
+    """The radiance that is lost per optical depth, and the depth; without any, the radiance in the
+    middle, which is the limit.
+    """
+    return [mi.Vector2f(dr.select(t.w > 0, t.z / t.w, t.y), t.w) for t in tallies]
 
 
 def _select(condition: mi.Bool, values: list, others: list) -> list:

@@ -55,6 +55,16 @@ def interleaved_channels(channels: Sequence[mi.Float]) -> mi.Float:
     return result
 
 
+def separate_channels(values: mi.Float, count: int) -> list[mi.Float]:
+    """The ``count`` channels of an array with the values of a voxel next to each other."""
+    if count == 1:
+        return [values]
+    first = dr.arange(mi.UInt32, dr.width(values) // count) * count
+    channels = [dr.gather(mi.Float, values, first + c) for c in range(count)]
+    dr.eval(channels)
+    return channels
+
+
 def voxel_and_channel(count: int, channels: int) -> tuple[mi.UInt32, mi.UInt32]:
     """Voxel and channel of each value of an array with ``channels`` interleaved for ``count``
     voxels.

@@ -2,8 +2,9 @@
 
 Where the phase function is not isotropic, the unknown is not the irradiance alone but all moments
 of the radiance up to the order of the phase function's Legendre expansion: as many times the voxels
-in one array, degree by degree. The first moment is the irradiance; scattering multiplies a moment
-of degree l by the phase function's moment g_l (see `phase`; Lewis and Miller 1984, chapter 4).
+in one array, degree by degree; channels that are swept together are next to each other. The first
+moment is the irradiance; scattering multiplies a moment of degree l by the phase function's moment
+g_l (see `phase`; Lewis and Miller 1984, chapter 4).
 """
 
 from __future__ import annotations
@@ -16,7 +17,12 @@ import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import concatenated, symbolic
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import layer_and_index
+from mitsuba_irrcache.solvers.discrete_ordinates.kernel import collisions
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
+    interleaved_channels,
+    layer_and_index,
+    voxel_and_channel,
+)
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     BoundaryOrdinateSet,
@@ -73,11 +79,13 @@ class Moments:
         none = np.zeros(len(incoming))
         table = tracks.table(directions, incoming, none, offsets, by_slice=True)
         table.boundary_source = boundary_source(table) if boundary_source is not None else None
-        active = tracks.active
-        sums = self.zeros(dr.width(active))
+        channels = (table if table.boundary_source is None else table.boundary_source).channels
+        sums = self.zeros(tracks.active_count * channels)
         box = tracks.lower, tracks.lower + tracks.size
-        for axis, group, copies in tracks.sweep_separately(table):
-            sums = _add_uncollided(self, sums, copies, group, axis, tracks.grid, *box, active)
+        place, channel = voxel_and_channel(tracks.active_count, channels)
+        values = dr.gather(mi.UInt32, tracks.active, place), channel, channels
+        for axis, group, copies in tracks.sweep_separately(table, channels=channels):
+            sums = _add_uncollided(self, sums, copies, group, axis, tracks.grid, *box, *values)
             dr.eval(sums)
         return concatenated(sums)
 
@@ -86,18 +94,20 @@ class Moments:
         return [dr.opaque(mi.Float, 0, width) for _ in range(self.count)]
 
     def uncollided(
-        self, sets: list[OrdinateSet] | list[BoundaryOrdinateSet], tracks: Tracks
-    ) -> tuple[mi.Float, list[mi.Float | None]]:
+        self, sets: list[OrdinateSet] | list[BoundaryOrdinateSet], tracks: Tracks, channels: int
+    ) -> list[mi.Float | None]:
         """Moments of the uncollided radiance along tracks at the active voxels, the sum of all
         ordinate ``sets``, without that of narrow sources; and those of each narrow source (None
-        where it is not distant).
+        where it is not distant). In so many ``channels``, of which what enters may have one only.
         """
-        found = [
-            self.sweep_uncollided(tracks, *arguments) if len(arguments[0]) else None
-            for arguments in sets[0].uncollided(sets, self.angular_basis)
-        ]
-        smooth = dr.opaque(mi.Float, 0, self.count * dr.width(tracks.active))
-        return (smooth if found[0] is None else found[0]), found[1:]
+        width, found = self.count * tracks.active_count, []
+        for arguments in sets[0].uncollided(sets, self.angular_basis):
+            swept = self.sweep_uncollided(tracks, *arguments) if len(arguments[0]) else None
+            if swept is not None and dr.width(swept) < width * channels:
+                swept = interleaved_channels([swept] * channels)
+            found.append(swept)
+        smooth = dr.opaque(mi.Float, 0, width * channels)
+        return [smooth if found[0] is None else found[0], *found[1:]]
 
 
 class AnisotropicMultigridLevel(MultigridLevel):
@@ -122,61 +132,79 @@ class AnisotropicMultigridLevel(MultigridLevel):
         smooth = Moments(self.moments.angular_basis, min(self.moments.order, COARSE_ORDER))
         return AnisotropicMultigridLevel(sigma_t, albedo, tracks, self.all_axes, moments=smooth)
 
+    @property
+    def _measured(self) -> int:
+        # What converges slowly is smooth in direction.
+        return min(self.moments.count, (COARSE_ORDER + 1) ** 2)
+
     def restrict(self, values: mi.Float) -> mi.Float:
         coarser = self.coarser
-        moment, place = layer_and_index(coarser.tracks.active_count, coarser.moments.count)
-        begin, result = moment * dr.opaque(mi.UInt32, self.tracks.active_count), mi.Float(0)
+        moment, place, channel = coarser._indices(coarser.moments.count)
+        begin, result = moment * dr.opaque(mi.UInt32, self._width) + channel, mi.Float(0)
         for child, weight in self._children:
-            voxel = begin + dr.gather(mi.UInt32, child, place)
-            result += dr.gather(mi.Float, values, voxel) * dr.gather(mi.Float, weight, place)
+            at = begin + dr.gather(mi.UInt32, child, place) * self.channels
+            result += dr.gather(mi.Float, values, at) * dr.gather(mi.Float, weight, place)
         dr.eval(result)
         return result
 
     def prolong(self, values: mi.Float) -> mi.Float:
         """As `MultigridLevel.prolong`; moments that the coarser level does not have are 0."""
-        moments, count = self.coarser.moments, self.coarser.tracks.active_count
-        moment, place = layer_and_index(self.tracks.active_count, moments.count)
-        begin = moment * dr.opaque(mi.UInt32, count)
-        known = self._interpolated(values, place, 1, begin)
-        result = dr.opaque(mi.Float, 0, self.moments.count * self.tracks.active_count)
+        moment, place, channel = self._indices(self.coarser.moments.count)
+        begin = moment * dr.opaque(mi.UInt32, self.coarser._width) + channel
+        known = self._interpolated(values, place, self.channels, begin)
+        result = dr.opaque(mi.Float, 0, self.moments.count * self._width)
         dr.scatter(result, known, dr.arange(mi.UInt32, dr.width(known)))
         dr.eval(result)
         return result
 
     def sweep(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
         """As `MultigridLevel.sweep`, for all moments."""
-        moments, active, voxels = self.moments, self.tracks.active, self.grid.voxel_count
-        if phi is not None and table.boundary_source is not None:
-            table.boundary_source.update(phi)
-        received, lost = (moments.zeros(self.tracks.active_count) for _ in range(2))
-        depth = dr.opaque(mi.Float, 0, self.tracks.active_count)
-        scattered = None if phi is None else self._scattered(phi)
+        return self._swept(phi, table, with_irradiance=True)
+
+    def collisions(self, phi: mi.Float | None, table: TrackTable) -> mi.Float:
+        return self._swept(phi, table, with_irradiance=False)[1]
+
+    def _swept(
+        self, phi: mi.Float | None, table: TrackTable, with_irradiance: bool
+    ) -> tuple[mi.Float | None, mi.Float]:
+        """The results of `sweep`, of which the irradiance can be left out."""
+        moments, scattered = self.moments, None
+        if phi is not None:
+            scattered = self._scattered(phi)
+            if table.boundary_source is not None:
+                table.boundary_source.update(phi)
 
         def source(group: PairGroup) -> mi.Float:
             return self.source_along(scattered, group)
 
-        for _, group, copies in self.tracks.sweep_separately(table, source):
-            found = _add_collided(moments, received, lost, depth, copies, group, active, voxels)
-            dr.eval(found)
-            received, lost, depth = found
+        collided = moments.zeros(self._width)
+        received = moments.zeros(self._width) if with_irradiance else None
+        lost, depth = (dr.opaque(mi.Float, 0, self._width) for _ in range(2))
+        where = self._slots(), self._swept_values
+        groups = self.tracks.sweep_separately(table, source, self.channels, not with_irradiance)
+        for _, group, copies in groups:
+            sums = received, collided, lost, depth
+            received, collided, lost, depth = _add_collided(moments, *sums, copies, group, *where)
+            dr.eval(received, collided, lost, depth)
         # Weighting by optical depth makes scattering conserve the collided energy.
-        collided = [4 * dr.pi * lost[0] / dr.select(depth > 0, depth, 1), *lost[1:]]
+        weighted = 4 * dr.pi * lost / dr.select(depth > 0, depth, 1)
+        collided[0] = self.collided_irradiance(depth, weighted, collided[0])
         if scattered is not None:
             # Ordinates integrate the difference from a voxel's source, whose moments are known.
-            received = [mean + moments.moment(scattered, k) for k, mean in enumerate(received)]
-            collided = [mean + moments.moment(scattered, k) for k, mean in enumerate(collided)]
-        pairs = zip(collided, received, strict=True)
-        collided = [self.collided_irradiance(depth, mean, other) for mean, other in pairs]
-        return concatenated(received), concatenated(collided)
+            own = [moments.moment(scattered, k) for k in range(moments.count)]
+            collided = [a + b for a, b in zip(collided, own, strict=True)]
+            if received is not None:
+                received = [a + b for a, b in zip(received, own, strict=True)]
+        return None if received is None else concatenated(received), concatenated(collided)
 
     def source_along(self, scattered: mi.Float | None, group: PairGroup) -> mi.Float:
         """Radiance that ``scattered`` moments (None for 0) have along both ways of all pairs of a
         group, pair by pair.
         """
-        voxels = self.grid.voxel_count
-        values = dr.opaque(mi.Float, 0, 2 * len(group) * voxels)
+        count = self._swept_values
+        values = dr.opaque(mi.Float, 0, 2 * len(group) * count)
         if scattered is not None:
-            _write_source(self.moments, values, scattered, group, self.tracks.active, voxels)
+            _write_source(self.moments, values, scattered, group, self._slots(), count)
             dr.eval(values)
         return values
 
@@ -184,7 +212,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
         self, phi: mi.Float, index: mi.UInt32, direction: mi.Vector3f | None
     ) -> mi.Float:
         """As `MultigridLevel.scattered_radiance`."""
-        step = dr.opaque(mi.UInt32, self.tracks.active_count)
+        step = dr.opaque(mi.UInt32, self._width)
         result = dr.gather(mi.Float, phi, index)
         basis = self.moments.angular_basis.basis(direction)
         for factor in basis[: self.moments.count - 1]:
@@ -194,21 +222,51 @@ class AnisotropicMultigridLevel(MultigridLevel):
 
     def _scattered(self, phi: mi.Float) -> mi.Float:
         """Moments of the scattered radiance, per optical depth."""
-        moment, place = layer_and_index(self.tracks.active_count, self.moments.count)
+        moment, place = layer_and_index(self._width, self.moments.count)
         factor = dr.gather(mi.Float, self.moments.factors, moment)
         scattered = phi * factor * dr.gather(mi.Float, self.albedo, place)
         dr.eval(scattered)
         return scattered
 
+    # Arrays
+
+    @property
+    def _width(self) -> int:
+        """Values of one moment: of all channels of the active voxels."""
+        return self.tracks.active_count * self.channels
+
+    @property
+    def _swept_values(self) -> int:
+        """Values that an ordinate leaves: in all channels of all voxels."""
+        return self.grid.voxel_count * self.channels
+
+    def _slots(self) -> mi.UInt32:
+        """Indices of the active voxels and their channels among the values of an ordinate."""
+        place, channel = voxel_and_channel(self.tracks.active_count, self.channels)
+        return dr.gather(mi.UInt32, self.tracks.active, place) * self.channels + channel
+
+    def _indices(self, moments: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """Moment, active voxel and channel of each value of an array of so many ``moments``."""
+        moment, place = layer_and_index(self._width, moments)
+        if self.channels == 1:
+            return moment, place, mi.UInt32(0)
+        voxel = place // self.channels
+        return moment, voxel, place - voxel * self.channels
+
 
 @symbolic
-def _add_uncollided(moments, sums: list, copies, group, axis: int, grid, lower, upper, active):
-    """``sums`` and the moments of the irradiance that a sweep of a group has left in ``copies``."""
+def _add_uncollided(
+    moments, sums: list, copies, group, axis: int, grid, lower, upper, voxel, channel, channels: int
+):
+    """``sums`` and the moments of the irradiance that a sweep of a group has left in ``copies``, at
+    each ``voxel`` in this ``channel``.
+    """
     voxels = dr.opaque(mi.UInt32, grid.voxel_count)
     k, begin = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(k < group.count, label="uncollided pairs"):
-        forward = values_at_centres(copies, grid, lower, upper, axis, active, begin=begin)
-        backward = values_at_centres(copies, grid, lower, upper, axis, active, begin=begin + voxels)
+        where = copies, grid, lower, upper, axis, voxel, channel, channels
+        forward = values_at_centres(*where, begin=begin)
+        backward = values_at_centres(*where, begin=begin + voxels)
         basis = moments.basis(-group.direction(k))
         sums = _add_pair(moments, sums, basis, forward, backward)
         k += 1
@@ -217,27 +275,33 @@ def _add_uncollided(moments, sums: list, copies, group, axis: int, grid, lower, 
 
 
 @symbolic
-def _add_collided(moments, received: list, lost: list, depth, copies, group, active, voxels: int):
-    """Adds the results of a sweep of a group, in ``copies``, at the ``active`` ones of so many
-    voxels: to the moments of the radiance without the voxel's own source; to the radiance lost and
-    its moments per optical depth; and to the optical ``depth`` times solid angles.
+def _add_collided(
+    moments, received: list | None, collided: list, lost, depth, copies, group, slots, values: int
+):
+    """Adds the results of a sweep of a group, in ``copies``, at these ``slots`` of the ``values``
+    of each ordinate, without the voxels' own source: to the moments of the radiance in the middle
+    of voxels, ``received`` (None: not known), and of collisions, to the radiance ``lost``, and to
+    the optical ``depth`` times solid angles.
     """
-    step = dr.opaque(mi.UInt32, voxels)
-    k, place = mi.UInt32(0), mi.UInt32(active)
+    step = dr.opaque(mi.UInt32, values)
+    k, place = mi.UInt32(0), mi.UInt32(slots)
     while dr.hint(k < group.count, label="collided pairs"):
-        forward = dr.gather(mi.Vector4f, copies, place)
-        backward = dr.gather(mi.Vector4f, copies, place + step)
         basis = moments.basis(-group.direction(k))
-        received = _add_pair(moments, received, basis, forward.y, backward.y)
         # Per depth of each track: with the sum of depths, tracks without matter would be missing
         # from the integral over directions, and the operator would have a norm above 1.
-        per_depth = [dr.select(v.w > 0, v.z / v.w, 0) for v in (forward, backward)]
-        higher = _add_pair(moments, lost, basis, *per_depth)[1:]
-        lost = [lost[0] + forward.z + backward.z, *higher]
-        depth = depth + group.weight(k) * (forward.w + backward.w)
+        if dr.hint(received is None, mode="scalar"):
+            forward = dr.gather(mi.Vector2f, copies, place)
+            backward = dr.gather(mi.Vector2f, copies, place + step)
+        else:
+            tallies = [dr.gather(mi.Vector4f, copies, i) for i in (place, place + step)]
+            received = _add_pair(moments, received, basis, *(t.y for t in tallies))
+            forward, backward = collisions(tallies)
+        collided = _add_pair(moments, collided, basis, forward.x, backward.x)
+        lost = lost + forward.x * forward.y + backward.x * backward.y
+        depth = depth + group.weight(k) * (forward.y + backward.y)
         k += 1
         place += 2 * step
-    return received, lost, depth
+    return received, collided, lost, depth
 
 
 def _add_pair(
@@ -252,13 +316,13 @@ def _add_pair(
 
 
 @symbolic
-def _write_source(moments, source, scattered, group, active, voxels: int):
-    """Writes the radiance per optical depth that the ``active`` ones of so many voxels scatter
-    along the ordinates of a group, and along their opposites.
+def _write_source(moments, source, scattered, group, slots, values: int):
+    """Writes the radiance per optical depth that is scattered along the ordinates of a group, and
+    along their opposites, at these ``slots`` of the ``values`` of each ordinate.
     """
     parts = [moments.moment(scattered, i) for i in range(moments.count)]
-    step = dr.opaque(mi.UInt32, voxels)
-    k, place = mi.UInt32(0), mi.UInt32(active)
+    step = dr.opaque(mi.UInt32, values)
+    k, place = mi.UInt32(0), mi.UInt32(slots)
     while dr.hint(k < group.count, label="sources of pairs"):
         even, odd = parts[0] * dr.inv_four_pi, mi.Float(0)
         basis = moments.basis(-group.direction(k))

@@ -112,6 +112,11 @@ class MultigridLevel:
     def _new_level(self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks) -> MultigridLevel:
         return MultigridLevel(sigma_t, albedo, tracks, self.all_axes)
 
+    @property
+    def _measured(self) -> int:
+        """How many of the unknowns of a voxel the size of an error is measured by."""
+        return 1
+
     # Transfer between levels
 
     def _interpolated_from(self, coarse: Grid) -> mi.UInt32:
@@ -199,6 +204,10 @@ class MultigridLevel:
         dr.eval(phi, collided)
         return phi, collided
 
+    def collisions(self, phi: mi.Float | None, table: TrackTable) -> mi.Float:
+        """The second result of `sweep`."""
+        return self.sweep(phi, table)[1]
+
     def collided_irradiance(
         self, depth: mi.Float, collided: mi.Float, irradiance: mi.Float
     ) -> mi.Float:
@@ -262,12 +271,12 @@ class MultigridLevel:
         # docs/primer, eq. (4.9)
         tables = self.tables(ordinates, boundary_source)
         phi = self._initial_guess(b, tables)
-        change, nonzero = np.inf, self._scattered_sums(dr.abs(b)).max() > 0
+        change, nonzero = np.inf, self._scattered_sums(dr.abs, b).max() > 0
         acceleration = AndersonAcceleration(self._scattered_sums)
         for _ in range(MAX_CYCLES if not self.coarsest and nonzero else 0):
             image = self.cycle(phi, b, tables)
-            scale = self._scattered_sums(dr.abs(image))
-            last, change = change, self._scattered_sums(dr.abs(image - phi))
+            scale = self._scattered_sums(dr.abs, image)
+            last, change = change, self._scattered_sums(lambda a, b: dr.abs(a - b), image, phi)
             # Errors decay by about the same factor each time. It is bounded from below, since the
             # first factors may be small: what converges slowest shows last.
             factor = np.clip(change / np.maximum(last, TINY), 0.5, 0.95)
@@ -284,14 +293,16 @@ class MultigridLevel:
                 )
         return phi
 
-    def _scattered_sums(self, values: mi.Float) -> np.ndarray:
-        """Sums of ``values`` for each channel, weighted by the scattering coefficient."""
+    def _scattered_sums(self, integrand: Callable, *fields: mi.Float) -> np.ndarray:
+        """Sums of the ``integrand`` of some ``fields`` for each channel, weighted by the scattering
+        coefficient.
+        """
         channels, voxels = self.channels, dr.opaque(mi.UInt32, self.tracks.active_count)
-        place = dr.arange(mi.UInt32, dr.width(values) // channels)
+        place = dr.arange(mi.UInt32, self._measured * self.tracks.active_count)
         voxel = place % voxels
         weight, sums = dr.gather(mi.Float, self.sigma_t, voxel), []
         for c in range(channels):
-            value = dr.gather(mi.Float, values, place * channels + c)
+            value = integrand(*(dr.gather(mi.Float, x, place * channels + c) for x in fields))
             albedo = dr.gather(mi.Float, self.albedo, voxel * channels + c)
             sums.append(dr.sum(value * albedo * weight))
         dr.eval(sums)
@@ -299,7 +310,7 @@ class MultigridLevel:
 
     def cycle(self, phi: mi.Float, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
         """A multigrid cycle: a step of source iteration, and the coarse correction of its error."""
-        return self.coarse_corrected(phi, self.sweep(phi, tables[0])[1] + b, tables[1:])
+        return self.coarse_corrected(phi, self.collisions(phi, tables[0]) + b, tables[1:])
 
     def coarse_corrected(
         self, phi: mi.Float, swept: mi.Float, coarse: list[TrackTable]
@@ -310,7 +321,7 @@ class MultigridLevel:
         # docs/primer, eq. (4.10)
         if self.coarsest:
             return swept
-        _, residual = self.coarser.sweep(self.restrict(swept - phi), coarse[0])
+        residual = self.coarser.collisions(self.restrict(swept - phi), coarse[0])
         result = swept + self.prolong(self.coarser._approximate_solution(residual, coarse))
         dr.eval(result)
         return result
@@ -333,7 +344,7 @@ class MultigridLevel:
         scale = np.abs(first).mean(axis=1)
         for _ in range(MAX_ITERATIONS):
             # As lists: NumPy's memory would be borrowed, and kernels differ with its alignment.
-            scattered = np.array(self.sweep(mi.Float(phi.T.ravel().tolist()), table)[1])
+            scattered = np.array(self.collisions(mi.Float(phi.T.ravel().tolist()), table))
             image = scattered.reshape(-1, self.channels).T + first
             history.append((phi, image))
             history = history[-HISTORY:]

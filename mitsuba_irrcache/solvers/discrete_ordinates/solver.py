@@ -63,18 +63,19 @@ BATCH, LARGEST_BATCH = 32, 256
 #: Ordinates of a pass in multiple scattering, where a batch consists of several: the orders before
 #: the last are solved for with one such set.
 DIRECTIONS = 16
-#: Voxels of a cache beyond which channels are swept one by one: together they take several times
-#: the memory.
-MOST_VOXELS_SWEPT_TOGETHER = 1 << 24
+#: Unknowns of a channel (voxels, times moments) beyond which channels are swept one by one:
+#: together they take several times the memory.
+MOST_SWEPT_TOGETHER = 1 << 24
 #: Relative change of the irradiance below which further orders of scattering are omitted, as single
 #: precision has it; tested every so many orders.
 NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
 
 
-def swept_together(medium: MediumGrid, voxels: int) -> bool:
-    """Whether all channels of a cache of so many ``voxels`` are swept at once."""
-    isotropic = medium.phase.is_isotropic
-    return isotropic and medium.sigma_t.channels == 1 and voxels <= MOST_VOXELS_SWEPT_TOGETHER
+def swept_together(medium: MediumGrid, unknowns: int) -> bool:
+    """Whether all channels are swept at once, of a cache of so many ``unknowns``: voxels times
+    moments.
+    """
+    return medium.sigma_t.channels == 1 and unknowns <= MOST_SWEPT_TOGETHER
 
 
 def batch_of(samples: int, multiple: int) -> int:
@@ -283,7 +284,7 @@ class Sweep:
     def _channel_groups(self, grey: bool) -> list[tuple[int, ...]]:
         """The channels that are swept together, of all or of the first one."""
         channels = range(1 if grey else self.cache.channels)
-        if swept_together(self._medium, self.cache.grid.voxel_count):
+        if swept_together(self._medium, self.cache.grid.voxel_count * max(1, self.cache.moments)):
             return [tuple(channels)]
         return [(c,) for c in channels]
 

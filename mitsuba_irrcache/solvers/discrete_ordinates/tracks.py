@@ -251,29 +251,40 @@ class Tracks:
             self._sweep_axis(volume, True, table, axis, pairs)
 
     def sweep_separately(
-        self, table: TrackTable, source: Callable[[PairGroup], mi.Float] | None = None
+        self,
+        table: TrackTable,
+        source: Callable[[PairGroup], mi.Float] | None = None,
+        channels: int = 1,
+        collisions: bool = False,
     ) -> Iterator[tuple[int, PairGroup, mi.Float]]:
         """Sweep groups of pairs, and yield for each its dominant axis and what its ordinates leave
         in the voxels: volumes one after the other, two for each pair, along the axis and against
         it.
 
         With ``source``, which makes such volumes of what voxels emit, these have the four values of
-        `sweep` for each voxel; else one, irradiance, laid out by slices.
+        `sweep` for each voxel and channel, or the two of ``collisions`` (see `SweptVolume`), which
+        are undefined where no track is; else one, irradiance, laid out by slices. Channels of a
+        voxel are next to each other.
         """
-        voxels = self.grid.voxel_count
-        most = max(1, MAX_COPIED_VOXELS // (2 * voxels))
+        values, width = self.grid.voxel_count * channels, (2 if collisions else 4) if source else 1
+        most = max(1, MAX_COPIED_VOXELS * 4 // (2 * values * width))
         for axis, pairs in table.by_axis:
             medium = self._medium(axis, source is not None)
             for start in range(0, len(pairs), most):
                 group = PairGroup(table, pairs[start : start + most])
                 number, track = layer_and_index(self._count, len(group))
-                copies = dr.opaque(mi.Float, 0, 2 * len(group) * voxels * (4 if source else 1))
-                begin = number * dr.opaque(mi.UInt32, 2 * voxels)
+                size = 2 * len(group) * values * width
+                # Zeros where empty slices are skipped.
+                defined = collisions and medium.empty is None
+                copies = dr.empty(mi.Float, size) if defined else dr.opaque(mi.Float, 0, size)
+                begin = number * dr.opaque(mi.UInt32, 2 * values)
                 volume = SweptVolume(
                     copies,
                     source(group) if source else None,
                     begin,
-                    begin_backward=begin + dr.opaque(mi.UInt32, voxels),
+                    channels,
+                    begin + dr.opaque(mi.UInt32, values),
+                    collisions,
                 )
                 sweep_tracks(medium, volume, table, group.pair(number), track)
                 dr.eval(copies)

@@ -134,7 +134,9 @@ def test_anderson_acceleration():
     rng = np.random.default_rng(8)
     matrix, b, weight = 0.15 * rng.uniform(0, 1, (6, 6)), rng.uniform(0, 1, 6), rng.uniform(0, 1, 6)
     factors = mi.Float(weight)
-    steps = anderson.AndersonAcceleration(lambda v: np.array([float(dr.sum(v * factors)[0])]))
+    steps = anderson.AndersonAcceleration(
+        lambda integrand, *fields: np.array([float(dr.sum(integrand(*fields) * factors)[0])])
+    )
     before, phi = None, np.zeros(6)
     for _ in range(4):
         image = matrix @ phi + b

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import mul
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -39,8 +41,8 @@ def test_a_sweep_is_its_own_transpose():
     pair = (1 + np.sin(3 * x + y), 1 + np.cos(2 * z - 4 * y))
     fields = [mi.Float(np.repeat(f.ravel(), len(own)).tolist()) for f in pair]
     swept = [level.sweep(field, table)[1] for field in fields]
-    first = level._scattered_sums(fields[0] * swept[1])
-    second = level._scattered_sums(fields[1] * swept[0])
+    first = level._scattered_sums(mul, fields[0], swept[1])
+    second = level._scattered_sums(mul, fields[1], swept[0])
     np.testing.assert_allclose(first, second, rtol=2e-3)
 
 

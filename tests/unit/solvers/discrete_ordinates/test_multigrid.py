@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -175,5 +177,5 @@ def test_anderson_acceleration_removes_a_slow_error():
     np.testing.assert_allclose(phi, solution, rtol=1e-5)
 
 
-def by_channel(values: mi.Float) -> np.ndarray:
-    return np.array(values).reshape(-1, 2).sum(axis=0)
+def by_channel(integrand: Callable, *fields: mi.Float) -> np.ndarray:
+    return np.array(integrand(*fields)).reshape(-1, 2).sum(axis=0)
