@@ -24,6 +24,8 @@ from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
 from mitsuba_irrcache.machine.versions import require_versions
+from mitsuba_irrcache.out_of_core.rendering import MappedMedium
+from mitsuba_irrcache.out_of_core.volume_settings import VolumeSettings
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.defaults import choose_stock
@@ -158,6 +160,35 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
          A file of another scene is rejected. With several media, each has a file with its id in
          the name. (Default: none)
 
+     * - sigma_t_file
+       - |string|
+       - File with the extinction of the medium, for volumes larger than memory, of which a part at
+         a time is read: ``.npy``, the folder of a Zarr array, or a raw file with a name like
+         ``head_256x256x113_uint16.raw``, of shape (z, y, x). Its values replace those of a
+         ``gridvolume`` in the scene, or are multiples of a constant extinction, and fill the box of
+         the medium; the medium's ``scale`` multiplies them. For ``max_depth`` 2 and -1 in one
+         medium with isotropic scattering under environments and suns, without surfaces.
+         (Default: none)
+
+     * - albedo_file
+       - |string|
+       - The same for the albedo, with the same voxels. (Default: none, the medium's)
+
+     * - max_memory
+       - |string|
+       - Memory that a volume in ``sigma_t_file`` may take, such as ``8GB``. (Default: half of what
+         is free)
+
+     * - work_folder
+       - |string|
+       - Folder for working files, on a disk with 10 bytes of free space for each voxel of
+         ``sigma_t_file`` and channel, 22 for all orders. (Default: that of ``sigma_t_file``)
+
+     * - irradiance_file
+       - |string|
+       - File ``.npy`` to which the irradiance in the voxels of ``sigma_t_file`` is written: float32
+         (z, y, x, channel). (Default: none)
+
      * - timeout
        - |float|
        - Seconds after which no further batch of the cache and no further pass of camera samples is
@@ -260,6 +291,12 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
         )
         self._search = self._tolerance_search(props)
+        files = VolumeSettings.of(props)
+        #: the medium of a scene whose extinction stays in a file
+        self._mapped: MappedMedium | None = None
+        if files is not None:
+            whole = not (self._search or self._layered or self._emission is not None)
+            self._mapped = MappedMedium(self._settings, files, whole)
         #: estimated error of the last image rendered with a ``tolerance``; None without
         self.certificate: Certificate | None = None
         properties.refuse_misspelt(props.wrapped, props.values)
@@ -388,6 +425,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def cached_media(self, scene: mi.Scene) -> list[CachedMedium]:
         """Return the visible media of ``scene``, each with its cache as far as it is filled."""
         self._refuse_tolerance("it chooses the cache for one view, and here there is none")
+        self._refuse_mapped("a cache in memory")
         with self._builder.lock, dr.suspend_grad():
             self._builder.fit(scene)
             return list(self._builder.parts)
@@ -397,6 +435,17 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         require_same_variant(self._variant, mi.variant())
         with self._builder.lock:
             self._stopping.begin(self._timeout)
+            if self._mapped is not None:
+                options = self._hide_emitters, self._quadrature, self._step
+                progress = self._stopping.raising(self.progress)
+                try:
+                    with dr.suspend_grad():
+                        return self._mapped.camera_rays(scene, *options, progress)
+                except Stopped:
+                    raise IrrcacheError(
+                        "irrcache: stopped before the irradiance of the medium in sigma_t_file was "
+                        "complete, so there is no image; raise timeout, or lower cache_spp."
+                    ) from None
             try:
                 with dr.suspend_grad():
                     self._builder.update(scene, self._stopping.raising(self.progress))
@@ -438,6 +487,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             raise IrrcacheError(
                 f"irrcache: tolerance cannot be used here, since {reason}; set resolution, "
                 "cache_spp and step instead."
+            )
+
+    def _refuse_mapped(self, what: str) -> None:
+        if self._mapped is not None:
+            raise IrrcacheError(
+                f"irrcache: {what} is not supported for a medium in sigma_t_file; remove "
+                "sigma_t_file, and reduce the volume to one that fits into memory."
             )
 
     def cancel(self) -> None:
@@ -489,6 +545,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         The mask is a random rounding of alpha.
         """
         self._refuse_tolerance("another integrator calls this one, without the sensor")
+        self._refuse_mapped("an integrator that calls this one")
         camera_rays = self._prepared(scene)
         if camera_rays is None:
             radiance, valid, _ = self._fallback().sample(scene, sampler, ray, medium, active)
@@ -544,6 +601,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         See `mitsuba_irrcache.pipeline.progressive.Targets`.
         """
         self._refuse_tolerance("a progressive run has targets of its own")
+        self._refuse_mapped("a progressive run (--budget, --error)")
 
         def image() -> tuple[mi.TensorXf, float]:
             tensor = self.render(scene, sensor, seed, spp)
@@ -629,6 +687,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check
 
         self._refuse_tolerance("an objective would jump with the resolution")
+        self._refuse_mapped("a gradient")
         camera_rays = self._prepared(scene)
         check(self._builder.parts, keys, self._layered)
         (part,) = self._builder.parts

@@ -36,11 +36,21 @@ class Packets:
     """Packed copy of several `GridField` on one ``grid``, at most `MAX_VALUES` per voxel.
 
     ``planes`` maps flat voxel indices to their non-negative values, one array for each value, and
-    ``largest`` holds the maximum representable value of each.
+    ``largest`` holds the maximum representable value of each. Of a grid that does not fit into
+    memory, some ``slices`` (first, end) along z are packed, whose voxels ``planes`` counts.
     """
 
-    def __init__(self, grid: Grid, planes: Callable, largest: Sequence[float]) -> None:
+    def __init__(
+        self,
+        grid: Grid,
+        planes: Callable,
+        largest: Sequence[float],
+        slices: tuple[int, int] | None = None,
+    ) -> None:
         self.grid, self.count = grid, len(largest)
+        first, end = slices or (0, grid.shape[0])
+        voxels = (end - first) * grid.shape[1] * grid.shape[2]
+        self._first = None if slices is None else dr.opaque(mi.Int32, first)
         #: whether a word holds a value and that of the neighbour along x
         self.paired = self.count in PAIRED_COUNTS
         sides = [int(n) for n in grid.resolution]
@@ -51,8 +61,9 @@ class Packets:
         largest = [max(value, MIN_SCALE) for value in largest]
         self._scales = [dr.opaque(mi.Float, value) for value in largest]
         scales = [dr.opaque(mi.Float, 1 / value) for value in largest]
-        index = dr.arange(mi.UInt32, grid.voxel_count)
+        index = dr.arange(mi.UInt32, voxels)
         x, y, z = grid.voxel_indices(index)
+        z = z if slices is None else z + mi.UInt32(self._first)
         noise = x * DITHER_STEPS[0] + y * DITHER_STEPS[1] + z * DITHER_STEPS[2]
 
         def numbers(index: mi.UInt32, noise: mi.UInt32) -> list[mi.UInt32]:
@@ -69,7 +80,7 @@ class Packets:
         self.words = 1 << (len(words) - 1).bit_length()
         words += [mi.UInt32(0)] * (self.words - len(words))
         # Allocated by Dr.Jit, because wide loads need an aligned array.
-        self.data = dr.empty(mi.UInt32, grid.voxel_count * self.words)
+        self.data = dr.empty(mi.UInt32, voxels * self.words)
         dr.scatter(self.data, _load(self.words)(*words), index)
         dr.eval(self.data)
 
@@ -83,6 +94,8 @@ class Packets:
             weights.append(s - mi.Float(corners[-1]))
         wx, wy, wz = weights
         nx, ny, _ = self.grid.sides
+        if self._first is not None:
+            corners[2] -= self._first
         base = (corners[2] * ny + corners[1]) * nx + corners[0]
         dx, dy, dz = self._steps
 

@@ -14,7 +14,7 @@ Rays read packed 16-bit copies of the fields (`packed_fields`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +31,7 @@ from mitsuba_irrcache.grids.packed_fields import AlongRay, Lookups
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.render.aovs import Layers
-from mitsuba_irrcache.render.empty_space import Clearance
+from mitsuba_irrcache.render.empty_space import Clearance, ClearanceAlongRay
 from mitsuba_irrcache.render.quadrature import curved, emission_weights, segment
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.transport.tracking import optical_depth
@@ -45,6 +45,21 @@ COARSER, COARSEST = 0.2, 0.03
 #: Maximum optical depth per step of the packed extinction: the 16-bit format has a limited range,
 #: which larger values would waste.
 OPAQUE = 4096.0
+
+
+class MarchedPart:
+    """A part of a medium through which rays are marched on from where the part before left them.
+
+    ``state`` is what a ray carries, None in the first part. It is replaced by that at the end.
+    Without further components of `Layers`, emission, and lights that are evaluated along rays.
+    """
+
+    def __init__(self, state: tuple | None) -> None:
+        self.state = state
+
+    def holds(self, fields: AlongRay, t: mi.Float) -> mi.Bool:
+        """Whether the fields are known at a distance along rays."""
+        raise NotImplementedError
 
 
 class Projection:
@@ -66,7 +81,9 @@ class Projection:
         edges: CutCells | None = None,
         falloff: InverseSquareFactor | None = None,
         direct_lights: Sequence[DirectLightAlongRays] = (),
+        lookups: Callable = Lookups,
     ) -> None:
+        """``lookups`` is called with the fields that rays read, and their limits."""
         self.medium, self._exponent = medium, None
         if medium.unscattered_exponent is not None:
             opaque = [dr.opaque(mi.Float, float(e)) for e in medium.unscattered_exponent]
@@ -104,7 +121,7 @@ class Projection:
         needed += [irradiance] if irradiance else []
         needed += [albedo] if irradiance or layered else []
         opaque = OPAQUE / length if length < dr.inf else dr.inf
-        self.lookups = Lookups(needed, [opaque, *[dr.inf] * (len(needed) - 1)])
+        self.lookups = lookups(needed, [opaque, *[dr.inf] * (len(needed) - 1)])
 
     def fetch(self, fields: AlongRay, t: mi.Float, view: tuple = ()) -> tuple:
         """Evaluate the fields at the distance ``t``.
@@ -191,8 +208,9 @@ class Projection:
         background: mi.Spectrum,
         offset: mi.Float,
         active: mi.Bool,
+        part: MarchedPart | None = None,
     ):
-        """March from ``near`` to ``far``.
+        """March from ``near`` to ``far``, or through a ``part`` of the medium.
 
         Returns the scattered radiance, the transmittance, the sums for `Layers`, and the emitted
         radiance. ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is
@@ -222,21 +240,21 @@ class Projection:
         max_radiance = dr.select(dark, 1, max_radiance)
         # Floats represent step numbers exactly up to 2^24; longer lattices have coarser steps.
         limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
-        while dr.hint(active, label="ray march"):
+        lattice = near, far, offset, step, per_step, limit
+        if dr.hint(part is not None, mode="scalar"):
+            if dr.hint(part.state is not None, mode="scalar"):
+                (k, stride, t, extinction, source, previous, previous_source, previous_length,
+                 transmittance, radiance, active) = part.state  # fmt: skip
+        going = mi.Bool(active)
+        if dr.hint(part is not None, mode="scalar"):
+            going &= part.holds(fields, _next_point(clearance, lattice, t, k, stride, active)[-1])
+        while dr.hint(going, label="ray march"):
             # Skip empty space: continue from the last lattice point inside it.
-            empty, wall = clearance.exit(t, active)
-            last = dr.floor(dr.fma(minimum(wall, far) - near, per_step, -offset)) + 1
-            skip = empty & (last >= k) & (last >= 1)
-            last = minimum(last, limit)
-            k = dr.select(skip, last + 1, k + stride - 1)
-            t = dr.select(skip, minimum(dr.fma(last - 1 + offset, step, near), far), t)
+            empty, wall, skip, k, t, end = _next_point(clearance, lattice, t, k, stride, active)
             extinction = dr.select(skip, 0, extinction)
             previous = dr.select(skip, 0, previous)
             previous_length = dr.select(skip, step, previous_length)
             emission_at_start = dr.select(skip, 0, emission_at_start)
-            end = minimum(dr.fma(k - 1 + offset, step, near), far)
-            end = dr.select(k == 0, near, end)
-            end = dr.select(k >= limit, far, end)
             next_extinction, next_source, next_extras = self.fetch(fields, end, view)
             # Where a segment enters or leaves matter, use the source of the end inside: the cache
             # may have no value at the other end.
@@ -301,6 +319,13 @@ class Projection:
             t = end
             k += 1
             active &= (t < far) & (~empty | (wall < far))
+            going = mi.Bool(active)
+            if dr.hint(part is not None, mode="scalar"):
+                following = _next_point(clearance, lattice, t, k, stride, active)[-1]
+                going &= part.holds(fields, following)
+        if dr.hint(part is not None, mode="scalar"):
+            part.state = (k, stride, t, extinction, source, previous, previous_source,
+                          previous_length, transmittance, radiance, active)  # fmt: skip
         return radiance, mi.Spectrum(transmittance), gathered, emitted
 
     def _albedo_at(self, p: mi.Point3f) -> mi.Spectrum:
@@ -354,6 +379,32 @@ class Projection:
             probes=[scale * e for e in errors[:-1]],
             bias=scale * errors[-1] if errors else mi.Float(0),
         )
+
+
+def _next_point(
+    clearance: ClearanceAlongRay,
+    lattice: tuple,
+    t: mi.Float,
+    k: mi.Float,
+    stride: mi.Float,
+    active: mi.Bool,
+) -> tuple:
+    """Find the next point of the lattice of steps at which to evaluate the fields, behind ``t``.
+
+    Returns whether space is empty at ``t`` and up to where, whether it is skipped, the number of
+    the point, the distance from which the segment to it begins, and that of the point.
+    """
+    near, far, offset, step, per_step, limit = lattice
+    empty, wall = clearance.exit(t, active)
+    last = dr.floor(dr.fma(minimum(wall, far) - near, per_step, -offset)) + 1
+    skip = empty & (last >= k) & (last >= 1)
+    last = minimum(last, limit)
+    k = dr.select(skip, last + 1, k + stride - 1)
+    t = dr.select(skip, minimum(dr.fma(last - 1 + offset, step, near), far), t)
+    end = minimum(dr.fma(k - 1 + offset, step, near), far)
+    end = dr.select(k == 0, near, end)
+    end = dr.select(k >= limit, far, end)
+    return empty, wall, skip, k, t, end
 
 
 def _simplified(field: Field) -> Field:

@@ -22,7 +22,7 @@ LEVELS = (
     {"solvers"},
     {"pipeline"},
     {"render"},
-    {"gradients"},
+    {"gradients", "out_of_core"},
     {"integrators", "cli", "compare"},
     {"farm", "view"},
 )

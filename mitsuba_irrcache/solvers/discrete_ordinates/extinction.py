@@ -40,13 +40,10 @@ class Extinction:
         self.grid, self.values_grid = grid, values_grid
         #: whether each voxel of ``grid`` has exactly one value
         self.per_voxel = values_grid.shape == grid.shape
-        slices = np.linalg.norm(grid.coordinates.matrix[:3, :3], axis=1).max()
-        top = float(min(dr.max(sigma_t)[0], MAX_OPTICAL_DEPTH * slices))
         #: whether collisions depend on how the extinction changes within a voxel
-        self.dense = top > DENSE * slices
+        top, self.dense = largest_extinction(grid, float(dr.max(sigma_t)[0]))
         self.quantum = top / LEVELS
-        levels = sigma_t * dr.opaque(mi.Float, LEVELS / top if top else 0)
-        self._levels = _packed(_dithered(dr.minimum(levels, LEVELS)))
+        self._levels = _packed(quantised(sigma_t, top))
         self._halves: dict[int, mi.UInt32] = {}  # of slices, by axis
 
     def sides(self, axis: int) -> np.ndarray:
@@ -92,6 +89,23 @@ class Extinction:
         return rows[0] if words == 1 else dr.ravel(mi.Vector2u(rows))
 
 
+def largest_extinction(grid: Grid, largest: float) -> tuple[float, bool]:
+    """The largest extinction that is distinguished where the ``largest`` one is this, and whether
+    voxels are so dense that their halves differ.
+    """
+    slices = np.linalg.norm(grid.coordinates.matrix[:3, :3], axis=1).max()
+    top = float(min(largest, MAX_OPTICAL_DEPTH * slices))
+    return top, top > DENSE * slices
+
+
+def quantised(sigma_t: mi.Float, top: float, first: int = 0) -> mi.UInt32:
+    """The extinction of the voxels from number ``first`` on, in units of the quantum, of which
+    ``top`` are `LEVELS`.
+    """
+    levels = sigma_t * dr.opaque(mi.Float, LEVELS / top if top else 0)
+    return _dithered(dr.minimum(levels, LEVELS), first=first)
+
+
 def _packed(values: mi.UInt32) -> mi.UInt32:
     """Two integers below 2^16 in each word: the first half of ``values``, and the second one."""
     dr.eval(values)
@@ -112,11 +126,14 @@ def _level(words: mi.UInt32, index: mi.UInt32) -> mi.UInt32:
     return dr.select(later, word >> 16, word & 0xFFFF)
 
 
-def _dithered(values: mi.Float, shift: float = 0.0) -> mi.UInt32:
+def _dithered(values: mi.Float, shift: float = 0.0, first: int = 0) -> mi.UInt32:
     """Integers, rounded up or down by a golden-ratio sequence (not at random): correct on average
     over any few neighbours, where rounding to the nearest would lose thin matter beside dense.
+
+    ``first`` is the number of the first value in the sequence.
     """
     index = dr.arange(mi.UInt32, dr.width(values))
+    index = index + dr.opaque(mi.UInt32, first & 0xFFFFFFFF) if first else index
     (dither,) = unit_floats([golden_words(index, int(shift * 2**32))])
     return mi.UInt32(dr.minimum(values + dither, LEVELS))
 

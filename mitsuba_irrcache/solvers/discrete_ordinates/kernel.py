@@ -66,18 +66,39 @@ class SweptVolume:
     collisions: bool = False
 
 
+class CarriedRadiance:
+    """What the tracks of one pair carry from one part of a volume to the next: for either way, the
+    radiance in each channel and the extinction passed last, one array for each.
+
+    ``before`` is the ``after`` of the part before, None in the first part. Where tracks are follows
+    from the table, the fields of which are those of the part.
+    """
+
+    def __init__(self, before: tuple[list[mi.Float], list[mi.Float]] | None) -> None:
+        self.before, self.after = before, None
+
+
 @symbolic
 def sweep_tracks(
-    medium: SweptMedium, volume: SweptVolume, table: TrackTable, pair: mi.UInt32, track: mi.UInt32
+    medium: SweptMedium,
+    volume: SweptVolume,
+    table: TrackTable,
+    pair: mi.UInt32,
+    track: mi.UInt32,
+    carried: CarriedRadiance | None = None,
 ):
     """Sweep pairs of opposite ordinates: lane by lane the ``track`` of a ``pair`` of the table,
     both ways at once. Two independent chains of arithmetic hide each other's latency.
+
+    With ``carried``, the volume is a part of a larger one, whose tracks go on.
     """
     sweep = _PairSweep(medium, volume, table, pair)
     # An array that the loop reads and writes has to be one of its variables.
-    values, (forward, backward) = volume.values, sweep.begin(mi.Int32(track))
+    values, (forward, backward) = volume.values, sweep.begin(mi.Int32(track), carried)
     while dr.hint(forward.active | backward.active, label="slices"):
         forward, backward = sweep.cross_slice(values, forward, backward)
+    if dr.hint(carried is not None, mode="scalar"):
+        carried.after = tuple([*way.radiance, way.previous] for way in (forward, backward))
 
 
 @symbolic
@@ -162,6 +183,16 @@ class _TransverseMotion:
         voxel = dr.select(outside, self.entry, voxel)
         return voxel, position, dr.select(outside, self.since_entry(position), 1.0)
 
+    def since_last_slice(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
+        """What `advance` returned last for tracks that are here: slices since entry, 1 unless new.
+
+        As new tracks are those that have moved less far from the side than tracks do in a slice.
+        """
+        new = dr.select(
+            self.slope > 0, position < self.slope, position >= self.slope + FIXED_POINT_ONE
+        )
+        return dr.select((voxel == self.entry) & new, self.since_entry(position), 1.0)
+
     def lower(self, voxel: mi.Int32, position: mi.Int32, per_voxel: bool) -> tuple:
         """Index of the lower of the two extinction values around the track, and the weight of the
         upper one. ``per_voxel``: each voxel has exactly one value.
@@ -191,9 +222,11 @@ class _Way:
         self.b = _TransverseMotion(b, -b.slope if number else b.slope)
         self.c = _TransverseMotion(c, -c.slope if number else c.slope)
 
-    def begin(self, track: mi.Int32, channels: int, restarts: bool) -> _TrackState:
+    def begin(
+        self, track: mi.Int32, channels: int, restarts: bool, carried: CarriedRadiance | None
+    ) -> _TrackState:
         """The state before the first slice that this way crosses; ``restarts``: with
-        ``since_surface``.
+        ``since_surface``; ``carried`` is as in `sweep_tracks`.
         """
         record, (fields_b, fields_c) = self.record, self.record.transverse
         # The divisor is 0 where a vector of lanes is not filled.
@@ -203,14 +236,24 @@ class _Way:
         zero = 0 * track  # makes uniform values as wide as the lanes
         position_b, position_c = fields_b.start + zero, fields_c.start + zero
         offset, extinction_offset = record.first_value + zero, record.first_extinction + zero
+        shift_b, shift_c = fields_b.first_shift, fields_c.first_shift
         if self.number:
-            last = record.slices - 1
-            b, c = b + fields_b.last_shift, c + fields_c.last_shift
-            b = dr.select(b >= fields_b.size, b - fields_b.size, b)
-            c = dr.select(c >= fields_c.size, c - fields_c.size, c)
+            last = record.last_slice
+            shift_b, shift_c = fields_b.last_shift, fields_c.last_shift
             position_b, position_c = fields_b.last_position + zero, fields_c.last_position + zero
             offset = record.first_value + record.stride * last + zero
             extinction_offset = record.first_extinction + record.extinction_stride * last + zero
+        b, c = b + shift_b, c + shift_c
+        b = dr.select(b >= fields_b.size, b - fields_b.size, b)
+        c = dr.select(c >= fields_c.size, c - fields_c.size, c)
+        if carried is None or carried.before is None:
+            since = minimum(self.b.start(b, position_b), self.c.start(c, position_c))
+            *radiance, previous = [mi.Float(0) for _ in range(channels + 1)]
+        else:
+            since = minimum(
+                self.c.since_last_slice(c, position_c), self.b.since_last_slice(b, position_b)
+            )
+            *radiance, previous = carried.before[self.number]
         return _TrackState(
             b=b,
             c=c,
@@ -218,9 +261,9 @@ class _Way:
             position_c=position_c,
             offset=offset,
             extinction_offset=extinction_offset,
-            since_entry=minimum(self.b.start(b, position_b), self.c.start(c, position_c)),
-            radiance=[mi.Float(0) for _ in range(channels)],
-            previous=mi.Float(0),
+            since_entry=since,
+            radiance=radiance,
+            previous=previous,
             crossed=mi.Int32(0),
             active=active,
             since_surface=mi.Float(1) if restarts else None,
@@ -376,10 +419,12 @@ class _PairSweep:
         #: what optical depths are multiplied by
         self.solid_angle = mi.Float(1) if self.separate else record.weight
 
-    def begin(self, track: mi.Int32) -> tuple[_TrackState, _TrackState]:
+    def begin(
+        self, track: mi.Int32, carried: CarriedRadiance | None
+    ) -> tuple[_TrackState, _TrackState]:
         restarts = self.crossings is not None and self.volume.source is None
         channels = self.volume.channels
-        forward, backward = (way.begin(track, channels, restarts) for way in self.ways)
+        forward, backward = (way.begin(track, channels, restarts, carried) for way in self.ways)
         return forward, backward
 
     def cross_slice(

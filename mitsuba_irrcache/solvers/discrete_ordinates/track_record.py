@@ -36,7 +36,9 @@ class TransverseFields:
     voxel_stride: Integer
     #: what a track moves by from slice to slice [voxels / `FIXED_POINT_ONE`]
     slope: Integer
-    #: position of all tracks within their voxels in the first slice
+    #: voxels by which tracks have moved before the first slice, modulo ``size``, and the position
+    #: of all tracks within their voxels there
+    first_shift: Integer
     start: Integer
     #: voxels by which tracks have moved in the last slice, modulo ``size``, and their position
     #: there
@@ -55,8 +57,10 @@ class TrackRecord:
     """
 
     transverse: tuple[TransverseFields, TransverseFields]
-    #: slices of the box of tracks
+    #: slices that tracks cross, and the one in which those against the axis begin: the last one of
+    #: the box of tracks
     slices: Integer
+    last_slice: Integer
     stride: Integer
     extinction_stride: Integer
     empty_stride: Integer

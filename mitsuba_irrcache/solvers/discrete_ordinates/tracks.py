@@ -149,8 +149,19 @@ class Tracks:
             offsets: (n, 2), in [0, 1), random shifts of the tracks.
             by_slice: whether the swept volume is laid out by the slices of each dominant axis.
         """
-        # docs/primer, eq. (4.3)
         incoming = incoming if incoming.ndim == 3 else incoming[..., None]
+        record, axis, along = self.record(directions, weights, offsets, by_slice)
+        forward = along > 0
+        incoming = np.where(forward[:, None, None], incoming, incoming[:, ::-1])
+        return TrackTable(record, incoming, axis, forward)
+
+    def record(
+        self, directions: np.ndarray, weights: np.ndarray, offsets: np.ndarray, by_slice: bool
+    ) -> tuple[TrackRecord, np.ndarray, np.ndarray]:
+        """The record of these ordinates, their dominant axes (n), and their velocities (n) along
+        these axes [voxels / scene unit].
+        """
+        # docs/primer, eq. (4.3)
         velocities = directions @ self._to_voxels.T
         axis = np.abs(velocities).argmax(axis=1)
         pairs = np.arange(len(directions))
@@ -175,6 +186,7 @@ class Tracks:
         record = TrackRecord(
             transverse=(transverse(0), transverse(1)),
             slices=self.size[axis],
+            last_slice=self.size[axis] - 1,
             stride=strides[pairs, axis],
             extinction_stride=extinction_strides[pairs, axis],
             empty_stride=empty_strides[axis],
@@ -189,9 +201,7 @@ class Tracks:
             direction_y=along_axis[:, 1],
             direction_z=along_axis[:, 2],
         )
-        forward = along > 0
-        incoming = np.where(forward[:, None, None], incoming, incoming[:, ::-1])
-        return TrackTable(record, incoming, axis, forward)
+        return record, axis, along
 
     def uncollided(
         self,
@@ -307,6 +317,7 @@ class Tracks:
             empty_stride=steps[2],
             voxel_stride=steps[3],
             slope=slope,
+            first_shift=0,
             start=start,
             last_shift=(end >> FIXED_POINT_BITS) % size[k],
             last_position=end & (FIXED_POINT_ONE - 1),

@@ -26,6 +26,11 @@ GIVEN = {
     "emission_scale": 2.5,
     "cache_file": "light.npz",
     "timeout": 33.25,
+    "sigma_t_file": "density.npy",
+    "albedo_file": "albedo.npy",
+    "max_memory": "8GB",
+    "work_folder": "scratch",
+    "irradiance_file": "fluence.npy",
 }
 #: The same for those that cannot be combined with others.
 ALONE = {"tolerance": 0.0125, "tolerance_of": "volume"}

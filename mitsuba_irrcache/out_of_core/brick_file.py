@@ -1,0 +1,116 @@
+"""A working file of a volume in bricks, boxes of which are read and written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+
+#: Voxels along an edge of a brick.
+EDGE = 32
+
+
+class BrickFile:
+    """Values (z, y, x, channel) of one type in a file without a name, 0 at first. The file vanishes
+    when it is closed, or with the process.
+
+    Slabs across any axis are read and written in whole bricks, each of which is contiguous; slabs
+    across x of an array with x fastest would touch every page of the file.
+    """
+
+    def __init__(
+        self, path: Path, shape: tuple[int, int, int], dtype: np.dtype, channels: int = 1
+    ) -> None:
+        self.shape, self.channels, self.dtype = shape, channels, np.dtype(dtype)
+        self._counts = [-(-n // EDGE) for n in shape]
+        self._bytes = EDGE**3 * channels * self.dtype.itemsize
+        if not hasattr(os, "pread"):
+            raise IrrcacheError(
+                "irrcache: sigma_t_file needs Linux or macOS: working files of this system cannot "
+                "be read at a position; use a volume that fits into memory."
+            )
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        os.unlink(path)
+        size = int(np.prod(self._counts, dtype=object)) * self._bytes
+        try:
+            os.ftruncate(self._file, size)
+            if hasattr(os, "posix_fallocate"):
+                # Reserved at once, so that a full disk shows now and not after hours.
+                os.posix_fallocate(self._file, 0, size)
+        except OSError as error:
+            self.close()
+            raise IrrcacheError(
+                f'irrcache: a working file of {size / 2**30:.1f} GiB cannot be made at "{path}": '
+                f"{error.strerror}; set work_folder to a folder on another disk."
+            ) from None
+
+    def close(self) -> None:
+        """Closes the file."""
+        os.close(self._file)
+
+    def read(self, lower: Sequence[int], upper: Sequence[int]) -> np.ndarray:
+        """Return the box between these voxels (z, y, x): (z, y, x), with channels if several."""
+        shape = [b - a for a, b in zip(lower, upper, strict=True)]
+        box = np.empty((*shape, self.channels), self.dtype)
+        for number, inside, outside in self._bricks(lower, upper):
+            box[outside] = self._brick(number)[inside]
+        return box[..., 0] if self.channels == 1 else box
+
+    def write(self, lower: Sequence[int], values: np.ndarray) -> None:
+        """Replaces a box from the voxel ``lower`` (z, y, x) on."""
+        values = values.reshape(*values.shape[:3], self.channels)
+        upper = [a + n for a, n in zip(lower, values.shape, strict=False)]
+        for number, inside, outside in self._bricks(lower, upper):
+            if all(part == slice(0, EDGE) for part in inside):
+                brick = np.ascontiguousarray(values[outside], self.dtype)
+            else:
+                brick = self._brick(number).copy()
+                brick[inside] = values[outside]
+            os.pwrite(self._file, brick.data.cast("B"), number * self._bytes)
+
+    def _brick(self, number: int) -> np.ndarray:
+        data = os.pread(self._file, self._bytes, number * self._bytes)
+        return np.frombuffer(data, self.dtype).reshape(EDGE, EDGE, EDGE, self.channels)
+
+    def _bricks(self, lower: Sequence[int], upper: Sequence[int]) -> Iterator[tuple]:
+        """Yield the number of each brick that a box meets, and the slices of their common part in
+        the brick and in the box.
+        """
+        _, ny, nx = self._counts
+        ranges = [range(a // EDGE, -(-b // EDGE)) for a, b in zip(lower, upper, strict=True)]
+        for at in product(*ranges):
+            inside, outside = [], []
+            for i, a, b in zip(at, lower, upper, strict=True):
+                first, last = max(i * EDGE, a), min((i + 1) * EDGE, b)
+                inside.append(slice(first - i * EDGE, last - i * EDGE))
+                outside.append(slice(first - a, last - a))
+            yield (at[0] * ny + at[1]) * nx + at[2], tuple(inside), tuple(outside)
+
+
+class RecordFile:
+    """Arrays of numbers, each of which is stored whole and read whole, by number."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._sizes = path, {}
+
+    def write(self, number: int, values: np.ndarray) -> None:
+        """Stores an array."""
+        self._sizes[number] = values.shape
+        values.tofile(self._name(number))
+
+    def read(self, number: int) -> np.ndarray | None:
+        """Return an array, and delete it from the disk; None where there is none."""
+        if number not in self._sizes:
+            return None
+        name, shape = self._name(number), self._sizes.pop(number)
+        values = np.fromfile(name, np.float32).reshape(shape)
+        name.unlink()
+        return values
+
+    def _name(self, number: int) -> Path:
+        return self._path.with_name(f"{self._path.name}-{number}")

@@ -1,0 +1,254 @@
+"""Media whose extinction stays in a file: which scenes are supported, and their camera rays."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
+from mitsuba_irrcache.grids.fields import ConstantField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.machine.memory import available_memory
+from mitsuba_irrcache.media.medium import MediumGrid, axis_aligned
+from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
+from mitsuba_irrcache.out_of_core.scattering import ScatteredIrradiance, add
+from mitsuba_irrcache.out_of_core.slab_march import MappedIrradiance, SlabProjection
+from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
+from mitsuba_irrcache.out_of_core.slabs import even_slabs
+from mitsuba_irrcache.out_of_core.survey import MappedField
+from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
+from mitsuba_irrcache.out_of_core.volume_settings import VolumeSettings, check_settings, work_folder
+from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
+from mitsuba_irrcache.render.camera import ClosedFormCameraRays
+from mitsuba_irrcache.scene.compile import compile_scene
+from mitsuba_irrcache.scene.description import SceneDescription
+from mitsuba_irrcache.scene.fingerprint import Snapshot
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
+from mitsuba_irrcache.solvers.discrete_ordinates.extinction import DENSE
+from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
+from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
+from mitsuba_irrcache.solvers.sweep import DIRECTIONS
+
+#: Emitters whose radiance enters along tracks.
+EMITTERS = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP, EmitterKind.SUN)
+#: Share of the free memory that is used if nothing else is said, and what Python, Mitsuba and its
+#: kernels take of it [bytes].
+SHARE, BASE = 0.5, 700 << 20
+#: Ordinates come in pairs, and batches in memory are multiples of this number.
+MULTIPLE = 32
+
+Progress = Callable[[str, int, int], None]
+
+
+class MappedMedium:
+    """The medium of a scene, its extinction in a file, and the irradiance in it."""
+
+    def __init__(self, settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
+        """``whole``: nothing but the radiance is wanted, of a medium that emits nothing."""
+        self._settings, self._files, self._whole = settings, files, whole
+        self._snapshot: Snapshot | None = None
+        self._folder: tempfile.TemporaryDirectory | None = None
+        self._medium: MediumGrid | None = None
+        self._irradiance: tuple[BrickFile, np.ndarray] | None = None
+        self._rays: ClosedFormCameraRays | None = None
+
+    def camera_rays(
+        self,
+        scene: mi.Scene,
+        hide_emitters: bool,
+        quadrature: str,
+        step: float,
+        progress: Progress | None = None,
+    ) -> ClosedFormCameraRays:
+        """Create the camera rays for ``scene``; the irradiance is computed if it is not known yet,
+        or if the scene has changed.
+        """
+        check_settings(self._settings, self._files, self._whole)
+        snapshot = Snapshot(scene, None, self._snapshot)
+        if self._rays is None or snapshot.changes(self._snapshot):
+            self._rays = None
+            self._compute(scene, progress)
+            field = MappedIrradiance(*self._irradiance, self._medium.sigma_t.grid)
+            arguments = self._medium, field, quadrature, step, self._memory
+            projection = SlabProjection(*arguments)
+            self._rays = ClosedFormCameraRays(projection, self._settings.max_depth, hide_emitters)
+            self._snapshot = snapshot
+        return self._rays
+
+    @property
+    def _memory(self) -> int:
+        wanted = self._files.max_memory or int(SHARE * available_memory())
+        return max(wanted - BASE, 64 << 20)
+
+    def _compute(self, scene: mi.Scene, progress: Progress | None) -> None:
+        """Find the irradiance of a scene."""
+        description = compile_scene(scene, max_depth=self._settings.max_depth)
+        medium, files = _only_medium(scene, description), self._files
+        sigma_t_file = VolumeFile(files.sigma_t)
+        grid = Grid(sigma_t_file.shape, _placement(medium))
+        sigma_t = MappedField(
+            sigma_t_file, grid, _scale(medium), f'sigma_t of medium "{medium.name}"'
+        )
+        changes = {"sigma_t": sigma_t, "macrocells": sigma_t.macrocells()}
+        if files.albedo:
+            changes["albedo"] = _albedo(VolumeFile(files.albedo), grid, medium.name)
+        self._medium = medium.replaced(**changes)
+        _log_start(grid, sigma_t)
+        self._folder = work_folder(files)
+        sweep = SlabSweep(sigma_t, Path(self._folder.name), self._memory)
+        if sweep.is_dense:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'irrcache: voxels of medium "{medium.name}" have optical depths of more than '
+                f"{DENSE:g}: their irradiance is less accurate than that of a volume in memory.",
+            )
+        ordinates, colour = self._ordinates(scene)
+
+        def report(done: int, total: int) -> None:
+            if progress is not None:
+                progress("cache", done, total)
+
+        if self._irradiance is not None:
+            self._irradiance[0].close()
+        shown = range(ordinates.incoming.shape[-1])
+        (arguments,) = OrdinateSet.uncollided([OrdinateSet(ordinates, shown)])
+        found = sweep.uncollided(*arguments, report)
+        if self._settings.max_depth < 0:
+            directions, _, weights, offsets = ordinates.scattering()
+            known = self._medium, found, colour, (directions, weights, offsets)
+            scattering = ScatteredIrradiance(sweep, *known)
+            scattering.solve(scene, description, replace(self._settings, samples=0))
+            scattered = scattering.find(report)
+            add(found, scattered)
+            scattered.close()
+        sweep.close()
+        self._irradiance = found, colour
+        if files.irradiance:
+            _write_irradiance(files.irradiance, found, colour)
+
+    def _ordinates(self, scene: mi.Scene) -> tuple[Ordinates, np.ndarray]:
+        """The ordinates, for single scattering those of the first batch of a cache in memory, and
+        the factors of channels.
+        """
+        all_orders = self._settings.max_depth < 0
+        samples = self._settings.samples or (1 if all_orders else 2) * DIRECTIONS
+        pairs = -(-samples // MULTIPLE) * MULTIPLE // 2
+        rng = np.random.default_rng((self._settings.seed, 0))
+        channels = 1 if mi.is_monochromatic else 3
+        illumination = DistantIllumination(scene)
+        if all_orders and self._medium.albedo.channels > 1:
+            return illumination.ordinates(1, pairs, rng)[0], np.ones(channels)
+        sets, colour = illumination.factored_ordinates(1, pairs, channels, rng)
+        return sets[0], colour
+
+
+def _only_medium(scene: mi.Scene, description: SceneDescription) -> MediumGrid:
+    """Return the medium of a scene whose extinction can stay in a file.
+
+    Raises UnsupportedSceneError, naming the object, for all other scenes.
+    """
+    if len(description.media.grids) != 1 or not description.visible:
+        _refuse(f"the scene has {len(description.media.grids)} media; it must have one")
+    (medium,) = description.visible
+    name = f'medium "{medium.name}"'
+    if not medium.is_isolated:
+        _refuse(f"there are surfaces or area emitters beside {name}, or it fills no box")
+    if not medium.phase.is_isotropic:
+        _refuse(f"{name} does not scatter isotropically")
+    if medium.boundary.kind != "box":
+        _refuse(f"{name} fills a {medium.boundary.kind} and not a box")
+    if medium.sigma_t.channels != 1:
+        _refuse(f"the extinction of {name} is coloured")
+    for emitter in scene.emitters():
+        kind = kind_of(emitter)
+        if kind not in EMITTERS:
+            _refuse(f'emitter "{emitter.id()}" ({emitter.class_name()}) is not far away')
+    return medium
+
+
+def _refuse(reason: str) -> None:
+    raise UnsupportedSceneError(
+        f"irrcache: {reason}, which is not supported for a medium in sigma_t_file. Such scenes "
+        "need one medium with isotropic scattering in a box, without surfaces, under environments "
+        "and suns; reduce the volume to one that fits into memory for all others."
+    )
+
+
+def _placement(medium: MediumGrid) -> np.ndarray:
+    """``to_world`` of the voxels: that of the scene's grid, else along the axes of the world."""
+    linear = medium.boundary.to_world[:3, :3]
+    ends = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
+    corners = medium.boundary.frame[:3, :3] @ ends + medium.boundary.frame[:3, 3:]
+    lower, upper = corners.min(axis=1), corners.max(axis=1)
+    if medium.sigma_t.grid is None:
+        if (np.count_nonzero(np.abs(linear) > 1e-6 * np.abs(linear).max(), axis=0) != 1).any():
+            _refuse(f'the box of medium "{medium.name}" is rotated')
+        return axis_aligned(lower, upper)
+    frame = medium.sigma_t.grid.to_world
+    own = frame[:3, :3] @ ends + frame[:3, 3:]
+    difference = max(np.abs(own.min(axis=1) - lower).max(), np.abs(own.max(axis=1) - upper).max())
+    if difference > 1e-5 * (upper - lower).max():
+        _refuse(f'the grid of medium "{medium.name}" is not its box')
+    return frame
+
+
+def _scale(medium: MediumGrid) -> float:
+    """The factor of the file's values: the scene's ``scale``, or the product of it and a constant
+    extinction.
+    """
+    sigma_t = medium.sigma_t
+    if isinstance(sigma_t, ConstantField):
+        return sigma_t.maximum
+    return float(sigma_t.scale[0])
+
+
+def _albedo(file: VolumeFile, grid: Grid, name: str) -> MappedField:
+    if file.shape != grid.shape:
+        raise IrrcacheError(
+            f'irrcache: albedo_file "{file.path}" has shape {file.shape}, and sigma_t_file '
+            f"{grid.shape} (z, y, x); they must have the same voxels."
+        )
+    field = MappedField(file, grid, 1.0, f'albedo of medium "{name}"')
+    if field.maximum > 1 + 1e-6:
+        raise IrrcacheError(
+            f'irrcache: the albedo in "{file.path}" reaches {field.maximum:g}; above 1 a medium '
+            "creates energy. Clip it to [0, 1]."
+        )
+    return field
+
+
+def _write_irradiance(name: str, irradiance: BrickFile, colour: np.ndarray) -> None:
+    """Write the irradiance, float32 (z, y, x, channel), slab by slab."""
+    path = Path(name)
+    partial = path.with_name(f".{path.name}.tmp")
+    shape, (slices, ny, nx) = (*irradiance.shape, len(colour)), irradiance.shape
+    try:
+        for first, last in even_slabs(slices, EDGE):
+            # Opened anew each time, as pages of a mapped file count as memory of the process.
+            mode = "r+" if first else "w+"
+            mapped = np.lib.format.open_memmap(partial, mode, np.float32, shape)
+            values = irradiance.read((first, 0, 0), (last, ny, nx))
+            values = values.reshape(last - first, ny, nx, -1)
+            mapped[first:last] = values * colour.astype(np.float32)
+            del mapped
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise IrrcacheError(
+            f'irrcache: irradiance_file "{path}" cannot be written: {error.strerror}.'
+        ) from None
+
+
+def _log_start(grid: Grid, sigma_t: MappedField) -> None:
+    depth = sigma_t.maximum * grid.voxel_size.max()
+    mi.Log(
+        mi.LogLevel.Info,
+        f"irrcache: {' x '.join(map(str, grid.shape[::-1]))} voxels, the densest of {depth:.2g} "
+        "optical depths, are read from a file slab by slab",
+    )

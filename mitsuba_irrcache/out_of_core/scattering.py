@@ -1,0 +1,196 @@
+"""All orders of scattering in volumes in files.
+
+A coarse copy of the medium, which fits into memory, is solved for all orders by multigrid. What has
+been scattered there, interpolated, and the uncollided irradiance of the whole volume are the source
+of a sweep of the whole volume, which finds one more order in all its detail: an iteration of
+phi <- A phi + b (docs/primer, eq. 4.9) whose initial error is that of the coarse grid. It is
+repeated while it changes much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grids.fields import ConstantField, GridField
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
+from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
+from mitsuba_irrcache.out_of_core.slabs import even_slabs
+from mitsuba_irrcache.out_of_core.survey import MappedField
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
+from mitsuba_irrcache.pipeline.defaults import choose_solver
+from mitsuba_irrcache.scene.description import SceneDescription
+
+#: Voxels along the longest side of the coarse copy, at most.
+COARSE = 128
+#: Passes over the whole volume, at most, and the relative change of the irradiance of collisions,
+#: in root mean square, up to which no other pass follows.
+MOST_PASSES, NEGLIGIBLE = 3, 0.01
+
+Progress = Callable[[int, int], None]
+
+
+def coarse_medium(medium: MediumGrid) -> MediumGrid:
+    """Make the coarse copy of a medium whose extinction is in a file: means over blocks of voxels,
+    of the albedo by extinction.
+    """
+    sigma_t, albedo = medium.sigma_t, medium.albedo
+    shape = sigma_t.grid.shape
+    factor = -(-max(shape) // COARSE)
+    sides = [-(-n // factor) for n in shape]
+    starts = [np.arange(m) * n // m for n, m in zip(shape, sides, strict=True)]
+    counts = [np.diff([*s, n]) for s, n in zip(starts, shape, strict=True)]
+    size = counts[0][:, None, None] * counts[1][:, None] * counts[2]
+    sums = np.zeros((2, *sides), np.float64)
+    for z, (first, count) in enumerate(zip(starts[0], counts[0], strict=True)):
+        values = sigma_t.file.read(first, first + count)
+        sums[0, z] = _block_sums(values, starts)
+        if isinstance(albedo, MappedField):
+            sums[1, z] = _block_sums(values * albedo.file.read(first, first + count), starts)
+    grid = Grid(tuple(sides), sigma_t.grid.to_world)
+    extinction = mi.Float((sums[0] / size).astype(np.float32).ravel())
+    changes = {"sigma_t": GridField(grid, extinction, 1, sigma_t.factor)}
+    if isinstance(albedo, MappedField):
+        mean = sums[1] / np.where(sums[0] > 0, sums[0], 1)
+        changes["albedo"] = GridField(grid, mi.Float(mean.astype(np.float32).ravel()), 1)
+    return medium.replaced(**changes)
+
+
+def _block_sums(values: np.ndarray, starts: list[np.ndarray]) -> np.ndarray:
+    rows = np.add.reduceat(values.sum(axis=0, dtype=np.float64), starts[1], axis=0)
+    return np.add.reduceat(rows, starts[2], axis=1)
+
+
+class ScatteredIrradiance:
+    """Scattered irradiance in ``medium``, the only one of a scene, given the ``uncollided`` one in
+    a file, both in units of ``colour`` (channels of the image).
+
+    ``ordinates`` are directions, weights and offsets of the passes over the whole volume.
+    """
+
+    def __init__(
+        self,
+        sweep: SlabSweep,
+        medium: MediumGrid,
+        uncollided: BrickFile,
+        colour: np.ndarray,
+        ordinates: tuple[np.ndarray, np.ndarray, np.ndarray],
+    ) -> None:
+        self._sweep, self._medium, self._uncollided = sweep, medium, uncollided
+        self._colour, self._ordinates = colour, ordinates
+        self._channels = uncollided.channels
+        self._grid: Grid = medium.sigma_t.grid
+        self._initial: GridField | None = None
+        self._albedo: BrickFile | None = None
+
+    def solve(
+        self, scene: mi.Scene, description: SceneDescription, settings: CacheSettings
+    ) -> None:
+        """Solve for all orders on a coarse grid, with these settings of a cache."""
+        coarse = coarse_medium(self._medium)
+        settings = replace(settings, resolution=max(coarse.sigma_t.grid.shape))
+        solver = choose_solver(scene, coarse, "sweep", -1, settings.resolution)
+        part = CachedMedium(scene, description, coarse, settings, solver, "", edited=False)
+        part.refine(scene, 0, False, None)
+        found = np.array(part.cache.scattered)
+        if self._channels == 1 and found.shape[3] > 1:
+            brightest = int(np.argmax(self._colour))
+            found = found[..., brightest : brightest + 1] / self._colour[brightest]
+        data = mi.Float(np.ascontiguousarray(found, np.float32).ravel())
+        self._initial = GridField(part.cache.grid, data, self._channels)
+
+    def find(self, progress: Progress) -> BrickFile:
+        """Return the file of the scattered irradiance, after one or more passes."""
+        if isinstance(self._medium.albedo, MappedField):
+            self._albedo = self._sweep.stored("albedo", self._medium.albedo)
+        before: BrickFile | None = None
+        for number in range(MOST_PASSES):
+
+            def source(lower: list[int], upper: list[int], before=before) -> np.ndarray:
+                return self._source(lower, upper, before)
+
+            name = f"scattered-{number}"
+            after = self._sweep.scattered(name, self._ordinates, source, self._channels, progress)
+            change = self._change(before, after)
+            if before is not None:
+                before.close()
+            before = after
+            mi.Log(
+                mi.LogLevel.Info,
+                f"irrcache: pass {number + 1} over the whole volume has changed the irradiance by "
+                f"{change:.2%}",
+            )
+            if change <= NEGLIGIBLE:
+                break
+        else:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"irrcache: the last of {MOST_PASSES} passes over the whole volume still changed "
+                f"the irradiance by {change:.1%}",
+            )
+        if self._albedo is not None:
+            self._albedo.close()
+        return before
+
+    def _source(self, lower: list[int], upper: list[int], before: BrickFile | None) -> np.ndarray:
+        """The scattered radiance per optical depth in a box."""
+        shape = [b - a for a, b in zip(lower, upper, strict=True)]
+        scattered = self._scattered(lower, upper, before)
+        irradiance = self._uncollided.read(lower, upper).reshape(scattered.shape) + scattered
+        if self._albedo is not None:
+            albedo = self._albedo.read(lower, upper)[..., None]
+        elif isinstance(self._medium.albedo, ConstantField):
+            albedo = np.array(self._medium.albedo.value, np.float32).ravel()
+        else:
+            albedo = self._evaluated(self._medium.albedo, lower, upper)
+        return (irradiance * albedo * np.float32(1 / (4 * np.pi))).reshape(*shape, self._channels)
+
+    def _scattered(self, lower: list[int], upper: list[int], known: BrickFile | None) -> np.ndarray:
+        if known is None:
+            return self._evaluated(self._initial, lower, upper)
+        return known.read(lower, upper).reshape(*_shape(lower, upper), self._channels)
+
+    def _evaluated(self, field: GridField, lower: list[int], upper: list[int]) -> np.ndarray:
+        """A field at the centres of the voxels of a box: (z, y, x, channel)."""
+        shape = _shape(lower, upper)
+        box = Grid(tuple(shape), np.eye(4))
+        at = box.voxel_indices(dr.arange(mi.UInt32, box.voxel_count))
+        first = [dr.opaque(mi.Float, n) for n in lower[::-1]]
+        place = mi.Point3f(*(mi.Float(a) + b for a, b in zip(at, first, strict=True))) + 0.5
+        value = field.at_world(self._grid.world.point(place))
+        channels = [value] if field.channels == 1 else list(value)
+        return np.stack([np.array(c) for c in channels], axis=-1).reshape(*shape, -1)
+
+    def _change(self, before: BrickFile | None, after: BrickFile) -> float:
+        """Root mean square of the change, relative to that of the whole irradiance, weighted by
+        extinction.
+        """
+        change = total = 0.0
+        slices, ny, nx = self._grid.shape
+        for first, last in even_slabs(slices, EDGE):
+            box = [first, 0, 0], [last, ny, nx]
+            new = self._scattered(*box, after)
+            weight = self._sweep.extinction(*box)[..., None].astype(np.float32)
+            difference = new - self._scattered(*box, before)
+            whole = new + self._uncollided.read(*box).reshape(new.shape)
+            change += float((weight * np.square(difference)).sum(dtype=np.float64))
+            total += float((weight * np.square(whole)).sum(dtype=np.float64))
+        return (change / max(total, 1e-300)) ** 0.5
+
+
+def add(total: BrickFile, part: BrickFile) -> None:
+    """Add the values of a file to those of another one."""
+    slices, ny, nx = total.shape
+    for first, last in even_slabs(slices, EDGE):
+        box = (first, 0, 0), (last, ny, nx)
+        total.write(box[0], total.read(*box) + part.read(*box))
+
+
+def _shape(lower: list[int], upper: list[int]) -> list[int]:
+    return [b - a for a, b in zip(lower, upper, strict=True)]

@@ -1,0 +1,156 @@
+"""Tracks through two slabs of a volume at a time, one for either way of each pair of ordinates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.out_of_core.slabs import Slab
+from mitsuba_irrcache.solvers.discrete_ordinates.kernel import SweptMedium
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
+    coordinates_of,
+    flat_index,
+    slicewise,
+    strides_of,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
+    FIXED_POINT_BITS,
+    FIXED_POINT_ONE,
+    TrackRecord,
+    TransverseFields,
+)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TRANSVERSE, TrackTable
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
+
+
+class _QuantisedValues:
+    """What `Tracks` asks of an extinction: one value for each voxel, in units of ``quantum``."""
+
+    per_voxel, dense = True, False
+
+    def __init__(self, grid: Grid, quantum: float) -> None:
+        self.grid, self.quantum = grid, quantum
+
+    def sides(self, axis: int) -> np.ndarray:
+        """Values along x, y, z."""
+        return self.grid.resolution
+
+
+class SlabTracks(Tracks):
+    """Tracks through all voxels of ``grid``, whose extinction is read slab by slab."""
+
+    def __init__(self, grid: Grid, quantum: float) -> None:
+        # Not that of the base class, which needs the extinction of all voxels.
+        self.surfaces = None
+        self.grid = self.extinction_grid = grid
+        self.lower, self.size = np.zeros(3, int), grid.resolution
+        self.one_launch = False
+        self._to_voxels = grid.coordinates.matrix[:3, :3]
+        self._extinction = _QuantisedValues(grid, quantum)
+        self._empty, self._first_extinction = None, [0, 0, 0]
+
+    def slab_table(
+        self,
+        ordinates: tuple[np.ndarray, np.ndarray, np.ndarray],
+        incoming: np.ndarray,
+        axis: int,
+        slabs: tuple[Slab, Slab],
+    ) -> TrackTable:
+        """The table of ordinates, all with the dominant ``axis``, for a pair of slabs.
+
+        Args:
+            ordinates: directions (n, 3), weights (n) and offsets (n, 2), as in `Tracks.table`.
+            incoming: (n, 2, channels), as there.
+            axis: dominant axis of the ordinates.
+            slabs: the slab that tracks along the axis cross, and the one that those against it
+                cross. The volume consists of both, or of one if they are the same.
+        """
+        record, _, along = self.record(*ordinates, by_slice=True)
+        (first, end), (_, last_end) = slabs
+        slices = (end - first) * (1 if slabs[0] == slabs[1] else 2)
+        sides = self.grid.resolution.copy()
+        sides[axis] = slices
+        strides = strides_of(sides, slicewise(axis))
+        transverse = [
+            _moved(fields, strides[k], first, last_end - 1)
+            for fields, k in zip(record.transverse, TRANSVERSE[axis], strict=True)
+        ]
+        record = replace(
+            record,
+            transverse=tuple(transverse),
+            slices=end - first,
+            last_slice=slices - 1,
+            stride=strides[axis],
+            extinction_stride=strides[axis],
+        )
+        forward = along > 0
+        incoming = np.where(forward[:, None, None], incoming, incoming[:, ::-1])
+        return _table(record, incoming, axis, forward)
+
+
+def _table(record: TrackRecord, incoming: np.ndarray, axis: int, forward: np.ndarray) -> TrackTable:
+    count = len(forward)
+    record = replace(record, slices=np.full(count, record.slices))
+    return TrackTable(record, incoming, np.full(count, axis), forward)
+
+
+def _moved(fields: TransverseFields, stride: int, first: int, last: int) -> TransverseFields:
+    """The fields of tracks that begin in slice ``first`` along the axis, and in ``last`` against
+    it.
+    """
+    ahead, behind = (fields.start + n * fields.slope for n in (first, last))
+    return replace(
+        fields,
+        stride=stride,
+        extinction_stride=stride,
+        first_shift=(ahead >> FIXED_POINT_BITS) % fields.size,
+        start=ahead & (FIXED_POINT_ONE - 1),
+        last_shift=(behind >> FIXED_POINT_BITS) % fields.size,
+        last_position=behind & (FIXED_POINT_ONE - 1),
+    )
+
+
+def by_slices(box: np.ndarray, axis: int) -> np.ndarray:
+    """Transpose a box (z, y, x, ...) to the layout of a swept volume, the slowest axis first."""
+    return box.transpose(*_order(axis), *range(3, box.ndim))
+
+
+def from_slices(values: np.ndarray, axis: int) -> np.ndarray:
+    """Transpose what `by_slices` returns back to (z, y, x, ...)."""
+    return values.transpose(*np.argsort(_order(axis)), *range(3, values.ndim))
+
+
+def _order(axis: int) -> list[int]:
+    return [2 - k for k in slicewise(axis)[::-1]]
+
+
+def slice_place(axis: int) -> int:
+    """Where ``axis`` is among those of `by_slices`."""
+    return 2 - slicewise(axis).index(axis)
+
+
+def swept_medium(parts: list[np.ndarray], axis: int) -> SweptMedium:
+    """The extinction of one or two slabs as tracks along ``axis`` read it: for each voxel its
+    quantised value and that of its neighbour (see `Extinction.corners`, by rows).
+
+    ``parts`` are boxes (z, y, x) of quantised values, uint16.
+    """
+    box = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2 - axis)
+    sides = np.array(box.shape[::-1])
+    values = box.ravel()
+    words = mi.UInt32((np.append(values, np.uint16(0)) if values.size % 2 else values).view("u4"))
+    at = coordinates_of(sides, slicewise(axis))
+    k, strides = TRANSVERSE[axis, 0], strides_of(sides)
+    index, last = flat_index(at, strides), dr.opaque(mi.UInt32, int(sides[k]) - 1)
+    upper = index + dr.select(at[k] < last, dr.opaque(mi.UInt32, strides[k]), 0)
+
+    def level(i: mi.UInt32) -> mi.UInt32:
+        return (dr.gather(mi.UInt32, words, i >> 1) >> ((i & 1) << 4)) & 0xFFFF
+
+    rows = level(index) | level(upper) << 16
+    dr.eval(rows)
+    return SweptMedium(rows, words=1)

@@ -1,0 +1,100 @@
+"""Files of volumes that are read slice by slice: NumPy's ``.npy``, raw files and Zarr arrays."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.machine.extras import require
+
+#: How names of raw files state voxels along x, y, z and the type, as in the Open SciVis data sets.
+RAW_NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32)|float(?:16|32|64))\.raw$")
+#: Names of the file in the folder of a Zarr array, of version 3 and 2 of the format.
+ZARR_MARKS = ("zarr.json", ".zarray")
+
+
+class VolumeFile:
+    """A volume (z, y, x) in a file, of which some slices at a time are in memory.
+
+    A file of the type ``.npy``, a Zarr folder with one array, or ``NAME_XxYxZ_TYPE.raw`` (little
+    endian, x fastest) such as ``head_256x256x113_uint16.raw``.
+
+    Raises:
+        IrrcacheError: a file that is none of these, is truncated, or holds no real numbers.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not self.path.exists():
+            raise IrrcacheError(f'irrcache: the volume file "{self.path}" does not exist.')
+        self._open = self._opener()
+        array = self._open()
+        if len(array.shape) != 3 or min(array.shape) < 2:
+            raise IrrcacheError(
+                f'irrcache: "{self.path}" has shape {tuple(array.shape)}; volumes larger than '
+                "memory have three axes (z, y, x) of at least 2 voxels and one channel."
+            )
+        if np.dtype(array.dtype).kind not in "iuf":
+            raise IrrcacheError(
+                f'irrcache: "{self.path}" holds values of type {array.dtype}; convert them to real '
+                "numbers, such as float32."
+            )
+        self.shape = tuple(int(n) for n in array.shape)
+
+    def read(self, first: int, last: int) -> np.ndarray:
+        """Return the slices from ``first`` up to before ``last``: float32 (z, y, x)."""
+        # Opened anew each time: pages of a mapped file count as memory of the process while it is
+        # mapped.
+        return np.ascontiguousarray(self._open()[first:last], dtype=np.float32)
+
+    @property
+    def description(self) -> str:
+        """Name, size and time of the file, by which its changes are noticed."""
+        status = self.path.stat()
+        return f"{self.path.resolve()}, {status.st_size} bytes, {status.st_mtime_ns}"
+
+    def _opener(self) -> Callable:
+        if any((self.path / mark).is_file() for mark in ZARR_MARKS):
+            return self._zarr
+        if self.path.suffix.lower() == ".npy":
+            return self._npy
+        match = RAW_NAME.search(self.path.name)
+        if match is None:
+            raise IrrcacheError(
+                f'irrcache: "{self.path}" is neither a .npy file, nor the folder of a Zarr array, '
+                "nor a raw file with a name like head_256x256x113_uint16.raw (voxels along x, y, z "
+                "and type)."
+            )
+        sides, kind = [int(n) for n in match.groups()[:3]], np.dtype(match[4]).newbyteorder("<")
+        expected = int(np.prod(sides, dtype=object)) * kind.itemsize
+        if self.path.stat().st_size != expected:
+            raise IrrcacheError(
+                f'irrcache: "{self.path}" has {self.path.stat().st_size} bytes, but its name '
+                f"promises {expected}; correct the name, or copy the file again."
+            )
+        return lambda: np.memmap(self.path, kind, mode="r", shape=tuple(sides[::-1]))
+
+    def _npy(self) -> np.ndarray:
+        try:
+            return np.load(self.path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise IrrcacheError(
+                f'irrcache: "{self.path}" is no complete .npy file ({error}); save it again.'
+            ) from None
+
+    def _zarr(self):
+        require("zarr", "science", f"reading {self.path}")
+        # Imported here because only Zarr arrays need it.
+        import zarr
+
+        array = zarr.open(str(self.path), mode="r")
+        if not isinstance(array, zarr.Array):
+            raise IrrcacheError(
+                f'irrcache: "{self.path}" is a Zarr group; name the folder of one of its arrays: '
+                f"{', '.join(sorted(array.array_keys())) or 'it has none'}."
+            )
+        return array

@@ -1,0 +1,167 @@
+"""Images of media whose extinction stays in a file are those of the same media in memory."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.out_of_core import scattering, slab_march, slab_sweep
+from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
+from mitsuba_irrcache.out_of_core.volume_settings import parse_memory
+from tests.support.scenes import SUN, boundary, image, load, medium, placement, texture
+
+SHAPE, PLACE = (45, 42, 48), placement()
+INTEGRATOR = {"type": "irrcache", "solver": "sweep", "max_depth": 2, "cache_spp": 32}
+
+
+@pytest.fixture
+def density(rgb, tmp_path, monkeypatch):
+    """A noisy volume; thin slabs, so that there are many of both kinds."""
+    monkeypatch.setattr(slab_sweep, "MOST_SLICES", 6)
+    monkeypatch.setattr(slab_march, "MOST_SLICES", 8)
+    values = texture(SHAPE, 0.1, 1.0, 3)
+    np.save(tmp_path / "density.npy", values)
+    return values
+
+
+def from_the_side() -> dict:
+    """A sensor some of whose rays run upwards along z, and some downwards."""
+    look = mi.ScalarTransform4f().look_at([5.0, 0.3, 0.2], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 24, "height": 24, "component_format": "float32"}
+    return {"type": "perspective", "fov": 34.0, "to_world": look, "film": film}
+
+
+def scene_of(tmp_path, interior: dict, **objects) -> mi.Scene:
+    """A scene whose medium takes its extinction from the file."""
+    files = {"sigma_t_file": str(tmp_path / "density.npy"), "max_memory": "1GB"}
+    return load(INTEGRATOR | files | objects.pop("files", {}), boundary(interior, PLACE), **objects)
+
+
+def test_an_image_is_the_same_to_the_last_bit_under_a_sun(density, tmp_path):
+    albedo = texture(SHAPE, 0.3, 1.0, 4)
+    np.save(tmp_path / "albedo.npy", albedo)
+    objects = {"emitter": SUN, "sensor": from_the_side()}
+    whole = load(INTEGRATOR, boundary(medium(density, albedo, PLACE), PLACE), **objects)
+    coarse = medium(density[:2, :2, :2], 0.5, PLACE)
+    files = {"albedo_file": str(tmp_path / "albedo.npy")}
+    parts = scene_of(tmp_path, coarse, files=files, **objects)
+    np.testing.assert_array_equal(image(parts, spp=2), image(whole, spp=2))
+
+
+def test_an_image_differs_by_rounding_alone_under_a_coloured_sky(density, tmp_path):
+    whole = load(INTEGRATOR, boundary(medium(2 * density, 0.9, PLACE), PLACE))
+    # A constant extinction in the scene is the factor of the values in the file.
+    parts = scene_of(tmp_path, medium(2.0, 0.9, PLACE))
+    np.testing.assert_allclose(image(parts, spp=2), image(whole, spp=2), rtol=1e-4)
+
+
+def test_the_irradiance_is_written_to_a_file(density, tmp_path):
+    whole = load(INTEGRATOR, boundary(medium(density, 0.9, PLACE), PLACE))
+    whole.integrator().prepare(whole)
+    file = tmp_path / "irradiance.npy"
+    parts = scene_of(
+        tmp_path, medium(density[:2, :2, :2], 0.9, PLACE), files={"irradiance_file": str(file)}
+    )
+    parts.integrator().prepare(parts)
+    expected = np.array(whole.integrator().cache.irradiance)
+    np.testing.assert_allclose(np.load(file), expected, rtol=1e-5)
+
+
+def test_all_orders_of_a_white_furnace_are_white(density, tmp_path, monkeypatch):
+    monkeypatch.setattr(scattering, "COARSE", 24)
+    file = tmp_path / "irradiance.npy"
+    files = {"irradiance_file": str(file), "max_depth": -1, "cache_spp": 32}
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    scene = scene_of(tmp_path, medium(8.0, 1.0, PLACE), files=files, emitter=sky)
+    scene.integrator().prepare(scene)
+    np.testing.assert_allclose(np.load(file), 4 * np.pi, rtol=0.02)
+
+
+def test_all_orders_are_those_of_a_solution_in_memory(density, tmp_path, monkeypatch):
+    monkeypatch.setattr(scattering, "COARSE", 24)
+    albedo = texture(SHAPE, 0.5, 1.0, 4)
+    np.save(tmp_path / "albedo.npy", albedo)
+    orders = {"max_depth": -1, "cache_spp": 32}
+    whole = load(INTEGRATOR | orders, boundary(medium(4 * density, albedo, PLACE), PLACE))
+    files = {"albedo_file": str(tmp_path / "albedo.npy"), **orders}
+    parts = scene_of(tmp_path, medium(4.0, 0.5, PLACE), files=files)
+    expected, found = image(whole, spp=2), image(parts, spp=2)
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 0.01 * expected.mean()
+
+
+def test_a_run_that_is_stopped_says_that_there_is_no_image(density, tmp_path):
+    scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE), files={"timeout": 1e-6})
+    with pytest.raises(RuntimeError, match="raise timeout"):
+        image(scene, spp=1)
+
+
+def test_an_edited_scene_is_rendered_anew(density, tmp_path):
+    scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE), emitter=SUN)
+    before = image(scene, spp=1)
+    np.testing.assert_array_equal(image(scene, spp=1), before)
+    params = mi.traverse(scene)
+    (key,) = [key for key in params.keys() if "irradiance" in key]
+    params[key] = 2 * params[key]
+    params.update()
+    np.testing.assert_allclose(image(scene, spp=1), 2 * before, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("interior", "objects", "named"),
+    [
+        ({}, {"emitter": {"type": "point", "position": [0, 3, 0]}}, "PointLight"),
+        ({"phase": {"type": "hg", "g": 0.3}}, {}, "isotropically"),
+        ({}, {"wall": {"type": "rectangle"}}, "surfaces"),
+        ({}, {"files": {"max_depth": 3}}, "max_depth"),
+        ({}, {"files": {"aovs": "depth"}}, "aovs"),
+        ({}, {"files": {"sigma_t_file": ""}}, "sigma_t_file"),
+        ({}, {"files": {"sigma_t_file": "none.npy"}}, "none.npy"),
+        ({}, {"files": {"max_memory": "much"}}, "much"),
+    ],
+)
+def test_what_is_not_supported_is_refused_by_name(density, tmp_path, interior, objects, named):
+    with pytest.raises((IrrcacheError, RuntimeError), match=named):
+        image(scene_of(tmp_path, medium(1.0, 0.9, PLACE) | interior, **objects), spp=1)
+
+
+def test_invalid_values_are_refused_with_their_place(density, tmp_path):
+    density[30, 20, 10] = np.nan
+    np.save(tmp_path / "density.npy", density)
+    with pytest.raises(RuntimeError, match=r"\(30, 20, 10\): nan"):
+        image(scene_of(tmp_path, medium(1.0, 0.9, PLACE)), spp=1)
+
+
+def test_files_of_all_formats_hold_the_same_values(tmp_path):
+    values = np.random.default_rng(5).integers(0, 1000, (7, 6, 5)).astype(np.uint16)
+    np.save(tmp_path / "a.npy", values)
+    values.tofile(tmp_path / "a_5x6x7_uint16.raw")
+    paths = [tmp_path / "a.npy", tmp_path / "a_5x6x7_uint16.raw"]
+    try:
+        import zarr
+    except ModuleNotFoundError:  # not for Python 3.10
+        pass
+    else:
+        zarr.create_array(str(tmp_path / "a.zarr"), data=values, chunks=(4, 4, 4))
+        paths.append(tmp_path / "a.zarr")
+    for path in paths:
+        file = VolumeFile(path)
+        assert file.shape == values.shape
+        np.testing.assert_array_equal(file.read(2, 5), values[2:5].astype(np.float32))
+
+
+def test_damaged_files_are_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((4, 4, 4)))
+    (tmp_path / "b.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:200])
+    np.save(tmp_path / "c.npy", np.zeros((4, 4)))
+    (tmp_path / "d_4x4x4_uint8.raw").write_bytes(b"1234")
+    (tmp_path / "e.raw").write_bytes(b"1234")
+    for name in ("b.npy", "c.npy", "d_4x4x4_uint8.raw", "e.raw", "f.npy"):
+        with pytest.raises(IrrcacheError, match=name):
+            VolumeFile(tmp_path / name)
+
+
+def test_sizes_of_memory():
+    sizes = {"": 0, "8GB": 8 << 30, "500 MB": 500 << 20, "1.5GiB": 3 << 29, "1000000": 1000000}
+    assert {text: parse_memory(text) for text in sizes} == sizes
