@@ -154,8 +154,8 @@ MUTANTS = (
     Mutant(
         "the background in front of the medium",
         "render/camera.py",
-        "background = self._attenuation(transmittance, ray.d) * background + emitted",
-        "background = background + emitted",
+        "(through * transmittance + straight * unscattered) * radiance + emitted",
+        "radiance + emitted",
         (CLOSED_FORMS,),
     ),
     Mutant(

@@ -70,8 +70,8 @@ OUTSIDE = (
     Mutant(
         "light in a forward peak is never scattered",
         "media/delta_m.py",
-        "unscattered_exponent=_mean(sigma_t) / remaining if remaining else 1.0,",
-        "unscattered_exponent=1.0,",
+        "unscattered_exponent=exponent,",
+        "unscattered_exponent=np.ones(1),",
         (SIMILARITY,),
     ),
     Mutant(
