@@ -53,6 +53,8 @@ class MappedMedium:
         """``whole``: nothing but the radiance is wanted, of a medium that emits nothing."""
         self._settings, self._files, self._whole = settings, files, whole
         self._snapshot: Snapshot | None = None
+        #: of the files that the irradiance was computed from
+        self._states: list | None = None
         self._folder: tempfile.TemporaryDirectory | None = None
         self._medium: MediumGrid | None = None
         self._irradiance: tuple[BrickFile, np.ndarray] | None = None
@@ -67,18 +69,21 @@ class MappedMedium:
         progress: Progress | None = None,
     ) -> ClosedFormCameraRays:
         """Create the camera rays for ``scene``; the irradiance is computed if it is not known yet,
-        or if the scene has changed.
+        or if the scene or a file has changed.
         """
         check_settings(self._settings, self._files, self._whole)
         snapshot = Snapshot(scene, None, self._snapshot)
-        if self._rays is None or snapshot.changes(self._snapshot):
+        paths = [path for path in (self._files.sigma_t, self._files.albedo) if path]
+        states = [VolumeFile(path).state for path in paths]
+        changed = states != self._states or snapshot.changes(self._snapshot)
+        if self._rays is None or changed:
             self._rays = None
             self._compute(scene, progress)
             field = MappedIrradiance(*self._irradiance, self._medium.sigma_t.grid)
             arguments = self._medium, field, quadrature, step, self._memory
             projection = SlabProjection(*arguments)
             self._rays = ClosedFormCameraRays(projection, self._settings.max_depth, hide_emitters)
-            self._snapshot = snapshot
+            self._snapshot, self._states = snapshot, states
         return self._rays
 
     @property

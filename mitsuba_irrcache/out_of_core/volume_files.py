@@ -52,10 +52,13 @@ class VolumeFile:
         return np.ascontiguousarray(self._open()[first:last], dtype=np.float32)
 
     @property
-    def description(self) -> str:
-        """Name, size and time of the file, by which its changes are noticed."""
-        status = self.path.stat()
-        return f"{self.path.resolve()}, {status.st_size} bytes, {status.st_mtime_ns}"
+    def state(self) -> list[tuple[str, int, int, int]]:
+        """Name, size, time and number of the file, or of each file in the folder: they change when
+        it is written.
+        """
+        parts = sorted(self.path.rglob("*")) if self.path.is_dir() else [self.path]
+        known = ((str(part), part.stat()) for part in parts)
+        return [(name, s.st_size, s.st_mtime_ns, s.st_ino) for name, s in known]
 
     def _opener(self) -> Callable:
         if any((self.path / mark).is_file() for mark in ZARR_MARKS):

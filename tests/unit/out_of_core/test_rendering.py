@@ -108,6 +108,29 @@ def test_an_edited_scene_is_rendered_anew(density, tmp_path):
     np.testing.assert_allclose(image(scene, spp=1), 2 * before, rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["npy", "zarr"])
+def test_an_overwritten_file_is_rendered_anew(density, tmp_path, kind):
+    file = str(tmp_path / f"volume.{kind}")
+
+    def write(values: np.ndarray) -> None:
+        if kind == "npy":
+            np.save(file, values)
+            return
+        zarr = pytest.importorskip("zarr")
+        zarr.open(file, mode="a", shape=SHAPE, dtype="f4", chunks=(32, 32, 32))[:] = values
+
+    write(density)
+    scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE), files={"sigma_t_file": file})
+    before = image(scene, spp=1)
+    write(density[::-1])
+    after = image(scene, spp=1)
+    np.testing.assert_array_equal(
+        after,
+        image(scene_of(tmp_path, medium(2.0, 0.9, PLACE), files={"sigma_t_file": file}), spp=1),
+    )
+    assert np.abs(after - before).max() > 0.01
+
+
 @pytest.mark.parametrize(
     ("interior", "objects", "named"),
     [
