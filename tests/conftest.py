@@ -27,9 +27,10 @@ from tests.support.scenes import (
 )
 
 shorten_compilation()
-# Idle threads of Dr.Jit wait actively: with more than cores, they take a quarter of the time.
+# Idle threads of Dr.Jit wait actively: with more than cores, they take a quarter of the time. With
+# a single thread Mitsuba waits for ever when it reads an EXR file.
 workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-dr.set_thread_count(max(1, (os.cpu_count() or 1) // workers))
+dr.set_thread_count(max(2, (os.cpu_count() or 1) // workers))
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -90,7 +90,8 @@ def set_up(environment: Environment) -> None:
         mi.set_log_level(mi.LogLevel.Error)
         for module in environment.modules:
             importlib.import_module(module)
-        threads = environment.threads or available_cores()
+        # With a single thread Mitsuba waits for ever when it reads an EXR file.
+        threads = max(2, environment.threads or available_cores())
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
         dr.eval(dr.arange(mi.Float, 4))
