@@ -169,6 +169,7 @@ class ClosedFormCameraRays:
                     "whose radiance is known only outside; set resolution to build a cache."
                 )
             scattered = self._half_space.radiance(ray, near, far, sampler, hit)
+        background = mi.Spectrum(0)
         if self.shows_emitters:
             background = (through * transmittance + straight * unscattered) * radiance + emitted
         alpha = mi.Float(1)
