@@ -6,6 +6,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -72,6 +73,19 @@ def test_a_worker_of_another_kind_says_why(environment, change, said):
     set_up(environment)
     with pytest.raises(UnfitWorkerError, match=said):
         set_up(replace(environment, **change))
+
+
+def test_a_worker_reads_exr_files_whatever_its_threads(environment, tmp_path):
+    """With a single thread of Dr.Jit, Mitsuba would never finish."""
+    threads = dr.thread_count()
+    try:
+        set_up(replace(environment, threads=1))
+        assert dr.thread_count() > 1
+        image = mi.Bitmap(np.ones((64, 64, 3), np.float32))
+        image.write(str(tmp_path / "image.exr"))
+        np.testing.assert_array_equal(np.array(mi.Bitmap(str(tmp_path / "image.exr"))), 1)
+    finally:
+        dr.set_thread_count(threads)
 
 
 def test_a_worker_that_sees_other_files_says_so(scene, tmp_path):
