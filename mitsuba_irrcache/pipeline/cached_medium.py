@@ -18,6 +18,7 @@ from mitsuba_irrcache.cache.angular import (
     order_of_direct_light,
     sources_of,
     warn_of_noise,
+    warn_of_sharp_shadows,
 )
 from mitsuba_irrcache.cache.area_light import area_lights_of
 from mitsuba_irrcache.cache.direct_light import DirectLight, direct_lights_of
@@ -187,7 +188,10 @@ class CachedMedium:
             medium, settings.max_depth, dr.width(active)
         )
         if basis is not None:
-            warn_of_noise(basis, samples, self.label + f'medium "{medium.name}"')
+            name = self.label + f'medium "{medium.name}"'
+            warn_of_noise(basis, samples, name)
+            if not medium.is_isolated:
+                warn_of_sharp_shadows(basis, name)
         samples = -(-samples // 2) if settings.with_error else samples
         direct_lights = self._direct_lights(scene, grid, active, classes)
         known = [light.emitter for light in direct_lights]
