@@ -148,6 +148,25 @@ def loaded(scenes, phase: dict, **settings) -> mi.Scene:
     return scenes.load(integrator, shape, 8, default_solver="path")
 
 
+@pytest.mark.parametrize(("g", "surfaces"), [(0.85, True), (0.85, False), (0.5, True)])
+def test_sharp_shadows_on_surfaces_are_announced(scenes, monkeypatch, g, surfaces):
+    """Blocks of the ground are up to 7 % too bright, under a forward peak and a sun."""
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
+    cloud = scenes.boundary(scenes.medium(1.0, 0.9) | {"phase": hg(g)})
+    objects = {"cloud": cloud, "sun": scenes.sun} | ({"ground": ground()} if surfaces else {})
+    settings = {
+        "type": "irrcache",
+        "solver": "auto",
+        "resolution": 4,
+        "cache_spp": 64,
+        "max_depth": -1,
+    }
+    scene = scenes.load(settings, None, 8, **objects)
+    scene.integrator().prepare(scene)
+    assert any("shadows on surfaces" in text for text in messages) == (surfaces and g > 0.8)
+
+
 @pytest.mark.parametrize("surfaces", [False, True])
 def test_channels_together_or_apart(scenes, monkeypatch, surfaces):
     medium = scenes.medium(1.0, (0.9, 0.6, 0.8)) | {"phase": hg(0.5)}
