@@ -205,8 +205,7 @@ class MediumAdjoint:
         the medium, and the first step. ``medium`` is around the sensor.
         """
         ray, camera_rays = each.ray, self._camera_rays
-        found = camera_rays.background(self._scene, ray, mi.Bool(True))
-        visible, background, *weights = found
+        visible, background, *weights = camera_rays.background(self._scene, ray, mi.Bool(True))
         behind = [each.radiance * background * weight for weight in weights]
         if not (visible or self._is_scaled):
             weights = [mi.Float(0), mi.Float(0)]

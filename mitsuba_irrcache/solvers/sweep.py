@@ -124,8 +124,7 @@ class SweepSolver(Solver):
         # Extinction with its neighbours, the radiance along tracks, sums and spreads; and for
         # further orders of scattering, the values of voxels and those stored between sweeps.
         once = max_depth == 2
-        together = sn_solver.swept_together(medium, voxels * max(1, moments))
-        sets = channels if together else 1
+        sets = channels if sn_solver.swept_together(medium, voxels, moments) else 1
         numbers = 5 + 2 * channels + (0 if once else 5 + 12 * sets + 3 * channels)
         return numbers + moments * (3 * channels + (4 if once else 10) * sets)
 

@@ -72,10 +72,11 @@ MOST_SWEPT_TOGETHER = 1 << 24
 NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
 
 
-def swept_together(medium: MediumGrid, unknowns: int) -> bool:
-    """Whether all channels are swept at once, of a cache of so many ``unknowns``: voxels times
-    moments.
+def swept_together(medium: MediumGrid, voxels: int, moments: int) -> bool:
+    """Whether all channels of a cache of so many ``voxels`` and angular ``moments`` (0: the
+    irradiance alone) are swept at once.
     """
+    unknowns = voxels * max(1, moments)
     return medium.sigma_t.channels == 1 and unknowns <= MOST_SWEPT_TOGETHER
 
 
@@ -285,7 +286,7 @@ class Sweep:
     def _channel_groups(self, grey: bool) -> list[tuple[int, ...]]:
         """The channels that are swept together, of all or of the first one."""
         channels = range(1 if grey else self.cache.channels)
-        if swept_together(self._medium, self.cache.grid.voxel_count * max(1, self.cache.moments)):
+        if swept_together(self._medium, self.cache.grid.voxel_count, self.cache.moments):
             return [tuple(channels)]
         return [(c,) for c in channels]
 
