@@ -181,8 +181,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - work_folder
        - |string|
-       - Folder for working files, on a disk with 10 bytes of free space for each voxel of
-         ``sigma_t_file`` and channel, 22 for all orders. (Default: that of ``sigma_t_file``)
+       - Folder for working files: 10 bytes per voxel of ``sigma_t_file``, 18 for all orders; three
+         channels: 26 and 50; 4 more for ``albedo_file``. (Default: that of ``sigma_t_file``)
 
      * - irradiance_file
        - |string|

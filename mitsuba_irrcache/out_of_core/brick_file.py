@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -17,7 +18,7 @@ EDGE = 32
 
 class BrickFile:
     """Values (z, y, x, channel) of one type in a file without a name, 0 at first. The file vanishes
-    when it is closed, or with the process.
+    when it is closed, or with this object.
 
     Slabs across any axis are read and written in whole bricks, each of which is contiguous; slabs
     across x of an array with x fastest would touch every page of the file.
@@ -35,6 +36,7 @@ class BrickFile:
                 "be read at a position; use a volume that fits into memory."
             )
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        self.close = weakref.finalize(self, os.close, self._file)
         os.unlink(path)
         size = int(np.prod(self._counts, dtype=object)) * self._bytes
         try:
@@ -45,13 +47,9 @@ class BrickFile:
         except OSError as error:
             self.close()
             raise IrrcacheError(
-                f'irrcache: a working file of {size / 2**30:.1f} GiB cannot be made at "{path}": '
+                f'irrcache: cannot create a working file of {size / 2**30:.1f} GiB at "{path}": '
                 f"{error.strerror}; set work_folder to a folder on another disk."
             ) from None
-
-    def close(self) -> None:
-        """Closes the file."""
-        os.close(self._file)
 
     def read(self, lower: Sequence[int], upper: Sequence[int]) -> np.ndarray:
         """Return the box between these voxels (z, y, x): (z, y, x), with channels if several."""

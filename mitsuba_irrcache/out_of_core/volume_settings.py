@@ -79,9 +79,8 @@ def work_folder(files: VolumeSettings) -> tempfile.TemporaryDirectory:
         return tempfile.TemporaryDirectory(prefix=".irrcache-", dir=parent)
     except OSError as error:
         raise IrrcacheError(
-            f'irrcache: no working files can be made in "{parent}" ({error.strerror}); set '
-            "work_folder to a folder with 10 bytes of free space for each voxel and channel, "
-            "22 for all orders."
+            f'irrcache: cannot create working files in "{parent}" ({error.strerror}); set '
+            "work_folder to a folder with 10 to 54 bytes of free space per voxel."
         ) from None
 
 

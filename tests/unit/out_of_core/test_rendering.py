@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import os
+from pathlib import Path
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -188,3 +192,22 @@ def test_damaged_files_are_refused(tmp_path):
 def test_sizes_of_memory():
     sizes = {"": 0, "8GB": 8 << 30, "500 MB": 500 << 20, "1.5GiB": 3 << 29, "1000000": 1000000}
     assert {text: parse_memory(text) for text in sizes} == sizes
+
+
+def test_working_files_disappear_with_the_integrator(density, tmp_path):
+    """They have no name, so that the system counts them until they are closed."""
+    descriptors = Path("/proc/self/fd")
+    if not descriptors.is_dir():
+        pytest.skip("open files are listed in /proc only")
+
+    def working_files() -> list[str]:
+        names = [os.readlink(file) for file in descriptors.iterdir() if file.is_symlink()]
+        return [name for name in names if name.startswith(str(tmp_path / ".irrcache-"))]
+
+    scene = scene_of(tmp_path, medium(2.0, 0.9, PLACE))
+    image(scene, spp=1)
+    assert working_files()
+    del scene
+    gc.collect()
+    assert not working_files()
+    assert not list(tmp_path.glob(".irrcache-*"))
