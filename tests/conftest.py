@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+from pathlib import Path
 from types import SimpleNamespace
 
 from tests.support.compilation import shorten_compilation  # isort: skip (before Dr.Jit)
@@ -27,10 +28,25 @@ from tests.support.scenes import (
 )
 
 shorten_compilation()
-# Idle threads of Dr.Jit wait actively: with more than cores, they take a quarter of the time. With
-# a single thread Mitsuba waits for ever when it reads an EXR file.
-workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-dr.set_thread_count(max(2, (os.cpu_count() or 1) // workers))
+# Idle threads of Dr.Jit wait actively: more of them than cores take a quarter of the time.
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+THREADS = max(1, (os.cpu_count() or 1) // WORKERS)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _threads(request):
+    """Select the number of threads of Dr.Jit for the tests of a file.
+
+    With a single one, Mitsuba waits for ever when it reads an EXR file.
+    """
+    needed = 2 if _reads_exr(request.path) else 1
+    if dr.thread_count() != (count := max(needed, THREADS)):
+        dr.set_thread_count(count)
+
+
+def _reads_exr(test_file: Path) -> bool:
+    """Whether tests may read EXR files: those that name one, and the snippets of the README."""
+    return test_file.name == "test_readme.py" or ".exr" in test_file.read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module", autouse=True)
