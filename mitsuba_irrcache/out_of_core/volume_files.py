@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.zarr_chunks import check_chunks
 from mitsuba_irrcache.machine.extras import require
 
 #: How names of raw files state voxels along x, y, z and the type, as in the Open SciVis data sets.
@@ -43,13 +44,22 @@ class VolumeFile:
                 f'irrcache: "{self.path}" holds values of type {array.dtype}; convert them to real '
                 "numbers, such as float32."
             )
+        if self.path.is_dir():
+            check_chunks(f'irrcache: "{self.path}"', self.path, array)
         self.shape = tuple(int(n) for n in array.shape)
 
     def read(self, first: int, last: int) -> np.ndarray:
         """Return the slices from ``first`` up to before ``last``: float32 (z, y, x)."""
         # Opened anew each time: pages of a mapped file count as memory of the process while it is
         # mapped.
-        return np.ascontiguousarray(self._open()[first:last], dtype=np.float32)
+        array = self._open()
+        try:
+            return np.ascontiguousarray(array[first:last], dtype=np.float32)
+        except Exception as error:  # the decoders of Zarr raise exceptions of any type
+            raise IrrcacheError(
+                f'irrcache: slices {first} to {last - 1} of "{self.path}" cannot be read '
+                f"({error}); copy or write it again."
+            ) from error
 
     @property
     def state(self) -> list[tuple[str, int, int, int]]:
@@ -94,7 +104,13 @@ class VolumeFile:
         # Imported here because only Zarr arrays need it.
         import zarr
 
-        array = zarr.open(str(self.path), mode="r")
+        try:
+            array = zarr.open(str(self.path), mode="r")
+        except Exception as error:  # of any type, where the metadata are damaged
+            raise IrrcacheError(
+                f'irrcache: "{self.path}" cannot be opened as a Zarr array ({error}); copy or '
+                "write it again."
+            ) from error
         if not isinstance(array, zarr.Array):
             raise IrrcacheError(
                 f'irrcache: "{self.path}" is a Zarr group; name the folder of one of its arrays: '

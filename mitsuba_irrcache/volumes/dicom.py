@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -35,30 +36,30 @@ def read_dicom_series(folder: str | os.PathLike, series: str | None = None) -> V
             slice, or slices missing, duplicated or unevenly spaced.
     """
     folder = Path(folder)
-    for file in sorted(folder.iterdir()):
-        if file.is_file():
-            check_lengths(file)
+    files = sorted(file for file in folder.iterdir() if file.is_file())
+    classes = {file: check_lengths(file) for file in files}
     uid = _choose_series(folder, series)
-    files = _series_files(folder, uid)
-    if len(files) < 2:
+    _check_left_out(folder, classes)
+    slices = _series_files(folder, uid)
+    if len(slices) < 2:
         raise IrrcacheError(
-            f"series {uid} in {folder} has {len(files)} slice; a volume needs at least 2"
+            f"series {uid} in {folder} has {len(slices)} slice; a volume needs at least 2"
         )
-    positions, orientation, modality = _slice_placement(files)
+    positions, orientation, modality = _slice_placement(slices)
     row, column = orientation.reshape(2, 3)
     order = np.argsort(positions @ np.cross(row, column), kind="stable")
     positions = positions[order]
     _check_gaps(folder, positions, np.cross(row, column))
     stack = positions[-1] - positions[0]
-    image = _read_slices([files[i] for i in order], folder)
+    image = _read_slices([slices[i] for i in order], folder)
     return VolumeData(
         values=SimpleITK.GetArrayFromImage(image),
-        spacing=(*image.GetSpacing()[:2], np.linalg.norm(stack) / (len(files) - 1)),
+        spacing=(*image.GetSpacing()[:2], np.linalg.norm(stack) / (len(slices) - 1)),
         origin=tuple(positions[0]),
         direction=np.stack([row, column, stack / np.linalg.norm(stack)], axis=1),
         unit="HU" if modality == "CT" else "",
         length_unit="mm",
-        source=f"{folder} ({len(files)} DICOM slices)",
+        source=f"{folder} ({len(slices)} DICOM slices)",
     )
 
 
@@ -76,6 +77,31 @@ def _choose_series(folder: Path, series: str | None) -> str:
     listing = "; ".join(f"{f} ({len(_series_files(folder, f))} slices)" for f in found)
     wanted = "several series" if series is None else f"no series {series}"
     raise IrrcacheError(f"folder {folder} has {wanted}: choose one with --series UID: {listing}")
+
+
+def _check_left_out(folder: Path, classes: dict[Path, str | None]) -> None:
+    """Refuse damaged slices, which GDCM leaves out: at an end of the series they would not be
+    missed.
+
+    A file in no series is one if it is named like a slice, and is no DICOM file of another class,
+    such as a report.
+    """
+    uids = SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
+    used = {Path(file).name for uid in uids for file in _series_files(folder, uid)}
+    patterns = {_pattern(name) for name in used}
+    wanted = {classes[folder / name] for name in used} | {None, ""}
+    for file, kind in classes.items():
+        is_slice = file.suffix.lower() == ".dcm" or _pattern(file.name) in patterns
+        if is_slice and kind in wanted and file.name not in used:
+            raise IrrcacheError(
+                f"{file} cannot be read as a slice, unlike others in its folder: it is truncated, "
+                "damaged or of another format; copy it again, or remove it from the folder"
+            )
+
+
+def _pattern(name: str) -> str:
+    """Return the name of a file with all numbers alike."""
+    return re.sub(r"\d+", "0", name)
 
 
 def _series_files(folder: Path, uid: str) -> tuple[str, ...]:

@@ -24,14 +24,14 @@ _IMPLICIT, _BIG, _DEFLATED = (
 #: Some writers put this in place of a value representation.
 _UNKNOWN = {b"??", b"  ", b"\0\0"}
 _META, _ITEM = 0x0002, 0xFFFE
-_TRANSFER_SYNTAX = (0x0002, 0x0010)
+_TRANSFER_SYNTAX, _STORAGE_CLASS = (0x0002, 0x0010), (0x0002, 0x0002)
 _UNDEFINED = 0xFFFFFFFF
 
 
-def check_lengths(path: str | os.PathLike) -> None:
-    """Check all elements of a DICOM file.
+def check_lengths(path: str | os.PathLike) -> str | None:
+    """Check all elements of a DICOM file, and return its storage class; None for other files.
 
-    Other files, and elements of unknown form, are left to the reader.
+    Elements of unknown form, and those after them, are left to the reader.
 
     Raises:
         IrrcacheError: an element reaches beyond the end of the file, or is malformed.
@@ -40,12 +40,12 @@ def check_lengths(path: str | os.PathLike) -> None:
     size = path.stat().st_size
     with path.open("rb") as stream:
         if stream.read(_PREAMBLE + 4)[_PREAMBLE:] != _MAGIC:
-            return
-        syntax = ""
+            return None
+        syntax, storage_class = "", ""
         while stream.tell() + 8 <= size:
             tag, length = _header(stream, syntax)
             if length is None or (syntax == _DEFLATED and tag[0] != _META):
-                return
+                break
             if length == _UNDEFINED:
                 continue  # the items of a sequence follow, each with a header of its own
             end = stream.tell() + length
@@ -56,8 +56,15 @@ def check_lengths(path: str | os.PathLike) -> None:
                     "again"
                 )
             if tag == _TRANSFER_SYNTAX:
-                syntax = stream.read(length).rstrip(b"\0 ").decode("ascii", "replace")
+                syntax = _text(stream.read(length))
+            elif tag == _STORAGE_CLASS:
+                storage_class = _text(stream.read(length))
             stream.seek(end)
+    return storage_class
+
+
+def _text(value: bytes) -> str:
+    return value.rstrip(b"\0 ").decode("ascii", "replace")
 
 
 def _header(stream: BinaryIO, syntax: str) -> tuple[tuple[int, int], int | None]:

@@ -69,7 +69,11 @@ class Format:
 
 TIFF = Format("TIFF", (".tif", ".tiff"), "tiff_files", "microscopy", ("tifffile",))
 NETCDF = Format(
-    "NetCDF", (".nc", ".nc4", ".cdf"), "netcdf_files", "science", ("xarray", "h5netcdf", "scipy")
+    "NetCDF",
+    (".nc", ".nc4", ".cdf"),
+    "netcdf_files",
+    "science",
+    ("xarray", "h5netcdf", "h5py", "scipy"),
 )
 ZARR = Format("Zarr", (".zarr",), "zarr_files", "science", ("zarr",))
 #: Files that mark a folder as Zarr, of format 3 and 2.

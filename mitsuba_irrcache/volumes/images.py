@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import re
+import struct
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,6 +36,9 @@ _COMPRESSED = re.compile(
 )
 _DIMENSIONS = re.compile(rb"^\s*NDims\s*[=:]\s*([-+]?\d+)", re.M)
 _MOST_DIMENSIONS = 10
+_NRRD = b"NRRD"
+#: Bytes of the headers of NIfTI-1 and Analyze, and of NIfTI-2, with which these headers begin.
+_NIFTI1, _NIFTI2 = 348, 540
 _COMPONENT_BYTES = {
     SimpleITK.sitkUInt8: 1,
     SimpleITK.sitkInt8: 1,
@@ -61,6 +65,9 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
         check_lengths(path)
     if path.suffix.lower() in (".mha", ".mhd"):
         _check_dimensions(path)
+    if path.suffix.lower() in (".nrrd", ".nhdr"):
+        _check_magic(path)
+    first_voxel = _first_voxel(path) if _reader_of(path) == "NiftiImageIO" else 0
     reader = SimpleITK.ImageFileReader()
     # The reader is fixed: one selected by the contents could read unchecked data files.
     reader.SetImageIO(_reader_of(path))
@@ -72,12 +79,12 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
         channel = picked(str(path), "channel", reader.GetNumberOfComponents(), options.channel)
         frames = int(np.prod(reader.GetSize()[3:], dtype=object))
         frame = picked(str(path), "frame", frames, options.frame)
-        _check_file_holds(path, data, _image_bytes(path, reader))
+        _check_file_holds(path, data, first_voxel + _image_bytes(path, reader))
         image = reader.Execute()
     except RuntimeError as error:
-        reason = str(error).strip().splitlines()[-1]
         raise IrrcacheError(
-            f"cannot read {path}: {reason} (is it truncated, or of another format?)"
+            f"cannot read {path}: {_reason(error)} (is it truncated, or of another format?); copy "
+            "or export it again"
         ) from error
     if image.GetDimension() == 4:
         image = image[..., frame]
@@ -112,10 +119,64 @@ def _check_dimensions(path: Path) -> None:
     """Refuse a MetaImage with more dimensions than fit in MetaIO's unchecked buffer."""
     with path.open("rb") as stream:
         found = _DIMENSIONS.search(stream.read(64 * 1024))
-    if found is not None and not 1 <= float(found[1]) <= _MOST_DIMENSIONS:
+    if found is None:
+        raise IrrcacheError(
+            f"{path} is no MetaImage: its header has no line such as NDims = 3; copy or export it "
+            "again"
+        )
+    if not 1 <= float(found[1]) <= _MOST_DIMENSIONS:
         raise IrrcacheError(
             f"{path} says that it has {found[1].decode()} dimensions; a volume has 3"
         )
+
+
+def _check_magic(path: Path) -> None:
+    with path.open("rb") as stream:
+        magic = stream.read(len(_NRRD))
+    if magic != _NRRD:
+        raise IrrcacheError(
+            f"{path} is no NRRD file: it begins with {magic!r}, not {_NRRD!r}; copy or export it "
+            "again"
+        )
+
+
+def _first_voxel(path: Path) -> int:
+    """Return the byte at which the voxels of a NIfTI or Analyze image begin in their file.
+
+    Raises:
+        IrrcacheError: the file does not begin with the header of such an image.
+    """
+    name = path.name.lower()
+    header = path.with_suffix(".hdr") if name.endswith(".img") else path
+    if not header.is_file():
+        return 0  # reported with the names of both files
+    try:
+        with gzip.open(header) if name.endswith(".gz") else header.open("rb") as stream:
+            content = stream.read(_NIFTI2)
+    except (EOFError, zlib.error, OSError) as error:
+        raise _damaged(header, error) from error
+    for order in "<>":
+        size = struct.unpack_from(order + "i", content)[0] if len(content) >= 4 else 0
+        if size == _NIFTI1 <= len(content):
+            offset = struct.unpack_from(order + "f", content, 108)[0]  # vox_offset
+        elif size == _NIFTI2 <= len(content):
+            offset = struct.unpack_from(order + "q", content, 168)[0]
+        else:
+            continue
+        if not name.endswith((".nii", ".nii.gz")):
+            return 0  # they are in a file of their own
+        return int(offset) if size < offset < 1 << 40 else size
+    raise IrrcacheError(
+        f"{header} is no NIfTI or Analyze image: it begins with {content[:4]!r} and not with the "
+        "length of a header, or ends within the header; copy or export it again"
+    )
+
+
+def _reason(error: Exception) -> str:
+    """Return the last line that ITK says about an error, without its own address."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    said = [line for line in lines if line and not line.startswith("Reason:")]
+    return re.sub(r"^ITK ERROR:\s*(\w+\(0x\w+\):\s*)?", "", said[-1]) if said else "unknown error"
 
 
 def _check_volume(path: Path, reader: SimpleITK.ImageFileReader) -> None:
@@ -184,13 +245,17 @@ def _check_gzip(path: Path, image_bytes: int) -> None:
             while block := stream.read(1 << 22):
                 unpacked += len(block)
     except (EOFError, zlib.error, OSError) as error:
-        raise IrrcacheError(f"{path} is truncated or damaged ({error}); copy it again") from error
+        raise _damaged(path, error) from error
     if unpacked < image_bytes:
         _raise_truncated(path, unpacked, image_bytes)
 
 
+def _damaged(path: Path, error: Exception) -> IrrcacheError:
+    return IrrcacheError(f"{path} is truncated or damaged ({error}); copy it again")
+
+
 def _raise_truncated(path: Path, actual: int, image_bytes: int) -> None:
     raise IrrcacheError(
-        f"{path} is truncated: {actual} bytes, but its header promises {image_bytes} bytes of "
-        "voxels; copy or export it again"
+        f"{path} is truncated: {actual} bytes, but its header promises {image_bytes}; copy "
+        "or export it again"
     )

@@ -7,10 +7,12 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import xarray
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.zarr_chunks import check_chunks
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.lengths import metres
 from mitsuba_irrcache.volumes.options import ReadOptions, chosen_field, scalar_volume
@@ -98,10 +100,16 @@ def open_dataset(path: Path) -> xarray.Dataset:
             engine = "scipy"
         elif magic == b"\x89HDF\r\n\x1a\n":
             engine = "h5netcdf"
+            with h5py.File(path) as file:  # where it fails, h5netcdf leaves a traceback behind
+                list(file["/"])
+        elif magic[:3] == b"CDF":
+            raise IrrcacheError(
+                f"{path} is a NetCDF file of a kind that is not read ({magic[:4]!r}); convert it "
+                "with nccopy -k netCDF-4"
+            )
         else:
             raise IrrcacheError(
-                f"{path} is no NetCDF file that is read: it begins with {magic!r}; convert it with "
-                "nccopy -k netCDF-4"
+                f"{path} is no NetCDF file: it begins with {magic!r}; copy or export it again"
             )
     options = {"consolidated": None} if engine == "zarr" else {}
     return xarray.open_dataset(path, engine=engine, decode_times=False, **options)
@@ -120,6 +128,8 @@ def read_variable(
             f"{source} has the dimensions {variable.dims}, of which {unknown} is neither space, "
             "time nor channel; select one index of it first"
         )
+    if path.is_dir():
+        _check_zarr(source, path, name)
     values = scalar_volume(source, variable.variable, letters, options)
     even_spacing = options.spacing is not None
     unit, placed = _placed(source, variable, axes, even_spacing)
@@ -137,6 +147,15 @@ def read_variable(
         length_unit=unit,
         source=source,
     )
+
+
+def _check_zarr(source: str, folder: Path, name: str) -> None:
+    """Refuse truncated chunks. (Absent ones are missing values or fill values to xarray.)"""
+    # Imported here because NetCDF files do not need it.
+    import zarr
+
+    array = zarr.open(str(folder / name), mode="r")
+    check_chunks(source, folder / name, array)
 
 
 def spatial_axes(variable: xarray.DataArray) -> dict[Hashable, str]:

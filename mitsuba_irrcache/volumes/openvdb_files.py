@@ -9,6 +9,7 @@ from __future__ import annotations
 import glob
 import importlib.util
 import os
+import struct
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -38,6 +39,8 @@ _TYPES = {
     "vec3i": "int32",
 }
 _MAGIC = b" BDV\0\0\0\0"
+#: Version of files from which on the header has the layout that is checked; bytes of its parts.
+_OLDEST_LAYOUT, _LIBRARY_VERSION, _UUID, _TWO_OFFSETS = 222, 8, 36, 16
 
 
 def read(path: Path, options: ReadOptions) -> VolumeData:
@@ -52,6 +55,7 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
         magic = stream.read(8)
     if magic != _MAGIC:
         raise IrrcacheError(f"{path} is no OpenVDB file: it begins with {magic!r}, not {_MAGIC!r}")
+    _check_ends(path)
     openvdb = load_openvdb(path)
     described = {grid.name: grid for grid in openvdb.readAllGridMetadata(str(path))}
     name = chosen_field(str(path), described, options.field, "grid")
@@ -77,6 +81,53 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
         scalar_volume(source, values, "xyzc"[: values.ndim], options),
         **placement_of(_index_to_world(grid.transform, low)),
         source=source,
+    )
+
+
+def _check_ends(path: Path) -> None:
+    """Compare the file with the ends of its grids, since OpenVDB reads missing values as zeros.
+
+    Files whose header is of another layout (before 2013) are left to the library.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+
+        def number(form: str) -> int:
+            data = stream.read(struct.calcsize(form))
+            if len(data) < struct.calcsize(form):
+                raise _truncated(path, size, size + 1)
+            return struct.unpack(form, data)[0]
+
+        def skip_text() -> None:
+            length = number("<I")
+            if stream.tell() + length > size:
+                raise _truncated(path, size, stream.tell() + length)
+            stream.seek(length, os.SEEK_CUR)
+
+        stream.seek(len(_MAGIC))
+        version = number("<I")
+        if version < _OLDEST_LAYOUT:
+            return
+        stream.seek(_LIBRARY_VERSION, os.SEEK_CUR)
+        has_offsets = stream.read(1) == b"\1"
+        stream.seek(_UUID, os.SEEK_CUR)
+        for _ in range(number("<I")):  # metadata: name, type and value
+            for _ in range(3):
+                skip_text()
+        for _ in range(number("<I") if has_offsets else 0):
+            for _ in range(3):  # name, type, and the grid whose tree is shared
+                skip_text()
+            stream.seek(_TWO_OFFSETS, os.SEEK_CUR)
+            end = number("<q")
+            if end > size:
+                raise _truncated(path, size, end)
+            stream.seek(end)
+
+
+def _truncated(path: Path, size: int, needed: int) -> IrrcacheError:
+    return IrrcacheError(
+        f"{path} is truncated: {size} bytes, but its grids end at byte {needed} or later; copy or "
+        "export it again"
     )
 
 

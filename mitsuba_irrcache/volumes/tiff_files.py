@@ -30,6 +30,8 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
             none chosen.
     """
     with _complete(path) as tiff:
+        if options.field is None and _are_slices(tiff.series):
+            return _read_pages(path, tiff, options)
         names = [series.name or str(i) for i, series in enumerate(tiff.series)]
         name = chosen_field(str(path), dict.fromkeys(names), options.field, "series")
         series = tiff.series[names.index(name)]
@@ -45,6 +47,27 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
             )
         values = scalar_volume(str(path), _decoded(path, series), axes, options)
         spacing, unit = _voxel_size(tiff)
+    return VolumeData(values, spacing, length_unit=unit, source=str(path))
+
+
+def _are_slices(series: Sequence[tifffile.TiffPageSeries]) -> bool:
+    """Return whether a file has several series, each of one slice like the others.
+
+    So writers leave it that compress page after page.
+    """
+    kinds = {(part.shape, part.dtype, part.axes) for part in series}
+    return len(series) > 1 and len(kinds) == 1 and series[0].axes in ("YX", "YXS")
+
+
+def _read_pages(path: Path, tiff: tifffile.TiffFile, options: ReadOptions) -> VolumeData:
+    needed = sum(int(np.prod(part.shape)) * part.dtype.itemsize for part in tiff.series)
+    require_memory(2 * needed, f"reading {path}", "crop or resample it first")
+    for part in tiff.series:
+        _check_segments(path, part)
+    slices = np.stack([_decoded(path, part) for part in tiff.series])
+    axes = "zyx" if slices.ndim == 3 else "zyxc"
+    spacing, unit = _voxel_size(tiff)
+    values = scalar_volume(str(path), slices, axes, options)
     return VolumeData(values, spacing, length_unit=unit, source=str(path))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import zarr
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.zarr_chunks import check_chunks
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.formats import ZARR_MARKS
 from mitsuba_irrcache.volumes.options import (
@@ -36,7 +37,8 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
     if isinstance(node, zarr.Array):
         source = str(path)
         axes = plain_axes(source, node.shape)
-        return VolumeData(scalar_volume(source, node, axes, options), source=source)
+        note = absent_chunks(source, path, node)
+        return VolumeData(scalar_volume(source, node, axes, options), source=source + note)
     image = _image_of(node)
     if image is not None:
         return _read_ome(path, *image, options)
@@ -44,6 +46,16 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
     from mitsuba_irrcache.volumes import netcdf_files
 
     return netcdf_files.read(path, options)
+
+
+def absent_chunks(source: str, folder: Path, array: zarr.Array) -> str:
+    """Check the chunks of an array, and return a note on absent ones for the summary.
+
+    Raises:
+        IrrcacheError: a truncated chunk.
+    """
+    absent = check_chunks(source, folder, array)
+    return f" ({absent} chunks are absent and count as {array.fill_value})" if absent else ""
 
 
 def _image_of(group: zarr.Group) -> tuple[zarr.Group, dict[str, Any]] | None:
@@ -87,11 +99,14 @@ def _read_ome(
             raise IrrcacheError(
                 f"{source} is placed by a {transformation['type']!r}; give scale and translation"
             )
+    if not isinstance(array, zarr.Array):
+        raise IrrcacheError(f"{source} is a group, not the array of a resolution; export it again")
+    note = absent_chunks(source, path / group.path / level, array)
     values = scalar_volume(source, array, names, options)
     return VolumeData(
         values,
         tuple(scale[names.index(axis)] for axis in "xyz"),
         tuple(shift[names.index(axis)] for axis in "xyz"),
         length_unit=next((a["unit"] for a in axes if a["name"] == "x" and "unit" in a), ""),
-        source=source,
+        source=source + note,
     )

@@ -211,3 +211,18 @@ def test_working_files_disappear_with_the_integrator(density, tmp_path):
     gc.collect()
     assert not working_files()
     assert not list(tmp_path.glob(".irrcache-*"))
+
+
+@pytest.mark.parametrize("codec", ["BloscCodec", "GzipCodec"])
+@pytest.mark.parametrize("damage", ["metadata", "cut", "cut by one byte"])
+def test_damaged_zarr_arrays_are_refused_by_name(tmp_path, codec, damage):
+    zarr = pytest.importorskip("zarr")
+    path = tmp_path / "volume.zarr"
+    values = texture((8, 8, 8), 0.1, 1.0, 3)
+    codec = getattr(zarr.codecs, codec)()
+    zarr.create_array(str(path), data=values, chunks=(4, 8, 8), compressors=codec)
+    file = path / "zarr.json" if damage == "metadata" else path / "c" / "1" / "0" / "0"
+    content = file.read_bytes()
+    file.write_bytes(content[:-1] if damage == "cut by one byte" else content[: len(content) // 2])
+    with pytest.raises(IrrcacheError, match=r"volume\.zarr"):
+        VolumeFile(path).read(0, 8)
