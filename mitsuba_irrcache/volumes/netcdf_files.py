@@ -150,7 +150,7 @@ def read_variable(
 
 
 def _check_zarr(source: str, folder: Path, name: str) -> None:
-    """Refuse truncated chunks. (Absent ones are missing values or fill values to xarray.)"""
+    """Refuse truncated chunks. To xarray absent ones are missing values, or fill values."""
     # Imported here because NetCDF files do not need it.
     import zarr
 
