@@ -8,42 +8,34 @@ from __future__ import annotations
 import html
 from collections.abc import Iterator
 from contextlib import contextmanager
-from time import perf_counter
 from typing import TYPE_CHECKING
 from weakref import ref
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core import properties
-from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
+from mitsuba_irrcache.core.cancellation import StopCondition
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.parameters import enabled, refuse_all
+from mitsuba_irrcache.imaging.camera_source import CameraRaySource
+from mitsuba_irrcache.imaging.image import ImageRenderer
+from mitsuba_irrcache.imaging.options import Options
+from mitsuba_irrcache.imaging.stock import StockIntegrators
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.variants import require_same_variant, require_variant
 from mitsuba_irrcache.machine.versions import require_versions
-from mitsuba_irrcache.out_of_core.rendering import MappedMedium
-from mitsuba_irrcache.out_of_core.volume_settings import VolumeSettings
-from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
-from mitsuba_irrcache.pipeline.defaults import choose_stock
 from mitsuba_irrcache.pipeline.progressive import Frame, Targets, frames
-from mitsuba_irrcache.render.aovs import AOVS, Layers, parse_aovs
-from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays, camera_rays_of
-from mitsuba_irrcache.render.denoise import FILTERS, filter_illumination
-from mitsuba_irrcache.render.film import check_film, exclusive, fill_film, planes, render_film
-from mitsuba_irrcache.render.quadrature import QUADRATURES
-from mitsuba_irrcache.render.tolerance import SCALES, Certificate, ToleranceSearch
-from mitsuba_irrcache.scene.consistency import check_sensor
-from mitsuba_irrcache.solvers.base import registered
+from mitsuba_irrcache.render.aovs import Layers
+from mitsuba_irrcache.render.camera import TracedCameraRays
+from mitsuba_irrcache.render.film import check_film, exclusive
+from mitsuba_irrcache.render.tolerance import CameraRays, Certificate
 
 if TYPE_CHECKING:  # most programs compute no gradients: their modules are imported on use
     from mitsuba_irrcache.gradients.backward import ParameterAdjoint
     from mitsuba_irrcache.gradients.operations import SharedIrradiance
-
-SOLVERS = ("auto", *sorted(solver.name for solver in registered()))
 
 
 class IrradianceCachingIntegrator(mi.SamplingIntegrator):
@@ -258,58 +250,18 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         require_versions()
         super().__init__(props)
         props = self._properties = properties.RecordedProperties(props)
-        max_depth = properties.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0")
-        self._hide_emitters = properties.flag(props, "hide_emitters", False)
-        self._filter = properties.choice(props, "filter", "none", FILTERS)
-        self._aovs = parse_aovs(properties.text(props, "aovs"))
-        self._settings = CacheSettings(
-            max_depth=max_depth,
-            rr_depth=properties.integer(props, "rr_depth", 5, 1, "at least 1"),
-            solver=properties.choice(props, "solver", "auto", SOLVERS),
-            resolution=properties.integer(
-                props, "resolution", 0, 0, "0 (chosen) or a number of voxels"
-            ),
-            samples=properties.integer(
-                props, "cache_spp", 0, 0, "0 (chosen) or a number of samples"
-            ),
-            seed=properties.integer(props, "cache_seed", 0, 0, "at least 0"),
-            file=properties.file_name(props, "cache_file"),
-            with_error=self._with_error,
-        )
-        self._quadrature = properties.choice(props, "quadrature", "exponential", QUADRATURES)
-        self._step = properties.number(
-            props, "step", 1.0, 1e-3, 1e3, "between 0.001 and 1000 voxel edges"
-        )
-        self._chosen_step = self._step
-        self._emission = props.get("emission", None)
-        largest = float(np.finfo(np.float32).max)
-        self._emission_scale = properties.number(
-            props, "emission_scale", 1.0, 0.0, largest, "a finite number that is not negative"
-        )
-        self._builder = self._new_builder(self._settings)
-        self._timeout = properties.number(
-            props, "timeout", -1.0, -1.0, 1e9, "a number of seconds, or -1 for none"
-        )
-        self._search = self._tolerance_search(props)
-        files = VolumeSettings.of(props)
-        #: the medium of a scene whose extinction stays in a file
-        self._mapped: MappedMedium | None = None
-        if files is not None:
-            whole = not (self._search or self._layered or self._emission is not None)
-            self._mapped = MappedMedium(self._settings, files, whole)
-        #: estimated error of the last image rendered with a ``tolerance``; None without
-        self.certificate: Certificate | None = None
-        properties.refuse_misspelt(props.wrapped, props.values)
+        self._options = Options.of(props)
+        settings, rays = self._options.settings, self._options.rays
         self._stopping = StopCondition()
-        self._camera_rays: ClosedFormCameraRays | TracedCameraRays | None = None
-        self._parts: list | None = None  # those of the camera rays
-        self._revision = 0  # revision of the builder for which the camera rays were created
-        #: Mitsuba's integrators for scenes without a visible medium, by name, and the current
-        #: choice
-        self._stock: dict[str, mi.Integrator] = {}
-        self._chosen = "volpath"
-        #: duration [s] of those stages of the last image that are measured
-        self.seconds: dict[str, float] = {}
+        self._stock = StockIntegrators(
+            max_depth=settings.max_depth,
+            rr_depth=settings.rr_depth,
+            hide_emitters=rays.hide_emitters,
+            timeout=self._options.timeout,
+        )
+        self._source = CameraRaySource(self._options, self._stopping, self._stock)
+        self._builder = self._source.builder
+        self._image = ImageRenderer(self._options)
         # Held by the images that share it: they hold the integrator.
         self._shared: ref[SharedIrradiance] | None = None
         #: called with (stage, done, total) while the cache is built; exceptions end the build
@@ -353,57 +305,18 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         super().traverse(callback)
-        if isinstance(self._emission, mi.Object):
-            callback.put("emission", self._emission, mi.ParamFlags.NonDifferentiable)
+        if isinstance(self._options.emission, mi.Object):
+            callback.put("emission", self._options.emission, mi.ParamFlags.NonDifferentiable)
 
-    def _new_builder(self, settings: CacheSettings) -> CacheBuilder:
-        return CacheBuilder(settings, self._emission, self._emission_scale)
+    @property
+    def certificate(self) -> Certificate | None:
+        """Estimated error of the last image rendered with a ``tolerance``; None without."""
+        return self._source.certificate
 
-    def _tolerance_search(self, props: properties.RecordedProperties) -> ToleranceSearch | None:
-        """Create the search for settings that meet the ``tolerance``, None without one."""
-        tolerance = properties.number(props, "tolerance", 0.0, 0.0, 1.0, "between 0 (none) and 1")
-        unit = properties.choice(props, "tolerance_of", "image", SCALES)
-        if not tolerance:
-            return None
-        if self._settings.file:
-            raise IrrcacheError(
-                "irrcache: tolerance chooses the resolution anew for every view, so it cannot be "
-                "combined with cache_file; set resolution and cache_spp for a cache in a file."
-            )
-
-        def camera_rays(builder: CacheBuilder, step: float):
-            return camera_rays_of(
-                builder.parts, self._settings, self._hide_emitters, self._quadrature, step
-            )
-
-        step = self._step if "step" in props.wrapped else None
-        return ToleranceSearch(
-            tolerance, unit, self._settings, step, self._new_builder, camera_rays
-        )
-
-    def _meet_tolerance(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int) -> int:
-        """Choose cache and step for an image of ``sensor``; return the samples per pixel."""
-        check_sensor(scene, sensor)
-        self._stopping.begin(self._timeout)
-        progress = self._stopping.raising(self.progress)
-        try:
-            found = self._search.find(scene, sensor, spp, seed, progress)
-        except Stopped:
-            self.certificate = None
-            mi.Log(
-                mi.LogLevel.Warn,
-                "irrcache: stopped before the error of the image was known; the tolerance is not "
-                "guaranteed.",
-            )
-            return spp
-        before = self.certificate
-        builder, self._chosen_step, spp, self.certificate = found
-        self._builder.adopt(builder)
-        if self.certificate is not before:
-            exceeded = self.certificate.parts and not self.certificate.is_met
-            level = mi.LogLevel.Warn if exceeded else mi.LogLevel.Info
-            mi.Log(level, f"irrcache: {self.certificate}.")
-        return spp
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Duration [s] of those stages of the last image that are measured."""
+        return self._image.seconds
 
     def prepare(self, scene: mi.Scene, sensor: int | mi.Sensor = 0) -> None:
         """Build or complete the cache for ``scene``, unless it is up to date.
@@ -411,126 +324,42 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         With a ``tolerance``, it is the cache for an image of ``sensor``. If several threads call
         this, one builds the cache and the others wait.
         """
-        if self._search is not None:
+        if self._source.depends_on_view:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with dr.suspend_grad(), self._builder.lock:
-                self._meet_tolerance(scene, sensor, 0, 0)
+                self._source.meet_tolerance(scene, sensor, 0, 0, self.progress)
         self._prepared(scene)
 
     @property
     def depends_on_view(self) -> bool:
         """Whether a ``tolerance`` chooses the caches anew for every view."""
-        return self._search is not None
+        return self._source.depends_on_view
 
     def cached_media(self, scene: mi.Scene) -> list[CachedMedium]:
         """Return the visible media of ``scene``, each with its cache as far as it is filled."""
-        self._refuse_tolerance("it chooses the cache for one view, and here there is none")
-        self._refuse_mapped("a cache in memory")
+        self._source.refuse_tolerance("it chooses the cache for one view, and here there is none")
+        self._source.refuse_mapped("a cache in memory")
         with self._builder.lock, dr.suspend_grad():
             self._builder.fit(scene)
             return list(self._builder.parts)
 
-    def _prepared(self, scene: mi.Scene) -> ClosedFormCameraRays | TracedCameraRays | None:
+    def _prepared(self, scene: mi.Scene) -> CameraRays | None:
         """Return the camera rays for the cache of ``scene``; None if no medium is visible."""
         require_same_variant(self._variant, mi.variant())
-        with self._builder.lock:
-            self._stopping.begin(self._timeout)
-            if self._mapped is not None:
-                options = self._hide_emitters, self._quadrature, self._step
-                progress = self._stopping.raising(self.progress)
-                try:
-                    with dr.suspend_grad():
-                        return self._mapped.camera_rays(scene, *options, progress)
-                except Stopped:
-                    raise IrrcacheError(
-                        "irrcache: stopped before the irradiance of the medium in sigma_t_file was "
-                        "complete, so there is no image; raise timeout, or lower cache_spp."
-                    ) from None
-            try:
-                with dr.suspend_grad():
-                    self._builder.update(scene, self._stopping.raising(self.progress))
-            except Stopped:
-                self._log_what_is_missing()
-            if self._revision != self._builder.revision:
-                earlier, self._camera_rays = self._camera_rays, self._make_camera_rays()
-                is_same_scene = self._parts is self._builder.parts
-                if is_same_scene and isinstance(earlier, TracedCameraRays):
-                    self._camera_rays.adopt(earlier)
-                self._parts = self._builder.parts
-                # Only the thread that recorded a scatter operation can evaluate it.
-                dr.eval()
-                self._revision = self._builder.revision
-                if self._camera_rays is None:
-                    self._choose_stock(scene)
-            return self._camera_rays
-
-    def _choose_stock(self, scene: mi.Scene) -> None:
-        """Choose and log the integrator for a scene without a visible medium."""
-        self._chosen, reason = choose_stock(scene)
-        mi.Log(
-            mi.LogLevel.Info,
-            f"irrcache: no medium is visible, so no cache is used: {self._chosen} renders this "
-            f"scene ({reason}).",
-        )
-
-    def _log_what_is_missing(self) -> None:
-        done, target = self._builder.done, self._builder.target
-        if done < target:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f"irrcache: stopped with {done} of {target} samples per voxel in the cache. The "
-                "next rendering completes them.",
-            )
-
-    def _refuse_tolerance(self, reason: str) -> None:
-        if self._search is not None:
-            raise IrrcacheError(
-                f"irrcache: tolerance cannot be used here, since {reason}; set resolution, "
-                "cache_spp and step instead."
-            )
-
-    def _refuse_mapped(self, what: str) -> None:
-        if self._mapped is not None:
-            raise IrrcacheError(
-                f"irrcache: {what} is not supported for a medium in sigma_t_file; remove "
-                "sigma_t_file, and reduce the volume to one that fits into memory."
-            )
+        return self._source.camera_rays(scene, self.progress)
 
     def cancel(self) -> None:
         """End the current rendering, in any thread, with the samples completed so far."""
         self._stopping.cancel()
-        for integrator in self._stock.values():
-            integrator.cancel()
+        self._stock.cancel()
 
     def should_stop(self) -> bool:
         """Whether rendering was cancelled or has reached its ``timeout``."""
         return self._stopping.is_due
 
-    def _make_camera_rays(self) -> ClosedFormCameraRays | TracedCameraRays | None:
-        """Create the camera rays for the current caches; None if no medium is visible."""
-        return camera_rays_of(
-            self._builder.parts,
-            self._settings,
-            self._hide_emitters,
-            self._quadrature,
-            self._chosen_step,
-            self._layered,
-            self._with_error,
-        )
-
-    @property
-    def _layered(self) -> bool:
-        """Whether AOVs or the filter require more than the radiance."""
-        return bool(self._aovs) or self._filter != "none"
-
-    @property
-    def _with_error(self) -> bool:
-        """Whether the error of the cache must be projected with the radiance."""
-        return self._filter == "bilateral" or bool({"noise", "bias"} & {*self._aovs.values()})
-
     def aov_names(self) -> list[str]:
         """Names of the channels in addition to colour and alpha, in the film's order."""
-        return [f"{name}.{c}" for name, kind in self._aovs.items() for c in AOVS[kind]]
+        return self._image.aov_names()
 
     def sample(
         self,
@@ -544,16 +373,16 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         The mask is a random rounding of alpha.
         """
-        self._refuse_tolerance("another integrator calls this one, without the sensor")
-        self._refuse_mapped("an integrator that calls this one")
+        self._source.refuse_tolerance("another integrator calls this one, without the sensor")
+        self._source.refuse_mapped("an integrator that calls this one")
         camera_rays = self._prepared(scene)
         if camera_rays is None:
-            radiance, valid, _ = self._fallback().sample(scene, sampler, ray, medium, active)
-            return radiance, valid, self._aov_values(Layers.background_only(radiance))
-        radiance, alpha, layers = self._radiance(
+            radiance, valid, _ = self._stock.chosen.sample(scene, sampler, ray, medium, active)
+            return radiance, valid, self._image.aov_values(Layers.background_only(radiance))
+        radiance, alpha, layers = self._image.sample(
             camera_rays, scene, sampler, ray, medium, mi.Spectrum(1), mi.Bool(active)
         )
-        return radiance, sampler.next_1d(active) < alpha, self._aov_values(layers)
+        return radiance, sampler.next_1d(active) < alpha, self._image.aov_values(layers)
 
     def render(
         self,
@@ -570,15 +399,16 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         # Threads exclude each other if they share the integrator, whose cache one of them may
         # refine, or the film, which stores one image only.
         with dr.suspend_grad(), self._builder.lock, exclusive(sensor.film()):
-            if self._search is not None:
-                spp = self._meet_tolerance(scene, sensor, spp, seed)
+            if self._source.depends_on_view:
+                spp = self._source.meet_tolerance(scene, sensor, spp, seed, self.progress)
             camera_rays = self._prepared(scene)
+            view = scene, sensor, seed, spp
             if camera_rays is None:
-                film = self._render_empty(scene, sensor, seed, spp)
+                film = self._image.render_stock(self._stock.chosen, *view)
             else:
                 if isinstance(camera_rays, TracedCameraRays):
-                    camera_rays.prepare_view(scene, sensor, spp, self._settings.seed)
-                film = self._render(camera_rays, scene, sensor, seed, spp)
+                    camera_rays.prepare_view(scene, sensor, spp, self._options.settings.seed)
+                film = self._image.render(camera_rays, *view, self.should_stop)
             image = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 dr.eval(image)
@@ -600,8 +430,8 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
         See `mitsuba_irrcache.pipeline.progressive.Targets`.
         """
-        self._refuse_tolerance("a progressive run has targets of its own")
-        self._refuse_mapped("a progressive run (--budget, --error)")
+        self._source.refuse_tolerance("a progressive run has targets of its own")
+        self._source.refuse_mapped("a progressive run (--budget, --error)")
 
         def image() -> tuple[mi.TensorXf, float]:
             tensor = self.render(scene, sensor, seed, spp)
@@ -686,102 +516,17 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         """Return the derivatives of images of ``scene`` by the parameters ``keys``."""
         from mitsuba_irrcache.gradients.backward import ParameterAdjoint, check
 
-        self._refuse_tolerance("an objective would jump with the resolution")
-        self._refuse_mapped("a gradient")
+        self._source.refuse_tolerance("an objective would jump with the resolution")
+        self._source.refuse_mapped("a gradient")
         camera_rays = self._prepared(scene)
-        check(self._builder.parts, keys, self._layered)
+        check(self._builder.parts, keys, self._options.rays.layered)
         (part,) = self._builder.parts
-        image = camera_rays, self._step, self._emission
+        image = camera_rays, self._options.rays.step, self._options.emission
         return ParameterAdjoint(scene, params, keys, part, image, seed)
-
-    def _render(
-        self,
-        camera_rays: ClosedFormCameraRays | TracedCameraRays,
-        scene: mi.Scene,
-        sensor: mi.Sensor,
-        seed: int,
-        spp: int,
-    ) -> mi.Film:
-        medium = sensor.get_medium()
-        check_sensor(scene, sensor)  # the sensor may have moved, or may not belong to the scene
-
-        def radiance(sampler, ray, weight, active) -> tuple:
-            found = self._radiance(camera_rays, scene, sampler, ray, medium, weight, active)
-            return *found[:2], found[2].channels() if found[2] else []
-
-        count = camera_rays.projection.channel_count
-        names = [f"layer.{i}" for i in range(count)]
-        refine = isinstance(camera_rays, TracedCameraRays) and camera_rays.caches_surfaces
-        film = render_film(sensor, radiance, seed, spp, self.should_stop, names, refine)
-        if not count:
-            return film
-        _, alpha, channels = planes(film, count)
-        self._finish(film, Layers.of(channels), alpha)
-        return film
-
-    def _render_empty(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.Film:
-        """Render a scene without a visible medium by Mitsuba's own integrator, as background."""
-        film = sensor.film()
-        check_film(film, spp or sensor.sampler().sample_count(), 0, at_once=True)
-        self._fallback().render(scene, sensor, seed, spp)
-        if self._aovs:
-            colour, alpha, _ = planes(film, 0)
-            channels = (colour * 3)[: dr.size_v(mi.Spectrum)]
-            self._finish(film, Layers.background_only(mi.Spectrum(*channels)), alpha)
-        return film
-
-    def _finish(self, film: mi.Film, layers: Layers, alpha: mi.Float | None) -> None:
-        """Filter the layers, compose the image, and record the duration."""
-        if self._filter != "none":
-            dr.eval(layers)
-            dr.sync_thread()
-        started = perf_counter()
-        filtered = filter_illumination(self._filter, layers, film.crop_size())
-        if filtered is not None:
-            dr.eval(filtered)
-            dr.sync_thread()
-        self.seconds = {"filter": perf_counter() - started}
-        aovs = dict(zip(self.aov_names(), self._aov_values(layers), strict=True))
-        fill_film(film, layers.radiance(filtered), alpha, aovs)
-
-    def _aov_values(self, layers: Layers | None) -> list[mi.Float]:
-        return [value for kind in self._aovs.values() for value in layers.aov(kind)]
-
-    def _radiance(
-        self,
-        camera_rays: ClosedFormCameraRays | TracedCameraRays,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        medium: mi.Medium | None,
-        weight: mi.Spectrum,
-        active: mi.Bool,
-    ) -> tuple[mi.Spectrum, mi.Float, Layers | None]:
-        """Return radiance times ``weight``, alpha, and the layers of the radiance if required."""
-        view = camera_rays.sample(scene, sampler, mi.Ray3f(ray), medium, active)
-        layers = None
-        if self._layered:
-            layers = camera_rays.projection.layers(
-                view.scattered, view.transmittance, view.gathered, view.background, weight
-            )
-        return (view.scattered + view.background) * weight, view.alpha, layers
-
-    def _fallback(self) -> mi.Integrator:
-        if self._chosen not in self._stock:
-            self._stock[self._chosen] = mi.load_dict(
-                {
-                    "type": self._chosen,
-                    "max_depth": self._settings.max_depth,
-                    "rr_depth": self._settings.rr_depth,
-                    "hide_emitters": self._hide_emitters,
-                    "timeout": self._timeout,
-                }
-            )
-        return self._stock[self._chosen]
 
     def to_string(self) -> str:
         """All properties with their current values, as a record of how an image was computed."""
-        aovs = ", ".join(f"{name}:{kind}" for name, kind in self._aovs.items())
+        aovs = ", ".join(f"{name}:{kind}" for name, kind in self._options.aovs.items())
         values = self._properties.values | {"cache_spp": self.cache_spp, "aovs": aovs}
         return f"IrradianceCachingIntegrator[\n{properties.described(values)}\n]"
 

@@ -469,8 +469,7 @@ def test_no_work_for_unused_filter_and_aovs(scenes, monkeypatch):
     """Without filter and AOVs, no errors and layers are computed and no film is developed for
     them.
     """
-    from mitsuba_irrcache.integrators import irrcache
-
+    from mitsuba_irrcache.imaging import image
     from mitsuba_irrcache.render import camera
 
     def forbidden(*args, **kwargs):
@@ -478,10 +477,10 @@ def test_no_work_for_unused_filter_and_aovs(scenes, monkeypatch):
 
     monkeypatch.setattr(camera, "uncertainty_of", forbidden)
     for name in ("planes", "fill_film", "filter_illumination", "Layers"):
-        monkeypatch.setattr(irrcache, name, forbidden)
+        monkeypatch.setattr(image, name, forbidden)
     scene = noisy(scenes, {"cache_spp": 8}, size=6)
     assert scenes.image(scene, spp=1).shape == (6, 6, 3)
-    assert scene.integrator()._camera_rays.projection.channel_count == 0
+    assert scene.integrator()._source.latest.projection.channel_count == 0
 
 
 def test_aovs_without_errors_compute_none(scenes, monkeypatch):
@@ -492,7 +491,7 @@ def test_aovs_without_errors_compute_none(scenes, monkeypatch):
     scene = noisy(scenes, {"cache_spp": 8, "aovs": "colour,depth", "filter": "fixed"}, size=6)
     scenes.image(scene, spp=1)
     assert scene.integrator().cache.samples == 8
-    projection = scene.integrator()._camera_rays.projection
+    projection = scene.integrator()._source.latest.projection
     assert projection.channel_count == 4 * dr.size_v(mi.Spectrum) + 2
 
 

@@ -305,9 +305,9 @@ def test_interrupted_image(folder, capsys, monkeypatch):
     """Ctrl-C during rendering, which Mitsuba wraps in an error, is reported as an interrupt,
     too.
     """
-    from mitsuba_irrcache.integrators import irrcache
+    from mitsuba_irrcache.imaging import image
 
-    monkeypatch.setattr(irrcache, "render_film", interrupt)
+    monkeypatch.setattr(image, "render_film", interrupt)
     assert run("render", folder / "scene.xml", "-o", folder / "a.exr") == 130
     assert "interrupted; no image was written" in capsys.readouterr().err
     assert not (folder / "a.exr").exists()

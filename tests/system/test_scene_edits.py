@@ -138,7 +138,7 @@ def image(scene: mi.Scene, **options) -> np.ndarray:
 
 def image_without_past(scene: mi.Scene) -> np.ndarray:
     """Render with a new integrator of the same settings."""
-    same = scene.integrator()._settings
+    same = scene.integrator()._options.settings
     return image(scene, integrator=mi.load_dict(settings(same.solver, max_depth=same.max_depth)))
 
 

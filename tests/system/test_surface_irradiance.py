@@ -35,7 +35,7 @@ def scene_of(scenes, objects: dict, **settings) -> mi.Scene:
 
 def nodes_of(scene: mi.Scene):
     """Return the nodes on the surfaces that were rendered last, None without any."""
-    surfaces = scene.integrator()._camera_rays._surfaces
+    surfaces = scene.integrator()._source.latest._surfaces
     return None if surfaces is None else surfaces.nodes
 
 
@@ -131,7 +131,7 @@ def test_nodes_do_not_bias_the_image(scenes, build, options):
     scene = scene_of(scenes, build())
     with_nodes = np.mean([scenes.image(scene, spp=64, seed=s) for s in (1, 2)], axis=0)
     assert nodes_of(scene).count > 100
-    rays, surfaces = scene.integrator()._camera_rays, scene.integrator()._camera_rays._surfaces
+    rays, surfaces = scene.integrator()._source.latest, scene.integrator()._source.latest._surfaces
     rays._surfaces, rays._emitters, emitters = None, None, rays._emitters
     without = options.get("without", 16)
     halves = [

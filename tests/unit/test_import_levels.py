@@ -23,6 +23,7 @@ LEVELS = (
     {"pipeline"},
     {"render"},
     {"gradients", "out_of_core"},
+    {"imaging"},
     {"integrators", "cli", "compare"},
     {"farm", "view"},
 )

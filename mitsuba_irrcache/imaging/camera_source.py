@@ -1,0 +1,143 @@
+"""Camera rays for the current state of a scene, whose caches are completed first."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.imaging.options import Options
+from mitsuba_irrcache.imaging.stock import StockIntegrators
+from mitsuba_irrcache.out_of_core.rendering import MappedMedium
+from mitsuba_irrcache.pipeline.builder import Progress
+from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
+from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays
+from mitsuba_irrcache.render.tolerance import CameraRays, Certificate
+from mitsuba_irrcache.scene.consistency import check_sensor
+
+
+class CameraRaySource:
+    """Makes the camera rays for a scene, and keeps them while its caches stay the same.
+
+    Media and caches are those of ``builder``; with a ``tolerance``, those found for a view. A
+    volume in a file takes their place. ``stock`` is told about scenes without a visible medium,
+    for which there are no camera rays; ``stopping`` ends the construction of a cache early.
+    """
+
+    def __init__(self, options: Options, stopping: StopCondition, stock: StockIntegrators) -> None:
+        self._options, self._stopping, self._stock = options, stopping, stock
+        self.builder = options.builder(options.settings)
+        self._search = options.tolerance_search()
+        self._step = options.rays.step  # or that of the search
+        self._mapped: MappedMedium | None = None
+        if options.volume is not None:
+            whole = not (self._search or options.rays.layered or options.emission is not None)
+            self._mapped = MappedMedium(options.settings, options.volume, whole)
+        #: estimated error of the last image with a ``tolerance``
+        self.certificate: Certificate | None = None
+        #: camera rays of the last scene whose caches are in memory
+        self.latest: CameraRays | None = None
+        self._parts: list[CachedMedium] | None = None  # those of `latest`
+        self._revision = 0  # revision of the builder for which `latest` was created
+
+    @property
+    def depends_on_view(self) -> bool:
+        """Whether caches are chosen anew for every view."""
+        return self._search is not None
+
+    def refuse_tolerance(self, reason: str) -> None:
+        """Raise an error if settings are searched for."""
+        if self._search is not None:
+            raise IrrcacheError(
+                f"irrcache: tolerance cannot be used here, since {reason}; set resolution, "
+                "cache_spp and step instead."
+            )
+
+    def refuse_mapped(self, what: str) -> None:
+        """Raise an error if the extinction of the medium is in a file."""
+        if self._mapped is not None:
+            raise IrrcacheError(
+                f"irrcache: {what} is not supported for a medium in sigma_t_file; remove "
+                "sigma_t_file, and reduce the volume to one that fits into memory."
+            )
+
+    def meet_tolerance(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int, progress: Progress | None
+    ) -> int:
+        """Choose cache and step for an image of ``sensor``; return the samples per pixel."""
+        check_sensor(scene, sensor)
+        try:
+            found = self._search.find(scene, sensor, spp, seed, self._begin(progress))
+        except Stopped:
+            self.certificate = None
+            mi.Log(
+                mi.LogLevel.Warn,
+                "irrcache: stopped before the error of the image was known; the tolerance is not "
+                "guaranteed.",
+            )
+            return spp
+        before = self.certificate
+        builder, self._step, spp, self.certificate = found
+        self.builder.adopt(builder)
+        if self.certificate is not before:
+            exceeded = self.certificate.parts and not self.certificate.is_met
+            level = mi.LogLevel.Warn if exceeded else mi.LogLevel.Info
+            mi.Log(level, f"irrcache: {self.certificate}.")
+        return spp
+
+    def camera_rays(self, scene: mi.Scene, progress: Progress | None) -> CameraRays | None:
+        """Return the camera rays for the cache of ``scene``; None if no medium is visible."""
+        with self.builder.lock:
+            progress = self._begin(progress)
+            if self._mapped is not None:
+                return self._mapped_camera_rays(scene, progress)
+            try:
+                with dr.suspend_grad():
+                    self.builder.update(scene, progress)
+            except Stopped:
+                self._log_what_is_missing()
+            if self._revision != self.builder.revision:
+                self._renew(scene)
+            return self.latest
+
+    def _begin(self, progress: Progress | None) -> Progress:
+        """Start the timeout; return ``progress`` such that it raises `Stopped` when due."""
+        self._stopping.begin(self._options.timeout)
+        return self._stopping.raising(progress)
+
+    def _mapped_camera_rays(self, scene: mi.Scene, progress: Progress) -> ClosedFormCameraRays:
+        options = self._options.rays
+        try:
+            with dr.suspend_grad():
+                return self._mapped.camera_rays(
+                    scene, options.hide_emitters, options.quadrature, options.step, progress
+                )
+        except Stopped:
+            raise IrrcacheError(
+                "irrcache: stopped before the irradiance of the medium in sigma_t_file was "
+                "complete, so there is no image; raise timeout, or lower cache_spp."
+            ) from None
+
+    def _renew(self, scene: mi.Scene) -> None:
+        """Create the camera rays for the current caches of ``scene``."""
+        parts = self.builder.parts
+        earlier, is_same_scene = self.latest, self._parts is parts
+        self.latest = self._options.rays.camera_rays(self.builder, self._step)
+        if is_same_scene and isinstance(earlier, TracedCameraRays):
+            self.latest.adopt(earlier)
+        self._parts = parts
+        # Only the thread that recorded a scatter operation can evaluate it.
+        dr.eval()
+        self._revision = self.builder.revision
+        if self.latest is None:
+            self._stock.choose(scene)
+
+    def _log_what_is_missing(self) -> None:
+        done, target = self.builder.done, self.builder.target
+        if done < target:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"irrcache: stopped with {done} of {target} samples per voxel in the cache. The "
+                "next rendering completes them.",
+            )

@@ -1,0 +1,40 @@
+"""Mitsuba's own integrators, for scenes without a visible medium."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_irrcache.pipeline.defaults import choose_stock
+
+
+class StockIntegrators:
+    """Chooses, loads and keeps Mitsuba's integrators.
+
+    ``properties`` are those that all of them share, such as ``max_depth``.
+    """
+
+    def __init__(self, **properties: object) -> None:
+        self._properties = properties
+        self._loaded: dict[str, mi.Integrator] = {}
+        self._chosen = "volpath"
+
+    def choose(self, scene: mi.Scene) -> None:
+        """Choose and log the integrator for a scene without a visible medium."""
+        self._chosen, reason = choose_stock(scene)
+        mi.Log(
+            mi.LogLevel.Info,
+            f"irrcache: no medium is visible, so no cache is used: {self._chosen} renders this "
+            f"scene ({reason}).",
+        )
+
+    @property
+    def chosen(self) -> mi.Integrator:
+        """The integrator for the latest scene."""
+        if self._chosen not in self._loaded:
+            self._loaded[self._chosen] = mi.load_dict({"type": self._chosen} | self._properties)
+        return self._loaded[self._chosen]
+
+    def cancel(self) -> None:
+        """End the current rendering, in any thread."""
+        for integrator in self._loaded.values():
+            integrator.cancel()
