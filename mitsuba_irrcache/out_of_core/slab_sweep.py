@@ -109,7 +109,7 @@ class SlabSweep:
     ) -> BrickFile:
         directions, weights, offsets = all_ordinates
         total = BrickFile(self._folder / name, self.grid.shape, np.float32, incoming.shape[2])
-        _, axes, _ = self._tracks.record(directions, weights, offsets, by_slice=True)
+        axes = self._tracks.dominant_axes(all_ordinates)
         done = 0
         for axis in range(3):
             rows = np.flatnonzero(axes == axis)
@@ -160,7 +160,7 @@ class _AxisSweep:
         self._tracks, self._levels, self._axis = tracks, levels, axis
         self._ordinates, self._incoming, self._source = ordinates, incoming, source
         self._channels = incoming.shape[2]
-        self._track_count = int(np.prod(np.delete(tracks.size, axis)))
+        self._track_count = int(np.prod(np.delete(tracks.grid.resolution, axis)))
         self._track_index = dr.arange(mi.UInt32, self._track_count)
         dr.eval(self._track_index)
         #: what the tracks of each pair carry
@@ -180,7 +180,7 @@ class _AxisSweep:
         each = 2 * self._track_count * (BYTES + of_channel * self._channels)
         most = MOST_VALUES // (2 * self._track_count * self._channels)
         thickness = max(1, min(_thickness(memory - carried, each), most))
-        return symmetric_slabs(int(self._tracks.size[self._axis]), thickness)
+        return symmetric_slabs(int(self._tracks.grid.resolution[self._axis]), thickness)
 
     def cross(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.out_of_core.slabs import Slab
+from mitsuba_irrcache.solvers.discrete_ordinates.extinction import ExtinctionLayout
 from mitsuba_irrcache.solvers.discrete_ordinates.kernel import SweptMedium
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     coordinates_of,
@@ -17,6 +18,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     slicewise,
     strides_of,
 )
+from mitsuba_irrcache.solvers.discrete_ordinates.track_layout import TrackLayout, against_axis_last
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
     FIXED_POINT_BITS,
     FIXED_POINT_ONE,
@@ -24,34 +26,22 @@ from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
     TransverseFields,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TRANSVERSE, TrackTable
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 
-class _QuantisedValues:
-    """What `Tracks` asks of an extinction: one value for each voxel, in units of ``quantum``."""
-
-    per_voxel, dense = True, False
-
-    def __init__(self, grid: Grid, quantum: float) -> None:
-        self.grid, self.quantum = grid, quantum
-
-    def sides(self, axis: int) -> np.ndarray:
-        """Values along x, y, z."""
-        return self.grid.resolution
-
-
-class SlabTracks(Tracks):
-    """Tracks through all voxels of ``grid``, whose extinction is read slab by slab."""
+class SlabTracks:
+    """Tracks through all voxels of ``grid``, whose extinction is read slab by slab, one value for
+    each voxel in units of ``quantum`` [1/scene unit].
+    """
 
     def __init__(self, grid: Grid, quantum: float) -> None:
-        # Not that of the base class, which needs the extinction of all voxels.
-        self.surfaces = None
-        self.grid = self.extinction_grid = grid
-        self.lower, self.size = np.zeros(3, int), grid.resolution
-        self.one_launch = False
-        self._to_voxels = grid.coordinates.matrix[:3, :3]
-        self._extinction = _QuantisedValues(grid, quantum)
-        self._empty, self._first_extinction = None, [0, 0, 0]
+        self.grid = grid
+        extinction = ExtinctionLayout(grid, grid, quantum, is_dense=False)
+        self._layout = TrackLayout(extinction, (np.zeros(3, int), grid.resolution))
+
+    def dominant_axes(self, ordinates: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+        """The dominant axis of each of these ordinates, which are as in `slab_table`."""
+        _, axes, _ = self._layout.record(*ordinates, by_slice=True)
+        return axes
 
     def slab_table(
         self,
@@ -69,7 +59,7 @@ class SlabTracks(Tracks):
             slabs: the slab that tracks along the axis cross, and the one that those against it
                 cross. The volume consists of both, or of one if they are the same.
         """
-        record, _, along = self.record(*ordinates, by_slice=True)
+        record, _, forward = self._layout.record(*ordinates, by_slice=True)
         (first, end), (_, last_end) = slabs
         slices = (end - first) * (1 if slabs[0] == slabs[1] else 2)
         sides = self.grid.resolution.copy()
@@ -87,9 +77,7 @@ class SlabTracks(Tracks):
             stride=strides[axis],
             extinction_stride=strides[axis],
         )
-        forward = along > 0
-        incoming = np.where(forward[:, None, None], incoming, incoming[:, ::-1])
-        return _table(record, incoming, axis, forward)
+        return _table(record, against_axis_last(incoming, forward), axis, forward)
 
 
 def _table(record: TrackRecord, incoming: np.ndarray, axis: int, forward: np.ndarray) -> TrackTable:

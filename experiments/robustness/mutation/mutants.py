@@ -69,14 +69,14 @@ MUTANTS = (
     ),
     Mutant(
         "extinction of coarse caches shifted by half a voxel (sweep)",
-        "solvers/discrete_ordinates/tracks.py",
+        "solvers/discrete_ordinates/track_layout.py",
         "self.lower[k] * ratio - 0.5,",
         "self.lower[k] * ratio,",
         (SWEEP,),
     ),
     Mutant(
         "the cosine of the slope forgotten: length of a line in a slice (sweep)",
-        "solvers/discrete_ordinates/tracks.py",
+        "solvers/discrete_ordinates/track_layout.py",
         "length=1 / np.abs(along)",
         "length=1 / np.linalg.norm(velocities, axis=1)",
         (SWEEP,),

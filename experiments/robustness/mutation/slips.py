@@ -29,7 +29,7 @@ METRICS_OF_RUNS = "tests/unit/compare/test_metrics_common_error.py"
 SLIPS = (
     Mutant(
         "the way back begins a slice too far (lattice)",
-        "solvers/discrete_ordinates/tracks.py",
+        "solvers/discrete_ordinates/track_layout.py",
         "(size[axis] - 1) * slope",
         "size[axis] * slope",
         (LATTICE,),
@@ -43,7 +43,7 @@ SLIPS = (
     ),
     Mutant(
         "directions of lines against their axis not turned (lattice)",
-        "solvers/discrete_ordinates/tracks.py",
+        "solvers/discrete_ordinates/track_layout.py",
         "directions * np.sign(along)[:, None]",
         "directions",
         (LINE_DIRECTIONS,),

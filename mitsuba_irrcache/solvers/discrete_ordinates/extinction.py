@@ -29,22 +29,21 @@ LEVELS = (1 << 16) - 1
 DENSE = 0.5
 
 
-class Extinction:
-    """The extinction ``sigma_t`` [1/scene unit] at all voxels of ``values_grid``, for tracks
-    through the voxels of ``grid``, which lies over the same box.
+class ExtinctionLayout:
+    """Where tracks through the voxels of ``grid`` find the extinction, whose values are those of
+    the voxels of ``values_grid``, which lies over the same box.
 
-    Values are integers below 2^16, in units of ``quantum``.
+    Values are integers below 2^16, in units of ``quantum`` [1/scene unit]. ``is_dense``: collisions
+    depend on how the extinction changes within a voxel.
     """
 
-    def __init__(self, grid: Grid, values_grid: Grid, sigma_t: mi.Float) -> None:
+    def __init__(self, grid: Grid, values_grid: Grid, quantum: float, is_dense: bool) -> None:
         self.grid, self.values_grid = grid, values_grid
-        #: whether each voxel of ``grid`` has exactly one value
-        self.per_voxel = values_grid.shape == grid.shape
-        #: whether collisions depend on how the extinction changes within a voxel
-        top, self.dense = largest_extinction(grid, float(dr.max(sigma_t)[0]))
-        self.quantum = top / LEVELS
-        self._levels = _packed(quantised(sigma_t, top))
-        self._halves: dict[int, mi.UInt32] = {}  # of slices, by axis
+        self.quantum, self._is_dense = quantum, is_dense
+
+    def is_read_by_voxel(self, has_source: bool) -> bool:
+        """Whether sweeps read one value for each voxel of the grid."""
+        return self.values_grid.shape == self.grid.shape and not (has_source and self._is_dense)
 
     def sides(self, axis: int) -> np.ndarray:
         """Values along x, y, z: one slice for each of the grid's along ``axis``."""
@@ -52,11 +51,23 @@ class Extinction:
         sides[axis] = self.grid.resolution[axis]
         return sides
 
-    def words(self, per_voxel: bool, by_rows: bool) -> int:
-        """How many words `corners` holds for each value: one (by rows) or two where there is one
-        value ``per_voxel``, four for both halves of slices.
+    def words(self, has_source: bool, by_rows: bool) -> int:
+        """How many words `Extinction.corners` holds for each value: one (by rows) or two where
+        sweeps read one value for each voxel, four for both halves of slices.
         """
-        return (1 if by_rows else 2) if per_voxel else 4
+        return (1 if by_rows else 2) if self.is_read_by_voxel(has_source) else 4
+
+
+class Extinction:
+    """The extinction ``sigma_t`` [1/scene unit] at all voxels of ``values_grid``, for tracks
+    through the voxels of ``grid``, which lies over the same box.
+    """
+
+    def __init__(self, grid: Grid, values_grid: Grid, sigma_t: mi.Float) -> None:
+        top, is_dense = largest_extinction(grid, float(dr.max(sigma_t)[0]))
+        self.layout = ExtinctionLayout(grid, values_grid, top / LEVELS, is_dense)
+        self._levels = _packed(quantised(sigma_t, top))
+        self._halves: dict[int, mi.UInt32] = {}  # of slices, by axis
 
     def corners(self, axis: int, words: int) -> mi.UInt32:
         """For each value in all slices along ``axis`` the four values around a track: itself and
@@ -66,14 +77,16 @@ class Extinction:
         single word holds the row of two, and the row above is read separately, which takes half as
         much memory in all.
         """
-        sides = self.sides(axis)
+        sides = self.layout.sides(axis)
         if words < 4:
             values = None
         elif axis in self._halves:
             values = self._halves[axis]
         else:
             count = int(sides[axis])
-            values = self._halves[axis] = _slice_halves(self._levels, self.values_grid, count, axis)
+            values = self._halves[axis] = _slice_halves(
+                self._levels, self.layout.values_grid, count, axis
+            )
         at = coordinates_of(sides, slicewise(axis))
         index, strides = flat_index(at, strides_of(sides)), strides_of(sides)
         steps = []

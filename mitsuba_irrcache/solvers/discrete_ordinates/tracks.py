@@ -19,7 +19,8 @@ arithmetic, and odd parts of what is integrated over directions cancel.
 
 Long characteristics: Askew, *A characteristics formulation of the neutron transport equation in
 complicated geometries*, AEEW-M 1108, 1972. The kernel is in `kernel`, the extinction as it reads it
-in `extinction`, and the table of ordinates in `track_table`.
+in `extinction`, the record of a pair of ordinates in `track_layout`, and their table in
+`track_table`.
 """
 
 from __future__ import annotations
@@ -42,23 +43,13 @@ from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
     sweep_tracks,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
-    STANDARD,
     flat_index,
     layer_and_index,
     slicewise,
     strides_of,
 )
-from mitsuba_irrcache.solvers.discrete_ordinates.track_record import (
-    FIXED_POINT_BITS,
-    FIXED_POINT_ONE,
-    TrackRecord,
-    TransverseFields,
-)
-from mitsuba_irrcache.solvers.discrete_ordinates.track_table import (
-    TRANSVERSE,
-    PairGroup,
-    TrackTable,
-)
+from mitsuba_irrcache.solvers.discrete_ordinates.track_layout import TrackLayout, against_axis_last
+from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup, TrackTable
 
 #: Share of second differences that turns means over cross sections of voxels into values at their
 #: centres: a mean over a unit square smooths with variance 1/12 along both axes, and the Taylor
@@ -97,7 +88,6 @@ class Tracks:
         self.grid, self.extinction_grid = grid, extinction_grid or grid
         self.pause = pause
         self.lower, self.size = np.array(lower), np.array(upper) - np.array(lower)
-        self._to_voxels = grid.coordinates.matrix[:3, :3]
         self._count = max(int(np.prod(np.delete(self.size, axis))) for axis in range(3))
         self._indices = dr.arange(mi.UInt32, self._count)
         dr.eval(self._indices)
@@ -114,12 +104,17 @@ class Tracks:
             if surfaces is not None:
                 needed = concatenated([needed, surfaces.voxels])
             self._empty = EmptySpace.find(grid, needed, lower, upper)
-        #: where the extinction of each axis begins in an array for all of them
-        self._first_extinction = [0, 0, 0]
+        first_extinction = [0, 0, 0]
         if self.one_launch:
-            sizes = [np.prod(self._extinction.sides(axis)) for axis in range(3)]
-            self._first_extinction = np.cumsum([0, *sizes[:2]]).tolist()
+            sizes = [np.prod(self._extinction.layout.sides(axis)) for axis in range(3)]
+            first_extinction = np.cumsum([0, *sizes[:2]]).tolist()
             self._all_corners: dict[int, mi.UInt32] = {}  # of all axes
+        self._layout = TrackLayout(
+            self._extinction.layout,
+            (self.lower, self.size),
+            self._empty.strides if self._empty else (0, 0, 0),
+            first_extinction,
+        )
 
     def active_index(self, voxels: mi.UInt32) -> mi.UInt32:
         """Where these voxels are among the active ones; for others, the number of active voxels."""
@@ -150,58 +145,8 @@ class Tracks:
             by_slice: whether the swept volume is laid out by the slices of each dominant axis.
         """
         incoming = incoming if incoming.ndim == 3 else incoming[..., None]
-        record, axis, along = self.record(directions, weights, offsets, by_slice)
-        forward = along > 0
-        incoming = np.where(forward[:, None, None], incoming, incoming[:, ::-1])
-        return TrackTable(record, incoming, axis, forward)
-
-    def record(
-        self, directions: np.ndarray, weights: np.ndarray, offsets: np.ndarray, by_slice: bool
-    ) -> tuple[TrackRecord, np.ndarray, np.ndarray]:
-        """The record of these ordinates, their dominant axes (n), and their velocities (n) along
-        these axes [voxels / scene unit].
-        """
-        # docs/primer, eq. (4.3)
-        velocities = directions @ self._to_voxels.T
-        axis = np.abs(velocities).argmax(axis=1)
-        pairs = np.arange(len(directions))
-        along = velocities[pairs, axis]
-        strides, extinction_strides = self._strides(axis, by_slice)
-        empty_strides = np.array(self._empty.strides if self._empty else (0, 0, 0))
-        voxels = np.array(strides_of(self.grid.resolution))
-        per_voxel = self._per_voxel(has_source=not by_slice)
-        if per_voxel:
-            first_extinction = extinction_strides @ self.lower
-        else:
-            first_extinction = self.lower[axis] * extinction_strides[pairs, axis]
-        last = self.extinction_grid.resolution - 1 - (self.lower if per_voxel else 0)
-
-        def transverse(number: int) -> TransverseFields:
-            k = TRANSVERSE[axis, number]
-            slope = velocities[pairs, k] / along
-            step = strides[pairs, k], extinction_strides[pairs, k], empty_strides[k], voxels[k]
-            return self._transverse_fields(axis, k, slope, offsets[:, number], step, last[k])
-
-        along_axis = directions * np.sign(along)[:, None]
-        record = TrackRecord(
-            transverse=(transverse(0), transverse(1)),
-            slices=self.size[axis],
-            last_slice=self.size[axis] - 1,
-            stride=strides[pairs, axis],
-            extinction_stride=extinction_strides[pairs, axis],
-            empty_stride=empty_strides[axis],
-            voxel_stride=voxels[axis],
-            first_value=strides @ self.lower,
-            first_extinction=first_extinction + np.array(self._first_extinction)[axis],
-            first_voxel=voxels @ self.lower,
-            length=1 / np.abs(along),
-            weight=weights,
-            quantum=self._extinction.quantum,
-            direction_x=along_axis[:, 0],
-            direction_y=along_axis[:, 1],
-            direction_z=along_axis[:, 2],
-        )
-        return record, axis, along
+        record, axis, forward = self._layout.record(directions, weights, offsets, by_slice)
+        return TrackTable(record, against_axis_last(incoming, forward), axis, forward)
 
     def uncollided(
         self,
@@ -291,56 +236,6 @@ class Tracks:
                 self.pause()
                 yield axis, group, copies
 
-    def _transverse_fields(
-        self,
-        axis: np.ndarray,
-        k: np.ndarray,
-        slope: np.ndarray,
-        offset: np.ndarray,
-        steps: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-        last: np.ndarray,
-    ) -> TransverseFields:
-        """Fields of n pairs with these dominant axes for the transverse axes ``k``: voxels by which
-        tracks move per slice, random shifts, steps of the four flat indices, and the coordinates
-        of the last extinction value.
-        """
-        size = self.size
-        slope = np.rint(slope * FIXED_POINT_ONE).astype(np.int64)
-        slope[slope == 0] = 1  # tracks never stay in a face
-        start = np.minimum((offset * FIXED_POINT_ONE).astype(np.int64), FIXED_POINT_ONE - 1)
-        end = start + (size[axis] - 1) * slope
-        ratio = (self.extinction_grid.resolution / self.grid.resolution)[k]
-        return TransverseFields(
-            size=size[k],
-            stride=steps[0],
-            extinction_stride=steps[1],
-            empty_stride=steps[2],
-            voxel_stride=steps[3],
-            slope=slope,
-            first_shift=0,
-            start=start,
-            last_shift=(end >> FIXED_POINT_BITS) % size[k],
-            last_position=end & (FIXED_POINT_ONE - 1),
-            extinction_ratio=ratio,
-            extinction_origin=self.lower[k] * ratio - 0.5,
-            extinction_last=last,
-        )
-
-    def _per_voxel(self, has_source: bool) -> bool:
-        """Whether sweeps read one value of the extinction for each voxel."""
-        return self._extinction.per_voxel and not (has_source and self._extinction.dense)
-
-    def _strides(self, axis: np.ndarray, by_slice: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Strides (n, 3) of the swept volume and of the extinction for each dominant axis."""
-        layouts = [slicewise(k) for k in range(3)]
-        volume = [
-            strides_of(self.grid.resolution, layout if by_slice else STANDARD) for layout in layouts
-        ]
-        extinction = [
-            strides_of(self._extinction.sides(k), layout) for k, layout in enumerate(layouts)
-        ]
-        return np.array(volume)[axis], np.array(extinction)[axis]
-
     def _medium(self, axis: int, has_source: bool) -> SweptMedium:
         """The extinction for tracks along ``axis``, and empty space.
 
@@ -348,7 +243,7 @@ class Tracks:
         suffice; sweeps with a source would have replaced it there by their wider volumes.
         """
         by_rows = not has_source and not self.one_launch
-        words = self._extinction.words(self._per_voxel(has_source), by_rows)
+        words = self._extinction.layout.words(has_source, by_rows)
         if self.one_launch:
             if words not in self._all_corners:
                 parts = [self._extinction.corners(k, words) for k in range(3)]
