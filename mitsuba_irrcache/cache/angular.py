@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import copy
 from itertools import count, islice
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -104,6 +105,10 @@ class Source:
         sine = dr.maximum(self._size / distance, MIN_ANGULAR_RADIUS)
         cosine = dr.select(sine < MAX_LAMP_SINE, dr.sqrt(1 - dr.square(sine)), 2)
         return offset / distance, cosine
+
+    def distance(self, p: mi.Point3f) -> mi.Float:
+        """Return the distance from ``p`` to the centre of the source, infinite if it is ``far``."""
+        return mi.Float(dr.inf) if self.far else dr.norm(self.place - mi.Vector3f(p))
 
     def variance(self, p: mi.Point3f) -> mi.Float:
         """Mean square angle between the centre of the source and its points, seen from ``p``."""
@@ -266,6 +271,20 @@ class AngularBasis:
             found.append(gain - 1 if source.sharp else gain)
         return found
 
+    def corrections(
+        self, p: mi.Point3f, direction: mi.Vector3f, depths: list[mi.Float]
+    ) -> list[mi.Float]:
+        """Differences that several scattering events into the forward peak make to `gains`, where
+        ``depths`` are their mean numbers between each source and the camera.
+        """
+        found = []
+        for source, depth in zip(self.sources, depths, strict=True):
+            towards, _ = source.seen_from(p)
+            variance = source.variance(p) if source.wide else None
+            cosine = dr.dot(direction, towards)
+            found.append(self.phase.aureole.correction(cosine, depth, variance))
+        return found
+
     def _blurred(
         self, gain: mi.Float, cosine: mi.Float, variance: mi.Float, whole: bool
     ) -> mi.Float:
@@ -354,16 +373,43 @@ def warn_of_sharp_shadows(basis: AngularBasis, name: str) -> None:
     )
 
 
+class SourceDepths(Protocol):
+    """Optical depths of a forward peak between voxels and narrow sources, see `PeakDepths`."""
+
+    channels: int
+    extinctions: list[list[mi.Float]]
+
+    def lengths(self, p: mi.Point3f) -> list[mi.Float]:
+        """Return the length in the medium of the line from ``p`` to each source."""
+
+
 class AngularField:
     """The factor f as a field; ``phi`` and ``moments`` are given per voxel, ordered by channel."""
 
     def __init__(
-        self, directional: AngularBasis, grid: Grid, phi: list[mi.Float], moments: list[mi.Float]
+        self,
+        directional: AngularBasis,
+        grid: Grid,
+        phi: list[mi.Float],
+        moments: list[mi.Float],
+        depths: SourceDepths | None = None,
+        extinctions: list[mi.Float] | None = None,
     ) -> None:
+        """``depths`` are those of a forward peak, with their ``extinctions`` on the grid, ordered
+        by channel; without them, every scattering event counts as the only one.
+        """
         self.directional, self.grid, self.channels = directional, grid, len(phi)
+        self._depths, self._moments = depths, len(moments) // len(phi)
+        sources = len(directional.sources) if depths is not None else 0
         rows = []
         for c, irradiance in enumerate(phi):
-            rows += [irradiance, *moments[c :: self.channels]]
+            own = moments[c :: self.channels]
+            # The interpolated mean extinction is weighted by the irradiance of the source.
+            weighted = [
+                own[k - sources] * extinctions[depths.channels * k + min(c, depths.channels - 1)]
+                for k in range(sources)
+            ]
+            rows += [irradiance, *own, *weighted]
         self._row = len(rows) // self.channels
         self._loads = -(-len(rows) // WIDTH)
         rows += [mi.Float(0)] * (self._loads * WIDTH - len(rows))
@@ -383,22 +429,53 @@ class AngularField:
         basis: list[mi.Float],
         active: mi.Bool,
         with_peak: bool = True,
+        peak_depth: mi.Float | mi.Color3f | None = None,
     ) -> mi.Float | mi.Color3f:
         """Evaluate f at ``p`` for a ray along ``direction``.
 
         ``basis`` is the result of `AngularBasis.basis`; ``with_peak`` as in `AngularBasis.gains`.
+        ``peak_depth`` is the optical depth of scattering into the forward peak between ``p`` and
+        the camera; None: that is neglected, as is the one between ``p`` and narrow sources.
         """
         directional = self.directional
         values = self._interpolated(self.grid.coordinates.point(p), active)
+        rows = [values[c * self._row : (c + 1) * self._row] for c in range(self.channels)]
         weights = basis + directional.gains(p, direction, active, with_peak)
+        corrections = [[]] * self.channels
+        if with_peak and peak_depth is not None and self._depths is not None:
+            depths = self._depths_to_camera(p, rows, peak_depth)
+            corrections = [directional.corrections(p, direction, d) for d in depths]
+            corrections = corrections * (self.channels // len(corrections))
         found = []
-        for c in range(self.channels):
-            phi, *moments = values[c * self._row : (c + 1) * self._row]
+        for (phi, *values), correction in zip(rows, corrections, strict=True):
+            moments = values[: self._moments]
             extra = sum(w * m for w, m in zip(weights, moments, strict=True))
+            narrow = moments[len(basis) :]
+            extra += sum(w * m for w, m in zip(correction, narrow, strict=False))
             ratio = dr.select(phi > 0, 1 + extra / dr.select(phi > 0, phi, 1), 1)
             # A truncated series may be negative, and noisy moments are unbounded.
             found.append(dr.clip(ratio, 0, directional.phase.peak))
         return found[0] if self.channels == 1 else mi.Color3f(found)
+
+    def _depths_to_camera(
+        self, p: mi.Point3f, rows: list[list[mi.Float]], peak_depth: mi.Float | mi.Color3f
+    ) -> list[list[mi.Float]]:
+        """Return the depths of the peak from each source past ``p`` to the camera, in each channel
+        or, where they are alike, in one.
+        """
+        sources, found = len(self.directional.sources), []
+        before = [peak_depth] if isinstance(peak_depth, mi.Float) else list(peak_depth)
+        groups = [[row] for row in rows] if len(before) > 1 and len(rows) > 1 else [rows]
+        lengths = self._depths.lengths(p)
+        for group, depth in zip(groups, before, strict=False):
+            total = []
+            for k, length in enumerate(lengths):
+                irradiance = sum(row[1 + self._moments - sources + k] for row in group)
+                weighted = sum(row[1 + self._moments + k] for row in group)
+                mean = dr.select(irradiance > 0, weighted / irradiance, 0)
+                total.append(dr.fma(mean, length, depth))
+            found.append(total)
+        return found
 
     def _interpolated(self, u: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         """Interpolate the stored values trilinearly."""

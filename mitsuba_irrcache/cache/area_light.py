@@ -191,8 +191,15 @@ class AreaLight(DirectLight):
     def has_one_direction(self) -> bool:
         return False
 
-    def mean_rest(self, basis: AngularBasis, p: mi.Point3f, direction: mi.Vector3f) -> mi.Float:
-        """Average `AngularBasis.rest` over the radiance from the emitter.
+    def mean_rest(
+        self,
+        basis: AngularBasis,
+        p: mi.Point3f,
+        direction: mi.Vector3f,
+        peak_depth: mi.Float | mi.Color3f | None = None,
+    ) -> mi.Float | mi.Color3f:
+        """Average `AngularBasis.rest` over the radiance from the emitter, with `Aureole.correction`
+        where the ``peak_depth`` between the emitter and the camera is given.
 
         Its points differ between lookups, so that the error of sharp phase functions is noise. The
         radiance is weighted by the transmittance along each line for the mean extinction.
@@ -202,7 +209,7 @@ class AreaLight(DirectLight):
         length, depth = self._closest_length(p), self.depth(p)
         depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
-        return self._mean_rest(basis, p, direction, mean, self._phase_samples, rng)
+        return self._mean_rest(basis, p, direction, mean, self._phase_samples, rng, peak_depth)
 
     @symbolic
     def _mean_rest(
@@ -213,16 +220,23 @@ class AreaLight(DirectLight):
         sigma_t: mi.Float,
         count: mi.UInt32,
         rng: mi.PCG32,
+        peak_depth: mi.Float | mi.Color3f | None,
     ):
         """See `mean_rest`, with ``count`` points and the mean extinction ``sigma_t``."""
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))
         vertex.p = p
         shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
-        total, sum_of_weights, k = mi.Float(0), mi.Float(0), mi.UInt32(0)
+        coloured = isinstance(peak_depth, mi.Color3f)
+        total = mi.Color3f(0) if dr.hint(coloured, mode="scalar") else mi.Float(0)
+        sum_of_weights, k = mi.Float(0), mi.UInt32(0)
         while dr.hint(k < count, label="phase function over an emitter"):
             _, towards, distance, weight = self._sample(vertex, k, shift)
             weight *= dr.exp(-sigma_t * self._length_within(p, towards, distance))
-            total += dr.select(weight > 0, weight * basis.rest(p, direction, towards), 0)
+            rest = basis.rest(p, direction, towards)
+            if dr.hint(peak_depth is not None, mode="scalar"):
+                cosine = dr.dot(direction, towards)
+                rest = rest + basis.phase.aureole.correction(cosine, peak_depth)
+            total += dr.select(weight > 0, weight * rest, 0)
             sum_of_weights += weight
             k += 1
         return dr.select(sum_of_weights > 0, total / sum_of_weights, 0)

@@ -21,6 +21,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis, AngularField, order_of_direct_light
 from mitsuba_irrcache.cache.conservative import unbiased
+from mitsuba_irrcache.cache.peak_depths import peak_depth
 from mitsuba_irrcache.core.fast_math import absorptance, clipped, maximum, minimum
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.spectrum import channel_mean, scatter_channels
@@ -71,6 +72,14 @@ class DirectLight:
         depth, self._passed = self._attenuation(scene, p)
         #: mean extinction on the line to the emitter, for lookups
         self.extinction = self._extinction(scene, depth, survey)
+        #: optical depth of the truncated forward peak over that of the medium, in each channel, or
+        #: the field of its mean extinction, if that is not the same everywhere; None without a peak
+        self._peak_ratio = self._peak_extinction = None
+        if medium.unscattered_exponent is not None:
+            ratio = [dr.opaque(mi.Float, float(e - 1)) for e in medium.unscattered_exponent]
+            self._peak_ratio = ratio[0] if len(ratio) == 1 else mi.Color3f(ratio)
+        elif medium.original is not None:
+            self._peak_extinction = self._extinction_of_peak(survey)
         # transmittance of surfaces and other media at the voxels; None without any
         self._others = self._field_of_others(self._passed, survey) if medium.is_traced else None
         self._means: mi.Spectrum | None = None
@@ -110,6 +119,14 @@ class DirectLight:
         """Return the optical depth of the medium between world positions and the emitter."""
         # docs/primer, eq. (2.5)
         return self.extinction.at_world(p, active) * self.length(p)
+
+    def peak_depth(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
+        """Return the optical depth of scattering into the truncated forward peak between world
+        positions and the emitter.
+        """
+        if self._peak_extinction is None:
+            return self.depth(p, active) * self._peak_ratio
+        return self._peak_extinction.at_world(p, active) * self.length(p)
 
     def length(self, p: mi.Point3f) -> mi.Float:
         """Return the length in the medium of the line from world positions to the emitter."""
@@ -162,6 +179,16 @@ class DirectLight:
         length, sigma_t = self.length(self._centres), self._medium.sigma_t.at_world(self._centres)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
         return self._field_of_extinction(mean, survey)
+
+    def _extinction_of_peak(self, survey: VoxelClasses | None) -> GridField:
+        """Create the field of the mean extinction of the forward peak over `length`."""
+        ray, near, far = DirectLight._line(self, self._centres)
+        depth, length = (
+            peak_depth(self._medium, ray, near, far, near < far),
+            self.length(self._centres),
+        )
+        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
+        return _on_grid(self._grid, self._voxels, mean, survey)
 
     def _field_of_extinction(
         self, mean: mi.Float | mi.Color3f, survey: VoxelClasses | None
@@ -298,17 +325,31 @@ class DirectLightAlongRays:
         """
         self._light, self._basis, self._moments = light, basis, moments
 
-    def _gain(self, p: mi.Point3f, direction: mi.Vector3f, with_peak: bool) -> mi.Float:
-        """Mean of `AngularBasis.gain` over the radiance from the emitter."""
+    def _gain(
+        self,
+        p: mi.Point3f,
+        direction: mi.Vector3f,
+        with_peak: bool,
+        peak_depth: mi.Float | mi.Color3f | None = None,
+    ) -> mi.Float | mi.Color3f:
+        """Mean of `AngularBasis.gain` over the radiance from the emitter; ``peak_depth`` as in
+        `AngularField.factor`.
+        """
         # docs/primer, eq. (2.11)
         light, basis = self._light, self._basis
         if light.has_one_direction:
-            return basis.gain(p, direction, light.towards(p), with_peak)
+            gain = basis.gain(p, direction, light.towards(p), with_peak)
+            if peak_depth is None or not basis.phase.forward:
+                return gain
+            depth, cosine = light.peak_depth(p) + peak_depth, dr.dot(direction, light.towards(p))
+            return maximum(gain + basis.phase.aureole.correction(cosine, depth), 0.0)
         view = direction, basis.basis(direction)
         smooth = self._moments.factor(p, *view, mi.Bool(True), with_peak)
         if not basis.has_rest(with_peak):
             return smooth
-        return dr.maximum(smooth + light.mean_rest(basis, p, direction), 0)
+        if peak_depth is not None and basis.phase.forward:
+            peak_depth = light.peak_depth(p) + peak_depth
+        return maximum(smooth + light.mean_rest(basis, p, direction, peak_depth), 0.0)
 
     def at(
         self,
@@ -316,15 +357,16 @@ class DirectLightAlongRays:
         active: mi.Bool,
         direction: mi.Vector3f | None = None,
         with_peak: bool = False,
+        peak_depth: mi.Float | mi.Color3f | None = None,
     ) -> mi.Spectrum:
         """Evaluate the irradiance at world positions, for anisotropic scattering times 4 pi times
-        the phase function for scattering into ``direction``; ``with_peak`` as in
-        `AngularBasis.gain`.
+        the phase function for scattering into ``direction``; ``with_peak`` and ``peak_depth`` as in
+        `AngularField.factor`.
         """
         light = self._light
         passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
         if self._basis is not None:
-            passed = passed * self._gain(p, direction, with_peak)
+            passed = passed * self._gain(p, direction, with_peak, peak_depth)
         return mi.Spectrum(passed) * light.unobstructed(p, active)
 
     def mean_extinction(self, p: mi.Point3f, active: mi.Bool) -> mi.Float | mi.Color3f:
@@ -339,12 +381,15 @@ class DirectLightAlongRays:
         means: tuple,
         weights: tuple,
         albedo: tuple,
+        with_peak: bool = True,
+        peak_depth: mi.Float | mi.Color3f | None = None,
     ) -> mi.Spectrum:
         """Integrate the radiance scattered towards the camera along a segment.
 
         Given at both ``ends`` (distances along the ray) are the extinction ``sigma``, the mean
         extinction on the line to the emitter (``means``) and the ``albedo``; ``weights`` are the
-        result of `quadrature.segment`.
+        result of `quadrature.segment`; ``with_peak`` and ``peak_depth`` are as in
+        `AngularField.factor`.
 
         The segment is divided into parts. In a part with constant extinction c and optical depth C,
         along which the optical depth to the emitter changes linearly from s0 to s0 + S,
@@ -376,7 +421,7 @@ class DirectLightAlongRays:
         absorbed = absorptance(0.5 * (near + far))
         rule = dr.select(absorbed > 0, (weights[0] + weights[1]) / absorbed, 1)
         if self._basis is not None:
-            total *= self._gain(ray(0.5 * (a + b)), ray.d, with_peak=True)
+            total *= self._gain(ray(0.5 * (a + b)), ray.d, with_peak, peak_depth)
         return total * mi.Spectrum(rule) * dr.inv_four_pi
 
     def _parts(

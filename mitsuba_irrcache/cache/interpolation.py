@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.direct_light import DirectLight
+from mitsuba_irrcache.cache.peak_depths import PeakDepths
 from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
@@ -20,6 +21,8 @@ class Interpolation(Immutable):
             there are none.
         direct_lights: emitters whose irradiance camera rays evaluate themselves; the layers of the
             cache hold its means over voxels.
+        peak_depths: optical depths of scattering into a truncated forward peak between the voxels
+            and narrow sources; None where no peak is truncated, or there are no such sources.
         voxel_classes: where voxels lie among surfaces and media; None where no surface and no other
             medium is among them.
     """
@@ -30,9 +33,11 @@ class Interpolation(Immutable):
         falloff: InverseSquareFactor | None = None,
         direct_lights: Sequence[DirectLight] = (),
         voxel_classes: VoxelClasses | None = None,
+        peak_depths: PeakDepths | None = None,
     ) -> None:
         self.directional, self.falloff = directional, falloff
         self.direct_lights, self.voxel_classes = tuple(direct_lights), voxel_classes
+        self.peak_depths = peak_depths
 
 
 #: Trilinear interpolation of isotropically scattered radiance, and nothing else.

@@ -71,7 +71,12 @@ def moment_field(
             inside = dr.gather(mi.Bool, classes.inside, active)
             chosen = [dr.select(inside, v, 0) for v in chosen]
         scattered.append([on_grid(grid, active, [v]).array for v in chosen])
-    return AngularField(interpolation.directional, grid, *scattered)
+    depths, extinctions = interpolation.peak_depths, None
+    if depths is not None:
+        extinctions = [
+            on_grid(grid, active, [c]).array for source in depths.extinctions for c in source
+        ]
+    return AngularField(interpolation.directional, grid, *scattered, depths, extinctions)
 
 
 def _interpolated_means(sums: BatchSums, interpolation: Interpolation) -> list[mi.Float]:

@@ -11,7 +11,7 @@ coefficients suffice.
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +20,7 @@ import numpy as np
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.media.aureole import PEAK_MOMENTS, Aureole
 
 #: Maximum order of the spherical harmonics in a cache, without and with truncation of a forward
 #: peak.
@@ -94,6 +95,13 @@ class Phase:
         moments = np.where(known, (self.moments - share) / (1 - share), 0)
         return Phase(self.plugin, moments, self.peak / (1 - share), share, self.moments)
 
+    @cached_property
+    def aureole(self) -> Aureole:
+        """Correction of narrow sources for multiple scattering into the ``forward`` peak."""
+        moments = legendre_moments(self.plugin, PEAK_MOMENTS)[0] / self.forward
+        moments[: self.order + 1] = 1
+        return Aureole(moments, self.forward / (1 - self.forward))
+
     def gain(
         self, p: mi.Point3f, direction: mi.Vector3f, towards: mi.Vector3f, active: mi.Bool = True
     ) -> mi.Float:
@@ -123,20 +131,25 @@ def phase_of(medium: mi.Medium, boundary: Boundary, name: str) -> Phase:
     plugin = medium.phase_function()
     if plugin.class_name() == "IsotropicPhaseFunction":
         return ISOTROPIC
-    cosines, weights = _gauss_legendre()
-    values, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], NODES), cosines)
-    known = np.polynomial.legendre.legvander(cosines, MOMENTS - 1)
-    moments = 2 * np.pi * (weights * values) @ known
+    moments, highest = legendre_moments(plugin, MOMENTS)
     _check(plugin, boundary, f"{name} has the phase function {plugin.class_name()}, which")
     if np.abs(moments[1:]).max() < 1e-6:
         return ISOTROPIC
     ends, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], 2), np.array([-1.0, 1.0]))
-    return Phase(plugin, moments / moments[0], 4 * np.pi * max(values.max(), ends.max()))
+    return Phase(plugin, moments, 4 * np.pi * max(highest, ends.max()))
+
+
+def legendre_moments(plugin: mi.PhaseFunction, count: int) -> tuple[np.ndarray, float]:
+    """Return the first moments g_0 = 1, g_1, ... of a phase function, and its largest value."""
+    cosines, weights = _gauss_legendre()
+    values, _ = _evaluate(plugin, np.tile([[0.0], [0.0], [1.0]], NODES), cosines)
+    moments = (weights * values) @ np.polynomial.legendre.legvander(cosines, count - 1)
+    return moments / moments[0], float(values.max())
 
 
 @cache
 def _gauss_legendre() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights on [-1, 1], cached because computing them dominates the other work here."""
+    """Nodes and weights on [-1, 1], stored because computing them dominates the other work here."""
     return np.polynomial.legendre.leggauss(NODES)
 
 

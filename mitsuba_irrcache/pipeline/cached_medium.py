@@ -23,6 +23,7 @@ from mitsuba_irrcache.cache.angular import (
 from mitsuba_irrcache.cache.area_light import area_lights_of
 from mitsuba_irrcache.cache.direct_light import DirectLight, direct_lights_of
 from mitsuba_irrcache.cache.interpolation import Interpolation
+from mitsuba_irrcache.cache.peak_depths import PeakDepths
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
@@ -199,7 +200,10 @@ class CachedMedium:
         if known:
             basis = _angular_basis(scene, medium, known)
         moments = basis.count if basis is not None else 0
-        interpolation = Interpolation(basis, falloff, direct_lights, classes)
+        peak_depths = None
+        if medium.original is not None and basis.sources and dr.width(active):
+            peak_depths = PeakDepths(medium, grid, active, basis.sources)
+        interpolation = Interpolation(basis, falloff, direct_lights, classes, peak_depths)
 
         def empty(fingerprint: dict[str, str]) -> IrradianceCache:
             return IrradianceCache(

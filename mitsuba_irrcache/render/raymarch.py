@@ -110,6 +110,11 @@ class Projection:
         on_grid = irradiance is not None and irradiance.grid is not None
         cell = irradiance.grid.voxel_size.min() if on_grid else medium.shortest_edge
         self.cell = dr.opaque(mi.Float, float(cell))
+        #: scattering into the truncated forward peak over the remaining scattering coefficient
+        self._peak_share: mi.Float | None = None
+        if self.truncates_peak:
+            share = medium.phase.forward
+            self._peak_share = dr.opaque(mi.Float, float(share / (1 - share)))
         max_radiance = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
         if directional is not None:
             max_radiance *= directional.directional.phase.peak
@@ -123,26 +128,44 @@ class Projection:
         opaque = OPAQUE / length if length < dr.inf else dr.inf
         self.lookups = lookups(needed, [opaque, *[dr.inf] * (len(needed) - 1)])
 
-    def fetch(self, fields: AlongRay, t: mi.Float, view: tuple = ()) -> tuple:
+    def fetch(
+        self,
+        fields: AlongRay,
+        t: mi.Float,
+        view: tuple = (),
+        peak: Sequence = (),
+        length: mi.Float | None = None,
+    ) -> tuple:
         """Evaluate the fields at the distance ``t``.
 
         Returns the extinction; the source albedo Phi / (4 pi), in-scattered radiance per unit of
-        optical depth, without the inverse-square factor; and the albedo and the relative errors of
-        Phi, as far as layers need them. ``view`` is the result of `angular_terms`.
+        optical depth, without the inverse-square factor; the albedo and the relative errors of Phi,
+        as far as layers need them; and the ``peak`` at ``t``. ``view`` is the result of
+        `angular_terms`.
+
+        ``peak`` is the optical depth of scattering into a truncated forward peak between the camera
+        and the beginning of a segment of this ``length`` that ends at ``t``, and the extinction of
+        the peak there. If it is empty, scattering into a truncated peak is excluded.
         """
         # docs/primer, eq. (1.3)
         p, active = fields.ray(t), mi.Bool(True)
         sigma_t, *rest = fields.at(t, active)
         extras = [rest[-1]] if self.layered else []
         if not self.has_cache:
-            return sigma_t, mi.Float(0), extras
+            return sigma_t, mi.Float(0), extras, []
         phi, albedo = rest
         phi = self._exclude_occluded(p, phi, active)
         if self.uncertainty is not None:
             extras += self.uncertainty.at_world(p, phi, active)
+        if peak:
+            depth, extinction = peak
+            peak = [depth + 0.5 * length * extinction, sigma_t * albedo * self._peak_share]
+            peak[0] += 0.5 * length * peak[1]
         if self.directional is not None:
-            phi = phi * self.directional.factor(p, *view, active)
-        return sigma_t, albedo * phi * dr.inv_four_pi, extras
+            with_peak = bool(peak) or not self.truncates_peak
+            depth = peak[0] if peak else None
+            phi = phi * self.directional.factor(p, *view, active, with_peak, depth)
+        return sigma_t, albedo * phi * dr.inv_four_pi, extras, list(peak)
 
     def angular_terms(self, direction: mi.Vector3f) -> tuple:
         """Precompute the terms of `fetch` that depend on the direction; empty if isotropic."""
@@ -209,12 +232,14 @@ class Projection:
         offset: mi.Float,
         active: mi.Bool,
         part: MarchedPart | None = None,
+        with_peak: bool = True,
     ):
         """March from ``near`` to ``far``, or through a ``part`` of the medium.
 
         Returns the scattered radiance, the transmittance, the sums for `Layers`, and the emitted
         radiance. ``offset`` in (0, 1] is the length of the first step in steps; ``background`` is
-        the radiance behind the medium, required for early termination.
+        the radiance behind the medium, required for early termination. Without ``with_peak``
+        narrow sources are not scattered into a truncated forward peak.
         """
         # docs/primer, eqs. (1.1), (5.1)
         clearance, fields = self.clearance.along(ray), self.lookups.along(ray)
@@ -225,6 +250,7 @@ class Projection:
         t, step = mi.Float(near), self.step
         per_step = dr.rcp(step)
         extinction, source, extras = self._zero_sample()
+        peak = self._zero_peak() if with_peak else []
         previous, previous_source, previous_length = extinction, source, mi.Float(dr.inf)
         grey = self.medium.sigma_t.channels == 1
         view = self.angular_terms(ray.d)
@@ -255,7 +281,12 @@ class Projection:
             previous = dr.select(skip, 0, previous)
             previous_length = dr.select(skip, step, previous_length)
             emission_at_start = dr.select(skip, 0, emission_at_start)
-            next_extinction, next_source, next_extras = self.fetch(fields, end, view)
+            length = end - t
+            if dr.hint(bool(peak), mode="scalar"):
+                peak = [peak[0], dr.select(skip, 0, peak[1])]
+            next_extinction, next_source, next_extras, next_peak = self.fetch(
+                fields, end, view, peak, length
+            )
             # Where a segment enters or leaves matter, use the source of the end inside: the cache
             # may have no value at the other end.
             enters = dr.max(mi.Spectrum(extinction)) == 0
@@ -265,7 +296,6 @@ class Projection:
             leaves = dr.max(mi.Spectrum(next_extinction)) == 0
             next_source = dr.select(leaves, source, next_source)
             next_extras = _select(leaves, extras, next_extras)
-            length = end - t
             ratio = length / previous_length
             # Ignore the curvature behind a short first step.
             ratio = dr.select(ratio < 2, ratio, 0)
@@ -286,8 +316,16 @@ class Projection:
             for i, light in enumerate(self._direct_lights):
                 mean = dr.select(skip, light.mean_extinction(ray(t), skip), means[i])
                 means[i] = light.mean_extinction(ray(end), active)
+                peak_depth = 0.5 * (peak[0] + next_peak[0]) if peak else None
                 radiance += transmittance * light.scattered(
-                    ray, (t, end), ends[0], (mean, means[i]), weights, albedos
+                    ray,
+                    (t, end),
+                    ends[0],
+                    (mean, means[i]),
+                    weights,
+                    albedos,
+                    bool(peak) or not self.truncates_peak,
+                    peak_depth,
                 )
             if dr.hint(self.layered, mode="scalar"):
                 gathered = _gather(
@@ -308,6 +346,7 @@ class Projection:
             transmittance *= segment_transmittance
             previous, previous_source, previous_length = extinction, source, length
             extinction, source, extras = next_extinction, next_source, next_extras
+            peak = next_peak
             # Upper bound of the remaining radiance, relative to the accumulated radiance (1 if both
             # are 0).
             remaining = dr.max(mi.Spectrum(transmittance)) * max_radiance
@@ -343,6 +382,15 @@ class Projection:
         if self.uncertainty is not None and self.has_cache:
             extras += [mi.Float(0)] * self.uncertainty.count
         return zero(self.medium.sigma_t.channels), source, extras
+
+    def _zero_peak(self) -> list:
+        """Return the optical depth and the extinction of a truncated forward peak before a ray
+        enters the medium; empty without such a peak.
+        """
+        if not self.truncates_peak:
+            return []
+        is_coloured = 3 in (self.medium.sigma_t.channels, self.medium.albedo.channels)
+        return [(mi.Color3f if is_coloured else mi.Float)(0) for _ in range(2)]
 
     @property
     def channel_count(self) -> int:

@@ -1,0 +1,89 @@
+"""The aureole: radiance of a narrow source scattered several times into a forward peak.
+
+delta-M (`delta_m`) treats scattering into the forward peak as unscattered, and the TMS correction
+scatters the radiance of narrow sources once with the full phase function, wherever that happens
+along a path. Light that is scattered n times into the peak is thus counted n times, each time with
+the angular distribution of a single scattering event. It should be counted once, with that of n
+events: around the source the image is up to twice too bright, and the aureole too narrow.
+
+For small angles the number of events along a path is Poisson distributed with mean D, the optical
+depth of scattering into the peak, and the Legendre moments of successive distributions multiply
+(Goudsmit and Saunderson 1940). With the moments q_l of the peak, the sum over all n >= 1 has the
+moments e^-D(1 - q_l) - e^-D. One event per position has D q_l, so the phase function of the peak is
+replaced by that with the moments
+
+    a_l = [e^-D(1 - q_l) - e^-D] / D.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Number of Legendre moments, and that from which on they are attenuated, so that a series of a
+#: phase function that is sharper than they resolve does not oscillate.
+PEAK_MOMENTS, FIRST_ATTENUATED = 256, 128
+#: Numbers of angles, mean numbers of scattering events, and angular extents of sources in the
+#: table; the largest of the latter two, beyond which the values are those of the largest.
+ANGLES, DEPTHS, EXTENTS = 128, 32, 24
+MAX_DEPTH, MAX_EXTENT = 30.0, 1.0
+
+
+class Aureole:
+    """The difference between several scattering events into a forward peak and one."""
+
+    # docs/primer, eq. (5.11)
+
+    def __init__(self, moments: np.ndarray, scale: float) -> None:
+        """Tabulate it for a peak with the Legendre ``moments`` q_0 = 1, q_1, ..., `PEAK_MOMENTS` in
+        all, and the share f of the phase function; ``scale`` is f / (1 - f).
+        """
+        angles = np.pi * np.linspace(0, 1, ANGLES) ** 2
+        depths = MAX_DEPTH * np.linspace(0, 1, DEPTHS) ** 2
+        extents = MAX_EXTENT * np.linspace(0, 1, EXTENTS)
+        table = scale * _differences(moments, angles, depths, np.square(extents))
+        table = table.astype(np.float32)
+        self._wide = mi.Texture3f(mi.TensorXf(table[..., None]), wrap_mode=dr.WrapMode.Clamp)
+        self._narrow = mi.Texture2f(mi.TensorXf(table[0][..., None]), wrap_mode=dr.WrapMode.Clamp)
+
+    def correction(
+        self,
+        cosine: mi.Float,
+        depth: mi.Float | mi.Color3f,
+        variance: mi.Float | None = None,
+    ) -> mi.Float | mi.Color3f:
+        """Return what has to be added to 4 pi p / (1 - f) for scattering at an angle with this
+        ``cosine``, where ``depth`` is the mean number of scattering events into the peak between
+        the source and the camera.
+
+        ``variance`` is the mean square angle of a source with extent.
+        """
+        if isinstance(depth, mi.Color3f):
+            return mi.Color3f([self.correction(cosine, d, variance) for d in depth])
+        angle = _centred(dr.sqrt(dr.safe_acos(cosine) * dr.inv_pi), ANGLES)
+        depth = _centred(dr.sqrt(dr.minimum(depth, MAX_DEPTH) * (1 / MAX_DEPTH)), DEPTHS)
+        if variance is None:
+            return self._narrow.eval(mi.Point2f(angle, depth))[0]
+        extent = _centred(dr.minimum(dr.sqrt(variance) * (1 / MAX_EXTENT), 1), EXTENTS)
+        return self._wide.eval(mi.Point3f(angle, depth, extent))[0]
+
+
+def _centred(place: mi.Float, count: int) -> mi.Float:
+    """Convert a place in [0, 1] between the first and the last texel to one on a texture."""
+    return dr.fma(place, (count - 1) / count, 0.5 / count)
+
+
+def _differences(
+    moments: np.ndarray, angles: np.ndarray, depths: np.ndarray, variances: np.ndarray
+) -> np.ndarray:
+    """Evaluate the sums over Legendre polynomials, an array (variance, depth, angle)."""
+    degrees = np.arange(PEAK_MOMENTS)
+    depths = np.maximum(depths, 1e-6)[:, None]
+    several = np.exp(-depths) * np.expm1(depths * moments) / depths
+    beyond = np.clip((degrees - FIRST_ATTENUATED) / (PEAK_MOMENTS - FIRST_ATTENUATED), 0, 1)
+    window = 0.5 * (1 + np.cos(np.pi * beyond))
+    coefficients = (2 * degrees + 1) * window * (several - moments)
+    blur = np.exp(-0.25 * degrees * (degrees + 1) * variances[:, None])
+    polynomials = np.polynomial.legendre.legvander(np.cos(angles), PEAK_MOMENTS - 1)
+    return (blur[:, None] * coefficients) @ polynomials.T
