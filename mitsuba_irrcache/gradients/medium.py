@@ -98,6 +98,7 @@ class MediumAdjoint:
             if self._transport.channels == 1:
                 factors = [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
                 colour = mi.Spectrum(factors)
+        _warn_of_aureole(part)
         beside = None
         if self._phases is not None:
             marches = [
@@ -329,3 +330,17 @@ def values_per_voxel(cache: IrradianceCache) -> int:
 def _largest(channels: list[mi.Float]) -> float:
     """The largest magnitude; 0 without any channels."""
     return max((float(dr.max(dr.abs(values))[0]) for values in channels), default=0.0)
+
+
+def _warn_of_aureole(part: CachedMedium) -> None:
+    """Log a warning if derivatives neglect several scattering events into a forward peak."""
+    cache = part.cache
+    if part.medium.original is None or cache is None or cache.directional is None:
+        return
+    if cache.directional.sources or cache.direct_lights:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'irrcache: medium "{part.medium.name}" scatters sharply: gradients count several '
+            "scattering events into its forward peak as single ones. In pixels within about 10 "
+            "degrees of a sun, point or lamp behind the medium they are wrong by up to a half.",
+        )

@@ -1,0 +1,112 @@
+"""Media with a sharp forward peak in front of narrow sources, and their shadows, by volpath."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SIZE = 16
+DENSITY = np.random.default_rng(0).random((6, 6, 6)) ** 2
+ALBEDO = np.random.default_rng(1).random((6, 6, 6)) * 0.5 + 0.5
+
+
+def cloud(depth: float, g: float, albedo: object = 0.95, tint=(1.0,)) -> dict:
+    """A unit cube of this mean optical depth."""
+    placed = mi.ScalarTransform4f().translate(-0.5)
+    data = (DENSITY / DENSITY.mean() * depth)[..., None] * np.array(tint)
+    if isinstance(albedo, np.ndarray):
+        grid = mi.VolumeGrid(albedo[..., None].astype(np.float32))
+        albedo = {"type": "gridvolume", "grid": grid, "raw": True, "to_world": placed}
+    return {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().scale(0.5),
+        "bsdf": {"type": "null"},
+        "interior": {
+            "type": "heterogeneous",
+            "albedo": albedo,
+            "phase": {"type": "hg", "g": g},
+            "sigma_t": {
+                "type": "gridvolume",
+                "grid": mi.VolumeGrid(data.astype(np.float32)),
+                "raw": True,
+                "to_world": placed,
+            },
+        },
+    }
+
+
+def emitter(kind: str, angle: float) -> dict:
+    """An emitter behind the cube, at this angle [degrees] from the axis of the camera."""
+    a = np.deg2rad(angle)
+    towards = np.array([-np.sin(a), 0, -np.cos(a)])
+    colour = {"type": "rgb", "value": [1.0, 0.8, 0.6]}
+    if kind == "sun":
+        return {"type": "directional", "direction": -towards, "irradiance": colour}
+    position = (6 * towards).tolist()
+    if kind == "point":
+        return {"type": "point", "position": position, "intensity": colour}
+    if kind == "lamp":
+        radiance = {"type": "area", "radiance": colour}
+        return {"type": "sphere", "center": position, "radius": 0.25, "emitter": radiance}
+    pixels = np.full((64, 128, 3), 0.02, np.float32)
+    u = int(np.round((np.arctan2(towards[0], -towards[2]) / (2 * np.pi)) % 1 * 128))
+    pixels[31:33, [(u + k) % 128 for k in (-1, 0)]] = (160, 120, 80)
+    return {"type": "envmap", "bitmap": mi.Bitmap(pixels)}
+
+
+def load(settings: dict, camera: tuple, **objects: dict) -> mi.Scene:
+    origin, target, up = camera
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    sensor = {
+        "type": "perspective",
+        "fov": 12,
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, up),
+        "film": film | {"pixel_format": "rgb"},
+    }
+    return mi.load_dict({"type": "scene", "integrator": settings, "sensor": sensor} | objects)
+
+
+def error(camera: tuple, spp: int, settings: dict | None = None, **objects: dict) -> tuple:
+    """Return the error of the mean and the largest error of a block of 4 x 4 pixels, relative to
+    the mean, and the standard error of the latter.
+    """
+    ours = {"type": "irrcache", "solver": "sweep", "max_depth": -1, "resolution": 16}
+    image = np.array(mi.render(load(ours | (settings or {}), camera, **objects), spp=64, seed=1))
+    scene = load({"type": "volpath", "max_depth": -1, "rr_depth": 1000}, camera, **objects)
+    halves = [np.array(mi.render(scene, spp=spp // 2, seed=s), np.float64) for s in (5, 6)]
+
+    def blocks(pixels: np.ndarray) -> np.ndarray:
+        return pixels.reshape(SIZE // 4, 4, SIZE // 4, 4, 3).mean(axis=(1, 3, 4))
+
+    expected = blocks(sum(halves) / 2)
+    noise = np.abs(blocks(halves[0] - halves[1])).mean() / 2 / expected.mean()
+    difference = (blocks(image) - expected) / expected.mean()
+    return difference.mean(), np.abs(difference).max(), noise
+
+
+@pytest.mark.parametrize(
+    ("kind", "angle", "depth", "g", "albedo", "tint"),
+    [
+        ("sun", 8, 4.0, 0.85, 0.95, (1.0,)),
+        ("sun", 4, 3.0, 0.7, 0.95, (1.0,)),
+        ("sun", 8, 3.0, 0.85, ALBEDO, (1.0,)),
+        ("sun", 8, 3.0, 0.85, 0.95, (0.5, 1.0, 1.5)),
+        ("point", 8, 4.0, 0.85, 0.95, (1.0,)),
+        ("lamp", 20, 4.0, 0.85, 0.95, (1.0,)),
+        ("spot of an environment", 10, 4.0, 0.85, 0.95, (1.0,)),
+    ],
+    ids=lambda value: str(value) if isinstance(value, (str, float, int)) else "",
+)
+def test_against_the_light(kind, angle, depth, g, albedo, tint):
+    """Several scattering events into the peak count once; they counted several times, which made
+    images up to twice too bright.
+    """
+    camera = (0, 0, 4), (0, 0, 0), (0, 1, 0)
+    objects = {"cloud": cloud(depth, g, albedo, tint), "emitter": emitter(kind, angle)}
+    mean, block, noise = error(camera, 2048, **objects)
+    assert noise < 0.03
+    assert abs(mean) < 0.02 + 2 * noise
+    assert block < 0.06 + 2 * noise
