@@ -15,6 +15,7 @@ from mitsuba_irrcache.core.argument_types import argument, finite, finite_number
 from mitsuba_irrcache.core.stage_display import StageDisplay
 from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.volumes import processing, transfer_files
+from mitsuba_irrcache.volumes.colours import USES, ColourVolume, linear, read_colours
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.detached import OPTION
 from mitsuba_irrcache.volumes.formats import format_of, suffixes
@@ -104,23 +105,94 @@ def run(args: argparse.Namespace) -> int:
         IrrcacheError: invalid input; no files are written then.
     """
     display = StageDisplay(is_updated=False)  # large volumes have progress bars
+    if args.colour is not None:
+        return _run_in_colour(args, display)
     with display.stage(f"reading {args.input[0]}"):
         volume, mapping = _volume(args)
     with display.stage("computing extinction and albedo"):
-        resampled, sigma_t, albedo = processing.bake(
-            volume, mapping, _target_size(volume, args), args.supersample
-        )
-    settings = scene_settings(args)
+        baked = processing.bake(volume, mapping, _target_size(volume, args), args.supersample)
+    return _write(args, display, mapping, baked)
+
+
+def _run_in_colour(args: argparse.Namespace, display: StageDisplay) -> int:
+    """Import channels as albedo, emission or extinction."""
+    mapping = _mapping(args)
+    _check_colour(args, mapping)
+    with display.stage(f"reading {args.input[0]}"):
+        channels = read_colours(args.input[0], args.colour, lambda number: _read(args, number))
+    with display.stage("computing extinction and albedo"):
+        size = _target_size(_cropped(channels.density, args), args)
+        if args.colour == "extinction":
+            parts = [_process(channel, args) for channel in channels.rgb]
+            baked = [processing.bake(part, mapping, size, args.supersample) for part in parts]
+            resampled, _, albedo = baked[0]
+            sigma_t = np.stack([extinction for _, extinction, _ in baked], axis=-1)
+            return _write(args, display, mapping, (resampled, sigma_t, albedo))
+        density = _process(channels.density, args)
+        resampled, sigma_t, albedo = processing.bake(density, mapping, size, args.supersample)
+        rgb = _resampled_rgb(channels, size, args)
+    if args.colour == "albedo":
+        return _write(args, display, mapping, (resampled, sigma_t, np.minimum(rgb, 1.0)))
+    return _write(args, display, mapping, (resampled, sigma_t, albedo), rgb)
+
+
+def _check_colour(args: argparse.Namespace, mapping: TransferFunction | DensityMapping) -> None:
+    option = f"--colour {args.colour}"
+    if args.cloud or args.channel is not None:
+        other = "--cloud" if args.cloud else "--channel"
+        raise IrrcacheError(f"{option} and {other} exclude each other; leave one of them out")
+    if args.raw_shape is not None or args.input[0].startswith("phantom:"):
+        raise IrrcacheError(f"{args.input[0]}: {option} needs a file with 3 or 4 channels")
+    if args.colour == "albedo" and args.albedo is not None:
+        raise IrrcacheError(f"{option} and --albedo both state the albedo; leave one of them out")
+    if args.colour == "extinction" and not isinstance(mapping, DensityMapping):
+        raise IrrcacheError(f"{option} needs --density: a transfer function maps one channel")
+    if args.colour == "extinction" and args.isolate is not None:
+        raise IrrcacheError(f"{option} does not support --isolate; import one --channel with it")
+
+
+def _cropped(volume: VolumeData, args: argparse.Namespace) -> VolumeData:
+    """Apply the steps that move voxels and do not change their values."""
+    if args.flip:
+        volume = processing.flip(volume, args.flip)
+    return volume if args.crop is None else processing.crop(volume, args.crop)
+
+
+def _resampled_rgb(
+    channels: ColourVolume, size: processing.Size, args: argparse.Namespace
+) -> np.ndarray:
+    """Return linear colours at ``size`` voxels, float32 ``(z, y, x, 3)``."""
+    parts = [_cropped(linear(channel, args.colour), args) for channel in channels.rgb]
+    if size != parts[0].size:
+        parts = [processing.resample(part, size) for part in parts]
+    return np.stack([part.values for part in parts], axis=-1)
+
+
+def _write(
+    args: argparse.Namespace,
+    display: StageDisplay,
+    mapping: TransferFunction | DensityMapping,
+    baked: tuple[VolumeData, np.ndarray, np.ndarray],
+    emission: np.ndarray | None = None,
+) -> int:
+    resampled, sigma_t, albedo = baked
+    settings = scene_settings(args, "volpath" if emission is None else "irrcache")
     with display.stage(f"writing {args.output}"):
         written = write_scene(
-            args.output, resampled, mapping, sigma_t, albedo, settings, overwrite=args.overwrite
+            args.output, resampled, mapping, sigma_t, albedo, settings, args.overwrite, emission
         )
     print(_summary(resampled, sigma_t, albedo, written, args.output))
+    if emission is not None:
+        print(f"emission       0 .. {emission.max():.4g} per unit length (integrator irrcache)")
     return 0
 
 
 def read(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | DensityMapping]:
     """Read the volume given by ``args`` at the requested resolution, and its appearance."""
+    if args.colour is not None:
+        raise IrrcacheError(
+            f"{args.input[0]}: --colour is for irrcache import; import the file, and view the scene"
+        )
     volume, mapping = _volume(args)
     size = _target_size(volume, args)
     return volume if size == volume.size else processing.resample(volume, size), mapping
@@ -250,6 +322,12 @@ def _add_selection(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--channel", type=whole(0), metavar="N", help="which value of each voxel, counted from 0"
     )
+    group.add_argument(
+        "--colour",
+        choices=USES,
+        help="read 3 channels as red, green and blue: the albedo or emission of a density, which "
+        "is a 4th channel or their luminance; or extinctions (with --density)",
+    )
     group.add_argument("--frame", type=whole(0), metavar="N", help="which time step, from 0")
     group.add_argument(
         "--spacing",
@@ -281,7 +359,7 @@ def _mapping(args: argparse.Namespace) -> TransferFunction | DensityMapping:
     return DensityMapping(scale, albedo * 3 if len(albedo) == 1 else albedo)
 
 
-def _read(args: argparse.Namespace) -> VolumeData:
+def _read(args: argparse.Namespace, channel: int | None = None) -> VolumeData:
     source = args.input[0]
     if source.partition(":")[0] == "phantom" and len(args.input) == 1:
         return _phantom(source)
@@ -295,7 +373,13 @@ def _read(args: argparse.Namespace) -> VolumeData:
         raw=raw,
         series=args.series,
         replace_nan=args.replace_nan,
-        options=ReadOptions(args.field, args.channel, args.frame, args.spacing, args.data_folder),
+        options=ReadOptions(
+            args.field,
+            args.channel if channel is None else channel,
+            args.frame,
+            args.spacing,
+            args.data_folder,
+        ),
         cloud=_cloud(args),
     )
 
@@ -339,10 +423,7 @@ def _phantom(source: str) -> VolumeData:
 
 
 def _process(volume: VolumeData, args: argparse.Namespace) -> VolumeData:
-    if args.flip:
-        volume = processing.flip(volume, args.flip)
-    if args.crop is not None:
-        volume = processing.crop(volume, args.crop)
+    volume = _cropped(volume, args)
     if args.rescale is not None:
         if len(args.rescale) != 2:
             raise IrrcacheError(f"--rescale {args.rescale}: give SLOPE,INTERCEPT")
@@ -386,14 +467,15 @@ def _summary(
     volume: VolumeData, sigma_t: np.ndarray, albedo: np.ndarray, written: int, output: str
 ) -> str:
     """Summarise the import in a few lines that make a wrong unit or spacing obvious."""
+    extinction = sigma_t if sigma_t.ndim == 3 else sigma_t.max(axis=-1)
     depths = [
-        float((sigma_t.sum(axis=2 - axis, dtype=np.float64) * spacing).max())
+        float((extinction.sum(axis=2 - axis, dtype=np.float64) * spacing).max())
         for axis, spacing in enumerate(volume.spacing)
     ]
     size = " x ".join(str(n) for n in volume.size)
     spacing = " x ".join(f"{s:.4g}" for s in volume.spacing)
     extent = " x ".join(f"{e:.4g}" for e in volume.physical_size)
-    empty = 1.0 - np.count_nonzero(sigma_t) / sigma_t.size
+    empty = 1.0 - np.count_nonzero(extinction) / extinction.size
     values = np.asarray(volume.values)
     unit = f" {volume.unit}" if volume.unit else ""
     length = f" ({volume.length_unit})" if volume.length_unit else ""

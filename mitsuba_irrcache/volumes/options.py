@@ -98,13 +98,16 @@ def picked(source: str, what: str, count: int, wanted: int | None) -> int:
     if wanted is None and count == 1:
         return 0
     if wanted is None:
+        uses = "albedo or emission" if count == 4 else "albedo, emission or extinction"
+        colours = f"; or read them as colours: --colour {uses}"
         raise IrrcacheError(
             f"{source} has {count} {what}s; choose one with --{what} N, from 0 to {count - 1}"
+            f"{colours if what == 'channel' and count in (3, 4) else ''}"
         )
     if not 0 <= wanted < count:
+        remedy = f"give 0 to {count - 1}" if count > 1 else f"leave --{what} out"
         raise MissingItemError(
-            f"{source} has {count} {what}(s), but --{what} is {wanted}; give 0 to {count - 1}",
-            count,
+            f"{source} has {count} {what}(s), but --{what} is {wanted}; {remedy}", count
         )
     return wanted
 
@@ -134,11 +137,11 @@ def scalar_volume(source: str, array: Any, axes: str, options: ReadOptions) -> n
             f"{source} is one slice of shape {tuple(array.shape)}; give a volume with axes "
             "(z, y, x), or the files of all slices"
         )
-    wanted = {"c": ("channel", options.channel), "t": ("frame", options.frame)}
-    index = tuple(
-        slice(None) if axis in spatial else _picked_of(source, *wanted[axis], count)
-        for axis, count in zip(axes, array.shape, strict=True)
-    )
+    chosen = {
+        "c": picked(source, "channel", sizes.get("c", 1), options.channel),
+        "t": picked(source, "frame", sizes.get("t", 1), options.frame),
+    }
+    index = tuple(slice(None) if axis in spatial else chosen[axis] for axis in axes)
     voxels = int(np.prod([sizes[axis] for axis in spatial], dtype=object))
     require_memory(voxels * dtype.itemsize, f"reading {source}", "crop or resample it first")
     values = np.asarray(array[index])
@@ -193,11 +196,6 @@ def placement_of(matrix: np.ndarray) -> dict[str, Any]:
         "origin": tuple(matrix[:3, 3]),
         "direction": direction,
     }
-
-
-def _picked_of(source: str, what: str, wanted: int | None, count: int) -> int:
-    """Return the index along an axis; along one of length 1 there is nothing to choose."""
-    return 0 if count == 1 else picked(source, what, count, wanted)
 
 
 def _listed(names: Sequence[str]) -> str:

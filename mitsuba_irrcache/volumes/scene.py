@@ -16,6 +16,7 @@ from mitsuba_irrcache.volumes.staging import staged_files, staged_folder
 from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 
 SIGMA_T_FILE, ALBEDO_FILE, MAPPING_FILE = "sigma_t.vol", "albedo.vol", "transfer_function.json"
+EMISSION_FILE = "emission.vol"
 _FIELD_OF_VIEW = 30.0
 _MARGIN = 1.08
 # Views as (direction in which the camera lies, up). Medical volumes are LPS: the patient faces -y
@@ -61,8 +62,11 @@ def write_scene(
     albedo: np.ndarray,
     settings: SceneSettings | None = None,
     overwrite: bool = False,
+    emission: np.ndarray | None = None,
 ) -> int:
     """Write ``scene.xml``, ``sigma_t.vol``, ``albedo.vol`` and ``transfer_function.json``.
+
+    With ``emission`` also ``emission.vol``, which the integrator ``irrcache`` alone renders.
 
     Args:
         target: a folder, created atomically; it replaces an earlier import on success only. Or a
@@ -70,10 +74,11 @@ def write_scene(
             whose unrelated files are not changed.
         volume: gives the placement; scene units are its world units.
         mapping: how the grids were made, saved as a record.
-        sigma_t: shape ``(z, y, x)``, extinction in 1/world unit.
+        sigma_t: shape ``(z, y, x)`` or ``(z, y, x, 3)``, extinction in 1/world unit.
         albedo: shape ``(z, y, x, 3)``; stored as one channel where it is grey.
         settings: defaults of the scene's parameters.
         overwrite: replace an earlier import.
+        emission: shape ``(z, y, x, 3)``, radiance emitted per world unit.
 
     Returns:
         the number of bytes written.
@@ -87,7 +92,8 @@ def write_scene(
     target = Path(target)
     as_file = target.suffix.lower() == ".xml"
     scene_name = target.name if as_file else "scene.xml"
-    names = {SIGMA_T_FILE, ALBEDO_FILE, MAPPING_FILE, scene_name}
+    # An earlier import may have had an emission.
+    names = {SIGMA_T_FILE, ALBEDO_FILE, EMISSION_FILE, MAPPING_FILE, scene_name}
     staged = (
         staged_files(target.parent, names, overwrite)
         if as_file
@@ -96,8 +102,11 @@ def write_scene(
     with staged as folder:
         write_vol(folder / SIGMA_T_FILE, sigma_t)
         write_vol(folder / ALBEDO_FILE, albedo[..., :1] if _is_grey(albedo) else albedo)
+        if emission is not None:
+            write_vol(folder / EMISSION_FILE, emission)
         (folder / MAPPING_FILE).write_text(mapping.to_json(), encoding="utf-8")
-        xml = scene_xml(volume.to_world, camera(volume, sigma_t, settings.up), settings)
+        view = camera(volume, sigma_t, settings.up)
+        xml = scene_xml(volume.to_world, view, settings, emission is not None)
         (folder / scene_name).write_text(xml, encoding="utf-8")
         return sum(path.stat().st_size for path in folder.iterdir())
 
@@ -126,7 +135,12 @@ def camera(volume: VolumeData, sigma_t: np.ndarray, up: str = "z") -> tuple[np.n
     return target + distance * towards, target, up_vector
 
 
-def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: SceneSettings) -> str:
+def scene_xml(
+    to_world: np.ndarray,
+    view: tuple[np.ndarray, ...],
+    settings: SceneSettings,
+    emits: bool = False,
+) -> str:
     """Return the scene; ``to_world`` is of the grids' unit cube, ``view`` as from ``camera``."""
     grid, boundary = _text(to_world), _text(_boundary_to_world(to_world))
     origin, target, up = (_text(vector) for vector in view)
@@ -141,6 +155,15 @@ def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: Scen
         "scale": f"{settings.scale:.9g}",
         "radiance": f"{settings.radiance:.9g}",
     }
+    emission = ""
+    if emits:
+        defaults["emission"] = "1"
+        emission = f"""
+        <volume name="emission" type="gridvolume">
+            <string name="filename" value={quoteattr(EMISSION_FILE)}/>
+            <transform name="to_world"><matrix value="{grid}"/></transform>
+        </volume>
+        <float name="emission_scale" value="$emission"/>"""
     phase = '<phase type="isotropic"/>'
     if settings.asymmetry:
         defaults["g"] = f"{settings.asymmetry:.9g}"
@@ -159,7 +182,7 @@ def scene_xml(to_world: np.ndarray, view: tuple[np.ndarray, ...], settings: Scen
 
     <integrator type="$integrator">
         <integer name="max_depth" value="$max_depth"/>
-        <boolean name="hide_emitters" value="$hide_emitters"/>
+        <boolean name="hide_emitters" value="$hide_emitters"/>{emission}
     </integrator>
 
     <sensor type="perspective">
@@ -234,7 +257,7 @@ def _text(numbers: np.ndarray) -> str:
 
 def _occupied_ends(volume: VolumeData, sigma_t: np.ndarray) -> np.ndarray:
     """Return world positions ``(n, 3)`` of the first and last nonzero voxel of each row."""
-    occupied = sigma_t > 0
+    occupied = sigma_t > 0 if sigma_t.ndim == 3 else (sigma_t > 0).any(axis=-1)
     z, y = np.nonzero(occupied.any(axis=2))
     rows = occupied[z, y]
     first = rows.argmax(axis=1)
@@ -253,7 +276,7 @@ def _is_grey(albedo: np.ndarray) -> bool:
 
 def _check_medium(volume: VolumeData, sigma_t: np.ndarray, albedo: np.ndarray) -> None:
     shape = volume.values.shape
-    if sigma_t.shape != shape or albedo.shape != (*shape, 3):
+    if sigma_t.shape not in (shape, (*shape, 3)) or albedo.shape != (*shape, 3):
         raise IrrcacheError(
             f"extinction {sigma_t.shape} and albedo {albedo.shape} do not fit the volume {shape}; "
             "bake them from it"
