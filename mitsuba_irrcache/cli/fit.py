@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--held-out", type=whole(0), default=0, metavar="N",
-        help="how many of the last images are not fitted, but tell the error (default: 0)",
+        help="number of images at the end that are held out to measure the error (default: 0)",
     )  # fmt: skip
     parser.add_argument(
         "--method", choices=METHODS, default=own.method, help="optimiser (default: %(default)s)"

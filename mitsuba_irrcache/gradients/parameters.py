@@ -86,7 +86,7 @@ def _first_key_of(params: mi.SceneParameters, node: mi.Object, keys: list[str]) 
 def refuse(key: str, reason: str) -> None:
     """Raise the error for a parameter without gradients."""
     raise IrrcacheError(
-        f'irrcache computes no gradient of the parameter "{key}": {reason}. Gradients are known of '
+        f'irrcache computes no gradient of the parameter "{key}": {reason}. It has gradients of '
         "sigma_t and albedo of a medium and of the radiance of emitters and emission; detach this "
         'parameter (dr.disable_grad, params.update), or use the integrator "prbvolpath".'
     )

@@ -108,7 +108,7 @@ def _read_header(path: Path) -> tuple[tuple[int, int, int], int, np.ndarray]:
     if file_bytes != expected:
         state = "truncated" if file_bytes < expected else "too long"
         raise IrrcacheError(
-            f"{path} is {state}: its header says {size} voxels (x, y, z) and {channels} channels, "
-            f"{expected} bytes, but it has {file_bytes}; copy or export it again"
+            f"{path} is {state}: its header declares {size} voxels (x, y, z) and {channels} "
+            f"channels, {expected} bytes, but it has {file_bytes}; copy or export it again"
         )
     return tuple(size), channels, np.array(fields[7:], dtype=np.float64).reshape(2, 3)

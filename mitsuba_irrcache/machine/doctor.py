@@ -315,7 +315,9 @@ def _system_lines(report: dict[str, Any]) -> list[str]:
     system, cuda, cache = report["system"], report["cuda"], report["kernel_cache"]
     extensions = ", ".join(system["vector_extensions"]) or "vector extensions unknown"
     gpu = f"CUDA {cuda['driver']}" if cuda["available"] else "no GPU that Dr.Jit can use"
-    writable = "" if cache["writable"] else " - NOT WRITABLE, every start compiles anew"
+    writable = (
+        "" if cache["writable"] else " - not writable: every process compiles its kernels again"
+    )
     return [
         "System",
         f"  Python         {system['python']}",

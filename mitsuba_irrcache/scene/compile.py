@@ -192,7 +192,7 @@ def _among_others(grids: list[MediumGrid], number: int, visible: set[str]) -> Me
 
 def _warn_that_none_is_visible(emission: Emission | None, reason: str) -> None:
     if emission is not None:
-        _refuse(f"{reason}, and emission of media is unknown to volpath")
+        _refuse(f"{reason}, and volpath does not render the emission of media")
     mi.Log(
         mi.LogLevel.Warn,
         f"irrcache: {reason}, so this scene is rendered as volpath does. A shape that only bounds "

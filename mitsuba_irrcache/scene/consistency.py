@@ -378,11 +378,12 @@ def _refuse_dispute(scene: mi.Scene, names: _Names, votes: Counter) -> None:
             _refuse_single(scene, names, side, set())
     first, second = (names.shape(side) for side in sides)
     raise UnsupportedSceneError(
-        f"irrcache: {first} and {second} disagree about the medium between them: the one says "
-        f"{names.medium(one)}, the other {names.medium(other)}. They overlap, or share a face, or "
-        "one is within the other without saying so, or there is a gap between them. The medium "
-        "would depend on the path of a ray. Move them apart by a thousandth of their size; "
-        "where one is within the other, give it the medium around it as its exterior. Otherwise "
+        f"irrcache: {first} and {second} disagree about the medium between them: "
+        f"{names.medium(one)} according to the first, {names.medium(other)} according to the "
+        "second. They overlap, or share a face, or there is a gap between them, or one is within "
+        "the other and has another exterior than the medium around it. The medium would depend on "
+        "the path of a ray. Move them apart by a thousandth of their size, or correct the "
+        "exterior. Otherwise "
         'render this scene with "volpath", which shows the medium that was entered last.'
     )
 
@@ -405,8 +406,8 @@ def _refuse_single(scene: mi.Scene, names: _Names, number: int, media: set[int])
             'once more, or toggle flip_normals. Otherwise render this scene with "volpath".'
         )
     raise UnsupportedSceneError(
-        f"irrcache: {names.shape(number)} is not closed, or overlaps itself: rays enter and leave "
-        "its medium other than in turn, and take it to infinity, or lose it within. (Mitsuba "
+        f"irrcache: {names.shape(number)} is not closed, or overlaps itself: some rays enter its "
+        "medium twice, or leave it without having entered. (Mitsuba "
         "merges meshes that bound the same medium into one shape.) Close it, or move its parts "
         'apart by a thousandth of their size. Otherwise render this scene with "volpath".'
     )
@@ -415,9 +416,10 @@ def _refuse_single(scene: mi.Scene, names: _Names, number: int, media: set[int])
 def _refuse_infinite(names: _Names, medium: int) -> None:
     """Raise the error for a medium in which rays leave the scene."""
     raise UnsupportedSceneError(
-        f"irrcache: {names.medium(medium)} is the exterior of shapes and fills none, and rays take "
-        "it out of the scene: volpath then shows no light from there. Put a closed shape with a "
-        "null BSDF, such as a cube, around everything that has it as its interior. Otherwise "
+        f"irrcache: {names.medium(medium)} is the exterior of shapes, but the interior of none: it "
+        "would be infinite, and no radiance of an environment would reach the camera. Put a closed "
+        "shape with a null BSDF, such as a cube, around the scene, and make the medium its "
+        "interior. Otherwise "
         'render this scene with "volpath".'
     )
 

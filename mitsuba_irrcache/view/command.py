@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     if args.mode.startswith("llvm"):
         require_llvm()
     if args.output is not None and not args.output.absolute().parent.is_dir():
-        raise IrrcacheError(f'--output is "{args.output}", whose parent folder is not there.')
+        raise IrrcacheError(f'--output is "{args.output}", whose parent folder does not exist.')
     _show(args)
     return 0
 

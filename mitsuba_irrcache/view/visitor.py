@@ -220,7 +220,7 @@ class Visitor:
             send("comparison", {"mode": "off"}, key)
             return
         if found is None:
-            found = Compared(picture.view.compared, "volpath waits for the camera to rest")
+            found = Compared(picture.view.compared, "volpath waits until the camera stops")
         send("comparison", described(found), key)
         if found.reference is not None:
             pixels = io.BytesIO()

@@ -93,8 +93,9 @@ def _found(
             standard = str(dataset[name].attrs.get("standard_name", ""))
             if candidate in (name.lower(), standard):
                 return name
+    option = "--" + what.replace(" content", "").replace(" ", "-")
     raise IrrcacheError(
-        f"{path} has no variable that is known to be the {what}; name it, of "
+        f"{path} has no variable that is recognised as the {what}; name it with {option}: one of "
         f"{', '.join(map(repr, volumes)) or 'none with three axes'}"
     )
 

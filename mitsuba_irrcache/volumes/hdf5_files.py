@@ -44,7 +44,7 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
         dataset, source = found[name], f"{path}[{name}]"
         if dataset.external or dataset.is_virtual:
             raise IrrcacheError(
-                f"{source} keeps its values in other files; copy them into this one"
+                f"{source} stores its values in other files; copy them into this one"
             )
         readable_type(source, dataset.dtype)
         values = scalar_volume(source, dataset, plain_axes(source, dataset.shape), options)

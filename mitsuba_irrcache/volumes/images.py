@@ -125,9 +125,7 @@ def _check_dimensions(path: Path) -> None:
             "again"
         )
     if not 1 <= float(found[1]) <= _MOST_DIMENSIONS:
-        raise IrrcacheError(
-            f"{path} says that it has {found[1].decode()} dimensions; a volume has 3"
-        )
+        raise IrrcacheError(f"{path} declares {found[1].decode()} dimensions; a volume has 3")
 
 
 def _check_magic(path: Path) -> None:

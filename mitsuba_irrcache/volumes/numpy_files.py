@@ -80,7 +80,9 @@ def _check_array(source: str, stream: BinaryIO, size: int) -> _Header:
     readers = {(1, 0): np.lib.format.read_array_header_1_0}
     readers[2, 0] = readers[3, 0] = np.lib.format.read_array_header_2_0
     if (major, minor) not in readers:
-        raise IrrcacheError(f"{source} has version {major}.{minor} of NumPy's format; save it anew")
+        raise IrrcacheError(
+            f"{source} has version {major}.{minor} of NumPy's format; save it again"
+        )
     shape, _, dtype = readers[major, minor](stream)
     # An array of objects has no fixed size.
     expected = int(np.prod(shape, dtype=object)) * dtype.itemsize

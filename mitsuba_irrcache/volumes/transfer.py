@@ -266,7 +266,9 @@ def parse_transfer_function(text: str) -> TransferFunction:
     try:
         document = json.loads(text)
     except json.JSONDecodeError as error:
-        raise IrrcacheError(f"not JSON ({error}); see the format in the manual") from error
+        raise IrrcacheError(
+            f"not JSON ({error}); the documentation describes the format under volume formats"
+        ) from error
     _check_keys(document)
     opacity_values, opacities = _points(document, "opacity", 1)
     colour_values, colours = _points(document, "colour", 3)

@@ -90,7 +90,7 @@ def _of_mrml(path: Path, wanted: str | None) -> TransferFunction:
     attributes = elements[name].attrib
     for key in ("scalarOpacity", "colorTransfer"):
         if key not in attributes:
-            raise IrrcacheError(f"volume property {name!r} has no {key}; save it anew")
+            raise IrrcacheError(f"volume property {name!r} has no {key}; save it again")
     return _slicer_function(
         f"3D Slicer: {name}",
         attributes["scalarOpacity"],
@@ -148,7 +148,7 @@ def _of_bumps(bumps: list) -> TransferFunction:
     values = np.linspace(0, 1, _SAMPLES)
     colour, alpha = np.zeros((_SAMPLES, 3)), np.zeros((_SAMPLES, 1))
     if not bumps:
-        raise IrrcacheError("the list has no bumps; add one in VPT and save it anew")
+        raise IrrcacheError("the list has no bumps; add one in VPT and save it again")
     for number, bump in enumerate(bumps):
         try:
             x, y = (float(bump["position"][axis]) for axis in "xy")

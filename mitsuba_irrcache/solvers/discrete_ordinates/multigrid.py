@@ -281,7 +281,7 @@ class MultigridLevel:
             # first factors may be small: what converges slowest shows last.
             factor = np.clip(change / np.maximum(last, TINY), 0.5, 0.95)
             error = (change * factor / (1 - factor) / np.maximum(scale, TINY)).max()
-            mi.Log(mi.LogLevel.Debug, f"irrcache: multiple scattering known to {error:.1e}")
+            mi.Log(mi.LogLevel.Debug, f"irrcache: multiple scattering, relative error {error:.1e}")
             phi = acceleration.next(phi, image)
             if error <= TOLERANCE * tolerance:
                 break
@@ -289,7 +289,8 @@ class MultigridLevel:
             if not self.coarsest and nonzero:
                 mi.Log(
                     mi.LogLevel.Warn,
-                    f"irrcache: light of high orders of scattering is known to {error:.1e} only",
+                    "irrcache: multiple scattering has not converged, its relative error is "
+                    f"{error:.1e}",
                 )
         return phi
 
@@ -351,8 +352,8 @@ class MultigridLevel:
             residual = image - phi
             if not np.isfinite(residual).all():
                 raise IrrcacheError(
-                    "irrcache: the light in the medium is not finite in single precision; lower "
-                    "the radiance of the emitters (light of the first order: "
+                    "irrcache: the irradiance in the medium is not finite in single precision; "
+                    "lower the radiance of the emitters (irradiance before scattering: "
                     f"{scale.max():.1e} on average)."
                 )
             if (np.abs(residual).mean(axis=1) <= self._tolerance * scale).all():

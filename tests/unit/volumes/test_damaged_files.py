@@ -151,7 +151,7 @@ def test_reports_beside_dicom_slices_are_ignored(tmp_path):
         ("metaimage", "web page", "is no MetaImage"),
         ("netcdf4", "web page", "is no NetCDF file: it begins with b'<html>40'"),
         ("npy", "half", "is truncated: .* bytes, but its header promises"),
-        ("mitsuba", "half", "is truncated: its header says"),
+        ("mitsuba", "half", "is truncated: its header declares"),
         ("hdf5", "half", "truncated file"),
         ("openvdb", "half", "is truncated: .* bytes, but its grids end at byte"),
         ("nanovdb", "half", "is truncated"),

@@ -441,7 +441,7 @@ def test_values_in_other_files_are_not_read(tmp_path):
         file.create_dataset(
             "a", (4, 5, 8), "f4", external=[(str(tmp_path / "other.raw"), 0, h5py.h5f.UNLIMITED)]
         )
-    with pytest.raises(IrrcacheError, match=r"a\.h5\[a\] keeps its values in other files"):
+    with pytest.raises(IrrcacheError, match=r"a\.h5\[a\] stores its values in other files"):
         read_volume(tmp_path / "a.h5")
 
 

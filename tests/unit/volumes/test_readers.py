@@ -152,7 +152,7 @@ def test_meta_images_of_invalid_dimensions_are_refused(tmp_path, count):
     """MetaImages of impossible dimensions are refused; 2^31 crashed the process."""
     file = write_image(tmp_path / "a.mha", ramp())
     file.write_bytes(file.read_bytes().replace(b"NDims = 3", b"NDims = %d" % count))
-    with pytest.raises(IrrcacheError, match=rf"a\.mha says that it has {count} dimensions"):
+    with pytest.raises(IrrcacheError, match=rf"a\.mha declares {count} dimensions"):
         read_volume(file)
 
 
