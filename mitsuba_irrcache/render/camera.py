@@ -38,12 +38,10 @@ from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
-    PathEnd,
-    PathStart,
     is_null,
     medium_after,
-    trace,
 )
+from mitsuba_irrcache.transport.path_tracer import PathEnd, PathStart, PathTracer
 
 #: Camera rays, at least about, by which nodes on surfaces are placed: in a small image, one for
 #: each pixel would miss the narrow cells in corners.
@@ -308,19 +306,13 @@ class TracedCameraRays:
             )
         else:
             start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True)
-            direct, reflected, interacted, path_end, _ = trace(
-                scene,
-                self.media,
-                start,
-                self.max_depth,
-                self.rr_depth,
-                self.hide_emitters,
-                rng,
-                traced,
-                self._is_known if self._ends_in_media else None,
-            )
+            depths = self.max_depth, self.rr_depth
+            known = self._is_known if self._ends_in_media else None
+            paths = PathTracer(scene, self.media, *depths, self.hide_emitters, known)
+            sums, _ = paths.trace(start, rng, traced)
+            direct, reflected, interacted = sums.direct, sums.scattered, sums.interacted
             if self._ends_in_media:
-                reflected += path_end.weight * self._irradiance(path_end) * dr.inv_four_pi
+                reflected += sums.end.weight * self._irradiance(sums.end) * dr.inv_four_pi
         direct_weight = weight
         if self.narrow is not None:
             lamp = self.narrow.hits_source(ray.o, ray.d, far=mi.Bool(False), near=traced)

@@ -1,18 +1,12 @@
-"""Path tracing through surfaces and several media: distance sampling, visibility, paths.
+"""What paths through surfaces and several media consist of: free flights, visibility, scattering.
 
-The same path loop serves both sides of the method: from voxel centres it estimates the irradiance,
-from surfaces seen by the camera it estimates the reflected radiance. Surfaces, BSDFs and emitters
-are Mitsuba's; media are sampled on their grids, with local majorants and analytic transmittance for
-homogeneous ones.
-
-Depth has the meaning it has in ``volpath``: every collision in a medium and every surface that is
-not null is a vertex of the path; null surfaces are free. An emitter contributes if fewer than
-``max_depth`` vertices precede it.
+Surfaces, BSDFs and emitters are Mitsuba's; media are sampled on their grids, with local majorants
+and analytic transmittance for homogeneous ones. The loop over vertices is in `path_tracer`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +14,6 @@ import mitsuba as mi
 from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.media.phase import interaction
 from mitsuba_irrcache.transport.tracking import free_flight, medium_transmittance, transmittance
 
 #: Maximum number of surface crossings of a path; coincident surfaces could otherwise loop forever.
@@ -271,178 +264,6 @@ def sample_emitter(
     return record, dr.select(active_em, radiance * attenuation, 0), rng
 
 
-class PathStart:
-    """Initial state of paths: a ray, its medium, and how it was sampled.
-
-    ``depth`` is the number of preceding vertices. ``pdf`` is the density of the ray's direction if
-    emitters were also sampled at the previous vertex; 0 if not, so that emitters hit by the ray
-    count fully. ``clear`` states that there is no medium before the first surface. The radiance of
-    the emitters ``excluded`` is not added if the ray hits them before any other vertex.
-    """
-
-    def __init__(
-        self,
-        ray: mi.Ray3f,
-        pointer: mi.MediumPtr,
-        depth: int,
-        pdf: float,
-        clear: bool = False,
-        excluded: Sequence[mi.EmitterPtr] = (),
-    ) -> None:
-        self.ray, self.pointer = ray, pointer
-        self.depth, self.pdf, self.clear = depth, pdf, clear
-        self.excluded = tuple(excluded)
-
-
-class PathEnd:
-    """Final state of paths that end in a medium whose radiance is known.
-
-    Position, direction and medium of the collision, and the path throughput ``weight`` including
-    the albedo; 0 for paths that end elsewhere.
-    """
-
-    def __init__(
-        self, p: mi.Point3f, direction: mi.Vector3f, pointer: mi.MediumPtr, weight: mi.Spectrum
-    ) -> None:
-        self.p, self.direction, self.pointer, self.weight = p, direction, pointer, weight
-
-
-@symbolic
-def trace(
-    scene: mi.Scene,
-    media: Media,
-    start: PathStart,
-    max_depth: mi.UInt32,
-    rr_depth: mi.UInt32,
-    hide_emitters: bool,
-    rng: mi.PCG32,
-    active: mi.Bool,
-    known: Callable | None = None,
-):
-    """Trace one path per lane.
-
-    Returns the radiance received directly from emitters and emissive media, the scattered radiance,
-    whether any interaction occurred, the path's `PathEnd`, and the random number generator.
-
-    ``known`` is an optional predicate that selects media whose radiance is known; paths end with
-    their first collision in such a medium.
-    """
-    direct, scattered = mi.Spectrum(0), mi.Spectrum(0)
-    throughput, eta = mi.Spectrum(1), mi.Float(1)
-    ray, pointer = mi.Ray3f(start.ray), mi.MediumPtr(start.pointer)
-    depth, crossings = mi.UInt32(start.depth), mi.UInt32(0)
-    pdf = mi.Float(start.pdf)  #: density of the current direction, 0 if emitters were not sampled
-    last = dr.zeros(mi.Interaction3f)  #: previous vertex
-    last.p = ray.o
-    clear, interacted = mi.Bool(start.clear), mi.Bool(False)
-    end_position, end_direction = mi.Point3f(ray.o), mi.Vector3f(ray.d)
-    end_medium = mi.MediumPtr(pointer)
-    end_throughput = mi.Spectrum(0)  #: throughput at the end
-    active = mi.Bool(active) & (depth < max_depth)
-    context = mi.BSDFContext()
-    while dr.hint(active, label="paths"):
-        # Apply Russian roulette as volpath does; it bounds the variation of the throughput.
-        survival = dr.minimum(dr.max(throughput) * dr.square(eta), MAX_SURVIVAL)
-        survival = dr.select(depth > rr_depth, survival, 1)
-        active &= (rng.next_float32(active) < survival) & (dr.max(throughput) > 0)
-        throughput = dr.select(active, throughput / survival, throughput)
-
-        si = scene.ray_intersect(ray, active)
-        collided, t, throughput, rng, emitted = media.sample_distance(
-            pointer, ray, si.t, throughput, rng, active & ~clear
-        )
-        first = depth == start.depth
-        direct += dr.select(first, emitted, 0)
-        scattered += dr.select(first, 0, emitted)
-        clear = mi.Bool(False)
-        surface = active & ~collided
-        interacted |= collided
-        if dr.hint(known is not None, mode="scalar"):
-            is_end = collided & known(pointer)
-            end_position = dr.select(is_end, ray(t), end_position)
-            end_direction = dr.select(is_end, ray.d, end_direction)
-            end_medium = dr.select(is_end, pointer, end_medium)
-            end_throughput = dr.select(is_end, throughput, end_throughput)
-            collided &= ~is_end
-
-        # Add emission of emitters hit by the ray, with multiple importance sampling.
-        emitter = si.emitter(scene, surface)
-        hit_emitter = surface & (emitter != None)  # noqa: E711
-        skipped = mi.Bool(False)
-        if dr.hint(hide_emitters, mode="scalar"):
-            hidden = hit_emitter & (depth == 0)
-            hit_emitter &= ~hidden
-            # As in volpath, hidden emitters are transparent if they are outside of all media.
-            skipped = hidden & si.is_valid() & (pointer == None)  # noqa: E711
-        record = mi.DirectionSample3f(scene, si, last)
-        sampled = hit_emitter & (pdf > 0)
-        density = scene.pdf_emitter_direction(last, record, sampled)
-        mis_weight = dr.select(sampled, power_heuristic(pdf, density), 1)
-        emitted = dr.select(hit_emitter, throughput * emitter.eval(si, hit_emitter) * mis_weight, 0)
-        for excluded in start.excluded:
-            emitted = dr.select(first & (emitter == excluded), 0, emitted)
-        direct += dr.select(first, emitted, 0)
-        scattered += dr.select(first, 0, emitted)
-        surface &= si.is_valid()
-
-        # Construct the next vertex and sample an emitter from it.
-        scatters = surface & ~skipped
-        bsdf = si.bsdf()
-        smooth = scatters & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        vertex = dr.zeros(mi.Interaction3f)
-        vertex.p = dr.select(collided, ray(t), si.p)
-        vertex.n = dr.select(collided, 0, si.n)
-        vertex.time, vertex.wavelengths = ray.time, ray.wavelengths
-        active_em = (collided | smooth) & (depth + 1 < max_depth)
-        sample = mi.Point2f(rng.next_float32(active_em), rng.next_float32(active_em))
-        record, emitted = scene.sample_emitter_direction(vertex, sample, False, active_em)
-        active_em &= (record.pdf > 0) & (dr.max(emitted) > 0)
-        value, density = bsdf.eval_pdf(context, si, si.to_local(record.d), active_em & smooth)
-        value = dr.select(collided, mi.Spectrum(dr.inv_four_pi), value)
-        density = dr.select(collided, dr.inv_four_pi, density)
-        if dr.hint(not media.isotropic, mode="scalar"):
-            collision, phase = interaction(ray(t), ray.d), pointer.phase_function()
-            value, density = _phase_value(
-                phase, collision, record.d, active_em & collided, value, density
-            )
-        active_em &= dr.max(value) > 0
-        medium_em = dr.select(surface, medium_after(si, record.d, pointer), pointer)
-        attenuation, rng = visibility(scene, media, vertex, record.p, medium_em, rng, active_em)
-        mis_weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
-        scattered += dr.select(
-            active_em, throughput * value * emitted * attenuation * mis_weight, 0
-        )
-
-        # Sample the BSDF or the phase function and continue the path.
-        choice = rng.next_float32(active)
-        sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
-        towards, value, scale, is_vertex, density = sample_bsdf(si, choice, sample, scatters)
-        throughput = dr.select(scatters, throughput * value, throughput)
-        eta = dr.select(scatters, eta * scale, eta)
-        pdf = dr.select(is_vertex, density, pdf)
-        pdf = dr.select(collided, dr.inv_four_pi, pdf)
-        direction = mi.warp.square_to_uniform_sphere(sample)
-        if dr.hint(not media.isotropic, mode="scalar"):
-            direction, value, density = phase.sample(
-                mi.PhaseFunctionContext(), collision, choice, sample, collided
-            )
-            throughput = dr.select(collided, throughput * value, throughput)
-            pdf = dr.select(collided, density, pdf)
-        next_direction = dr.select(skipped, ray.d, towards)
-        next_ray = si.spawn_ray(next_direction)
-        pointer = dr.select(scatters, medium_after(si, next_direction, pointer), pointer)
-        ray.o = dr.select(collided, vertex.p, next_ray.o)
-        ray.d = dr.select(collided, direction, next_ray.d)
-        is_vertex |= collided
-        last = dr.select(is_vertex, vertex, last)
-        depth = dr.select(is_vertex, depth + 1, depth)
-        interacted |= is_vertex
-        crossings += 1
-        active &= (collided | surface) & (depth < max_depth) & (crossings < MOST_CROSSINGS)
-    end = PathEnd(end_position, end_direction, end_medium, end_throughput)
-    return direct, scattered, interacted, end, rng
-
-
 def sample_bsdf(
     si: mi.SurfaceInteraction3f,
     choice: mi.Float,
@@ -464,19 +285,3 @@ def sample_bsdf(
     delta = mi.has_flag(found.sampled_type, mi.BSDFFlags.Delta)
     density = dr.select(delta, 0, found.pdf)
     return si.to_world(found.wo), value, found.eta, is_vertex, density
-
-
-def _phase_value(
-    phase: mi.PhaseFunctionPtr,
-    collision: mi.MediumInteraction3f,
-    towards: mi.Vector3f,
-    active: mi.Bool,
-    value: mi.Spectrum,
-    density: mi.Float,
-) -> tuple[mi.Spectrum, mi.Float]:
-    """Evaluate the phase function and its density ``towards`` a direction where ``active``.
-
-    Elsewhere ``value`` and ``density`` are returned unchanged.
-    """
-    own, pdf = phase.eval_pdf(mi.PhaseFunctionContext(), collision, towards, active)
-    return dr.select(active, own, value), dr.select(active, pdf, density)

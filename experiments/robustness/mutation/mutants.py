@@ -202,8 +202,8 @@ MUTANTS = (
     ),
     Mutant(
         "emitters counted twice: sampled and met (surfaces)",
-        "transport/path.py",
-        "mis_weight = dr.select(sampled, power_heuristic(pdf, density), 1)",
+        "transport/path_tracer.py",
+        "mis_weight = dr.select(sampled, power_heuristic(path.pdf, density), 1)",
         "mis_weight = mi.Float(1)",
         ("tests/system/test_surfaces.py",),
     ),

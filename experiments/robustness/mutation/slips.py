@@ -134,8 +134,8 @@ SLIPS = (
     ),
     Mutant(
         "emitters in closed form are hit by paths, too (area light)",
-        "transport/path.py",
-        "dr.select(first & (emitter == excluded), 0, emitted)",
+        "transport/path_tracer.py",
+        "dr.select(is_direct & (emitter == each), 0, emitted)",
         "emitted",
         ("tests/system/test_area_lights.py",),
     ),
@@ -274,9 +274,9 @@ SLIPS = (
     ),
     Mutant(
         "emitters sampled one vertex too late (transport)",
-        "transport/path.py",
-        "(depth + 1 < max_depth)",
-        "(depth < max_depth)",
+        "transport/path_tracer.py",
+        "(path.depth + 1 < self._max_depth)",
+        "(path.depth < self._max_depth)",
         ("tests/unit/transport/test_path.py",),
     ),
     Mutant(

@@ -38,7 +38,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.crossings import (
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import BoundarySource, TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
-from mitsuba_irrcache.transport.path import Media, PathStart, trace, trace_to_infinity
+from mitsuba_irrcache.transport.path import Media, trace_to_infinity
+from mitsuba_irrcache.transport.path_tracer import PathStart, PathTracer
 
 #: Cells of an ordinate, at most about: a path is traced for one track in each; rays that only test
 #: the visibility of emitters are cheaper. Radiance from surfaces varies more from one direction to
@@ -83,13 +84,18 @@ class SurfaceBoundary:
         self.refracts = medium.refracts
         #: whether tracks carry what glass refracts from emitters; else see `refracted_light`
         self.carries_refracted = True
-        self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
-        self.max_depth = dr.opaque(mi.UInt32, 0xFFFFFFFF)
+        self._depths = dr.opaque(mi.UInt32, 0xFFFFFFFF), dr.opaque(mi.UInt32, rr_depth)
 
     @property
     def has_sources(self) -> bool:
         """Whether tracks meet emitters or emissive media by chance."""
         return bool(self.area_emitters) or self.other_media.is_emissive
+
+    @property
+    def paths(self) -> PathTracer:
+        """Paths in the current scene that end in the medium."""
+        own = self.pointer
+        return PathTracer(self.scene, self.media, *self._depths, known=lambda other: other == own)
 
     def crossings(self, tracks: Tracks, ordinates: Ordinates) -> SurfaceCrossings | None:
         """Where tracks along ``ordinates`` cross surfaces among the voxels."""
@@ -487,12 +493,10 @@ def _trace_all(
     direction = mi.Vector3f(0, 0, 1)
     if paths:
         begin = PathStart(ray, pointer, depth=1, pdf=0.0, clear=pointer == boundary.pointer)
-        _, scattered, _, end, _ = trace(
-            boundary.scene, boundary.media, begin, boundary.max_depth, boundary.rr_depth, False,
-            rng, hit & (weight > 0), lambda medium: medium == boundary.pointer,
-        )  # fmt: skip
+        sums, _ = boundary.paths.trace(begin, rng, hit & (weight > 0))
+        end = sums.end
         if boundary.carries_refracted:
-            emitted = emitted + weight * scattered
+            emitted = emitted + weight * sums.scattered
         direction = end.direction
         reflected = weight * end.weight * dr.inv_four_pi
         if boundary.surfaces is None:

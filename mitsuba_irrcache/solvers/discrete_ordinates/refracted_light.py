@@ -16,7 +16,8 @@ from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_strea
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import SurfaceBoundary
-from mitsuba_irrcache.transport.path import PathStart, flags_of, trace
+from mitsuba_irrcache.transport.path import flags_of
+from mitsuba_irrcache.transport.path_tracer import PathStart
 
 #: Paths of a batch for all voxels together, and for each one, at least and at most; of a launch.
 PATHS, FEWEST, MOST, LANES = 1 << 24, 16, 1024, 1 << 21
@@ -78,11 +79,8 @@ def _mean(
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
     pointer = dr.select(mi.Bool(True), boundary.pointer, dr.zeros(mi.MediumPtr, dr.width(lane)))
     start = PathStart(mi.Ray3f(p, direction), pointer, depth=1, pdf=0.0)
-    _, scattered, *_ = trace(
-        boundary.scene, boundary.media, start, boundary.max_depth, boundary.rr_depth, False, rng,
-        mi.Bool(True), lambda medium: medium == boundary.pointer,
-    )  # fmt: skip
-    values = [c * weight * (4 * dr.pi) for c in scattered]
+    sums, _ = boundary.paths.trace(start, rng, mi.Bool(True))
+    values = [c * weight * (4 * dr.pi) for c in sums.scattered]
     dr.eval(values, weight)
     total = dr.block_sum(weight, samples)
     means = [dr.block_sum(value, samples) / total for value in values]

@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.transport.path import Media, PathStart, power_heuristic, sample_emitter, trace
+from mitsuba_irrcache.transport.path import Media, power_heuristic, sample_emitter
+from mitsuba_irrcache.transport.path_tracer import PathStart, PathTracer
 
 
 def contributions(
@@ -44,11 +45,11 @@ def contributions(
         light = dr.select(record.emitter == emitter, 0, light)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
     start = PathStart(mi.Ray3f(position, direction), pointer, 1, dr.inv_four_pi, excluded=excluded)
-    uncollided, scattered, *_ = trace(scene, media, start, max_depth, rr_depth, False, rng, always)
+    sums, _ = PathTracer(scene, media, max_depth, rr_depth).trace(start, rng, always)
     sphere = 4 * dr.pi
     return [
         (record.d, light, mi.Spectrum(0)),
-        (direction, sphere * uncollided, sphere * scattered),
+        (direction, sphere * sums.direct, sphere * sums.scattered),
     ]
 
 
