@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import Source
 from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.narrow_sources import Source
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.tracking import optical_depth
 

@@ -15,8 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import concatenated
+from mitsuba_irrcache.lights.narrow_sources import sources_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.anisotropic import directions_of

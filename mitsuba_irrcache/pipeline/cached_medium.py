@@ -16,7 +16,6 @@ import numpy as np
 from mitsuba_irrcache.cache.angular import (
     AngularBasis,
     order_of_direct_light,
-    sources_of,
     warn_of_noise,
     warn_of_sharp_shadows,
 )
@@ -30,6 +29,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, marked
 from mitsuba_irrcache.lights.emitters import position_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
+from mitsuba_irrcache.lights.narrow_sources import sources_of
 from mitsuba_irrcache.machine.memory import release_unused_memory, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache

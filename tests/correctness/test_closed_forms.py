@@ -12,10 +12,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.lights.narrow_sources import sources_of
 from mitsuba_irrcache.render.raymarch import Projection
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.base import SolverTask

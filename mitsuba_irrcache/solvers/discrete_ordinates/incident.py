@@ -13,11 +13,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import is_bright, spots_of
 from mitsuba_irrcache.cache.direct_light import DirectLight
 from mitsuba_irrcache.core.sequences import kronecker_steps, lattice_points
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+from mitsuba_irrcache.lights.narrow_sources import is_bright, spots_of
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
     Ordinates,

@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache.angular import AngularBasis, sources_of
+from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.errors import UnsupportedSceneError
+from mitsuba_irrcache.lights.narrow_sources import sources_of
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.path.estimator import contributions
 
