@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import NoReturn
 
 from mitsuba_irrcache import __version__
+from mitsuba_irrcache.cli.parser import SuggestingParser
 from mitsuba_irrcache.errors import IrrcacheError, origin, original_message
 from mitsuba_irrcache.machine.extras import missing_package
 
@@ -83,7 +84,7 @@ def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
 
     Only the command that they name is imported, since each takes time to import.
     """
-    parser = argparse.ArgumentParser(
+    parser = SuggestingParser(
         prog="irrcache", description="Irradiance caching for participating media in Mitsuba 3."
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
@@ -92,7 +93,7 @@ def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text)
         if arguments and arguments[0] == name:
             module = import_module(f"mitsuba_irrcache.{path}")
-            command.description = module.__doc__
+            command.description = (module.__doc__ or "").replace("``", '"')
             module.add_arguments(command)
             command.set_defaults(run=module.run)
     return parser

@@ -64,7 +64,7 @@ def staged_files(folder: str | os.PathLike, names: set[str], overwrite: bool) ->
     taken = sorted(name for name in names if (folder / name).exists())
     if taken and not overwrite:
         raise IrrcacheError(
-            f"{folder} has {', '.join(taken)} already; choose another folder, or overwrite"
+            f"{folder} has {', '.join(taken)} already; choose another folder, or give --overwrite"
         )
     with _temporary_beside(folder / "scene") as temporary:
         built = temporary / "new"
@@ -105,7 +105,7 @@ def _check_replaceable(folder: Path, names: set[str], overwrite: bool) -> None:
             f"{', ...' if len(foreign) > 3 else ''}) and is not replaced; choose another folder"
         )
     if present and not overwrite:
-        raise IrrcacheError(f"folder {folder} is not empty; choose another, or overwrite")
+        raise IrrcacheError(f"folder {folder} is not empty; choose another, or give --overwrite")
 
 
 @contextmanager

@@ -28,12 +28,25 @@ UNREACHABLE = re.compile(
 #: As README.md begins, with a small image; "-I" keeps the repository off the path.
 USE = """
 import mitsuba as mi
+import numpy as np
 import mitsuba_irrcache
 from mitsuba_irrcache.scenes import scene_path
 mi.set_variant("llvm_ad_rgb")
 scene = mi.load_file(scene_path("cloud"), size=16)
 image = mi.TensorXf(mi.render(scene, spp=4))
 assert image.shape == (16, 16, 3) and 0.1 < float(mi.Float(image.array)[384]) < 10, image
+named = mi.load_string(
+    '<scene version="3.0.0"><integrator type="irrcache"><integer name="max_depth" value="2"/>'
+    "</integrator></scene>"
+)
+assert type(named.integrator()).__name__ == "IrradianceCachingIntegrator"
+try:
+    mi.load_dict({"type": "irrcache", "max_dept": 2})
+except RuntimeError as error:
+    assert 'did you mean "max_depth"' in str(error), error
+else:
+    raise AssertionError("a misspelt property was accepted")
+np.save("density.npy", np.linspace(0, 1, 120, dtype=np.float32).reshape(4, 5, 6))
 print(scene_path("cloud"))
 print(mitsuba_irrcache.__file__)
 """
@@ -97,13 +110,28 @@ def test_the_wheel_does_what_the_readme_says(distributions, version, tmp_path):
     done = irrcache("render", scene, *small)
     assert done.returncode == 0 and (tmp_path / "out.png").stat().st_size > 100, done.stderr
 
-    # Commands whose packages are extras say which one, and how to install it.
-    (tmp_path / "volume.nii.gz").write_bytes(b"0")
-    for extra, command in {
-        "volumes": ("import", "volume.nii.gz", "--density", "-o", "other"),
-        "compare": ("compare", scene, "-i", "irrcache", "-o", "report"),
-        "view": ("view", scene),
-    }.items():
+    # Formats that need no extra, and the integrator by its name in a scene.
+    done = irrcache("import", "density.npy", "--density", "3", "-o", "plain")
+    assert done.returncode == 0, done.stderr
+    sizes = ("-D", "width=16", "-D", "height=16", "-D", "integrator=irrcache")
+    done = irrcache("render", "plain/scene.xml", *sizes, "--spp", "4")
+    assert done.returncode == 0, done.stderr
+    done = irrcache("doctor")
+    assert "[volumes]" in done.stdout and "Traceback" not in done.stdout + done.stderr
+
+    # Commands and formats whose packages are extras say which one, and how to install it.
+    for suffix in ("nii.gz", "tif", "nc", "nvdb"):
+        (tmp_path / f"volume.{suffix}").write_bytes(b"0")
+    imported = ("--density", "-o", "other")
+    for extra, command in (
+        ("volumes", ("import", "volume.nii.gz", *imported)),
+        ("microscopy", ("import", "volume.tif", *imported)),
+        ("science", ("import", "volume.nc", *imported)),
+        ("nanovdb", ("import", "volume.nvdb", *imported)),
+        ("compare", ("compare", scene, "-i", "irrcache", "-o", "report")),
+        ("view", ("view", scene)),
+        ("farm", ("farm", "frames", scene, "--vary", "size=8:16:2", "-o", "frames")),
+    ):
         done = irrcache(*command)
         assert done.returncode == 1, done.stdout
         assert f'-m pip install "mitsuba_irrcache[{extra}]"' in done.stderr

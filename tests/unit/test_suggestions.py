@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mitsuba as mi
 import pytest
 
@@ -67,3 +69,23 @@ def test_misspelt_preset_and_key():
         load_preset("ct-bones")
     with pytest.raises(ValueError, match=r'"opacitty" .did you mean "opacity"'):
         parse_transfer_function('{"format": "", "version": 1, "opacitty": [], "colour": []}')
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("rendr scene.xml", "'rendr'.*did you mean \"render\""),
+        ("render scene.xml --sppp 3", 'argument --sppp .did you mean "--spp"'),
+        ("render scene.xml -m llvm_rgb", "'llvm_rgb'.*did you mean \"llvm_ad_rgb\""),
+        # Where a required option is misspelt, that is the error and not its absence.
+        ("import a.npy --densty 3 -o out", 'argument --densty .did you mean "--density"'),
+        ("import a.npy --density --asymetry=0.5 -o out", 'did you mean "--asymmetry"'),
+        ("farm frmes scene.xml", "'frmes'.*did you mean \"frames\""),
+        ("farm frames scene.xml -o out --worker 2 --thread 1 --schedulr a", "--scheduler"),
+    ],
+)
+def test_misspelt_arguments_of_the_command(arguments, message, capsys):
+    with pytest.raises(SystemExit) as status:
+        main(arguments.split())
+    assert status.value.code == 2
+    assert re.search(message, capsys.readouterr().err)
