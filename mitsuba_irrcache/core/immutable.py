@@ -27,6 +27,10 @@ class Immutable:
 
         cls.__init__ = construct
 
+    def attributes(self) -> dict[str, Any]:
+        """Return the attributes that the constructor was given, by name; not the private ones."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
     def __setattr__(self, name: str, value: object) -> None:
         if "_is_complete" in self.__dict__:
             raise AttributeError(

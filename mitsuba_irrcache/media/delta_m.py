@@ -25,7 +25,7 @@ import numpy as np
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.media.medium import MediumGrid, Unscaled
 
 #: Numbers of parts, along each axis, of a voxel of the albedo in which the scaled medium is
 #: evaluated, in the order in which they are tried; and the number of voxels that ends that.
@@ -49,8 +49,7 @@ def without_forward_peak(medium: MediumGrid) -> MediumGrid:
         sigma_t=scaled,
         albedo=albedo,
         phase=phase,
-        unscattered_exponent=exponent,
-        original=medium,
+        unscaled=Unscaled(medium, exponent),
     )
 
 

@@ -15,6 +15,57 @@ from mitsuba_irrcache.media.emission import Emission
 from mitsuba_irrcache.media.phase import ISOTROPIC, Phase
 
 
+class MediumContext(Immutable):
+    """Where a medium is in its scene.
+
+    Attributes:
+        pointer: Mitsuba's medium, which identifies the medium of a ray. None if rays are not traced
+            through the scene's shapes, because the scene has only an isotropic medium in its
+            boundary.
+        number: place in the scene's list of media.
+        others: the other media of the scene in the order of that list, before delta-M scaling.
+        is_isolated: whether this medium in its boundary is all there is beside emitters.
+        has_exact_boundary: whether the medium fills its boundary, which otherwise encloses it.
+        refracts: whether radiance passes its boundary other than straight.
+    """
+
+    def __init__(
+        self,
+        pointer: mi.MediumPtr | None = None,
+        number: int = 0,
+        others: tuple[MediumGrid, ...] = (),
+        *,
+        is_isolated: bool = True,
+        has_exact_boundary: bool = True,
+        refracts: bool = False,
+    ) -> None:
+        self.pointer, self.number, self.others = pointer, number, others
+        self.is_isolated, self.has_exact_boundary = is_isolated, has_exact_boundary
+        self.refracts = refracts
+
+    def among(self, others: tuple[MediumGrid, ...]) -> MediumContext:
+        """The same with these ``others``."""
+        return MediumContext(**self.attributes() | {"others": others})
+
+
+#: The context of a medium that fills its boundary, without any shapes.
+ALONE = MediumContext()
+
+
+class Unscaled(Immutable):
+    """What delta-M scaling made a medium of (see `delta_m`).
+
+    Attributes:
+        medium: the medium before.
+        exponent: power of the transmittance of the scaled medium, for each channel of the albedo,
+            that gives the share of light that is not scattered at all, where light scattered into
+            a forward peak counts as transmitted. None where it is not the same everywhere.
+    """
+
+    def __init__(self, medium: MediumGrid, exponent: np.ndarray | None) -> None:
+        self.medium, self.exponent = medium, exponent
+
+
 class MediumGrid(Immutable):
     """``sigma_t`` [1/scene unit] and ``albedo`` inside ``boundary`` and the world box ``bbox``.
 
@@ -23,19 +74,8 @@ class MediumGrid(Immutable):
         emission: emission coefficient of the medium; None where it emits nothing.
         phase: phase function, the same everywhere.
         name: unique among the media of a scene.
-        pointer: Mitsuba's medium, which identifies the medium of a ray. None if rays are not traced
-            through the scene's shapes, because the scene has only an isotropic medium in its
-            boundary.
-        number: place in the scene's list of media.
-        others: the other media of the scene in the order of that list, before delta-M scaling.
-        is_isolated: whether this medium in its boundary is all there is beside emitters.
-        has_exact_boundary: whether the medium fills ``boundary``, which otherwise encloses it.
-        refracts: whether radiance passes its boundary other than straight.
-        unscattered_exponent: power of the transmittance, for each channel of the albedo, that gives
-            the share of light that is not scattered at all, where light scattered into a forward
-            peak counts as transmitted (see `delta_m`). None where it is not the same everywhere, or
-            the medium is not scaled.
-        original: the medium before delta-M scaling; None where it is not scaled.
+        context: where the medium is in its scene.
+        unscaled: what it was made of by delta-M scaling; None where it is not scaled.
         macrocells: local majorants of ``sigma_t``.
     """
 
@@ -49,23 +89,13 @@ class MediumGrid(Immutable):
         emission: Emission | None = None,
         phase: Phase = ISOTROPIC,
         name: str = "",
-        pointer: mi.MediumPtr | None = None,
-        number: int = 0,
-        others: tuple[MediumGrid, ...] = (),
-        is_isolated: bool = True,
-        has_exact_boundary: bool = True,
-        refracts: bool = False,
-        unscattered_exponent: np.ndarray | None = None,
-        original: MediumGrid | None = None,
+        context: MediumContext = ALONE,
+        unscaled: Unscaled | None = None,
         macrocells: Macrocells | None = None,
     ) -> None:
         self.sigma_t, self.albedo, self.boundary, self.bbox = sigma_t, albedo, boundary, bbox
         self.emission, self.phase = emission, phase
-        self.name, self.pointer = name, pointer
-        self.number, self.others = number, others
-        self.is_isolated, self.has_exact_boundary = is_isolated, has_exact_boundary
-        self.refracts = refracts
-        self.unscattered_exponent, self.original = unscattered_exponent, original
+        self.name, self.context, self.unscaled = name, context, unscaled
         self.macrocells = macrocells or Macrocells.build(sigma_t, boundary)
         if bbox is not None:
             corners = [mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in p)) for p in bbox]
@@ -73,15 +103,53 @@ class MediumGrid(Immutable):
 
     def replaced(self, **changes: object) -> MediumGrid:
         """A medium with other attributes; ``macrocells`` are those of its extinction."""
-        attributes = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        attributes = self.attributes()
         if "sigma_t" in changes or "boundary" in changes:
             del attributes["macrocells"]
         return MediumGrid(**attributes | changes)
+
+    # The context, and what the medium was
+
+    @property
+    def pointer(self) -> mi.MediumPtr | None:
+        return self.context.pointer
+
+    @property
+    def number(self) -> int:
+        return self.context.number
+
+    @property
+    def others(self) -> tuple[MediumGrid, ...]:
+        return self.context.others
+
+    @property
+    def is_isolated(self) -> bool:
+        return self.context.is_isolated
+
+    @property
+    def has_exact_boundary(self) -> bool:
+        return self.context.has_exact_boundary
+
+    @property
+    def refracts(self) -> bool:
+        return self.context.refracts
 
     @property
     def is_traced(self) -> bool:
         """Whether rays in the medium are traced through the scene's shapes."""
         return self.pointer is not None
+
+    @property
+    def original(self) -> MediumGrid | None:
+        """The medium before delta-M scaling; None where it is not scaled."""
+        return self.unscaled.medium if self.unscaled is not None else None
+
+    @property
+    def unscattered_exponent(self) -> np.ndarray | None:
+        """See `Unscaled.exponent`; None where the medium is not scaled."""
+        return self.unscaled.exponent if self.unscaled is not None else None
+
+    # Geometry
 
     @property
     def frame(self) -> np.ndarray:

@@ -20,7 +20,7 @@ from mitsuba_irrcache.lights.emitters import EmittersByKind, check_placement, ki
 from mitsuba_irrcache.media.bake import bake, children
 from mitsuba_irrcache.media.delta_m import without_forward_peak
 from mitsuba_irrcache.media.emission import Emission, check_emission_is_within
-from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.media.medium import MediumContext, MediumGrid
 from mitsuba_irrcache.media.phase import Phase, refuse_sharp
 from mitsuba_irrcache.scene.consistency import (
     RAY_OFFSET,
@@ -131,12 +131,14 @@ def _baked(
         dr.make_opaque(pointer)
         grid = bake(medium, exact or Boundary("box", _extent(medium, filled))).replaced(
             name=_unique_name(medium, [g.name for g in grids]),
-            number=len(grids),
-            pointer=pointer,
             emission=emission,
-            is_isolated=is_isolated,
-            has_exact_boundary=exact is not None,
-            refracts=any(refracts(shape) for shape in filled),
+            context=MediumContext(
+                pointer,
+                len(grids),
+                is_isolated=is_isolated,
+                has_exact_boundary=exact is not None,
+                refracts=any(refracts(shape) for shape in filled),
+            ),
         )
         grids.append(grid)
         if _is_visible(scene, medium):
@@ -187,7 +189,7 @@ def _among_others(grids: list[MediumGrid], number: int, visible: set[str]) -> Me
     others = tuple(grid for grid in grids if grid is not medium)
     if medium.name in visible and medium.phase.has_peak:
         medium = without_forward_peak(medium)
-    return medium.replaced(others=others) if others else medium
+    return medium.replaced(context=medium.context.among(others)) if others else medium
 
 
 def _warn_that_none_is_visible(emission: Emission | None, reason: str) -> None:

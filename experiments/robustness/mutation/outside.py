@@ -70,8 +70,8 @@ OUTSIDE = (
     Mutant(
         "light in a forward peak is never scattered",
         "media/delta_m.py",
-        "unscattered_exponent=exponent,",
-        "unscattered_exponent=np.ones(1),",
+        "unscaled=Unscaled(medium, exponent),",
+        "unscaled=Unscaled(medium, np.ones(1)),",
         (SIMILARITY,),
     ),
     Mutant(
