@@ -61,14 +61,27 @@ def _meant(message: str, path: Path) -> str:
     plugin = re.search(r'Plugin "(\w+)" not found', message)
     if plugin is not None:
         return suggestion(plugin[1], _plugin_names())
-    unused = re.search(r"unused parameters:\s*- \$(\w+)=", message)
+    unused = re.search(r"unused parameters:\s*- \$(\w+)=(\S*)", message)
     if unused is not None:
-        declared = re.findall(r'\$\{?(\w+)|<default\s+name="(\w+)"', path.read_text("utf-8"))
-        return suggestion(unused[1], filter(None, sum(declared, ())))
+        return _about_parameter(unused[1], unused[2], path)
     unreferenced = re.search(r'unreferenced propert.*of type "\w+":\s*- \w+ "(\w+)"', message)
     if unreferenced is not None and "integrator plugin" in message:
         return suggestion(unreferenced[1], SHARED_PROPERTIES)
     return ""
+
+
+def _about_parameter(name: str, value: str, path: Path) -> str:
+    """Explain that a scene file has no such parameter."""
+    declared = re.findall(r'\$\{?(\w+)|<default\s+name="(\w+)"', path.read_text("utf-8"))
+    names = sorted({name for pair in declared for name in pair if name})
+    meant = suggestion(name, names)
+    if meant:
+        return meant
+    known = ", ".join(f"${known}" for known in names) or "none"
+    return (
+        f"\nA scene has the parameters that its file declares, here: {known}. For a property of "
+        f"the integrator give -i 'irrcache{{{name}={value}}}'."
+    )
 
 
 def _plugin_names() -> list[str]:

@@ -64,6 +64,15 @@ def test_misspelt_names_of_a_scene(tmp_path, capsys, integrator, name, options, 
     assert f'did you mean "{meant}"?' in capsys.readouterr().err
 
 
+def test_property_given_as_a_parameter_of_the_scene(tmp_path, capsys):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE.format(integrator="volpath", name="max_depth"))
+    assert main(["render", str(scene), "-D", "max_depth=3"]) == 1
+    said = capsys.readouterr().err
+    assert "parameters that its file declares, here: $radiance." in said
+    assert "give -i 'irrcache{max_depth=3}'" in said
+
+
 def test_misspelt_preset_and_key():
     with pytest.raises(ValueError, match=r"'ct-bones' .did you mean \"ct-bone\""):
         load_preset("ct-bones")
