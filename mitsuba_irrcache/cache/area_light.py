@@ -39,6 +39,10 @@ from mitsuba_irrcache.transport.tracking import medium_transmittance
 
 #: Number of points on an emitter: for all voxels together, and minimum and maximum for each voxel.
 SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 1 << 24, 32, 512
+#: Samples of the cache per point on an emitter, above the minimum. The means over these points are
+#: the only part of the cache that further samples do not refine, so that their number determines
+#: how far the error can decrease.
+CACHE_SAMPLES_PER_POINT = 4
 #: Largest mean bias of the optical depths due to the number of points; most of it is corrected.
 LARGEST_BIAS = 5e-4
 #: Number of points on an emitter over which the phase function is averaged at a lookup, beyond its
@@ -66,12 +70,17 @@ class AreaLight(DirectLight):
         grid: Grid,
         voxels: mi.UInt32,
         classes: VoxelClasses | None = None,
+        samples: int = 0,
     ) -> None:
-        """Compute the factors; ``classes`` is None if no surface is among the voxels."""
+        """Compute the factors; ``classes`` is None if no surface is among the voxels. The cache has
+        this number of ``samples`` per voxel.
+        """
+        #: number of points on the emitter, from which its factors at a voxel are computed
+        self.points_per_voxel = 0
+        self._fewest = max(FEWEST_SAMPLES, samples // CACHE_SAMPLES_PER_POINT)
         self._solid_angle, self._radiance = SolidAngle.of(emitter), _radiance(emitter)
         # An emitter does not keep its shape alive, which Mitsuba accesses as long as it exists.
         self._shape = emitter.get_shape()
-        self._area = dr.opaque(mi.Float, float(np.ravel(self._shape.surface_area())[0]))
         self._edges = classes.cut_cells if classes is not None else None
         samples = PEAK_SAMPLES if medium.phase.forward else PHASE_SAMPLES
         self._phase_samples = dr.opaque(mi.UInt32, samples)
@@ -154,7 +163,8 @@ class AreaLight(DirectLight):
     def _attenuation(
         self, scene: mi.Scene, p: mi.Point3f
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
-        voxels, count = self._voxels, self._sample_count(scene)
+        voxels = self._voxels
+        count = self.points_per_voxel = self._sample_count(scene)
         rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
         sums = self._sums(scene, p, dr.opaque(mi.UInt32, count), rng, self.order)
         transmitted, visible, _, _, _, angular = sums
@@ -170,9 +180,11 @@ class AreaLight(DirectLight):
 
     def _sample_count(self, scene: mi.Scene) -> int:
         """Return the number of points for each voxel: as many as `SAMPLES` in all permit, or, where
-        the transmittance varies over the emitter, as many as `LARGEST_BIAS` requires.
+        the transmittance varies over the emitter, as many as `LARGEST_BIAS` requires; in any case
+        more for a cache of more samples.
         """
-        permitted = np.clip(SAMPLES // dr.width(self._voxels), FEWEST_SAMPLES, MOST_SAMPLES)
+        most = max(MOST_SAMPLES, self._fewest)
+        permitted = np.clip(SAMPLES // dr.width(self._voxels), self._fewest, most)
         p, stream = self._test_positions()
         count = dr.opaque(mi.UInt32, FEWEST_SAMPLES)
         mean, bias = _mean_and_bias(*self._sums(scene, p, count, stream))
@@ -182,7 +194,7 @@ class AreaLight(DirectLight):
         dr.eval(total, relative)
         bias = float(relative[0]) / max(float(total[0]), 1e-30)
         required = FEWEST_SAMPLES * np.sqrt(bias / LARGEST_BIAS)
-        return int(np.clip(np.ceil(required), permitted, MOST_SAMPLES))
+        return int(np.clip(np.ceil(required), permitted, most))
 
     def angular_means(self) -> list[mi.Float]:
         return self._angular_means
@@ -230,7 +242,7 @@ class AreaLight(DirectLight):
         total = mi.Color3f(0) if dr.hint(coloured, mode="scalar") else mi.Float(0)
         sum_of_weights, k = mi.Float(0), mi.UInt32(0)
         while dr.hint(k < count, label="phase function over an emitter"):
-            _, towards, distance, weight = self._sample(vertex, k, shift)
+            _, towards, distance, weight = self._sample(vertex, shares, k, shift)
             weight *= dr.exp(-sigma_t * self._length_within(p, towards, distance))
             rest = basis.rest(p, direction, towards)
             if dr.hint(peak_depth is not None, mode="scalar"):
@@ -257,9 +269,9 @@ class AreaLight(DirectLight):
         odd, odd_total = mi.Spectrum(0), mi.Float(0)
         angular = [mi.Float(0) for _ in range(order * (order + 2))]
         others = Media.around(self._medium).without(self._medium)
-        pair, k = 1 if self._solid_angle.density > 0 else 0, mi.UInt32(0)
+        shares, k = self._solid_angle.shares(p), mi.UInt32(0)
         while dr.hint(k < count, label="points on an emitter"):
-            target, direction, distance, weight = self._sample(vertex, k, shift)
+            target, direction, distance, weight = self._sample(vertex, shares, k, shift)
             seen = weight > 0
             ray = mi.Ray3f(p, direction)
             passed = medium_transmittance(self._medium, ray, distance, seen)
@@ -268,7 +280,7 @@ class AreaLight(DirectLight):
             transmitted += passed
             visible += dr.select(seen, passed * past, 0)
             total += weight
-            is_odd = ((k >> pair) & 1) == 1
+            is_odd = (k & 1) == 1
             odd += dr.select(is_odd, passed, 0)
             odd_total += dr.select(is_odd, weight, 0)
             if dr.hint(order > 0, mode="scalar"):
@@ -279,31 +291,21 @@ class AreaLight(DirectLight):
         return transmitted, visible, total, odd, odd_total, angular
 
     def _sample(
-        self, vertex: mi.Interaction3f, k: mi.UInt32, shift: mi.Vector2f
+        self, vertex: mi.Interaction3f, shares: list[mi.Float], k: mi.UInt32, shift: mi.Vector2f
     ) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float]:
-        """Sample a point by its area or, every other time, by its direction (balance heuristic).
+        """Sample a point about uniformly by solid angle; ``shares`` are those of `SolidAngle`.
 
         Returns the point, its direction and distance, and the solid angle for which it stands, up
-        to a factor. Few points by area are close to a position next to the emitter.
+        to a factor. Both sides of flat emitters count, so that the factors continue behind them.
         """
-        flat, alternates = self._solid_angle.is_flat, self._solid_angle.density > 0
-        number = k >> 1 if alternates else k
-        sample = mi.Point2f(kronecker(number, 2, (shift.x, shift.y)))
-        record = self._shape.sample_direction(vertex, sample)
-        # Both sides of flat emitters count, so that the factors continue behind them.
-        seen = (record.pdf > 0) & (flat | (dr.dot(record.n, record.d) < 0))
-        target, direction, distance = record.p, record.d, record.dist
-        density = mi.Float(record.pdf)
-        if alternates:
-            by_area = (k & 1) == 0
-            towards, hit, length, cosine = self._solid_angle.sample_direction(vertex.p, sample)
-            target = dr.select(by_area, target, vertex.p + length * towards)
-            direction = dr.select(by_area, direction, towards)
-            distance = dr.select(by_area, distance, length)
-            density = dr.select(by_area, density, dr.square(length) / (self._area * cosine))
-            density += self._solid_angle.density
-            seen = dr.select(by_area, seen, hit)
-        return target, direction, distance, dr.select(seen, dr.rcp(density) + SMALL_ANGLE, 0)
+        sample = mi.Point2f(kronecker(k, 2, (shift.x, shift.y)))
+        if self._solid_angle.kind == "sphere":
+            record = self._shape.sample_direction(vertex, sample)
+            seen = (record.pdf > 0) & (dr.dot(record.n, record.d) < 0)
+            weight = dr.select(seen, dr.rcp(record.pdf) + SMALL_ANGLE, 0)
+            return record.p, record.d, record.dist, weight
+        direction, distance, angle = self._solid_angle.sample(vertex.p, shares, sample)
+        return vertex.p + distance * direction, direction, distance, angle + SMALL_ANGLE
 
     def _field_of_extinction(
         self, mean: mi.Float | mi.Color3f, classes: VoxelClasses | None
@@ -335,8 +337,11 @@ def area_lights_of(
     grid: Grid,
     voxels: mi.UInt32,
     classes: VoxelClasses | None = None,
+    samples: int = 0,
 ) -> list[AreaLight]:
-    """Return the direct light of the area emitters of simple shapes."""
+    """Return the direct light of the area emitters of simple shapes, for a cache of this number of
+    ``samples`` per voxel.
+    """
     if medium.is_isolated or not dr.width(voxels):
         return []
     lights = [
@@ -348,7 +353,7 @@ def area_lights_of(
     order = order_of_direct_light(medium.phase)
     values = (VALUES + order * (order + 2)) * dr.width(voxels)
     count = min(MOST_LIGHTS, MOST_VALUES // values)
-    return [AreaLight(scene, e, medium, grid, voxels, classes) for e in lights[:count]]
+    return [AreaLight(scene, e, medium, grid, voxels, classes, samples) for e in lights[:count]]
 
 
 def _mean_and_bias(

@@ -7,13 +7,15 @@ lies in between. It varies by an order of magnitude within a voxel next to the e
 
 from __future__ import annotations
 
+import functools
+import operator
 from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.grids.boundary import Boundary, box_frame, sphere_frame
+from mitsuba_irrcache.grids.boundary import box_frame, sphere_frame
 from mitsuba_irrcache.grids.grid import Affine
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, varies_in_space
 
@@ -21,6 +23,10 @@ from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, varies_in_spa
 DISK_SIDES = 16
 #: Tolerated deviation of four corners from a parallelogram, relative to its size.
 FLAT_TOLERANCE = 1e-4
+#: Points are sampled as from this far from the plane of a face at least, relative to the distance
+#: of the closest point and to the size of the face: in the plane, where it is seen under no solid
+#: angle, their distribution would be none.
+LOWEST, SMALLEST = 0.1, 1e-3
 #: Corners of the faces of the cube [-1, 1]^3, in order around each face.
 FACES = [
     [np.insert([a, b], axis, side) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -43,14 +49,11 @@ class SolidAngle:
         self._world, self._local = Affine(frame), Affine(np.linalg.inv(frame))
         self._centre = _point(frame[:3, 3])
         self._radius = dr.opaque(mi.Float, float(np.linalg.norm(frame[:3, 0])))
-        self._normal = None if normal is None else mi.Vector3f(_point(normal))
-        self._box = Boundary("box", frame) if kind == "box" else None
-        #: density [1/sr] of directions that `sample_direction` samples; 0 for spheres
-        self.density = {"sphere": 0.0, "box": 1 / (4 * np.pi)}.get(kind, 1 / (2 * np.pi))
         self._polygons = [
             ([_point(v) for v in corners], _point(front))
             for corners, front in _polygons(kind, frame, normal)
         ]
+        self._faces = _faces(kind, frame)
 
     @classmethod
     def of(cls, emitter: mi.Emitter) -> SolidAngle | None:
@@ -92,27 +95,67 @@ class SolidAngle:
             local.z = 0
         return self._world.point(local)
 
-    def sample_direction(
-        self, p: mi.Point3f, sample: mi.Point2f
-    ) -> tuple[mi.Vector3f, mi.Bool, mi.Float, mi.Float]:
-        """Sample a direction uniformly, for flat shapes within the hemisphere that faces them.
+    def shares(self, p: mi.Point3f) -> list[mi.Float]:
+        """Return the solid angle of each face at world positions over that of all, for `sample`.
 
-        Returns the direction, whether it hits the shape, the distance, and the cosine there.
+        Flat shapes have one face. Within a box all faces are seen, from behind.
         """
-        if self._box is not None:
-            direction = mi.warp.square_to_uniform_sphere(sample)
-            hit, distance, _ = self._box.intersect(mi.Ray3f(p, direction))
-            normal = self._box.outward_normal(p + distance * direction)
-            return direction, hit & (distance > 0), distance, dr.abs(dr.dot(normal, direction))
-        height = dr.dot(self._normal, self._centre - p)
-        frame = mi.Frame3f(self._normal * dr.sign(height))
-        local = mi.warp.square_to_uniform_hemisphere(sample)
-        direction, distance = frame.to_world(local), dr.abs(height) / local.z
-        q = self._local.point(p + distance * direction)
-        extent = dr.norm(mi.Vector2f(q.x, q.y)) if self.kind == "disk" else dr.abs(q.x)
-        if self.kind == "rectangle":
-            extent = dr.maximum(extent, dr.abs(q.y))
-        return direction, (extent <= 1) & (local.z > 0), distance, local.z
+        if len(self._polygons) < 2:
+            return [mi.Float(1)]
+        seen = [dr.dot(front, p - corners[0]) > 0 for corners, front in self._polygons]
+        is_inside = ~functools.reduce(operator.or_, seen)
+        angles = [
+            dr.select(face | is_inside, _polygon_solid_angle(corners, p), 0)
+            for face, (corners, _) in zip(seen, self._polygons, strict=True)
+        ]
+        total = sum(angles)
+        return [angle / dr.maximum(total, 1e-30) for angle in angles]
+
+    def sample(
+        self, p: mi.Point3f, shares: list[mi.Float], sample: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+        """Sample a point of any shape but a sphere about uniformly by solid angle, from both sides.
+
+        Returns its direction, its distance, and the solid angle for which it stands, which varies
+        by a small factor between the points, smoothly. ``shares`` are those of `shares`.
+
+        The lines parallel to one edge are sampled uniformly by the angle in the plane perpendicular
+        to them, and the points of a line by the solid angle, whose distribution is known.
+        """
+        x, (face, share) = sample.x, (self._faces[0], shares[0])
+        begin = mi.Float(0)
+        for other, its_share in zip(self._faces[1:], shares[1:], strict=True):
+            is_next = (x >= begin + share) & (its_share > 0)
+            begin = dr.select(is_next, begin + share, begin)
+            share = dr.select(is_next, its_share, share)
+            face = [dr.select(is_next, b, a) for a, b in zip(face, other, strict=True)]
+        if len(self._faces) > 1:
+            x = dr.clip((x - begin) / dr.maximum(share, 1e-30), 0, 1)
+        centre, normal, across, along, half, shear, length = face
+        offset = mi.Vector3f(centre - p)
+        height, middle, start = (dr.dot(offset, axis) for axis in (normal, across, along))
+        # The distributions are those for a position at least this far from the plane of the face.
+        closest = dr.norm(self.closest(p) - p)
+        away = dr.maximum(dr.abs(height), dr.maximum(LOWEST * closest, SMALLEST * length))
+        first, last = (dr.atan((middle + side * half) / away) for side in (-1, 1))
+        low, high = middle - half, middle + half
+        s = dr.clip(away * dr.tan(dr.lerp(first, last, x)), low, high)
+        a = (s - middle) / half
+        reach = length
+        if self.kind == "disk":
+            reach = length * dr.safe_sqrt(1 - a * a)
+        start += a * shear
+        distance = dr.square(away) + dr.square(s)
+        low, high = start - reach, start + reach
+        before, after = (t * dr.rsqrt(distance + dr.square(t)) for t in (low, high))
+        part = dr.lerp(before, after, sample.y)
+        t = part * dr.sqrt(distance / dr.maximum(1 - part * part, 1e-12))
+        t = dr.clip(t, low, high)
+        direction = height * normal + s * across + t * along
+        length = dr.norm(direction)
+        ratio = dr.sqrt(distance + dr.square(t)) / dr.maximum(length, 1e-30)
+        angle = dr.abs(height) / away * ratio * dr.square(ratio) * (last - first) * (after - before)
+        return direction / dr.maximum(length, 1e-30), length, angle / dr.maximum(share, 1e-30)
 
 
 def _shape_frame(shape: mi.Shape) -> tuple[str, np.ndarray] | None:
@@ -181,6 +224,32 @@ def _polygons(
         front = np.cross(corners[1] - corners[0], corners[2] - corners[1])
         outwards = np.mean(corners, axis=0) - frame[:3, 3] if normal is None else normal
         found.append((corners, front * np.sign(front @ outwards)))
+    return found
+
+
+def _faces(kind: str, frame: np.ndarray) -> list[list[mi.Vector3f | mi.Float]]:
+    """Return the placement of each face: its centre, its normal, the two axes in its plane, and
+    half of its extent along the first, of its shear, and of its edge along the second one.
+    """
+    if kind == "sphere":
+        return []
+    found = []
+    axes = range(3) if kind == "box" else (2,)
+    for axis in axes:  # in the order of `FACES`
+        for side in (-1.0, 1.0) if kind == "box" else (0.0,):
+            u, v = (frame[:3, k] for k in range(3) if k != axis)
+            length = np.linalg.norm(v)
+            along = v / length
+            across = u - (u @ along) * along
+            half = np.linalg.norm(across)
+            across /= half
+            centre = frame[:3, 3] + side * frame[:3, axis]
+            vectors = centre, np.cross(across, along), across, along
+            numbers = half, u @ along, length
+            found.append(
+                [mi.Vector3f(_point(value)) for value in vectors]
+                + [dr.opaque(mi.Float, float(value)) for value in numbers]
+            )
     return found
 
 

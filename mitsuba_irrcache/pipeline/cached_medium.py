@@ -194,7 +194,7 @@ class CachedMedium:
             if not medium.is_isolated:
                 warn_of_sharp_shadows(basis, name)
         samples = -(-samples // 2) if settings.with_error else samples
-        direct_lights = self._direct_lights(scene, grid, active, classes)
+        direct_lights = self._direct_lights(scene, grid, active, classes, samples)
         known = [light.emitter for light in direct_lights]
         falloff = InverseSquareFactor.of(scene, grid, known)
         if known:
@@ -258,14 +258,21 @@ class CachedMedium:
             )
 
     def _direct_lights(
-        self, scene: mi.Scene, grid: Grid, active: mi.UInt32, classes: VoxelClasses | None
+        self,
+        scene: mi.Scene,
+        grid: Grid,
+        active: mi.UInt32,
+        classes: VoxelClasses | None,
+        samples: int,
     ) -> list[DirectLight]:
-        """Return the emitters whose irradiance camera rays evaluate themselves."""
+        """Return the emitters whose irradiance camera rays evaluate themselves, for a cache of this
+        number of ``samples`` per voxel.
+        """
         medium, lights = self.medium, []
         if self.solver.knows_direct_lights(scene, medium, grid, active):
             dense = border_error(medium, grid) > SMALL_BORDER_ERROR
             lights = direct_lights_of(scene, medium, grid, active, dense, classes)
-            lights += area_lights_of(scene, medium, grid, active, classes)
+            lights += area_lights_of(scene, medium, grid, active, classes, samples)
         if medium.refracts:  # others reach no voxel straight
             lights = [light for light in lights if _is_within(medium, light.emitter)]
         return lights

@@ -140,11 +140,11 @@ SLIPS = (
         ("tests/system/test_area_lights.py",),
     ),
     Mutant(
-        "densities of points and directions not added (area light)",
-        "cache/area_light.py",
-        "density += self._solid_angle.density",
-        "density = dr.select(by_area, density, self._solid_angle.density)",
-        ("tests/system/test_area_lights.py",),
+        "points on emitters all stand for the same solid angle (area light)",
+        "lights/solid_angle.py",
+        "dr.abs(height) / away * ratio",
+        "dr.abs(height) / away + 0 * ratio",
+        ("tests/unit/lights/test_solid_angle.py",),
     ),
     Mutant(
         "a flat emitter with fog on both sides bounds it (area light)",

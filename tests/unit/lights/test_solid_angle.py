@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.core.sequences import kronecker
 from mitsuba_irrcache.lights.solid_angle import SolidAngle
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -77,20 +78,50 @@ def test_closest_point(name):
 
 
 @pytest.mark.parametrize("name", ["rectangle", "disk", "cube"])
-def test_sampled_directions(name):
-    """The share of sampled directions that hit the shape is its solid angle times the density."""
-    angle = SolidAngle.of(emitter(SHAPES[name]))
-    rng, count = mi.PCG32(1 << 20), 1 << 20
-    sample = mi.Point2f(rng.next_float32(), rng.next_float32())
-    for p in ([0.6, 0.9, 0.1], [-0.5, -0.6, 0.9], [0.3, 0.1, 1.4]):
+@pytest.mark.parametrize("sheared", [False, True])
+def test_sampled_points(name, sheared):
+    """Sampled points lie on the shape, where they are seen; their mean weight is the solid angle,
+    from the back of flat shapes too, and no weight is much larger.
+    """
+    frame = SolidAngle.of(emitter(SHAPES[name])).frame
+    if sheared:
+        frame = frame @ np.array([[1, 0.6, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    angle = SolidAngle(name.replace("cube", "box"), frame, None if name == "cube" else frame[:3, 2])
+    count = 1 << 18
+    lane = dr.arange(mi.UInt32, count)
+    sample = mi.Point2f(mi.Float(lane) / count, kronecker(lane, 1)[0])
+    for p in ([0.6, 0.9, 0.1], [-0.5, -0.6, 0.9], [0.3, 0.1, 1.4], [0.2, 0.0, 0.6]):
         position = mi.Point3f(*(dr.full(mi.Float, v, count) for v in p))
-        direction, hit, distance, cosine = angle.sample_direction(position, sample)
-        at, share = position + distance * direction, float(dr.mean(dr.select(hit, 1.0, 0.0))[0])
-        seen = max(np.array(angle.at(mi.Point3f(p)))[0], _behind(angle, p))
-        assert share == pytest.approx(seen * angle.density, rel=0.03)
-        on_shape = np.array(dr.norm(angle.closest(at) - at))[np.array(hit)]
-        assert on_shape.max() < 1e-4
-        assert 0 < np.array(cosine)[np.array(hit)].min()
+        shares = angle.shares(position)
+        direction, distance, weight = angle.sample(position, shares, sample)
+        local = np.linalg.inv(frame) @ [*np.array(position + distance * direction), np.ones(count)]
+        if name == "cube":
+            np.testing.assert_allclose(np.abs(local[:3]).max(axis=0), 1, atol=1e-4)
+        else:
+            extent = np.hypot(*local[:2]) if name == "disk" else np.abs(local[:2]).max(axis=0)
+            assert np.abs(local[2]).max() < 1e-5 and extent.max() < 1 + 1e-4
+        seen = max(float(angle.at(mi.Point3f(p))[0]), _behind(angle, p)) or 4 * np.pi
+        # The solid angle of a disk is that of a polygon.
+        assert float(dr.mean(weight)[0]) == pytest.approx(
+            seen, rel=0.02 if name == "disk" else 1e-3
+        )
+        assert float(dr.max(weight)[0]) < 3 * seen
+
+
+@pytest.mark.parametrize("name", ["rectangle", "disk", "cube"])
+def test_sampled_points_of_positions_in_a_plane(name):
+    """In the plane of a flat shape, on it and inside of a box, samples are finite and lie on it."""
+    angle = SolidAngle.of(emitter(SHAPES[name]))
+    rng, count = mi.PCG32(1 << 12), 1 << 12
+    sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+    local = ([0, 0, 0], [0.3, -0.2, 0], [2, 0, 0], [0, 40, 0], [1, 1, 0])
+    for place in local:
+        p = (angle.frame @ [*place, 1])[:3]
+        position = mi.Point3f(*(dr.full(mi.Float, float(v), count) for v in p))
+        direction, distance, weight = angle.sample(position, angle.shares(position), sample)
+        assert np.isfinite(np.array(weight)).all() and np.array(weight).min() >= 0
+        at = np.array(position + distance * direction)
+        assert np.abs(np.linalg.inv(angle.frame) @ [*at, np.ones(count)]).max() < 1 + 1e-3
 
 
 def _behind(angle: SolidAngle, p: list[float]) -> float:
