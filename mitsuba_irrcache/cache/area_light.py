@@ -240,7 +240,7 @@ class AreaLight(DirectLight):
         shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
         coloured = isinstance(peak_depth, mi.Color3f)
         total = mi.Color3f(0) if dr.hint(coloured, mode="scalar") else mi.Float(0)
-        sum_of_weights, k = mi.Float(0), mi.UInt32(0)
+        shares, sum_of_weights, k = self._solid_angle.shares(p), mi.Float(0), mi.UInt32(0)
         while dr.hint(k < count, label="phase function over an emitter"):
             _, towards, distance, weight = self._sample(vertex, shares, k, shift)
             weight *= dr.exp(-sigma_t * self._length_within(p, towards, distance))
