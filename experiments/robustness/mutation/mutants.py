@@ -325,7 +325,7 @@ MUTANTS = (
         "cache/lookups.py",
         "values = conserving(grid, values, known, channels, share, separated)",
         "values = values + 0",
-        ("tests/system/test_point_lights.py",),
+        ("tests/unit/cache/test_lookups.py",),
     ),
     Mutant(
         "interpolated roots keep half of the light that bends",

@@ -1,0 +1,33 @@
+"""Lookups in a cache have the irradiance of its voxels."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.cache.volume import BATCH, IrradianceCache
+from mitsuba_irrcache.grids.grid import Grid
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+SIDE, POINTS = 12, 6
+
+
+@pytest.mark.parametrize("kind", ["correlated", "noisy"])
+def test_a_field_with_a_sharp_end_is_conserved(kind):
+    """The mean over a field that is 0 outside of a slab is that of its voxels; plainly interpolated
+    square roots lose a sixth of a voxel at either end, 8 % in all.
+
+    Voxels with errors of their own are conserved where these are large, see `share_of_noise`.
+    """
+    grid, voxels = Grid((SIDE,) * 3, np.eye(4)), mi.UInt32(np.arange(SIDE**3, dtype=np.uint32))
+    phi = np.zeros((SIDE,) * 3)
+    phi[4:8] = 1
+    cache = IrradianceCache(grid, voxels, 1, -1, correlated=kind == "correlated")
+    values = cache.real(2 * phi.ravel())  # of two batches; a relative variance of 1
+    cache.add(0, 2 * BATCH, [((values, None), (values,))])
+    along = 1.5 + (np.arange(POINTS * (SIDE - 3)) + 0.5) / POINTS
+    u = np.stack(np.meshgrid(along, along, along)).reshape(3, -1) / SIDE
+    found = float(np.array(cache.field().at_world(mi.Point3f(np.float32(u))), np.float64).mean())
+    assert found == pytest.approx(4 / (SIDE - 3), rel=0.02)
