@@ -266,7 +266,9 @@ class TracedCameraRays:
         width, height = (int(n) for n in sensor.film().crop_size())
         samples = width * height * (spp or sensor.sampler().sample_count())
         self.caches_surfaces = False
-        if self._emitters is None or (samples < FEWEST_SAMPLES and not self._refracts):
+        # Shadows of media with a forward peak are sharp with cached irradiance only.
+        is_worth_it = samples >= FEWEST_SAMPLES or self._refracts or self.narrow is not None
+        if self._emitters is None or not is_worth_it:
             return
         if self._surfaces is None:
             self._surfaces = SurfaceIrradiance(self._paths(), seed)

@@ -213,6 +213,21 @@ class Projection:
             return dr.exp(-mi.Spectrum(optical_depth(self.medium.original, ray, near, far, active)))
         return dr.power(transmittance, self._exponent)
 
+    def share_unscattered(
+        self,
+        transmittance: mi.Spectrum,
+        ray: mi.Ray3f,
+        near: mi.Float,
+        far: mi.Float,
+        active: mi.Bool,
+    ) -> mi.Spectrum:
+        """Return the part of a ``transmittance`` (see `unscattered`) that belongs to radiance that
+        is not scattered into a truncated forward peak.
+        """
+        unscattered = self.unscattered(transmittance, ray, near, far, active)
+        share = unscattered / dr.maximum(transmittance, 1e-30)
+        return dr.select(active & (near < far), dr.minimum(share, 1), 1)
+
     def _exclude_occluded(
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
     ) -> mi.Float | mi.Color3f:

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
+from mitsuba_irrcache.cache.angular import Source
 from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
 from mitsuba_irrcache.render.surface_paths import SurfacePaths, facing, lambertian
@@ -24,6 +25,9 @@ from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 #: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance;
 #: by which those gather it that only other nodes see.
 PROBES, GATHERED, GATHERED_INDIRECT = 32, 128, 32
+#: Rays by which a node gathers what forward peaks scatter, around each narrow source, and the mean
+#: cosine of the angle between them for a source without extent.
+AROUND_SOURCES, MEAN_COSINE = 64, 0.85
 #: Nodes of a view up to which all rays are used: more nodes are close to each other, so that their
 #: errors average out within a pixel.
 FINE_NODES = 1 << 15
@@ -176,8 +180,50 @@ class SurfaceIrradiance:
             radiance, factor = (emitted + radiance) * weight, factor * weight
             dr.eval(radiance, other, factor)  # in one launch
             own = [dr.block_sum(c, rays) for c in list(radiance)]
+            for source in self.paths.narrow_sources:
+                around = self._gather_around(scene, source, numbers, (p, normals, medium, distance))
+                own = [a + b for a, b in zip(own, around, strict=True)]
             dr.eval(own)
             self._exchange.append(Exchange(rays, own, other, list(factor)))
+
+    def _gather_around(
+        self, scene: mi.Scene, source: Source, numbers: mi.UInt32, place: tuple
+    ) -> list[mi.Float]:
+        """Return the irradiance at nodes by what truncated forward peaks scatter of the radiance of
+        a narrow ``source``.
+
+        Rays are distributed around the direction of the source like the Henyey-Greenstein phase
+        function, the more broadly the larger the source.
+        """
+        # docs/primer, eq. (5.12)
+        p, (geometric, shading), medium, distance = place
+        lane, k = Divisor(AROUND_SOURCES).split(
+            dr.arange(mi.UInt32, dr.width(numbers) * AROUND_SOURCES)
+        )
+        words = mi.sample_tea_32(
+            dr.gather(mi.UInt32, self.nodes.streams(numbers)[1], lane), self._seed
+        )
+        shift = unit_floats(words)
+        share = dr.opaque(mi.Float, 1 / AROUND_SOURCES)
+        u = (mi.Float(k) + shift[0]) * share, kronecker(k, 1, [shift[1]])[0]
+        vertex = dr.zeros(mi.Interaction3f, dr.width(lane))
+        vertex.p = dr.gather(mi.Point3f, p, lane)
+        vertex.n = dr.gather(mi.Normal3f, geometric, lane)
+        towards, cosine = source.seen_from(vertex.p)
+        radius = dr.sqrt(dr.maximum(1 - dr.square(dr.minimum(cosine, 1)), 0))
+        g = MEAN_COSINE * dr.select(cosine > 1, 0.1, dr.maximum(1 - radius, 0.1))
+        local, density = _henyey_greenstein(g, mi.Point2f(*u))
+        ray = vertex.spawn_ray(mi.Frame3f(towards).to_world(local))
+        normal = dr.gather(mi.Normal3f, shading, lane)
+        weight = dr.maximum(dr.dot(normal, ray.d), 0) * share / density
+        above = (weight > 0) & (dr.dot(vertex.n, ray.d) > 0)
+        active = above & (dr.gather(mi.Float, distance, lane) > 0)
+        pointer = self.paths.media.pointer_of(dr.gather(mi.UInt32, medium, lane))
+        rng = random_stream(mi.sample_tea_32(words[0] ^ k, words[1]))
+        radiance = self.paths.scattered_forward(scene, ray, pointer, rng, active)
+        found = dr.select(active, radiance * weight, 0)
+        dr.eval(found)
+        return [dr.block_sum(c, AROUND_SOURCES) for c in list(found)]
 
     def _solve(self) -> None:
         """Solve E = E_0 + H E by iteration."""
@@ -213,6 +259,19 @@ class Exchange:
         ]
         dr.eval(received)
         return [a + dr.block_sum(b, self.rays) for a, b in zip(self.own, received, strict=True)]
+
+
+def _henyey_greenstein(g: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+    """Sample a direction around the z axis with the mean cosine ``g`` > 0; return its density
+    [1/sr], too.
+    """
+    ratio = (1 - dr.square(g)) / dr.fma(2 * g, u.x, 1 - g)
+    cosine = dr.clip((1 + dr.square(g) - dr.square(ratio)) / (2 * g), -1, 1)
+    sine = dr.sqrt(1 - dr.square(cosine))
+    sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
+    base = dr.maximum(1 + dr.square(g) - 2 * g * cosine, 1e-12)
+    density = dr.inv_four_pi * (1 - dr.square(g)) / (base * dr.sqrt(base))
+    return mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine), density
 
 
 def _joined(parts: Sequence) -> object:

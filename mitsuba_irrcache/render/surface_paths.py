@@ -4,6 +4,10 @@ A path ends at the first diffuse surface whose irradiance can be interpolated. M
 glossy surfaces are sampled as in path tracing. Between surfaces the in-scattered radiance of the
 media is integrated by ray marching of their caches, which is free of the noise of sampled
 collisions.
+
+Where a medium has a forward peak that counts as unscattered (`media/delta_m`), narrow sources reach
+surfaces attenuated by the original extinction, so that their shadows are sharp. What the peak
+scatters of their radiance is gathered by the nodes along rays of their own.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.cache.angular import Source
 from mitsuba_irrcache.cache.surface import INDIRECT_LEVELS, LEVELS, SurfaceNodes
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import kronecker
@@ -161,12 +166,22 @@ class SurfacePaths:
             corners = [(p.medium.frame @ UNIT_CUBE)[:3] for p in projections]
             nodes = SurfaceNodes(np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2)))
         self.nodes = nodes
+        #: narrow sources, if any medium has a truncated forward peak, and the media before that
+        self.narrow = next((p.directional.directional for p in projections if p.truncates_peak), None)
+        self._original_media = media
+        if self.narrow is not None:
+            self._original_media = Media([grid.original or grid for grid in media.grids])
         #: levels of nodes for points that the camera sees, and for others
         self.levels, self.indirect_levels = (
             dr.opaque(mi.UInt32, n) for n in (LEVELS, INDIRECT_LEVELS)
         )
         #: irradiance of the nodes, one array for each channel
         self.irradiance = [mi.Float(0) for _ in range(dr.size_v(mi.Spectrum))]
+
+    @property
+    def narrow_sources(self) -> tuple[Source, ...]:
+        """Narrow sources whose radiance truncated forward peaks scatter, empty without a peak."""
+        return () if self.narrow is None else (*self.narrow.sources, *self.narrow.others)
 
     @symbolic
     def follow(
@@ -195,6 +210,7 @@ class SurfacePaths:
         pdf, last = mi.Float(0), dr.zeros(mi.Interaction3f)
         last.p = ray.o
         first, interacted = mi.Bool(True), mi.Bool(False)
+        share, has_peaks = mi.Spectrum(1), self.narrow is not None
         clear = mi.Bool(not from_node)
         end_number, end_factor = mi.UInt32(0), mi.Spectrum(0)
         depth, crossings = mi.UInt32(0), mi.UInt32(0)
@@ -214,10 +230,18 @@ class SurfacePaths:
                 entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
                 hit &= active & ~clear & (pointer == projection.medium.pointer)
                 scattered, transmittance, _, volume_emission = projection.march(
-                    ray, entry, leave, mi.Spectrum(self.brightest), offset, hit
+                    ray,
+                    entry,
+                    leave,
+                    mi.Spectrum(self.brightest),
+                    offset,
+                    hit,
+                    with_peak=not from_node,
                 )
                 radiance += dr.select(hit, throughput * (scattered + volume_emission), 0)
                 throughput = dr.select(hit, throughput * transmittance, throughput)
+                if dr.hint(projection.truncates_peak, mode="scalar"):
+                    share *= projection.share_unscattered(transmittance, ray, entry, leave, hit)
             clear = mi.Bool(False)
 
             # Add emission, with multiple importance sampling where the last vertex sampled it.
@@ -229,6 +253,10 @@ class SurfacePaths:
             value = emitter.eval(si, is_emitter)
             excess = self.emitters.excess(emitter, value)
             value *= throughput
+            if dr.hint(has_peaks, mode="scalar"):
+                narrow = self.narrow.hits_source(last.p, ray.d, is_emitter & ~valid, is_emitter & valid)
+                narrow &= first | (not from_node)
+                value *= dr.select(narrow, share, 1)
             record = mi.DirectionSample3f(scene, si, last)
             sampled = is_emitter & (pdf > 0) & (excess > 0)
             density = emitter.pdf_direction(last, record, sampled)
@@ -264,8 +292,9 @@ class SurfacePaths:
             if dr.hint(not from_node, mode="scalar"):
                 u = dr.select(first, camera_sample.u, u)
             on_emitters = EmitterSample(u, dr.select(first, camera_sample.sign, 1))
+            straight = ends | (not from_node)
             direct, rng = self.direct(
-                scene, si, pointer, on_emitters, rng, smooth, ends, not from_node
+                scene, si, pointer, on_emitters, rng, smooth, (ends, straight), not from_node
             )
             radiance += dr.select(smooth, throughput * direct, 0)
             vertex = vertex_at(si)
@@ -282,6 +311,7 @@ class SurfacePaths:
             eta = dr.select(scatters, eta * scale, eta)
             pdf = dr.select(is_vertex, density, pdf)
             last = dr.select(is_vertex, vertex, last)
+            share = dr.select(is_vertex, 1, share)
             first &= ~is_vertex
             interacted |= is_vertex
             depth = dr.select(is_vertex, depth + 1, depth)
@@ -299,12 +329,15 @@ class SurfacePaths:
         return emitted, radiance, interacted, end_number, end_factor
 
     @symbolic
-    def direct(self, scene, si, pointer, sample, rng, active, ends, exact: bool):
+    def direct(self, scene, si, pointer, sample, rng, active, where, exact: bool):
         """Return the radiance reflected at ``si`` that comes straight from the sampled emitters.
 
-        With multiple importance sampling: where the path ``ends``, a ray is sampled from the BSDF
-        for it here. The transmittance has no noise if it is to be ``exact``.
+        ``where`` are two masks. With multiple importance sampling: where the path ends (the first
+        one), a ray is sampled from the BSDF for it here. Narrow sources are attenuated by the
+        original extinction where the second one holds, see `transmittance_to`. The transmittance
+        has no noise if it is to be ``exact``.
         """
+        ends, straight = where
         result, number, context = mi.Spectrum(0), mi.UInt32(0), mi.BSDFContext()
         vertex, active = vertex_at(si), mi.Bool(active) & (self.emitters.count > 0)
         while dr.hint(active, label="sampled emitters"):
@@ -314,8 +347,8 @@ class SurfacePaths:
             value *= f
             reflects = active & (record.pdf > 0) & (dr.max(value) > 0)
             behind = medium_after(si, record.d, pointer)
-            passed, rng = visibility(
-                scene, self.media, vertex, record.p, behind, rng, reflects, exact
+            passed, rng = self.transmittance_to(
+                scene, vertex, record, behind, rng, reflects, straight, exact
             )
             weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
             result += dr.select(reflects, value * passed * weight, 0)
@@ -325,6 +358,27 @@ class SurfacePaths:
             met, rng = self.met_by_bsdf(scene, si, pointer, rng, ends, exact)
             result += met
         return result, rng
+
+    def transmittance_to(self, scene, vertex, record, behind, rng, active, straight, exact: bool):
+        """Return the transmittance from ``vertex`` to the position of an emitter in ``record``.
+
+        Where ``straight``, radiance of narrow sources that is scattered into a truncated forward
+        peak does not count as transmitted: it is part of what nodes gather, or of the radiance that
+        is scattered towards the vertex.
+        """
+        narrow = mi.Bool(False)
+        if dr.hint(self.narrow is not None, mode="scalar"):
+            far = mi.has_flag(record.emitter.flags(), mi.EmitterFlags.Infinite)
+            narrow = straight & self.narrow.hits_source(vertex.p, record.d, far, ~far)
+        passed, rng = visibility(
+            scene, self.media, vertex, record.p, behind, rng, active & ~narrow, exact
+        )
+        if dr.hint(self.narrow is not None, mode="scalar"):
+            own, rng = visibility(
+                scene, self._original_media, vertex, record.p, behind, rng, active & narrow, exact
+            )
+            passed = dr.select(narrow, own, passed)
+        return passed, rng
 
     def met_by_bsdf(self, scene, si, pointer, rng, active, exact: bool):
         """Return the radiance reflected at ``si`` from a sampled emitter that a ray meets which is
@@ -336,9 +390,23 @@ class SurfacePaths:
         active = active & (sample.pdf > 0) & (dr.max(f) > 0)
         direction, vertex = si.to_world(sample.wo), vertex_at(si)
         pointer = medium_after(si, direction, pointer)
+        narrow = mi.Bool(False)
+        if self.narrow is not None:
+            narrow = self.narrow.hits_source(vertex.p, direction, mi.Bool(True), mi.Bool(True))
         end, passed, rng = first_opaque(
-            scene, self.media, si.spawn_ray(direction), pointer, rng, active, exact
+            scene, self.media, si.spawn_ray(direction), pointer, rng, active & ~narrow, exact
         )
+        if self.narrow is not None:
+            own_end, own, rng = first_opaque(
+                scene,
+                self._original_media,
+                si.spawn_ray(direction),
+                pointer,
+                rng,
+                active & narrow,
+                exact,
+            )
+            end, passed = dr.select(narrow, own_end, end), dr.select(narrow, own, passed)
         emitter = end.emitter(scene, active)
         is_emitter = active & (emitter != None)  # noqa: E711
         value = emitter.eval(end, is_emitter)
@@ -348,6 +416,35 @@ class SurfacePaths:
         density = emitter.pdf_direction(vertex, record, is_emitter)
         weight = power_heuristic(sample.pdf, density)
         return dr.select(is_emitter, f * value * excess * weight * passed, 0), rng
+
+    @symbolic
+    def scattered_forward(self, scene, ray, pointer, rng, active):
+        """Return the radiance of narrow sources that truncated forward peaks scatter into ``ray``
+        before the first surface that is not null.
+        """
+        ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
+        radiance, throughput, crossings = mi.Spectrum(0), mi.Spectrum(1), mi.UInt32(0)
+        while dr.hint(active, label="scattered forward"):
+            si = scene.ray_intersect(ray, active)
+            offset = 1 - rng.next_float32(active)
+            for projection in self.projections:
+                hit, entry, leave = projection.medium.intersect(ray)
+                entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
+                hit &= active & (pointer == projection.medium.pointer)
+                ends = ray, entry, leave, mi.Spectrum(self.brightest), offset, hit
+                smooth, transmittance, *_ = projection.march(*ends, with_peak=False)
+                if dr.hint(projection.truncates_peak, mode="scalar"):
+                    scattered, *_ = projection.march(*ends)
+                    radiance += dr.select(hit, throughput * (scattered - smooth), 0)
+                throughput = dr.select(hit, throughput * transmittance, throughput)
+            crosses = active & si.is_valid() & is_null(si.bsdf().flags())
+            factor = si.bsdf().eval_null_transmission(si, crosses)
+            throughput = dr.select(crosses, throughput * factor, throughput)
+            pointer = dr.select(crosses, medium_after(si, ray.d, pointer), pointer)
+            ray = si.spawn_ray(ray.d)
+            crossings += 1
+            active &= crosses & (crossings < MOST_CROSSINGS)
+        return radiance
 
     def visible(self, scene, si, numbers, weights, active):
         """Reduce the ``weights`` of nodes, where ``active``, to those that are visible from a
