@@ -263,21 +263,19 @@ def warn_of_noise(basis: AngularBasis, samples: int, name: str) -> None:
     )
 
 
-def warn_of_sharp_shadows(basis: AngularBasis, name: str) -> None:
-    """Log a warning if radiance of narrow sources that a forward peak scatters reaches surfaces
-    unscattered.
+def warn_of_sharp_shadows(forward: float, name: str, reason: str) -> None:
+    """Log a warning that radiance of narrow sources that a forward peak of this share scatters
+    reaches surfaces unscattered, for this ``reason``.
 
     It is right on average over a surface, and not in shadows: under a cloud with g = 0.85 and a
     sun, blocks of pixels of the ground are up to 7 % of the image's mean too bright.
     """
-    if not basis.phase.forward or not basis.sources:
-        return
     mi.Log(
         mi.LogLevel.Warn,
-        f"irrcache: {name} scatters {basis.phase.forward:.0%} into a forward peak, which counts as "
-        "unscattered on the way from suns, points, spots and bright spots to surfaces (delta-M): "
-        "its shadows on surfaces are too bright in their middle, by several per cent. Use volpath "
-        "where they matter.",
+        f"irrcache: {name} scatters {forward:.0%} into a forward peak, which counts as unscattered "
+        f"on the way from emitters to surfaces (delta-M), because {reason}: its shadows on "
+        "surfaces are too bright in their middle, by several per cent. Use volpath where they "
+        "matter.",
     )
 
 

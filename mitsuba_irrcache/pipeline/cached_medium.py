@@ -27,9 +27,9 @@ from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, marked
-from mitsuba_irrcache.lights.emitters import position_of
+from mitsuba_irrcache.lights.emitters import EmitterKind, position_of
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
-from mitsuba_irrcache.lights.narrow_sources import sources_of
+from mitsuba_irrcache.lights.narrow_sources import MAX_LAMPS, sources_of
 from mitsuba_irrcache.machine.memory import release_unused_memory, require_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
@@ -191,8 +191,9 @@ class CachedMedium:
         if basis is not None:
             name = self.label + f'medium "{medium.name}"'
             warn_of_noise(basis, samples, name)
-            if not medium.is_isolated:
-                warn_of_sharp_shadows(basis, name)
+            reason = self._why_shadows_are_too_bright()
+            if reason is not None:
+                warn_of_sharp_shadows(medium.phase.forward, name, reason)
         samples = -(-samples // 2) if settings.with_error else samples
         direct_lights = self._direct_lights(scene, grid, active, classes, samples)
         known = [light.emitter for light in direct_lights]
@@ -222,6 +223,20 @@ class CachedMedium:
         if not self.file:
             return empty({})
         return self._resume(empty(self._fingerprint(scene, grid, moments)), edited) or empty({})
+
+    def _why_shadows_are_too_bright(self) -> str | None:
+        """Return why a forward peak counts as unscattered between emitters and surfaces; None if it
+        does not.
+        """
+        description = self.description
+        if self.medium.original is None or not description.has_surfaces:
+            return None
+        if len(description.visible) < len(description.media.grids):
+            return "another medium is behind surfaces, so that no irradiance is cached on them"
+        lamps = len(description.emitters.of(EmitterKind.AREA))
+        if lamps > MAX_LAMPS:
+            return f"there are {lamps} area emitters, and only {MAX_LAMPS} are treated as narrow"
+        return None
 
     def _choose_grid(self) -> tuple[Grid, str]:
         """Return the grid of the cache, and why it has its size."""

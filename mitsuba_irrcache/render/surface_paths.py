@@ -167,7 +167,9 @@ class SurfacePaths:
             nodes = SurfaceNodes(np.min(corners, axis=(0, 2)), np.max(corners, axis=(0, 2)))
         self.nodes = nodes
         #: narrow sources, if any medium has a truncated forward peak, and the media before that
-        self.narrow = next((p.directional.directional for p in projections if p.truncates_peak), None)
+        self.narrow = next(
+            (p.directional.directional for p in projections if p.truncates_peak), None
+        )
         self._original_media = media
         if self.narrow is not None:
             self._original_media = Media([grid.original or grid for grid in media.grids])
@@ -254,7 +256,9 @@ class SurfacePaths:
             excess = self.emitters.excess(emitter, value)
             value *= throughput
             if dr.hint(has_peaks, mode="scalar"):
-                narrow = self.narrow.hits_source(last.p, ray.d, is_emitter & ~valid, is_emitter & valid)
+                narrow = self.narrow.hits_source(
+                    last.p, ray.d, is_emitter & ~valid, is_emitter & valid
+                )
                 narrow &= first | (not from_node)
                 value *= dr.select(narrow, share, 1)
             record = mi.DirectionSample3f(scene, si, last)

@@ -9,6 +9,8 @@ import pytest
 pytestmark = pytest.mark.usefixtures("rgb")
 
 SIZE = 16
+TOWARDS_THE_LIGHT = {"camera": ((0, 0, 4), (0, 0, 0), (0, 1, 0)), "fov": 12}
+BELOW_THE_CLOUD = {"camera": ((0, 2.2, 3.2), (0, -1.0, 0), (0, 1, 0)), "fov": 45}
 DENSITY = np.random.default_rng(0).random((6, 6, 6)) ** 2
 ALBEDO = np.random.default_rng(1).random((6, 6, 6)) * 0.5 + 0.5
 
@@ -57,25 +59,25 @@ def emitter(kind: str, angle: float) -> dict:
     return {"type": "envmap", "bitmap": mi.Bitmap(pixels)}
 
 
-def load(settings: dict, camera: tuple, **objects: dict) -> mi.Scene:
-    origin, target, up = camera
+def load(settings: dict, view: dict, **objects: dict) -> mi.Scene:
+    origin, target, up = view["camera"]
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     sensor = {
         "type": "perspective",
-        "fov": 12,
+        "fov": view["fov"],
         "to_world": mi.ScalarTransform4f().look_at(origin, target, up),
         "film": film | {"pixel_format": "rgb"},
     }
     return mi.load_dict({"type": "scene", "integrator": settings, "sensor": sensor} | objects)
 
 
-def error(camera: tuple, spp: int, settings: dict | None = None, **objects: dict) -> tuple:
+def error(view: dict, spp: int, settings: dict | None = None, **objects: dict) -> tuple:
     """Return the error of the mean and the largest error of a block of 4 x 4 pixels, relative to
     the mean, and the standard error of the latter.
     """
     ours = {"type": "irrcache", "solver": "sweep", "max_depth": -1, "resolution": 16}
-    image = np.array(mi.render(load(ours | (settings or {}), camera, **objects), spp=64, seed=1))
-    scene = load({"type": "volpath", "max_depth": -1, "rr_depth": 1000}, camera, **objects)
+    image = np.array(mi.render(load(ours | (settings or {}), view, **objects), spp=64, seed=1))
+    scene = load({"type": "volpath", "max_depth": -1, "rr_depth": 1000}, view, **objects)
     halves = [np.array(mi.render(scene, spp=spp // 2, seed=s), np.float64) for s in (5, 6)]
 
     def blocks(pixels: np.ndarray) -> np.ndarray:
@@ -104,9 +106,47 @@ def test_against_the_light(kind, angle, depth, g, albedo, tint):
     """Several scattering events into the peak count once; they counted several times, which made
     images up to twice too bright.
     """
-    camera = (0, 0, 4), (0, 0, 0), (0, 1, 0)
     objects = {"cloud": cloud(depth, g, albedo, tint), "emitter": emitter(kind, angle)}
-    mean, block, noise = error(camera, 2048, **objects)
+    mean, block, noise = error(TOWARDS_THE_LIGHT, 2048, **objects)
     assert noise < 0.03
     assert abs(mean) < 0.02 + 2 * noise
     assert block < 0.06 + 2 * noise
+
+
+@pytest.mark.parametrize(
+    ("kind", "objects"),
+    [("sun", 0), ("lamp", 0), ("point", 1)],
+    ids=["sun", "lamp", "point, gloss"],
+)
+def test_shadows(kind, objects):
+    """Paths that end in irradiance on surfaces counted what a peak scatters forward twice, and the
+    middle of shadows was up to 11 % too bright.
+    """
+    ground = mi.ScalarTransform4f().translate((0, -1.2, 0)).rotate((1, 0, 0), -90).scale(4)
+    colour = {"type": "rgb", "value": [1.0, 0.8, 0.6]}
+    lamp = mi.ScalarTransform4f().translate((-0.6, 3, 0.4)).rotate((1, 0, 0), 90).scale(0.3)
+    above = {
+        "sun": {"type": "directional", "direction": [0.3, -1, -0.2], "irradiance": colour},
+        "point": {"type": "point", "position": [-0.6, 3, 0.4], "intensity": colour},
+        "lamp": {
+            "type": "rectangle",
+            "to_world": lamp,
+            "emitter": {"type": "area", "radiance": colour},
+        },
+    }
+    scene = {
+        "cloud": cloud(3.0, 0.85),
+        "emitter": above[kind],
+        "ground": {
+            "type": "rectangle",
+            "to_world": ground,
+            "bsdf": {"type": "diffuse", "reflectance": 0.5},
+        },
+    }
+    if objects:
+        gloss = {"type": "roughconductor", "alpha": 0.2}
+        scene["ball"] = {"type": "sphere", "center": [1, -0.9, 0.3], "radius": 0.3, "bsdf": gloss}
+    mean, block, noise = error(BELOW_THE_CLOUD, 4096, **scene)
+    assert noise < 0.006
+    assert abs(mean) < 0.004 + noise
+    assert block < 0.02 + 4 * noise
