@@ -37,7 +37,7 @@ class LightPanel:
                 self._light("environment", lighting.environment, 0.0, 10.0, gui)
             self._sun = self._light("sun", lighting.sun, 0.0, 1000.0, gui)
             gui.add_html("<irrcache-light></irrcache-light>")
-        with gui.add_folder("Details", order=4, expand_by_default=False):
+        with gui.add_folder("Scattering and error", order=4, expand_by_default=False):
             self._add_details(gui, lighting)
         channel.receive("sun", self._turn_sun)
         self._tell_light()

@@ -65,6 +65,7 @@ class TransferPanel:
             "histogram": appearance.histogram.round(3).tolist(),
             "range": [float(appearance.edges[0]), float(appearance.edges[-1])],
             "unit": mapping.unit or appearance.volume.unit,
+            "length": f"{mapping.length:g} {appearance.volume.length_unit or 'unit of length'}",
             "undo": self._history.can(-1),
             "redo": self._history.can(1),
             "json": mapping.to_json(),

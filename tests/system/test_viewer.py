@@ -56,7 +56,7 @@ def test_edit_save_reload_and_second_window(browser, started):
     """
     address, folder = started
     window = browser.open(address, SIZE)
-    window.unfold("Details")
+    window.unfold("Scattering and error")
     window.enter("target error %", 25)
     first = settled(window)
     assert first.std() > 20

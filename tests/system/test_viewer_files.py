@@ -114,7 +114,7 @@ def test_transfer_functions_and_archives_are_exchanged(browser, reachable, tmp_p
     """
     window = browser.open(reachable, SIZE)
     page = window.page
-    window.unfold("Details")
+    window.unfold("Scattering and error")
     window.enter("target error %", 25)
     first = settled(window)
     with page.expect_download() as download:
@@ -171,7 +171,7 @@ def test_cameras_and_environment_of_a_scene_with_surfaces(browser, tmp_path, sce
     arguments = (str(tmp_path / "scene.xml"), "--port", "8720")
     with viewer(arguments, tmp_path / "log.txt") as address:
         window = browser.open(address, SIZE)
-        window.unfold("Details")
+        window.unfold("Scattering and error")
         window.enter("target error %", 20)
         front = settled(window)
         assert front.std() > 10

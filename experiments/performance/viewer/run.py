@@ -123,7 +123,7 @@ def _seen(window: Window, shown: int, since: float, width: int = 0) -> float:
 def editing(window: Window, repeats: int) -> dict[str, float]:
     """Measure from an edit of the transfer function, or else the density, to the new image."""
     found, has_curve = [], window.page.locator("irrcache-transfer").count() > 0
-    window.unfold("Details")
+    window.unfold("Scattering and error")
     window.enter("target error %", ENOUGH)
     for number in range(repeats):
         window.wait_for("^final", 60)  # no other image is displayed from now on

@@ -106,7 +106,7 @@ class User:
 
     def density(self, window: Window) -> None:
         """Change the density, sometimes to an invalid value."""
-        unfolded(window, "Details", "density").enter(
+        unfolded(window, "Scattering and error", "density").enter(
             "density", self._rng.choice(["0.5", "1", "2", "-3"])
         )
 

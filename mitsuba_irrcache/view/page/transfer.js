@@ -201,6 +201,7 @@
       this.selected = { curve, index };
       const [value, height] = points[index], opacity = curve === "opacity";
       this.find("opacity-label").hidden = !opacity;
+      this.find("opacity-label").title = `share of radiance lost over ${this.state.length}`;
       this.find("colour-label").hidden = opacity;
       this.find("unit").textContent = this.state.unit ? `value, ${this.state.unit}` : "value";
       this.fill("value", +value.toPrecision(6));
