@@ -16,18 +16,23 @@ from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.machine import doctor
 
 
-def replace_tables(document: Path, tables: dict[str, Table]) -> list[str]:
+def replace_tables(
+    document: Path, tables: dict[str, Table], origin: str | None = None
+) -> list[str]:
     """Replaces the blocks of ``document`` that have the names of ``tables``; returns these names.
 
-    Raises ValueError where the document has none of them.
+    Below each table stands its ``origin``; None: when and where it was measured. Raises ValueError
+    where the document has none of the tables.
     """
     text, found = document.read_text(), []
+    origin = provenance() if origin is None else origin
+    below = f"\n\n*{origin}*\n" if origin else "\n"
     for name, table in tables.items():
         block = re.compile(
             rf"(?<=<!-- table: {re.escape(name)} -->\n).*?(?=<!-- end -->)", re.DOTALL
         )
         if block.search(text):
-            new = f"{as_markdown(table)}\n\n*{provenance()}*\n"
+            new = as_markdown(table) + below
             text = block.sub(lambda _, new=new: new, text, count=1)
             found.append(name)
     if not found:

@@ -1,1 +1,1 @@
-"""The irradiance cache: statistics, lookups, angular moments, error estimates and files."""
+"""The irradiance cache: values, statistics, angular moments, direct light, errors, files."""

@@ -1,1 +1,1 @@
-"""Numerical helpers, plugin properties and utilities that do not depend on rendering."""
+"""Dr.Jit helpers, sequences, properties of plugins, cancellation."""

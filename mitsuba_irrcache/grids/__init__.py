@@ -1,1 +1,1 @@
-"""Voxel grids: placement, interpolation, majorants, occupancy, and bounding shapes."""
+"""Voxel grids, fields on them, boundaries, majorants, occupancy, 16-bit copies for rays."""

@@ -1,1 +1,1 @@
-"""Images of a scene: its caches brought up to date, camera rays, the film's layers."""
+"""The plugin's properties, camera rays for the present state of a scene, the composed image."""

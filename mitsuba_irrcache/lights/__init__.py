@@ -1,1 +1,1 @@
-"""Emitters: their classification, and the inverse-square factor of nearby small ones."""
+"""Kinds of emitters, narrow sources, solid angles, inverse-square factors of emitters nearby."""

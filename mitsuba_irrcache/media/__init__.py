@@ -1,1 +1,1 @@
-"""Participating media on grids: extinction, albedo, phase function, emission."""
+"""Participating media on grids: extinction, albedo, phase function, delta-M, emission."""

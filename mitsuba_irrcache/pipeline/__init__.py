@@ -1,1 +1,1 @@
-"""From a scene and settings to complete caches."""
+"""From a scene and settings to complete caches; defaults; progressive runs."""

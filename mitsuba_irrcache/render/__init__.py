@@ -1,1 +1,1 @@
-"""From caches to an image: ray marching, surfaces, film and denoising."""
+"""From caches to an image: camera rays, ray marching, surfaces, film, layers, filter."""

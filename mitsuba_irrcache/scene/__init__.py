@@ -1,1 +1,1 @@
-"""A Mitsuba scene as the solvers see it, and the checks that it can be rendered."""
+"""A Mitsuba scene as the solvers see it: checks, fingerprint, surfaces among voxels."""

@@ -1,1 +1,1 @@
-"""Free-flight sampling, transmittance estimation and path tracing in media and between surfaces."""
+"""Free flights and transmittance of media, and paths through surfaces and several media."""

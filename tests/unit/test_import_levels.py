@@ -8,31 +8,13 @@ from pathlib import Path
 import pytest
 
 import mitsuba_irrcache
+from experiments.docs.structure import LEVELS, ONLY
 
 PACKAGE = Path(mitsuba_irrcache.__file__).parent
-#: From the lowest level to the highest; folders of one level do not import each other.
-LEVELS = (
-    {"errors"},
-    {"core", "io", "machine"},
-    {"grids"},
-    {"media", "lights"},
-    {"transport"},
-    {"scene"},
-    {"cache"},
-    {"solvers"},
-    {"pipeline"},
-    {"render"},
-    {"gradients", "out_of_core"},
-    {"imaging"},
-    {"integrators", "cli", "compare"},
-    {"farm", "view"},
-)
-#: Folders that import less than their level permits.
-ONLY = {"volumes": {"errors", "core", "io", "machine"}}
 #: Modules that re-export names of the package.
 TOP = {"__init__", "__main__", "_register"}
 
-ALLOWED = ONLY | {
+ALLOWED = {name: set(below) for name, below in ONLY.items()} | {
     name: set().union(*LEVELS[:level]) | ({"volumes"} if name == "view" else set())
     for level, names in enumerate(LEVELS)
     for name in names
