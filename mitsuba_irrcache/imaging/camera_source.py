@@ -65,12 +65,19 @@ class CameraRaySource:
     def meet_tolerance(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int, progress: Progress | None
     ) -> int:
-        """Choose cache and step for an image of ``sensor``; return the samples per pixel."""
+        """Choose cache and step for an image of ``sensor``; return the samples per pixel.
+
+        The timeout starts here, for search and image together. If it ends the search, the image is
+        that of the finest cache so far.
+        """
         check_sensor(scene, sensor)
         try:
             found = self._search.find(scene, sensor, spp, seed, self._begin(progress))
         except Stopped:
             self.certificate = None
+            finest = self._search.finest
+            if finest is not None:
+                self.builder.adopt(finest)
             mi.Log(
                 mi.LogLevel.Warn,
                 "irrcache: stopped before the error of the image was known; the tolerance is not "
@@ -89,7 +96,10 @@ class CameraRaySource:
     def camera_rays(self, scene: mi.Scene, progress: Progress | None) -> CameraRays | None:
         """Return the camera rays for the cache of ``scene``; None if no medium is visible."""
         with self.builder.lock:
-            progress = self._begin(progress)
+            if self._search is None:
+                progress = self._begin(progress)
+            else:  # started by `meet_tolerance`
+                progress = self._stopping.raising(progress)
             if self._mapped is not None:
                 return self._mapped_camera_rays(scene, progress)
             try:

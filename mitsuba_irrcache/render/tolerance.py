@@ -161,6 +161,11 @@ class ToleranceSearch:
         """Return the largest error of a part of the estimate."""
         return SHARES[part] * self.tolerance
 
+    @property
+    def finest(self) -> CacheBuilder | None:
+        """Builder of the finest cache so far, also of a search that was stopped; None without."""
+        return self._levels[-1].builder if self._levels else None
+
     def find(
         self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int, progress: Progress | None
     ) -> tuple[CacheBuilder, float, int, Certificate]:

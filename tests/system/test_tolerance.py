@@ -11,6 +11,7 @@ import pytest
 from experiments.validation.limits.cases import Case
 from experiments.validation.limits.reference import single
 from mitsuba_irrcache.cli.main import main
+from mitsuba_irrcache.core.cancellation import StopCondition
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline.progressive import render_progressive
 from tests.support.scene_xml import FOG_IN_A_BOX
@@ -93,6 +94,51 @@ def test_an_estimate_that_is_stopped_is_no_certificate(mono):
     scene = Case("directional").scene(tolerance=TOLERANCE, timeout=1e-4)
     assert np.isfinite(np.array(mi.render(scene))).all()
     assert scene.integrator().certificate is None
+
+
+def stopping_after(integrator, count: int) -> list[int]:
+    """Cancel renderings of an integrator at call ``count`` of ``progress``; return its calls."""
+    calls = []
+
+    def progress(stage: str, done: int, total: int) -> None:
+        calls.append(done)
+        if len(calls) == count:
+            integrator.cancel()
+
+    integrator.progress = progress
+    return calls
+
+
+def test_a_search_that_is_stopped_leaves_its_finest_cache(mono):
+    """It is rendered as it is; no other cache is begun, and the next rendering goes on."""
+    complete = Case("directional").scene(tolerance=TOLERANCE)
+    calls = stopping_after(complete.integrator(), 0)
+    expected = np.array(mi.render(complete))
+    resolution = complete.integrator().certificate.settings["resolution"]
+    scene = Case("directional").scene(tolerance=TOLERANCE)
+    integrator = scene.integrator()
+    stopping_after(integrator, len(calls) - 1)
+    image = np.array(mi.render(scene))
+    assert integrator.certificate is None
+    assert 16 <= max(integrator.cache.grid.shape) < resolution
+    assert integrator.cache.samples > 0
+    assert image.mean() == pytest.approx(expected.mean(), rel=0.1)
+    integrator.progress = None
+    np.testing.assert_array_equal(np.array(mi.render(scene)), expected)
+
+
+def test_the_timeout_holds_for_search_and_image_together(mono, monkeypatch):
+    """The image has what the search left of the timeout."""
+    begun = []
+    begin = StopCondition.begin
+    monkeypatch.setattr(
+        StopCondition,
+        "begin",
+        lambda self, timeout=0.0: begun.append(timeout) or begin(self, timeout),
+    )
+    scene = Case("constant").scene(tolerance=0.05, timeout=1e6)
+    mi.render(scene, spp=4)
+    assert begun == [1e6]
 
 
 def test_scenes_without_a_cache_have_no_estimate(mono):
