@@ -16,6 +16,12 @@ from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.machine import doctor
 
 
+def plain_number(value: float, digits: int = 2) -> str:
+    """Return a number of so many significant digits without an exponent: 170 and not 1.7e+02."""
+    rounded = float(f"{value:.{digits}g}")
+    return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:g}"
+
+
 def replace_tables(
     document: Path, tables: dict[str, Table], origin: str | None = None
 ) -> list[str]:

@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from experiments.performance.kinds.scenes import KINDS, film, sensor
-from experiments.support.documents import replace_tables
+from experiments.support.documents import plain_number, replace_tables
 from experiments.support.options import add_document, begin, parser_of
 from experiments.support.store import Store
 from mitsuba_irrcache.compare.tables import Table
@@ -187,7 +187,7 @@ def _speeds(row: dict) -> list[str]:
         elif not found:
             cells.append("not reached")
         else:
-            cells.append(f"{stock / min(found):.2g} x, {min(found):.2g} s")
+            cells.append(f"{plain_number(stock / min(found))} x, {min(found):.2g} s")
     # An image of error e takes the cache's time and that of its samples, which goes with e^-2.
     last = row["irrcache"][-1]
     error, once = max(last["rmse"], row["resolved"]), max(last["cold"] - last["moved"], 1e-3)

@@ -24,7 +24,7 @@ from time import process_time
 import mitsuba as mi
 import numpy as np
 
-from experiments.support.documents import replace_tables
+from experiments.support.documents import plain_number, replace_tables
 from experiments.support.options import Options, add_document, begin, parser_of
 from experiments.support.store import Store
 from experiments.validation.glass.cases import CASES, build
@@ -101,7 +101,7 @@ def cells(name: str, row: dict) -> list[str]:
         f"{row['mean']:+.2f} ({row['mean_noise']:.2f})",
         f"{row['rmse']:.2f} ({row['rmse_noise']:.2f})",
         f"{row['worst']:+.1f} ({row['block_noise']:.1f})",
-        f"{row['cold']:.1f}", f"{row['stock']:.0f} ({row['stock'] / row['cold']:.2g} x)",
+        f"{row['cold']:.1f}", f"{row['stock']:.0f} ({plain_number(row['stock'] / row['cold'])} x)",
     ]  # fmt: skip
 
 

@@ -69,3 +69,11 @@ def test_tests_and_scripts_that_documents_name_exist(name):
         assert f"def {function}(" in files[0].read_text() or not function, f"{path}::{function}"
     for module in re.findall(r"(?<=-m )experiments[\w.]+", text):
         assert (ROOT / (module.replace(".", "/") + ".py")).exists(), module
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(172.4, "170"), (6310, "6300"), (15.2, "15"), (1.62, "1.6"), (0.853, "0.85"), (99.7, "100")],
+)
+def test_numbers_of_tables_have_no_exponent(value, text):
+    assert documents.plain_number(value) == text
