@@ -243,7 +243,7 @@ class SlabProjection(Projection):
             scattered, transmittance, *_ = super().march(*rays, part)
             dr.eval(scattered, transmittance, part.state)
             state, found = part.state, (scattered, transmittance)
-            if not dr.any(state[-1])[0]:
+            if not dr.any(state.active)[0]:
                 break
         self.lookups.groups = []
         return found

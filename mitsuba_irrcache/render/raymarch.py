@@ -15,6 +15,7 @@ Rays read packed 16-bit copies of the fields (`packed_fields`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +32,7 @@ from mitsuba_irrcache.grids.packed_fields import AlongRay, Lookups
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.render.aovs import Layers
-from mitsuba_irrcache.render.empty_space import Clearance, ClearanceAlongRay
+from mitsuba_irrcache.render.empty_space import Clearance
 from mitsuba_irrcache.render.quadrature import curved, emission_weights, segment
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.transport.tracking import optical_depth
@@ -54,7 +55,7 @@ class MarchedPart:
     Without further components of `Layers`, emission, and lights that are evaluated along rays.
     """
 
-    def __init__(self, state: tuple | None) -> None:
+    def __init__(self, state: _MarchState | None) -> None:
         self.state = state
 
     def holds(self, fields: AlongRay, t: mi.Float) -> mi.Bool:
@@ -97,7 +98,7 @@ class Projection:
         #: inverse-square factor of lamps, by which the cached irradiance is divided
         self.falloff = falloff
         #: emitters whose direct irradiance is excluded from the cached one
-        self._direct_lights = list(direct_lights)
+        self.direct_lights = list(direct_lights)
         #: surfaces that cut voxels, if any, and the irradiance they select voxels from
         self._edges = (edges, irradiance) if edges is not None else None
         albedo = _simplified(medium.albedo)
@@ -187,7 +188,7 @@ class Projection:
         if self.directional is not None:
             view = self.angular_terms(direction)
             phi = phi * self.directional.factor(p, *view, active, with_peak=False)
-        for light in self._direct_lights:
+        for light in self.direct_lights:
             phi = phi + light.at(p, active, direction)
         return phi
 
@@ -257,135 +258,18 @@ class Projection:
         narrow sources are not scattered into a truncated forward peak.
         """
         # docs/primer, eqs. (1.1), (5.1)
-        clearance, fields = self.clearance.along(ray), self.lookups.along(ray)
-        active = mi.Bool(active) & (near < far)
-        # Points of the lattice are numbered from 1; number 0 is ``near``, reached by a first step
-        # of length 0 that only evaluates the fields there.
-        k, stride = mi.Float(0), mi.Float(1)
-        t, step = mi.Float(near), self.step
-        per_step = dr.rcp(step)
-        extinction, source, extras = self._zero_sample()
-        peak = self._zero_peak() if with_peak else []
-        previous, previous_source, previous_length = extinction, source, mi.Float(dr.inf)
-        grey = self.medium.sigma_t.channels == 1
-        view = self.angular_terms(ray.d)
-        lamps = self.falloff.along(ray) if self.falloff is not None else []
-        transmittance = mi.Float(1) if dr.hint(grey, mode="scalar") else mi.Color3f(1)
-        radiance, emitted, emission_at_start = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
-        emission = self.medium.emission
-        gathered = self.zero_sums()
-        means = [light.mean_extinction(ray(t), active) for light in self._direct_lights]
-        max_radiance = dr.maximum(self.max_radiance, dr.max(background))
-        max_radiance += self.max_emission * dr.maximum(far - near, 0)
-        dark = max_radiance == 0
-        max_radiance = dr.select(dark, 1, max_radiance)
-        # Floats represent step numbers exactly up to 2^24; longer lattices have coarser steps.
-        limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
-        lattice = near, far, offset, step, per_step, limit
-        if dr.hint(part is not None, mode="scalar"):
-            if dr.hint(part.state is not None, mode="scalar"):
-                (k, stride, t, extinction, source, previous, previous_source, previous_length,
-                 transmittance, radiance, active) = part.state  # fmt: skip
-        going = mi.Bool(active)
-        if dr.hint(part is not None, mode="scalar"):
-            going &= part.holds(fields, _next_point(clearance, lattice, t, k, stride, active)[-1])
+        march = _RayMarch(self, ray, (near, far), background, offset)
+        is_first = part is None or part.state is None
+        state = march.begin(mi.Bool(active), with_peak) if is_first else part.state
+        going = march.goes_on(state, part)
         while dr.hint(going, label="ray march"):
-            # Skip empty space: continue from the last lattice point inside it.
-            empty, wall, skip, k, t, end = _next_point(clearance, lattice, t, k, stride, active)
-            extinction = dr.select(skip, 0, extinction)
-            previous = dr.select(skip, 0, previous)
-            previous_length = dr.select(skip, step, previous_length)
-            emission_at_start = dr.select(skip, 0, emission_at_start)
-            length = end - t
-            if dr.hint(bool(peak), mode="scalar"):
-                peak = [peak[0], dr.select(skip, 0, peak[1])]
-            next_extinction, next_source, next_extras, next_peak = self.fetch(
-                fields, end, view, peak, length
-            )
-            # Where a segment enters or leaves matter, use the source of the end inside: the cache
-            # may have no value at the other end.
-            enters = dr.max(mi.Spectrum(extinction)) == 0
-            source = dr.select(enters, next_source, source)
-            previous_source = dr.select(enters, next_source, previous_source)
-            extras = _select(enters, next_extras, extras)
-            leaves = dr.max(mi.Spectrum(next_extinction)) == 0
-            next_source = dr.select(leaves, source, next_source)
-            next_extras = _select(leaves, extras, next_extras)
-            ratio = length / previous_length
-            # Ignore the curvature behind a short first step.
-            ratio = dr.select(ratio < 2, ratio, 0)
-            ends = (extinction, next_extinction), (source, next_source)
-            if dr.hint(self.quadrature == "exponential", mode="scalar"):
-                ends = (
-                    curved(previous, extinction, next_extinction, ratio),
-                    curved(previous_source, source, next_source, ratio),
-                )
-            weights, segment_transmittance = segment(self.quadrature, ends[0], length)
-            near_radiance, far_radiance = weights[0] * ends[1][0], weights[1] * ends[1][1]
-            if dr.hint(self.falloff is not None, mode="scalar"):
-                falloff = self.falloff.means(lamps, t, end)
-                near_radiance, far_radiance = near_radiance * falloff[0], far_radiance * falloff[1]
-            radiance += transmittance * (near_radiance + far_radiance)
-            if dr.hint(bool(self._direct_lights), mode="scalar"):
-                albedos = self._albedo_at(ray(t)), self._albedo_at(ray(end))
-            for i, light in enumerate(self._direct_lights):
-                mean = dr.select(skip, light.mean_extinction(ray(t), skip), means[i])
-                means[i] = light.mean_extinction(ray(end), active)
-                peak_depth = 0.5 * (peak[0] + next_peak[0]) if peak else None
-                radiance += transmittance * light.scattered(
-                    ray,
-                    (t, end),
-                    ends[0],
-                    (mean, means[i]),
-                    weights,
-                    albedos,
-                    bool(peak) or not self.truncates_peak,
-                    peak_depth,
-                )
-            if dr.hint(self.layered, mode="scalar"):
-                gathered = _gather(
-                    gathered,
-                    transmittance,
-                    weights[0] * t + weights[1] * end,
-                    weights,
-                    (near_radiance, far_radiance),
-                    (extras, next_extras),
-                )
-            if dr.hint(emission is not None, mode="scalar"):
-                emission_at_end = mi.Spectrum(emission.at_world(ray(end), True))
-                sides = emission_weights(self.quadrature, ends[0], length)
-                emitted += transmittance * (
-                    sides[0] * emission_at_start + sides[1] * emission_at_end
-                )
-                emission_at_start = emission_at_end
-            transmittance *= segment_transmittance
-            previous, previous_source, previous_length = extinction, source, length
-            extinction, source, extras = next_extinction, next_source, next_extras
-            peak = next_peak
-            # Upper bound of the remaining radiance, relative to the accumulated radiance (1 if both
-            # are 0).
-            remaining = dr.max(mi.Spectrum(transmittance)) * max_radiance
-            accumulated = dr.select(dark, 1, dr.max(radiance + emitted))
-            active &= remaining > EARLY_STOP * accumulated
-            if dr.hint(self.quadrature == "exponential", mode="scalar"):
-                stride = dr.select(remaining > COARSER * accumulated, mi.Float(1), 2)
-                stride = dr.select(remaining > COARSEST * accumulated, stride, 4)
-            t = end
-            k += 1
-            active &= (t < far) & (~empty | (wall < far))
-            going = mi.Bool(active)
-            if dr.hint(part is not None, mode="scalar"):
-                following = _next_point(clearance, lattice, t, k, stride, active)[-1]
-                going &= part.holds(fields, following)
+            march.advance(state)
+            going = march.goes_on(state, part)
         if dr.hint(part is not None, mode="scalar"):
-            part.state = (k, stride, t, extinction, source, previous, previous_source,
-                          previous_length, transmittance, radiance, active)  # fmt: skip
-        return radiance, mi.Spectrum(transmittance), gathered, emitted
+            part.state = state
+        return state.radiance, mi.Spectrum(state.transmittance), state.gathered, state.emitted
 
-    def _albedo_at(self, p: mi.Point3f) -> mi.Spectrum:
-        return mi.Spectrum(self.medium.albedo.at_world(p))
-
-    def _zero_sample(self) -> tuple:
+    def zero_sample(self) -> tuple:
         """Return zeros of the same types as `fetch`."""
 
         def zero(*channels: int) -> mi.Float | mi.Color3f:
@@ -398,7 +282,7 @@ class Projection:
             extras += [mi.Float(0)] * self.uncertainty.count
         return zero(self.medium.sigma_t.channels), source, extras
 
-    def _zero_peak(self) -> list:
+    def zero_peak(self) -> list:
         """Return the optical depth and the extinction of a truncated forward peak before a ray
         enters the medium; empty without such a peak.
         """
@@ -444,30 +328,262 @@ class Projection:
         )
 
 
-def _next_point(
-    clearance: ClearanceAlongRay,
-    lattice: tuple,
-    t: mi.Float,
-    k: mi.Float,
-    stride: mi.Float,
-    active: mi.Bool,
-) -> tuple:
-    """Find the next point of the lattice of steps at which to evaluate the fields, behind ``t``.
-
-    Returns whether space is empty at ``t`` and up to where, whether it is skipped, the number of
-    the point, the distance from which the segment to it begins, and that of the point.
+@dataclass
+class _FieldSample:
+    """Results of `Projection.fetch` at a point: the extinction, the source albedo, and the values
+    that layers need.
     """
-    near, far, offset, step, per_step, limit = lattice
-    empty, wall = clearance.exit(t, active)
-    last = dr.floor(dr.fma(minimum(wall, far) - near, per_step, -offset)) + 1
-    skip = empty & (last >= k) & (last >= 1)
-    last = minimum(last, limit)
-    k = dr.select(skip, last + 1, k + stride - 1)
-    t = dr.select(skip, minimum(dr.fma(last - 1 + offset, step, near), far), t)
-    end = minimum(dr.fma(k - 1 + offset, step, near), far)
-    end = dr.select(k == 0, near, end)
-    end = dr.select(k >= limit, far, end)
-    return empty, wall, skip, k, t, end
+
+    extinction: mi.Float | mi.Color3f
+    source: mi.Float | mi.Color3f
+    extras: list
+
+
+@dataclass
+class _MarchState:
+    """What a ray carries from segment to segment.
+
+    ``k`` is the number of the next point of the lattice of steps, and ``stride`` how many it is
+    further than the last one, at distance ``t``, where the fields are ``here``. ``previous`` and
+    ``previous_length`` belong to the segment before. ``peak`` is that of `Projection.fetch`, and
+    ``means`` are the mean extinctions towards the direct lights.
+    """
+
+    k: mi.Float
+    stride: mi.Float
+    t: mi.Float
+    here: _FieldSample
+    previous: tuple
+    previous_length: mi.Float
+    peak: list
+    means: list
+    emission: mi.Spectrum
+    transmittance: mi.Float | mi.Color3f
+    radiance: mi.Spectrum
+    emitted: mi.Spectrum
+    gathered: list
+    active: mi.Bool
+
+
+@dataclass
+class _MarchedSegment:
+    """A segment up to the distance ``end``: the extinctions at both ends, with a correction for
+    curvature, and the ``weights`` of the source albedos there. ``skip``: behind empty space.
+    """
+
+    end: mi.Float
+    skip: mi.Bool
+    extinctions: tuple
+    weights: tuple
+
+
+class _RayMarch:
+    """The march of a `Projection` along rays between the distances of ``bounds``."""
+
+    def __init__(
+        self,
+        projection: Projection,
+        ray: mi.Ray3f,
+        bounds: tuple[mi.Float, mi.Float],
+        background: mi.Spectrum,
+        offset: mi.Float,
+    ) -> None:
+        near, far = bounds
+        self._projection, self._ray, self._near, self._far = projection, ray, near, far
+        self._clearance = projection.clearance.along(ray)
+        self._fields = projection.lookups.along(ray)
+        self._view = projection.angular_terms(ray.d)
+        falloff, step = projection.falloff, projection.step
+        self._lamps = falloff.along(ray) if falloff is not None else []
+        max_radiance = dr.maximum(projection.max_radiance, dr.max(background))
+        max_radiance += projection.max_emission * dr.maximum(far - near, 0)
+        self._dark = max_radiance == 0
+        self._max_radiance = dr.select(self._dark, 1, max_radiance)
+        # Floats represent step numbers exactly up to 2^24; longer lattices have coarser steps.
+        limit = dr.minimum(dr.ceil((far - near) / step) + 1, 2**24)
+        self._lattice = near, far, offset, step, dr.rcp(step), limit
+
+    def begin(self, active: mi.Bool, with_peak: bool) -> _MarchState:
+        """The state before the first segment.
+
+        Points of the lattice are numbered from 1; number 0 is the beginning, reached by a first
+        step of length 0 that only evaluates the fields there.
+        """
+        projection, t = self._projection, mi.Float(self._near)
+        active = active & (self._near < self._far)
+        here = _FieldSample(*projection.zero_sample())
+        grey = projection.medium.sigma_t.channels == 1
+        lights = projection.direct_lights
+        return _MarchState(
+            k=mi.Float(0),
+            stride=mi.Float(1),
+            t=t,
+            here=here,
+            previous=(here.extinction, here.source),
+            previous_length=mi.Float(dr.inf),
+            peak=projection.zero_peak() if with_peak else [],
+            means=[light.mean_extinction(self._ray(t), active) for light in lights],
+            emission=mi.Spectrum(0),
+            transmittance=(mi.Float if grey else mi.Color3f)(1),
+            radiance=mi.Spectrum(0),
+            emitted=mi.Spectrum(0),
+            gathered=projection.zero_sums(),
+            active=active,
+        )
+
+    def goes_on(self, state: _MarchState, part: MarchedPart | None) -> mi.Bool:
+        """Whether there is a further segment, in the ``part`` of the medium if there is one."""
+        if part is None:
+            return mi.Bool(state.active)
+        return state.active & part.holds(self._fields, self._next_point(state)[-1])
+
+    def advance(self, state: _MarchState) -> None:
+        """Add the next segment."""
+        projection = self._projection
+        empty, wall, skip, state.k, state.t, end = self._next_point(state)
+        length = end - state.t
+        self._skip_empty_space(state, skip)
+        *values, peak = projection.fetch(self._fields, end, self._view, state.peak, length)
+        there = _FieldSample(*values)
+        before = self._with_inner_sources(state, there)
+        extinctions, sources = self._curved(state, before, there, length)
+        weights, transmittance = segment(projection.quadrature, extinctions, length)
+        part = _MarchedSegment(end, skip, extinctions, weights)
+        scattered = self._add_scattered(state, part, sources)
+        self._add_direct(state, part, peak)
+        if projection.layered:
+            state.gathered = _gather(
+                state.gathered,
+                state.transmittance,
+                weights[0] * state.t + weights[1] * end,
+                weights,
+                scattered,
+                (state.here.extras, there.extras),
+            )
+        self._add_emitted(state, part, length)
+        state.transmittance = state.transmittance * transmittance
+        state.previous = state.here.extinction, state.here.source
+        state.previous_length = length
+        state.here, state.peak = there, peak
+        self._choose_stride(state)
+        state.t = end
+        state.k += 1
+        state.active &= (end < self._far) & (~empty | (wall < self._far))
+
+    def _next_point(self, state: _MarchState) -> tuple:
+        """Find the next point of the lattice of steps at which to evaluate the fields, behind the
+        last one.
+
+        Returns whether space is empty there and up to where, whether it is skipped, the number of
+        the point, the distance from which the segment to it begins, and that of the point.
+        """
+        near, far, offset, step, per_step, limit = self._lattice
+        empty, wall = self._clearance.exit(state.t, state.active)
+        last = dr.floor(dr.fma(minimum(wall, far) - near, per_step, -offset)) + 1
+        skip = empty & (last >= state.k) & (last >= 1)
+        last = minimum(last, limit)
+        k = dr.select(skip, last + 1, state.k + state.stride - 1)
+        t = dr.select(skip, minimum(dr.fma(last - 1 + offset, step, near), far), state.t)
+        end = minimum(dr.fma(k - 1 + offset, step, near), far)
+        end = dr.select(k == 0, near, end)
+        end = dr.select(k >= limit, far, end)
+        return empty, wall, skip, k, t, end
+
+    def _skip_empty_space(self, state: _MarchState, skip: mi.Bool) -> None:
+        """Continue from the last lattice point inside of empty space."""
+        state.here.extinction = dr.select(skip, 0, state.here.extinction)
+        extinction, source = state.previous
+        state.previous = dr.select(skip, 0, extinction), source
+        state.previous_length = dr.select(skip, self._projection.step, state.previous_length)
+        state.emission = dr.select(skip, 0, state.emission)
+        if state.peak:
+            state.peak = [state.peak[0], dr.select(skip, 0, state.peak[1])]
+
+    def _with_inner_sources(self, state: _MarchState, there: _FieldSample) -> tuple:
+        """Where a segment enters or leaves matter, use the source of the end inside: the cache may
+        have no value at the other end.
+
+        Returns extinction and source before the segment.
+        """
+        here, (extinction, previous_source) = state.here, state.previous
+        enters = dr.max(mi.Spectrum(here.extinction)) == 0
+        here.source = dr.select(enters, there.source, here.source)
+        previous_source = dr.select(enters, there.source, previous_source)
+        here.extras = _select(enters, there.extras, here.extras)
+        leaves = dr.max(mi.Spectrum(there.extinction)) == 0
+        there.source = dr.select(leaves, here.source, there.source)
+        there.extras = _select(leaves, here.extras, there.extras)
+        return extinction, previous_source
+
+    def _curved(
+        self, state: _MarchState, before: tuple, there: _FieldSample, length: mi.Float
+    ) -> tuple[tuple, tuple]:
+        """Extinctions and sources at both ends, corrected for their curvature in the exponential
+        rule.
+        """
+        here, ratio = state.here, length / state.previous_length
+        # Ignore the curvature behind a short first step.
+        ratio = dr.select(ratio < 2, ratio, 0)
+        if self._projection.quadrature != "exponential":
+            return (here.extinction, there.extinction), (here.source, there.source)
+        return (
+            curved(before[0], here.extinction, there.extinction, ratio),
+            curved(before[1], here.source, there.source, ratio),
+        )
+
+    def _add_scattered(self, state: _MarchState, part: _MarchedSegment, sources: tuple) -> tuple:
+        """Add in-scattered radiance; return that of both ends before its attenuation."""
+        near, far = part.weights[0] * sources[0], part.weights[1] * sources[1]
+        if self._projection.falloff is not None:
+            falloff = self._projection.falloff.means(self._lamps, state.t, part.end)
+            near, far = near * falloff[0], far * falloff[1]
+        state.radiance += state.transmittance * (near + far)
+        return near, far
+
+    def _add_direct(self, state: _MarchState, part: _MarchedSegment, peak: list) -> None:
+        """Add radiance that is scattered once on its way from the direct lights."""
+        projection, ray, end = self._projection, self._ray, part.end
+        if not projection.direct_lights:
+            return
+        albedo = projection.medium.albedo
+        albedos = tuple(mi.Spectrum(albedo.at_world(ray(t))) for t in (state.t, end))
+        for i, light in enumerate(projection.direct_lights):
+            skipped = light.mean_extinction(ray(state.t), part.skip)
+            mean = dr.select(part.skip, skipped, state.means[i])
+            state.means[i] = light.mean_extinction(ray(end), state.active)
+            peak_depth = 0.5 * (state.peak[0] + peak[0]) if state.peak else None
+            state.radiance += state.transmittance * light.scattered(
+                ray,
+                (state.t, end),
+                part.extinctions,
+                (mean, state.means[i]),
+                part.weights,
+                albedos,
+                bool(state.peak) or not projection.truncates_peak,
+                peak_depth,
+            )
+
+    def _add_emitted(self, state: _MarchState, part: _MarchedSegment, length: mi.Float) -> None:
+        emission = self._projection.medium.emission
+        if emission is None:
+            return
+        at_end = mi.Spectrum(emission.at_world(self._ray(part.end), True))
+        sides = emission_weights(self._projection.quadrature, part.extinctions, length)
+        state.emitted += state.transmittance * (sides[0] * state.emission + sides[1] * at_end)
+        state.emission = at_end
+
+    def _choose_stride(self, state: _MarchState) -> None:
+        """Choose the length of the next step by the radiance that remains, and end rays to which
+        little is added.
+        """
+        # Upper bound of the remaining radiance, relative to the accumulated radiance (1 if both
+        # are 0).
+        remaining = dr.max(mi.Spectrum(state.transmittance)) * self._max_radiance
+        accumulated = dr.select(self._dark, 1, dr.max(state.radiance + state.emitted))
+        state.active &= remaining > EARLY_STOP * accumulated
+        if self._projection.quadrature == "exponential":
+            stride = dr.select(remaining > COARSER * accumulated, mi.Float(1), 2)
+            state.stride = dr.select(remaining > COARSEST * accumulated, stride, 4)
 
 
 def _simplified(field: Field) -> Field:

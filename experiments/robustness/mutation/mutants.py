@@ -133,8 +133,8 @@ MUTANTS = (
     Mutant(
         "the last segment skipped",
         "render/raymarch.py",
-        "active &= (t < far) & (~empty",
-        "active &= (t + step < far) & (~empty",
+        "active &= (end < self._far) & (~empty",
+        "active &= (end + self._projection.step < self._far) & (~empty",
         (PROJECTION,),
     ),
     Mutant(

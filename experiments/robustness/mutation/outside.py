@@ -91,15 +91,15 @@ OUTSIDE = (
     Mutant(
         "a segment that enters matter has the light of its dark end",
         "render/raymarch.py",
-        "            source = dr.select(enters, next_source, source)\n",
+        "        here.source = dr.select(enters, there.source, here.source)\n",
         "",
         (SEGMENTS,),
     ),
     Mutant(
         "a segment that leaves matter has the light of its dark end",
         "render/raymarch.py",
-        "next_source = dr.select(leaves, source, next_source)",
-        "next_source = next_source + 0",
+        "there.source = dr.select(leaves, here.source, there.source)",
+        "there.source = there.source + 0",
         (SEGMENTS,),
     ),
 )

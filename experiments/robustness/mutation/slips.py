@@ -205,8 +205,8 @@ SLIPS = (
     Mutant(
         "what rays know of a lamp is that of the whole ray, not the segment",
         "render/raymarch.py",
-        "self.falloff.means(lamps, t, end)",
-        "self.falloff.means(lamps, near, end)",
+        "falloff.means(self._lamps, state.t, part.end)",
+        "falloff.means(self._lamps, self._near, part.end)",
         ("tests/system/test_point_lights.py",),
     ),
     Mutant(
