@@ -14,6 +14,9 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.dicom_lengths import check_lengths
 
+# Errors are raised with the name of the folder; ITK's own warnings would precede them.
+SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
+
 _POSITION = "0020|0032"
 _ORIENTATION = "0020|0037"
 _MODALITY = "0008|0060"

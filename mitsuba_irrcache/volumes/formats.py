@@ -79,6 +79,9 @@ ZARR = Format("Zarr", (".zarr",), "zarr_files", "science", ("zarr",))
 #: Files that mark a folder as Zarr, of format 3 and 2.
 ZARR_MARKS = ("zarr.json", ".zgroup", ".zarray", ".zattrs")
 
+#: Endings of pictures, each of which is a slice.
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+
 #: All formats of files and, if their name has an ending, of folders.
 FORMATS = (
     Format("Mitsuba volume", (".vol",), "mitsuba_files", up="y"),

@@ -55,9 +55,10 @@ def add_input(parser: argparse.ArgumentParser, besides: str = "") -> None:
         "input",
         nargs="+",
         metavar="INPUT",
-        help=f"{besides}a volume file ({suffixes()}), a DICOM folder, raw file(s) in one or "
-        "in slices, or one made here: phantom:thorax (a chest), phantom:cloud (needs --density), "
-        "each with :X,Y,Z after it for another size",
+        help=f"{besides}a volume file ({suffixes()}), a DICOM folder, a folder or list of slices "
+        "(TIFF, PNG, JPEG, BMP), raw file(s) in one or in slices, or one made here: "
+        "phantom:thorax (a chest), phantom:cloud (needs --density), each with :X,Y,Z after it for "
+        "another size",
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,15 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.extras import require
 from mitsuba_irrcache.volumes.data import VolumeData
-from mitsuba_irrcache.volumes.formats import NETCDF, TIFF, ZARR, ZARR_MARKS, format_of, suffixes
+from mitsuba_irrcache.volumes.formats import (
+    NETCDF,
+    PICTURES,
+    TIFF,
+    ZARR,
+    ZARR_MARKS,
+    format_of,
+    suffixes,
+)
 from mitsuba_irrcache.volumes.options import CloudVariables, ReadOptions
 from mitsuba_irrcache.volumes.raw import RawLayout, read_raw, read_raw_slices
 
@@ -63,11 +71,13 @@ def _read(
     if raw is not None:
         return read_raw(paths[0], raw) if len(paths) == 1 else read_raw_slices(paths, raw)
     if len(paths) > 1:
-        if all(path.name.lower().endswith(TIFF.suffixes) for path in paths):
-            return _read_tiff_slices(paths, options)
+        read = _reader_of_slices(paths)
+        if read is not None:
+            return read(paths, options)
         raise IrrcacheError(
-            f"{len(paths)} files from {paths[0]} on: several files are read as TIFF or raw slices "
-            "only; for raw slices give their --raw-shape X,Y,Z and --raw-type"
+            f"{len(paths)} files from {paths[0]} on: several files are read as slices only, all of "
+            f"them TIFF, pictures ({', '.join(PICTURES)}), or raw with --raw-shape X,Y,Z and "
+            "--raw-type"
         )
     single = paths[0]
     if not single.exists():
@@ -77,9 +87,11 @@ def _read(
         return known.read(single, options)
     if single.is_dir():
         return _read_folder(single, series, options)
+    if single.name.lower().endswith(PICTURES):
+        raise IrrcacheError(f"{single} is one slice; give a folder or list of all slices")
     raise IrrcacheError(
-        f"{single} has an extension that is not supported; give {suffixes()}, a DICOM folder, or "
-        "--raw-shape X,Y,Z for a raw file"
+        f"{single} has an extension that is not supported; give {suffixes()}, a DICOM folder, a "
+        f"folder or list of slices ({', '.join(PICTURES)}), or --raw-shape X,Y,Z for a raw file"
     )
 
 
@@ -103,13 +115,32 @@ def _read_folder(folder: Path, series: str | None, options: ReadOptions) -> Volu
         raise IrrcacheError(f"folder {folder} is empty; give a folder with a DICOM series")
     if names & set(ZARR_MARKS):
         return ZARR.read(folder, options)
-    if all(name.lower().endswith(TIFF.suffixes) for name in names):
-        return _read_tiff_slices([folder / name for name in names], options)
+    shown = [folder / name for name in sorted(names) if not name.startswith(".")]
+    read = _reader_of_slices(shown)
+    if read is not None:
+        return read(shown, options)
     require("SimpleITK", "volumes", f"reading {folder}")
     # Imported here because only these formats need SimpleITK.
     from mitsuba_irrcache.volumes.dicom import read_dicom_series
 
     return read_dicom_series(folder, series)
+
+
+def _reader_of_slices(paths: list[Path]) -> Callable | None:
+    """Return the function that stacks these files, or None if they are no slices."""
+    names = [path.name.lower() for path in paths]
+    if names and all(name.endswith(TIFF.suffixes) for name in names):
+        return _read_tiff_slices
+    if names and all(name.endswith(PICTURES) for name in names):
+        return _read_pictures
+    return None
+
+
+def _read_pictures(paths: list[Path], options: ReadOptions) -> VolumeData:
+    # Imported here because only pictures need OpenImageIO.
+    from mitsuba_irrcache.volumes.picture_slices import read_slices
+
+    return read_slices(paths, options)
 
 
 def _read_cloud(

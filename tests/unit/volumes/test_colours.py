@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.images import write_pixels
 from mitsuba_irrcache.io.mitsuba_vol import read_vol, write_vol
 from mitsuba_irrcache.volumes import importer
 from tests.support.volume_files import VTK_FILES
@@ -190,3 +191,47 @@ def test_colours_of_a_phantom_are_refused(tmp_path):
         importer.add_arguments(parser)
         options = ["--density", "--colour", "albedo", "-o", str(tmp_path / "out")]
         importer.run(parser.parse_args(["phantom:cloud", *options]))
+
+
+def slices(folder: Path, values: np.ndarray) -> Path:
+    folder.mkdir()
+    for number, part in enumerate(values, 8):  # file names in which 10 would come before 8
+        # OpenImageIO would divide the colours by alpha.
+        mi.Bitmap(np.ascontiguousarray(part)).write(str(folder / f"s{number}.png"))
+    return folder
+
+
+def test_pictures_of_slices_in_colour(tmp_path):
+    values = np.random.default_rng(3).integers(1, 256, (*SHAPE, 4)).astype(np.uint8)
+    folder = slices(tmp_path / "slices", values)
+    (folder / ".thumbnails").write_text("of a file manager")
+    target = imported(folder, "--colour", "albedo", "--density", 0.1, "--spacing", "1,1,3")
+    sigma_t = read_vol(target / "sigma_t.vol")[0][..., 0]
+    np.testing.assert_allclose(sigma_t, 0.1 * values[..., 3], rtol=1e-6)
+    np.save(tmp_path / "same.npy", values)
+    same = imported(tmp_path / "same.npy", "--colour", "albedo", "--density", 0.1, output="same")
+    albedo, expected = (read_vol(f / "albedo.vol")[0] for f in (target, same))
+    np.testing.assert_array_equal(albedo, expected)
+
+
+def test_grey_pictures_of_slices(tmp_path):
+    values = np.random.default_rng(3).integers(1, 256, (*SHAPE, 1)).astype(np.uint8)
+    target = imported(slices(tmp_path / "slices", values), "--density", 0.1)
+    np.testing.assert_allclose(read_vol(target / "sigma_t.vol")[0], 0.1 * values, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: (f / "s9.png").rename(f / "s29.png"), r"between s8\.png and s10\.png"),
+        (lambda f: write_pixels(f / "s9.png", np.ones((3, 3, 3), np.uint8)), r"s9\.png has shape"),
+        (lambda f: [p.unlink() for p in f.glob("s[91]*")], "is one slice"),
+    ],
+)
+def test_incomplete_pictures_are_refused(tmp_path, change, message):
+    folder = slices(tmp_path / "slices", np.ones((*SHAPE, 3), np.uint8))
+    change(folder)
+    with pytest.raises(IrrcacheError, match=message):
+        imported(folder, "--density", "--channel", 0)
+    with pytest.raises(IrrcacheError, match=r"s8\.png is one slice; give a folder"):
+        imported(folder / "s8.png", "--density", output="../out")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.io.images import write_pixels
 from mitsuba_irrcache.volumes.options import ReadOptions
 from mitsuba_irrcache.volumes.readers import read_volume
 from tests.support.volume_files import WRITTEN, Written, ramp
@@ -58,6 +59,12 @@ def _dicom(path: Path, values: np.ndarray) -> None:
     write_dicom(path, [0.0, 1.0, 2.0, 3.0])
 
 
+def _png(path: Path, values: np.ndarray) -> None:
+    path.mkdir()
+    for number, part in enumerate(values.astype(np.uint8), 8):
+        write_pixels(path / f"s{number}.png", part[..., None])
+
+
 TIFF, ZARR = ("tifffile",), ("zarr",)
 #: Files of formats above with other encodings.
 OTHERS = {
@@ -71,6 +78,7 @@ OTHERS = {
     "zarr by blosc": Written(".zarr", _zarr("BloscCodec"), ZARR),
     "zarr by gzip": Written(".zarr", _zarr("GzipCodec"), ZARR),
     "dicom": Written("", _dicom),
+    "png slices": Written("", _png),
 }
 #: Files of voxels without any header.
 PLAIN = (".img", ".raw", ".zraw")

@@ -387,9 +387,9 @@ def test_images_that_are_no_volumes_are_refused(tmp_path, values, message):
 
 
 def test_unsupported_extension_is_named(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"x")
-    with pytest.raises(IrrcacheError, match=r"a\.png.*--raw-shape"):
-        read_volume(tmp_path / "a.png")
+    (tmp_path / "a.gif").write_bytes(b"x")
+    with pytest.raises(IrrcacheError, match=r"a\.gif.*--raw-shape"):
+        read_volume(tmp_path / "a.gif")
 
 
 # Third-party data
