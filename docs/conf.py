@@ -37,6 +37,7 @@ extensions = [
     "sphinx_design",
     "sphinx_tabs.tabs",
     "sphinxcontrib.programoutput",
+    "code_breaks",
     "mitsuba_plugins",
 ]
 exclude_patterns = ["extensions", "README.md"]
