@@ -28,12 +28,9 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.film import CameraSampler, scattered_rays
 from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
 from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance
-from mitsuba_irrcache.render.surface_paths import (
-    EmitterSample,
-    SampledEmitters,
-    SurfacePaths,
-)
+from mitsuba_irrcache.render.surface_paths import SurfacePaths
 from mitsuba_irrcache.scene.description import SceneDescription
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 from mitsuba_irrcache.transport.path import (

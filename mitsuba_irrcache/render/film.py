@@ -21,7 +21,7 @@ from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.memory import require_memory
 from mitsuba_irrcache.render.pixel_filter import FurtherSamples, pixel_of, reconstructed
-from mitsuba_irrcache.render.surface_paths import EmitterSample
+from mitsuba_irrcache.render.sampled_emitters import EmitterSample
 
 #: Maximum number of camera samples per kernel launch, to limit the memory of samples and sampler.
 LANES = 1 << 22

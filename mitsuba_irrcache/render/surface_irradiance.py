@@ -19,7 +19,8 @@ import mitsuba as mi
 from mitsuba_irrcache.cache.angular import Source
 from mitsuba_irrcache.core.jit import Divisor, concatenated, symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream, unit_floats
-from mitsuba_irrcache.render.surface_paths import SurfacePaths, facing, lambertian
+from mitsuba_irrcache.render.surface_paths import SurfacePaths
+from mitsuba_irrcache.render.surface_vertices import facing, lambertian
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
 #: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance;

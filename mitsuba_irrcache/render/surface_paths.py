@@ -13,6 +13,7 @@ scatters of their radiance is gathered by the nodes along rays of their own.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -20,12 +21,17 @@ import numpy as np
 
 from mitsuba_irrcache.cache.surface import INDIRECT_LEVELS, LEVELS, SurfaceNodes
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.core.sequences import kronecker
-from mitsuba_irrcache.core.spectrum import luminance
-from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
 from mitsuba_irrcache.lights.narrow_sources import Source
 from mitsuba_irrcache.render.path_splitting import no_waiting, resumed, split
 from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
+from mitsuba_irrcache.render.surface_vertices import (
+    facing,
+    first_opaque,
+    lambertian,
+    unobstructed,
+    vertex_at,
+)
 from mitsuba_irrcache.transport.path import (
     MAX_SURVIVAL,
     MOST_CROSSINGS,
@@ -45,100 +51,8 @@ MEDIUM_CELLS = 8.0
 #: Height above the surface, over their distance, at which the visibility between a point and a node
 #: is tested: chords of curved surfaces lie below these.
 CHORD = 0.1
-#: Luminance over its mean from which on a direction of an environment counts as a peak, which
-#: casts shadows; samples of such an environment at each vertex.
-PEAK, ENVIRONMENT_SAMPLES = 8.0, 8
-#: Samples of emitters at each vertex, at most: if there are more emitters, each stands for several.
-MOST_EMITTERS = 16
-#: Largest relative difference of f in three directions for which a BSDF counts as Lambertian.
-LAMBERTIAN = 1e-4
 #: Corners of the unit cube in homogeneous coordinates.
 UNIT_CUBE = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0, 1)]).T
-
-
-class SampledEmitters:
-    """Emitters that are sampled at the vertices of paths: all but smooth environments.
-
-    Of an environment with a peak, such as a sun in a map of the sky, only the excess over
-    ``threshold`` (a luminance) is sampled; the remainder is gathered along all directions. Each
-    point-like or distant emitter is sampled once, an environment `ENVIRONMENT_SAMPLES` times.
-    """
-
-    def __init__(self, emitters: EmittersByKind) -> None:
-        slots = [(emitter, 0.0, 1.0) for emitter, kind in emitters if not kind.is_environment]
-        threshold = dr.inf
-        for environment in emitters.of(EmitterKind.ENVIRONMENT_MAP):
-            threshold = peak_threshold(environment)
-            if threshold < dr.inf:
-                share = 1 / ENVIRONMENT_SAMPLES
-                slots += [(environment, k * share, share) for k in range(ENVIRONMENT_SAMPLES)]
-        self.threshold = dr.opaque(mi.Float, threshold)
-        environments = [emitter for emitter, kind in emitters if kind.is_environment]
-        self._environment = mi.EmitterPtr(environments[0] if environments else None)
-        dr.make_opaque(self._environment)
-        #: whether rays can meet what is sampled
-        self.have_extent = threshold < dr.inf or any(
-            not (kind.is_environment or kind.has_one_direction or kind.is_point_like)
-            for _, kind in emitters
-        )
-        #: samples at each vertex, and how many emitters one of them stands for
-        self.count = dr.opaque(mi.UInt32, min(len(slots), MOST_EMITTERS))
-        self.stride = dr.opaque(mi.Float, max(len(slots) / MOST_EMITTERS, 1))
-        self._last = dr.opaque(mi.UInt32, max(len(slots) - 1, 0))
-        self._emitters = dr.zeros(mi.EmitterPtr, max(len(slots), 1))
-        for i, (emitter, *_) in enumerate(slots):
-            dr.scatter(self._emitters, mi.EmitterPtr(emitter), mi.UInt32(i))
-        self._first = mi.Float([first for _, first, _ in slots] or [0.0])
-        self._share = mi.Float([share for *_, share in slots] or [1.0])
-        dr.eval(self._emitters, self._first, self._share)
-
-    def excess(self, emitter: mi.EmitterPtr, radiance: mi.Spectrum) -> mi.Float:
-        """The part of a ``radiance`` of an emitter that is sampled."""
-        peak = dr.maximum(1 - self.threshold / dr.maximum(luminance(radiance), 1e-30), 0)
-        return dr.select(emitter == self._environment, peak, 1)
-
-    def sample(
-        self, number: mi.Float, vertex: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        """Sample a direction; return it with its radiance, without what is gathered, over its
-        density.
-
-        ``number`` is that of a sample, plus a random fraction, by which one emitter is chosen of
-        those that it stands for.
-        """
-        number = dr.minimum(mi.UInt32(number * self.stride), self._last)
-        emitter = dr.gather(mi.EmitterPtr, self._emitters, number, active)
-        share = dr.gather(mi.Float, self._share, number, active) * self.stride
-        first = dr.gather(mi.Float, self._first, number, active)
-        u = mi.Point2f(u.x, first + u.y * dr.gather(mi.Float, self._share, number, active))
-        record, value = emitter.sample_direction(vertex, u, active)
-        return record, value * share * self.excess(emitter, value * record.pdf)
-
-
-class EmitterSample:
-    """Position in [0, 1)^2 on the first sampled emitter at a vertex, shifted by a golden-ratio
-    sequence for further ones: backwards for the second one of an antithetic pair (``sign`` -1).
-    """
-
-    def __init__(self, u: mi.Point2f, sign: mi.Float | float = 1.0) -> None:
-        self.u, self.sign = u, mi.Float(sign)
-
-    def of(self, number: mi.UInt32) -> mi.Point2f:
-        """Return the position on the emitter with this number."""
-        u = self.u + self.sign * mi.Point2f(kronecker(number, 2))
-        return u - dr.floor(u)
-
-
-def peak_threshold(environment: mi.Emitter) -> float:
-    """The luminance beyond which an environment counts as a peak; infinite without peaks."""
-    u = np.random.default_rng(1).random((2, 1 << 14), dtype=np.float32)
-    si = dr.zeros(mi.SurfaceInteraction3f, u.shape[1])
-    si.wi = -mi.warp.square_to_uniform_sphere(mi.Point2f(u))
-    mean = float(dr.mean(luminance(environment.eval(si)))[0])
-    record, _ = environment.sample_direction(si, mi.Point2f(u))
-    si.wi = -record.d
-    highest = float(dr.max(luminance(environment.eval(si)))[0])
-    return PEAK * mean if highest > PEAK * mean else dr.inf
 
 
 class SurfacePaths:
@@ -203,134 +117,11 @@ class SurfacePaths:
         any interaction, and the node whose irradiance has to be added with the returned factor
         (only for rays from nodes; else it is included).
         """
-        from_node = on_emitter is None
-        splits = self.splits and not from_node
-        camera_sample = on_emitter or EmitterSample(mi.Point2f(0))
-        emitted, radiance = mi.Spectrum(0), mi.Spectrum(0)
-        throughput, eta = mi.Spectrum(1), mi.Float(1)
-        ray, pointer = mi.Ray3f(ray), mi.MediumPtr(pointer)
-        pdf, last = mi.Float(0), dr.zeros(mi.Interaction3f)
-        last.p = ray.o
-        first, interacted = mi.Bool(True), mi.Bool(False)
-        share, has_peaks = mi.Spectrum(1), self.narrow is not None
-        clear = mi.Bool(not from_node)
-        end_number, end_factor = mi.UInt32(0), mi.Spectrum(0)
-        depth, crossings = mi.UInt32(0), mi.UInt32(0)
-        waiting = no_waiting(ray, pointer) if splits else []
-        active = mi.Bool(active)
-        while dr.hint(active, label="surface paths"):
-            survival = dr.minimum(dr.max(throughput) * dr.square(eta), MAX_SURVIVAL)
-            survival = dr.select(depth > self.rr_depth, survival, 1)
-            active &= (rng.next_float32(active) < survival) & (dr.max(throughput) > 0)
-            throughput = dr.select(active, throughput / survival, throughput)
-
-            # Ray march the media up to the next surface.
-            si = scene.ray_intersect(ray, active)
-            offset = 1 - rng.next_float32(active)
-            for projection in self.projections:
-                hit, entry, leave = projection.medium.intersect(ray)
-                entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
-                hit &= active & ~clear & (pointer == projection.medium.pointer)
-                scattered, transmittance, _, volume_emission = projection.march(
-                    ray,
-                    entry,
-                    leave,
-                    mi.Spectrum(self.brightest),
-                    offset,
-                    hit,
-                    with_peak=not from_node,
-                )
-                radiance += dr.select(hit, throughput * (scattered + volume_emission), 0)
-                throughput = dr.select(hit, throughput * transmittance, throughput)
-                if dr.hint(projection.truncates_peak, mode="scalar"):
-                    share *= projection.share_unscattered(transmittance, ray, entry, leave, hit)
-            clear = mi.Bool(False)
-
-            # Add emission, with multiple importance sampling where the last vertex sampled it.
-            valid = active & si.is_valid()
-            emitter = si.emitter(scene, active)
-            is_emitter = active & (emitter != None)  # noqa: E711
-            if dr.hint(hide_emitters and not from_node, mode="scalar"):
-                is_emitter &= ~first
-            value = emitter.eval(si, is_emitter)
-            excess = self.emitters.excess(emitter, value)
-            value *= throughput
-            if dr.hint(has_peaks, mode="scalar"):
-                narrow = self.narrow.hits_source(
-                    last.p, ray.d, is_emitter & ~valid, is_emitter & valid
-                )
-                narrow &= first | (not from_node)
-                value *= dr.select(narrow, share, 1)
-            record = mi.DirectionSample3f(scene, si, last)
-            sampled = is_emitter & (pdf > 0) & (excess > 0)
-            density = emitter.pdf_direction(last, record, sampled)
-            weight = dr.select(sampled, power_heuristic(pdf, density), 1)
-            if dr.hint(from_node, mode="scalar"):
-                weight = dr.select(first, 0, weight)
-            value = dr.select(is_emitter, value * (1 - excess + excess * weight), 0)
-            emitted += dr.select(first, value, 0)
-            radiance += dr.select(first, 0, value)
-
-            # End at a diffuse surface with nodes: docs/primer, eq. (5.9).
-            bsdf = si.bsdf()
-            crosses = valid & is_null(bsdf.flags())
-            surface = valid & ~crosses
-            diffuse, factor = lambertian(si, surface)
-            normals = facing(si, ray.d)
-            levels = self.indirect_levels if from_node else self.levels
-            numbers, weights, uncertain, _, _ = self.nodes.find(si.p, normals, levels, diffuse)
-            weights = self.visible(scene, si, numbers, weights, diffuse & uncertain)
-            ends = diffuse & (weights[0] + weights[1] + weights[2] + weights[3] > 0)
-            if dr.hint(from_node, mode="scalar"):
-                end_number = dr.select(ends, chosen(numbers, weights, rng.next_float32(ends)), 0)
-                end_factor = dr.select(ends, throughput * factor, end_factor)
-            else:
-                known = self.irradiance_at(numbers, weights, ends)
-                radiance += dr.select(ends, throughput * factor * known, 0)
-            interacted |= ends
-
-            # Sample the emitters, and the BSDF where the path continues.
-            scatters = surface & ~ends
-            smooth = surface & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            u = mi.Point2f(rng.next_float32(smooth), rng.next_float32(smooth))
-            if dr.hint(not from_node, mode="scalar"):
-                u = dr.select(first, camera_sample.u, u)
-            on_emitters = EmitterSample(u, dr.select(first, camera_sample.sign, 1))
-            straight = ends | (not from_node)
-            direct, rng = self.direct(
-                scene, si, pointer, on_emitters, rng, smooth, (ends, straight), not from_node
-            )
-            radiance += dr.select(smooth, throughput * direct, 0)
-            vertex = vertex_at(si)
-            choice = rng.next_float32(scatters)
-            sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
-            if dr.hint(splits, mode="scalar"):
-                sample = dr.select(first, camera_sample.u, sample)
-                state = pointer, throughput, eta, vertex
-                waiting, found = split(waiting, si, state, (choice, sample), scatters)
-            else:
-                found = sample_bsdf(si, choice, sample, scatters)
-            direction, f, scale, is_vertex, density = found
-            throughput = dr.select(scatters, throughput * f, throughput)
-            eta = dr.select(scatters, eta * scale, eta)
-            pdf = dr.select(is_vertex, density, pdf)
-            last = dr.select(is_vertex, vertex, last)
-            share = dr.select(is_vertex, 1, share)
-            first &= ~is_vertex
-            interacted |= is_vertex
-            depth = dr.select(is_vertex, depth + 1, depth)
-            direction = dr.select(scatters, direction, ray.d)
-            pointer = dr.select(crosses | scatters, medium_after(si, direction, pointer), pointer)
-            ray = dr.select(crosses | scatters, si.spawn_ray(direction), ray)
-            crossings += 1
-            active &= (crosses | scatters) & (crossings < MOST_CROSSINGS)
-            if dr.hint(splits, mode="scalar"):
-                state = [ray, pointer, throughput, eta, last, pdf]
-                waiting, state, new = resumed(waiting, state, active)
-                ray, pointer, throughput, eta, last, pdf = state
-                depth = dr.select(new, 1, depth)
-                active |= new
-        return emitted, radiance, interacted, end_number, end_factor
+        follower = _PathFollower(self, scene, on_emitter, hide_emitters)
+        path, sums = follower.begin(ray, pointer, rng, active)
+        while dr.hint(path.active, label="surface paths"):
+            follower.advance(path, sums)
+        return sums.emitted, sums.radiance, sums.interacted, sums.end_number, sums.end_factor
 
     @symbolic
     def direct(self, scene, si, pointer, sample, rng, active, where, exact: bool):
@@ -532,91 +323,252 @@ class SurfacePaths:
         return place, found, distances
 
 
-@symbolic
-def first_opaque(
-    scene: mi.Scene,
-    media: Media,
-    ray: mi.Ray3f,
-    pointer: mi.MediumPtr,
-    rng: mi.PCG32,
-    active: mi.Bool,
-    exact: bool,
-):
-    """Find the first surface along ``ray`` that is not null, invalid where there is none.
+@dataclass
+class _FollowedPath:
+    """State of a path between surfaces."""
 
-    Returns it with the transmittance of null surfaces and media before it, without noise if
-    ``exact``, and the random generator.
-    """
-    ray, pointer, active = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Bool(active)
-    end, attenuation = dr.zeros(mi.SurfaceInteraction3f), mi.Spectrum(1)
-    crossings = mi.UInt32(0)
-    while dr.hint(active, label="first opaque surface"):
-        si = scene.ray_intersect(ray, active)
-        if dr.hint(exact, mode="scalar"):
-            factor = media.exact_transmittance(pointer, ray, si.t, active)
+    ray: mi.Ray3f
+    pointer: mi.MediumPtr
+    throughput: mi.Spectrum
+    eta: mi.Float
+    #: density of the direction, 0 if emitters were not sampled at the last vertex
+    pdf: mi.Float
+    last: mi.Interaction3f
+    #: whether there was no vertex yet
+    first: mi.Bool
+    #: part of the radiance of narrow sources that is not scattered into a truncated forward peak on
+    #: the way from the last vertex
+    share: mi.Spectrum
+    #: whether there is no medium before the next surface
+    clear: mi.Bool
+    depth: mi.UInt32
+    crossings: mi.UInt32
+    #: places for paths that were split off
+    waiting: list
+    rng: mi.PCG32
+    active: mi.Bool
+
+
+@dataclass
+class _PathSums:
+    """Results of `SurfacePaths.follow`."""
+
+    emitted: mi.Spectrum
+    radiance: mi.Spectrum
+    interacted: mi.Bool
+    end_number: mi.UInt32
+    end_factor: mi.Spectrum
+
+
+class _PathFollower:
+    """The loop over the surfaces of `SurfacePaths.follow`."""
+
+    def __init__(
+        self,
+        paths: SurfacePaths,
+        scene: mi.Scene,
+        on_emitter: EmitterSample | None,
+        hide_emitters: bool,
+    ) -> None:
+        self._paths, self._scene = paths, scene
+        self._from_node = on_emitter is None
+        self._splits = paths.splits and not self._from_node
+        self._camera_sample = on_emitter or EmitterSample(mi.Point2f(0))
+        self._hide_emitters = hide_emitters and not self._from_node
+
+    def begin(
+        self, ray: mi.Ray3f, pointer: mi.MediumPtr, rng: mi.PCG32, active: mi.Bool
+    ) -> tuple[_FollowedPath, _PathSums]:
+        """The state before the first surface, and sums of nothing."""
+        ray, pointer, last = mi.Ray3f(ray), mi.MediumPtr(pointer), dr.zeros(mi.Interaction3f)
+        last.p = ray.o
+        path = _FollowedPath(
+            ray=ray,
+            pointer=pointer,
+            throughput=mi.Spectrum(1),
+            eta=mi.Float(1),
+            pdf=mi.Float(0),
+            last=last,
+            first=mi.Bool(True),
+            share=mi.Spectrum(1),
+            clear=mi.Bool(not self._from_node),
+            depth=mi.UInt32(0),
+            crossings=mi.UInt32(0),
+            waiting=no_waiting(ray, pointer) if self._splits else [],
+            rng=rng,
+            active=mi.Bool(active),
+        )
+        black, none = mi.Spectrum(0), mi.UInt32(0)
+        return path, _PathSums(black, mi.Spectrum(0), mi.Bool(False), none, mi.Spectrum(0))
+
+    def advance(self, path: _FollowedPath, sums: _PathSums) -> None:
+        """Follow paths to their next surface, and into a direction from there."""
+        self._apply_roulette(path)
+        si = self._scene.ray_intersect(path.ray, path.active)
+        self._march_media(path, sums, si)
+        valid = path.active & si.is_valid()
+        self._add_hit_emitter(path, sums, si, valid)
+        crosses = valid & is_null(si.bsdf().flags())
+        surface = valid & ~crosses
+        ends = self._end_at_nodes(path, sums, si, surface)
+        self._add_sampled_emitters(path, sums, si, surface, ends)
+        self._scatter(path, sums, si, surface & ~ends, crosses)
+        if self._splits:
+            self._resume(path)
+
+    def _apply_roulette(self, path: _FollowedPath) -> None:
+        survival = dr.minimum(dr.max(path.throughput) * dr.square(path.eta), MAX_SURVIVAL)
+        survival = dr.select(path.depth > self._paths.rr_depth, survival, 1)
+        survives = path.rng.next_float32(path.active) < survival
+        path.active &= survives & (dr.max(path.throughput) > 0)
+        path.throughput = dr.select(path.active, path.throughput / survival, path.throughput)
+
+    def _march_media(
+        self, path: _FollowedPath, sums: _PathSums, si: mi.SurfaceInteraction3f
+    ) -> None:
+        """Ray march the media up to the next surface."""
+        offset = 1 - path.rng.next_float32(path.active)
+        for projection in self._paths.projections:
+            hit, entry, leave = projection.medium.intersect(path.ray)
+            entry, leave = dr.maximum(entry, 0), dr.minimum(leave, si.t)
+            hit &= path.active & ~path.clear & (path.pointer == projection.medium.pointer)
+            scattered, transmittance, _, emitted = projection.march(
+                path.ray,
+                entry,
+                leave,
+                mi.Spectrum(self._paths.brightest),
+                offset,
+                hit,
+                with_peak=not self._from_node,
+            )
+            sums.radiance += dr.select(hit, path.throughput * (scattered + emitted), 0)
+            path.throughput = dr.select(hit, path.throughput * transmittance, path.throughput)
+            if projection.truncates_peak:
+                path.share *= projection.share_unscattered(
+                    transmittance, path.ray, entry, leave, hit
+                )
+        path.clear = mi.Bool(False)
+
+    def _add_hit_emitter(
+        self,
+        path: _FollowedPath,
+        sums: _PathSums,
+        si: mi.SurfaceInteraction3f,
+        valid: mi.Bool,
+    ) -> None:
+        """Add emission, with multiple importance sampling where the last vertex sampled it."""
+        paths, emitter = self._paths, si.emitter(self._scene, path.active)
+        is_emitter = path.active & (emitter != None)  # noqa: E711
+        if self._hide_emitters:
+            is_emitter &= ~path.first
+        value = emitter.eval(si, is_emitter)
+        excess = paths.emitters.excess(emitter, value)
+        value *= path.throughput
+        if paths.narrow is not None:
+            narrow = paths.narrow.hits_source(
+                path.last.p, path.ray.d, is_emitter & ~valid, is_emitter & valid
+            )
+            narrow &= path.first | (not self._from_node)
+            value *= dr.select(narrow, path.share, 1)
+        record = mi.DirectionSample3f(self._scene, si, path.last)
+        sampled = is_emitter & (path.pdf > 0) & (excess > 0)
+        density = emitter.pdf_direction(path.last, record, sampled)
+        weight = dr.select(sampled, power_heuristic(path.pdf, density), 1)
+        if self._from_node:
+            weight = dr.select(path.first, 0, weight)
+        value = dr.select(is_emitter, value * (1 - excess + excess * weight), 0)
+        sums.emitted += dr.select(path.first, value, 0)
+        sums.radiance += dr.select(path.first, 0, value)
+
+    def _end_at_nodes(
+        self,
+        path: _FollowedPath,
+        sums: _PathSums,
+        si: mi.SurfaceInteraction3f,
+        surface: mi.Bool,
+    ) -> mi.Bool:
+        """End paths at diffuse surfaces with nodes; return where."""
+        # docs/primer, eq. (5.9)
+        paths = self._paths
+        diffuse, factor = lambertian(si, surface)
+        normals = facing(si, path.ray.d)
+        levels = paths.indirect_levels if self._from_node else paths.levels
+        numbers, weights, uncertain, _, _ = paths.nodes.find(si.p, normals, levels, diffuse)
+        weights = paths.visible(self._scene, si, numbers, weights, diffuse & uncertain)
+        ends = diffuse & (weights[0] + weights[1] + weights[2] + weights[3] > 0)
+        if self._from_node:
+            number = chosen(numbers, weights, path.rng.next_float32(ends))
+            sums.end_number = dr.select(ends, number, 0)
+            sums.end_factor = dr.select(ends, path.throughput * factor, sums.end_factor)
         else:
-            factor, rng = media.transmittance(pointer, ray, si.t, rng, active)
-        attenuation = dr.select(active, attenuation * factor, attenuation)
-        null = active & si.is_valid() & is_null(si.bsdf().flags())
-        end = dr.select(active & ~null, si, end)
-        factor = si.bsdf().eval_null_transmission(si, null)
-        attenuation = dr.select(null, attenuation * factor, attenuation)
-        pointer = dr.select(null, medium_after(si, ray.d, pointer), pointer)
-        ray = si.spawn_ray(ray.d)
-        crossings += 1
-        active &= null & (dr.max(attenuation) > 0) & (crossings < MOST_CROSSINGS)
-    # A line that exceeds the maximum number of crossings does not contribute.
-    return end, dr.select(crossings < MOST_CROSSINGS, attenuation, 0), rng
+            known = paths.irradiance_at(numbers, weights, ends)
+            sums.radiance += dr.select(ends, path.throughput * factor * known, 0)
+        sums.interacted |= ends
+        return ends
 
+    def _add_sampled_emitters(
+        self,
+        path: _FollowedPath,
+        sums: _PathSums,
+        si: mi.SurfaceInteraction3f,
+        surface: mi.Bool,
+        ends: mi.Bool,
+    ) -> None:
+        """Sample the emitters."""
+        rng, sample = path.rng, self._camera_sample
+        smooth = surface & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
+        u = mi.Point2f(rng.next_float32(smooth), rng.next_float32(smooth))
+        if not self._from_node:
+            u = dr.select(path.first, sample.u, u)
+        on_emitters = EmitterSample(u, dr.select(path.first, sample.sign, 1))
+        where = ends, ends | (not self._from_node)
+        direct, path.rng = self._paths.direct(
+            self._scene, si, path.pointer, on_emitters, rng, smooth, where, not self._from_node
+        )
+        sums.radiance += dr.select(smooth, path.throughput * direct, 0)
 
-@symbolic
-def unobstructed(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
-    """Whether no surface but null ones lies on ``ray`` up to its end."""
-    ray, clear, active = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)
-    crossings = mi.UInt32(0)
-    while dr.hint(active, label="visible nodes"):
-        si = scene.ray_intersect(ray, active)
-        hit = active & si.is_valid()
-        null = is_null(si.bsdf().flags())
-        clear &= ~(hit & ~null)
-        remaining = ray.maxt - si.t
-        ray = si.spawn_ray(ray.d)
-        ray.maxt = remaining
-        crossings += 1
-        active &= hit & null & (crossings < MOST_CROSSINGS)
-    return clear
+    def _scatter(
+        self,
+        path: _FollowedPath,
+        sums: _PathSums,
+        si: mi.SurfaceInteraction3f,
+        scatters: mi.Bool,
+        crosses: mi.Bool,
+    ) -> None:
+        """Sample the BSDF where paths continue, and pass null surfaces."""
+        rng, vertex = path.rng, vertex_at(si)
+        choice = rng.next_float32(scatters)
+        sample = mi.Point2f(rng.next_float32(scatters), rng.next_float32(scatters))
+        if self._splits:
+            sample = dr.select(path.first, self._camera_sample.u, sample)
+            state = path.pointer, path.throughput, path.eta, vertex
+            path.waiting, found = split(path.waiting, si, state, (choice, sample), scatters)
+        else:
+            found = sample_bsdf(si, choice, sample, scatters)
+        direction, f, scale, is_vertex, density = found
+        path.throughput = dr.select(scatters, path.throughput * f, path.throughput)
+        path.eta = dr.select(scatters, path.eta * scale, path.eta)
+        path.pdf = dr.select(is_vertex, density, path.pdf)
+        path.last = dr.select(is_vertex, vertex, path.last)
+        path.share = dr.select(is_vertex, 1, path.share)
+        path.first &= ~is_vertex
+        sums.interacted |= is_vertex
+        path.depth = dr.select(is_vertex, path.depth + 1, path.depth)
+        direction = dr.select(scatters, direction, path.ray.d)
+        goes_on = crosses | scatters
+        medium = medium_after(si, direction, path.pointer)
+        path.pointer = dr.select(goes_on, medium, path.pointer)
+        path.ray = dr.select(goes_on, si.spawn_ray(direction), path.ray)
+        path.crossings += 1
+        path.active &= goes_on & (path.crossings < MOST_CROSSINGS)
 
-
-def vertex_at(si: mi.SurfaceInteraction3f) -> mi.Interaction3f:
-    """The interaction from which emitters are sampled."""
-    vertex = dr.zeros(mi.Interaction3f)
-    vertex.p, vertex.n = si.p, si.n
-    vertex.time, vertex.wavelengths = si.time, si.wavelengths
-    return vertex
-
-
-def facing(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> tuple[mi.Normal3f, mi.Normal3f]:
-    """Geometric and shading normal on the side from which a ray arrives in ``direction``."""
-    geometric, shading = si.n, si.sh_frame.n
-    geometric = dr.select(dr.dot(geometric, direction) < 0, geometric, -geometric)
-    shading = dr.select(dr.dot(shading, direction) < 0, shading, -shading)
-    return mi.Normal3f(geometric), mi.Normal3f(shading)
-
-
-def lambertian(si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
-    """Whether the BSDF reflects alike in all directions, and its value f = reflectance / pi.
-
-    By flags and, since the normals of bump maps differ from those of the surface, by its values.
-    """
-    bsdf, context = si.bsdf(), mi.BSDFContext()
-    flags = bsdf.flags() & int(mi.BSDFFlags.All)
-    active = active & (flags == int(mi.BSDFFlags.DiffuseReflection))
-    side = dr.select(si.wi.z < 0, mi.Float(-1), 1)
-    value = bsdf.eval(context, si, mi.Vector3f(0, 0, side), active)
-    for x, y in ((0.6, 0.0), (-0.3, 0.51961524)):
-        other = bsdf.eval(context, si, mi.Vector3f(x, y, 0.8 * side), active) / 0.8
-        active = active & (dr.max(dr.abs(other - value)) <= LAMBERTIAN * dr.max(value))
-    return active, value
+    def _resume(self, path: _FollowedPath) -> None:
+        """Go on with paths that were split off where others have ended."""
+        state = [path.ray, path.pointer, path.throughput, path.eta, path.last, path.pdf]
+        path.waiting, state, new = resumed(path.waiting, state, path.active)
+        path.ray, path.pointer, path.throughput, path.eta, path.last, path.pdf = state
+        path.depth = dr.select(new, 1, path.depth)
+        path.active |= new
 
 
 def chosen(numbers: list[mi.UInt32], weights: list[mi.Float], u: mi.Float) -> mi.UInt32:
