@@ -27,7 +27,7 @@ from mitsuba_irrcache.machine.memory import release_unused_memory
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.render.film import CameraSampler, scattered_rays
-from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.render.raymarch import CachedFields, Projection
 from mitsuba_irrcache.render.sampled_emitters import EmitterSample, SampledEmitters
 from mitsuba_irrcache.render.surface_irradiance import SurfaceIrradiance
 from mitsuba_irrcache.render.surface_paths import SurfacePaths
@@ -71,18 +71,14 @@ def camera_rays_of(
             return Projection(medium, None, quadrature, step, layered)
         field = cache.field()
         release_unused_memory(cache.grid.voxel_count)
-        projection = Projection(
-            medium,
-            field,
-            quadrature,
-            step,
-            layered,
+        cached = CachedFields(
             uncertainty=uncertainty_of(cache) if with_error else None,
             directional=cache.directional_field(field.channels),
             edges=cache.voxel_classes.cut_cells if cache.voxel_classes is not None else None,
             falloff=cache.falloff,
             direct_lights=_along_rays(cache),
         )
+        projection = Projection(medium, field, quadrature, step, layered, cached)
         del field  # already copied by the projection
         release_unused_memory(cache.grid.voxel_count)
         return projection

@@ -63,11 +63,35 @@ class MarchedPart:
         raise NotImplementedError
 
 
+@dataclass(frozen=True)
+class CachedFields:
+    """What a cache holds beside its irradiance, and what it leaves to camera rays.
+
+    Attributes:
+        uncertainty: its error, if that is to be computed, too.
+        directional: the factor of anisotropic scattering.
+        edges: surfaces that cut voxels.
+        falloff: inverse-square factor of lamps, by which the cached irradiance is divided.
+        direct_lights: emitters whose direct irradiance is excluded from the cached one.
+
+    What is None or empty does not exist.
+    """
+
+    uncertainty: UncertaintyField | None = None
+    directional: AngularField | None = None
+    edges: CutCells | None = None
+    falloff: InverseSquareFactor | None = None
+    direct_lights: Sequence[DirectLightAlongRays] = ()
+
+
+#: Isotropic scattering, without lights and surfaces near the voxels.
+IRRADIANCE_ALONE = CachedFields()
+
+
 class Projection:
     """Ray marching of one medium: its fields, its cached irradiance, and the quadrature rule.
 
-    With ``layered``, rays also compute the further components of `Layers`; with ``uncertainty``,
-    also the error of the cache.
+    With ``layered``, rays also compute the further components of `Layers`.
     """
 
     def __init__(
@@ -77,11 +101,7 @@ class Projection:
         quadrature: str,
         step: float,
         layered: bool = False,
-        uncertainty: UncertaintyField | None = None,
-        directional: AngularField | None = None,
-        edges: CutCells | None = None,
-        falloff: InverseSquareFactor | None = None,
-        direct_lights: Sequence[DirectLightAlongRays] = (),
+        cached: CachedFields = IRRADIANCE_ALONE,
         lookups: Callable = Lookups,
     ) -> None:
         """``lookups`` is called with the fields that rays read, and their limits."""
@@ -93,14 +113,10 @@ class Projection:
         self._channels = irradiance.channels if irradiance else 1
         self.quadrature = quadrature
         self.layered = layered
-        self.uncertainty = uncertainty
-        self.directional = directional
-        #: inverse-square factor of lamps, by which the cached irradiance is divided
-        self.falloff = falloff
-        #: emitters whose direct irradiance is excluded from the cached one
-        self.direct_lights = list(direct_lights)
+        self.uncertainty, self.directional = cached.uncertainty, cached.directional
+        self.falloff, self.direct_lights = cached.falloff, list(cached.direct_lights)
         #: surfaces that cut voxels, if any, and the irradiance they select voxels from
-        self._edges = (edges, irradiance) if edges is not None else None
+        self._edges = (cached.edges, irradiance) if cached.edges is not None else None
         albedo = _simplified(medium.albedo)
         fields = medium.sigma_t, medium.albedo, irradiance, medium.emission
         grids = [f.grid for f in fields if f and f.grid]
@@ -117,8 +133,8 @@ class Projection:
             share = medium.phase.forward
             self._peak_share = dr.opaque(mi.Float, float(share / (1 - share)))
         max_radiance = irradiance.maximum * albedo.maximum / (4 * dr.pi) if irradiance else 0.0
-        if directional is not None:
-            max_radiance *= directional.directional.phase.peak
+        if self.directional is not None:
+            max_radiance *= self.directional.directional.phase.peak
         self.max_radiance = dr.opaque(mi.Float, max_radiance)
         emission = medium.emission
         self.max_emission = dr.opaque(mi.Float, emission.maximum if emission else 0.0)

@@ -17,7 +17,7 @@ from mitsuba_irrcache.cache.interpolation import Interpolation
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.narrow_sources import sources_of
-from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.render.raymarch import CachedFields, Projection
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.base import SolverTask
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
@@ -153,7 +153,9 @@ def radiance(medium, cache, cosine: float, step: float) -> float:
     _, near, far = medium.intersect(ray)
     field = cache.field()
     moments = cache.directional_field(field.channels)
-    projection = Projection(medium, field, "exponential", step, directional=moments)
+    projection = Projection(
+        medium, field, "exponential", step, cached=CachedFields(directional=moments)
+    )
     result, *_ = projection.march(ray, near, far, mi.Spectrum(0), mi.Float(1), mi.Bool(True))
     return float(result.x[0])
 

@@ -12,7 +12,7 @@ from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.fields import ConstantField, GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.render.raymarch import Projection
+from mitsuba_irrcache.render.raymarch import CachedFields, Projection
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -40,7 +40,9 @@ def test_errors_are_weighted_by_radiance(quadrature, offset):
     field = GridField(grid, dr.full(mi.Float, sigma, steps), 1)
     light = GridField(grid, dr.full(mi.Float, 4 * dr.pi, steps), 1)
     medium = MediumGrid(field, ConstantField(np.array([1.0])), Boundary("box", np.eye(4)))
-    projection = Projection(medium, light, quadrature, 1.0, layered=True, uncertainty=Errors())
+    projection = Projection(
+        medium, light, quadrature, 1.0, layered=True, cached=CachedFields(uncertainty=Errors())
+    )
     ray = mi.Ray3f(mi.Point3f(-3, 0, 0), mi.Vector3f(1, 0, 0))
     _, near, far = medium.intersect(ray)
     *_, gathered, _ = projection.march(
