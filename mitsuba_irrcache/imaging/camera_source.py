@@ -12,8 +12,8 @@ from mitsuba_irrcache.imaging.stock import StockIntegrators
 from mitsuba_irrcache.out_of_core.rendering import MappedMedium
 from mitsuba_irrcache.pipeline.builder import Progress
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
-from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays
-from mitsuba_irrcache.render.tolerance import CameraRays, Certificate
+from mitsuba_irrcache.render.camera import CameraRays, ClosedFormCameraRays, TracedCameraRays
+from mitsuba_irrcache.render.tolerance import Certificate
 from mitsuba_irrcache.scene.consistency import check_sensor
 
 

@@ -10,10 +10,9 @@ import mitsuba as mi
 
 from mitsuba_irrcache.imaging.options import Options
 from mitsuba_irrcache.render.aovs import AOVS, Layers
-from mitsuba_irrcache.render.camera import TracedCameraRays
+from mitsuba_irrcache.render.camera import CameraRays, TracedCameraRays
 from mitsuba_irrcache.render.denoise import filter_illumination
 from mitsuba_irrcache.render.film import check_film, fill_film, planes, render_film
-from mitsuba_irrcache.render.tolerance import CameraRays
 from mitsuba_irrcache.scene.consistency import check_sensor
 
 

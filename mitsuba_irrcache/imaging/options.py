@@ -11,10 +11,10 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.out_of_core.volume_settings import VolumeSettings
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
 from mitsuba_irrcache.render.aovs import parse_aovs
-from mitsuba_irrcache.render.camera import camera_rays_of
+from mitsuba_irrcache.render.camera import CameraRays, camera_rays_of
 from mitsuba_irrcache.render.denoise import FILTERS
 from mitsuba_irrcache.render.quadrature import QUADRATURES
-from mitsuba_irrcache.render.tolerance import SCALES, CameraRays, ToleranceSearch
+from mitsuba_irrcache.render.tolerance import SCALES, ToleranceSearch
 from mitsuba_irrcache.solvers.base import registered
 
 SOLVERS = ("auto", *sorted(solver.name for solver in registered()))

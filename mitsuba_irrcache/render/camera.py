@@ -58,7 +58,7 @@ def camera_rays_of(
     step: float = 1.0,
     layered: bool = False,
     with_error: bool = False,
-) -> ClosedFormCameraRays | TracedCameraRays | None:
+) -> CameraRays | None:
     """Create the camera rays for the current caches of ``parts``; None if no medium is visible.
 
     ``layered`` and ``with_error`` select what `Projection` computes in addition to the radiance.
@@ -417,6 +417,9 @@ class TracedCameraRays:
                 phi = mi.Spectrum(projection.irradiance_at(end.p, end.direction, here))
                 result = dr.select(here, phi, result)
         return result
+
+
+CameraRays = ClosedFormCameraRays | TracedCameraRays
 
 
 def _added(gathered: list, sums: list, transmittance: mi.Spectrum, scale: mi.Float) -> list:

@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +32,7 @@ from mitsuba_irrcache.core.sequences import kronecker
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings, Progress
 from mitsuba_irrcache.pipeline.defaults import needs_no_cache
-from mitsuba_irrcache.render.camera import ClosedFormCameraRays, TracedCameraRays
+from mitsuba_irrcache.render.camera import CameraRays, ClosedFormCameraRays, TracedCameraRays
 from mitsuba_irrcache.render.film import CameraSampler, PixelPositions, camera_ray
 
 #: Shares of the tolerance; their squares add up to about 1. Work is in proportion to n^3 N for n
@@ -63,9 +64,9 @@ STEP_ORDER = 2
 #: Samples per pixel that are tried.
 MOST_PIXEL_SAMPLES = 1 << 10
 
-CameraRays = ClosedFormCameraRays | TracedCameraRays
 MakeCameraRays = Callable[[CacheBuilder, float], CameraRays]
-Rays = tuple[mi.Ray3f, mi.Spectrum, mi.Medium | None]
+if TYPE_CHECKING:  # types of Mitsuba exist once a variant is set
+    Rays = tuple[mi.Ray3f, mi.Spectrum, mi.Medium | None]
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,12 @@ import pytest
 
 from mitsuba_irrcache.core.properties import RecordedProperties
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.imaging.options import Options
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
-def options(**properties):
-    from mitsuba_irrcache.imaging.options import Options  # needs a variant
-
+def options(**properties) -> Options:
     props = mi.Properties("irrcache")
     for name, value in properties.items():
         props[name] = value
