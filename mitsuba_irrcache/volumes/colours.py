@@ -30,11 +30,6 @@ class ColourVolume:
     density: VolumeData
     rgb: tuple[VolumeData, VolumeData, VolumeData]
 
-    def mapped(self, step: Callable[[VolumeData], VolumeData]) -> ColourVolume:
-        """Return all channels after a step that keeps the values of voxels apart."""
-        red, green, blue = self.rgb
-        return ColourVolume(step(self.density), (step(red), step(green), step(blue)))
-
 
 def read_colours(source: str, use: str, read: Callable[[int], VolumeData]) -> ColourVolume:
     """Read the channels of a file.
