@@ -17,7 +17,7 @@ from mitsuba_irrcache.gradients.resampling import volume_of
 from mitsuba_irrcache.gradients.scattering import Layers, OrdinatePart
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
-from mitsuba_irrcache.solvers.discrete_ordinates.incident import environment_radiance
+from mitsuba_irrcache.lights.environments import environment_radiance
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 
 

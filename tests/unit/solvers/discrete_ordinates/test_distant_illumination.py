@@ -106,3 +106,20 @@ def test_a_bright_texel_does_not_change_the_rest_of_an_environment(scenes):
     expected = 4 * np.pi * (radiance * value(directions)[:, 0]).mean()
     found = of_passes(sky, 20, 16, value)[:, 0]
     assert np.abs(found / expected - 1).max() < 0.03
+
+
+def test_smooth_environments_have_even_ordinates_only(scenes):
+    """Every set of these has the exact flux of a sky whose radiance is linear in the height, in
+    total and from above. Sampled directions would make both random.
+    """
+
+    def value(towards: np.ndarray) -> np.ndarray:
+        up = towards[..., 1]
+        return np.stack([np.ones_like(up), up], axis=-1)
+
+    height = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
+    sky, directions, radiance = sky_of(scenes, np.repeat(1 + 0.8 * height[:, None], 128, axis=1))
+    found = of_passes(sky, 8, 8, value)
+    exact = 4 * np.pi * (radiance[:, None] * value(directions)).mean(axis=0)
+    np.testing.assert_allclose(found, np.broadcast_to(exact, found.shape), rtol=2e-3)
+    assert len(sky.ordinates(1, 8, np.random.default_rng(1))[0].directions) == 8

@@ -1,0 +1,66 @@
+"""Radiance of environments, and how much detail the light of a scene has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import Enum
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_irrcache.core.sequences import GOLDEN_STEP, fibonacci_hemisphere, lattice_points
+from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
+
+#: Ratio of the largest to the mean radiance up to which an environment is smooth. Even directions
+#: have 0.3 to 0.8 times the error of directions sampled by its luminance up to a ratio of 5.5, and
+#: up to 3 times the error at 8.4.
+SMOOTH_CONTRAST = 4.0
+#: Number of directions by which that ratio is measured: even ones, and samples of the environment.
+EVEN, SAMPLES = 1 << 13, 1 << 14
+
+
+class Detail(Enum):
+    """How much the radiance that reaches a medium from outside varies with direction and position.
+
+    It decides how large the voxels of a cache may be, and how many directions are needed.
+    """
+
+    #: the same from all directions, or none
+    UNIFORM = "uniform"
+    #: from environments without bright regions
+    SMOOTH = "smooth"
+    #: all other emitters, which cast shadows with edges
+    SHARP = "sharp"
+
+    @classmethod
+    def of(cls, emitters: Iterable[mi.Emitter]) -> Detail:
+        """Classify the light of all ``emitters`` of a scene."""
+        found = cls.UNIFORM
+        for emitter in emitters:
+            kind = kind_of(emitter)
+            if kind is EmitterKind.ENVIRONMENT_MAP and is_smooth(emitter):
+                found = cls.SMOOTH
+            elif kind is not EmitterKind.CONSTANT_ENVIRONMENT:
+                return cls.SHARP
+        return found
+
+
+def is_smooth(environment: mi.Emitter) -> bool:
+    """Whether no direction of an environment is much brighter than its mean, in any channel."""
+    upper, _ = fibonacci_hemisphere(EVEN // 2)
+    even = environment_radiance(environment, np.concatenate([upper, -upper]))
+    points = mi.Point2f(np.float32(lattice_points(SAMPLES, GOLDEN_STEP)))
+    record, _ = environment.sample_direction(dr.zeros(mi.Interaction3f, SAMPLES), points)
+    sampled = environment_radiance(environment, -np.array(record.d, dtype=np.float64).T)
+    brightest = np.maximum(even.max(axis=0), sampled.max(axis=0))
+    return bool((brightest <= SMOOTH_CONTRAST * even.mean(axis=0)).all())  # False with NaN
+
+
+def environment_radiance(environment: mi.Emitter, directions: np.ndarray) -> np.ndarray:
+    """Radiance (n, channels) that travels from the environment along ``directions`` (n, 3)."""
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    interaction.wi = mi.Vector3f(directions.T.astype(np.float32))
+    channels = environment.eval(interaction)
+    values = [np.broadcast_to(np.array(v, dtype=np.float64), len(directions)) for v in channels]
+    return np.stack(values, axis=1)

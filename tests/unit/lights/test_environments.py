@@ -1,0 +1,52 @@
+"""How much detail the light of a scene has."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.lights.environments import Detail, is_smooth
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+CONSTANT = {"type": "constant", "radiance": 1.0}
+
+
+def sky(of_height, channel: int | None = None) -> dict:
+    """Return an environment map of radiances by height; only one channel has them if given."""
+    height = np.cos((np.arange(32) + 0.5) / 32 * np.pi)
+    values = np.ones((32, 64, 3), dtype=np.float32)
+    values[..., slice(None) if channel is None else [channel]] = of_height(height)[:, None, None]
+    return {"type": "envmap", "bitmap": mi.Bitmap(values)}
+
+
+def detail(*emitters: dict) -> Detail:
+    scene = mi.load_dict({"type": "scene"} | {f"e{k}": e for k, e in enumerate(emitters)})
+    return Detail.of(scene.emitters())
+
+
+def gradient(height: np.ndarray) -> np.ndarray:
+    return 1 + 0.9 * height
+
+
+def lobe(height: np.ndarray) -> np.ndarray:
+    return 0.1 + np.maximum(height, 0) ** 16
+
+
+def test_kinds_of_light():
+    sun = {"type": "directional", "direction": [0, -1, 0]}
+    lamp = {"type": "rectangle", "emitter": {"type": "area"}}
+    assert detail() is detail(CONSTANT) is Detail.UNIFORM
+    assert detail(sky(gradient)) is Detail.SMOOTH
+    assert detail(sky(lobe)) is detail(sky(lobe, 2)) is Detail.SHARP
+    assert detail(CONSTANT, sun) is detail(lamp) is detail(sky(gradient), lamp) is Detail.SHARP
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e6])
+def test_a_single_texel_is_no_smooth_sky(value):
+    pixels = np.ones((256, 512, 3), dtype=np.float32)
+    pixels[100, 200] = value
+    bitmap = mi.Bitmap(pixels)
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "envmap", "bitmap": bitmap}})
+    assert not is_smooth(scene.environment())
