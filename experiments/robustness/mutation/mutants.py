@@ -125,7 +125,7 @@ MUTANTS = (
     ),
     Mutant(
         "light of an environment from the other side (sweep)",
-        "solvers/discrete_ordinates/incident.py",
+        "lights/environments.py",
         "interaction.wi = mi.Vector3f(directions.T",
         "interaction.wi = mi.Vector3f(-directions.T",
         (SWEEP,),
