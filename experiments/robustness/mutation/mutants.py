@@ -182,7 +182,7 @@ MUTANTS = (
     Mutant(
         "roulette without its weight (path)",
         "solvers/path/solver.py",
-        "            weight /= survival\n",
+        "                weight /= survival\n",
         "",
         (UNBIASED,),
     ),

@@ -142,7 +142,12 @@ class Sweep:
             points = self._illumination.point_irradiance(medium, self._sample_points, known)
             self._direct = [[irradiance] for irradiance in points]
             self._sun_irradiance = [d.irradiance for d in known if d.distant]
-            return
+        else:
+            self._prepare_surroundings(scene, rr_depth)
+
+    def _prepare_surroundings(self, scene: mi.Scene, rr_depth: int) -> None:
+        """Prepare what traces rays among surfaces and other media."""
+        medium, cache = self._medium, self.cache
         box = occupied_box(cache.grid, cache.active)
         known = [light.emitter for light in cache.direct_lights]
         small, large = (

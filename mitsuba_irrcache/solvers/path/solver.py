@@ -308,21 +308,9 @@ class _Estimator:
         self, position: mi.Point3f, batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32
     ) -> Sequence[mi.Spectrum]:
         """Compute one sample per lane of both layers and of the moments."""
-        if not self.medium.is_traced:
-            return _estimate(
-                self.scene,
-                self.medium,
-                position,
-                batch,
-                within,
-                voxel,
-                self.seed,
-                self.orders,
-                self.rr_depth,
-                self.multiple,
-                self._sampled,
-            )
         rng, spread = _random_numbers(batch, within, voxel, self.seed)
+        if not self.medium.is_traced:
+            return self._estimate(position, spread, rng)
         number = dr.gather(mi.UInt32, self.cache.voxel_classes.medium_number, voxel)
         pointer = self.media.pointer_of(number)
         max_depth = dr.select(self.orders < 0xFFFFFFFF, self.orders + 1, self.orders)
@@ -339,6 +327,53 @@ class _Estimator:
             self._excluded,
         )
 
+    @symbolic
+    def _estimate(self, position: mi.Point3f, spread: list[mi.Float], rng: mi.PCG32):
+        """Compute one sample of both layers per lane in an isolated medium.
+
+        ``spread`` are four uniform numbers for the directions.
+        """
+        # docs/primer, eq. (3.1)
+        scene, medium, orders, rr_depth = self.scene, self.medium, self.orders, self.rr_depth
+        always = mi.Bool(True)
+        uncollided, rng = direct_light(
+            scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always, self._sampled
+        )
+        scattered, emits = mi.Spectrum(0), medium.emission is not None
+        further = 1 if emits else 0  # flights beyond the last collision
+        if dr.hint(self.multiple, mode="scalar"):
+            weight = mi.Spectrum(1)
+            direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
+            order = mi.UInt32(1)
+            active = order - further < orders
+            while dr.hint(active, label="scattering orders"):
+                ray = mi.Ray3f(position, direction)
+                hit, near, far = medium.intersect(ray)
+                near = dr.maximum(near, 0)
+                collided, t, weight, rng, light = free_flight(
+                    medium, ray, near, far, weight, rng, active & hit
+                )
+                if dr.hint(emits, mode="scalar"):
+                    uncollided += dr.select(order == 1, 4 * dr.pi * light, 0)
+                    scattered += dr.select(order == 1, 0, 4 * dr.pi * light)
+                    active &= order < orders
+                active &= collided
+                position = dr.select(active, ray(t), position)
+                weight *= medium.albedo.at_world(position, active)
+                active &= dr.max(weight) > 0
+                # Russian roulette, as volpath does it.
+                survival = dr.select(order > rr_depth, dr.minimum(dr.max(weight), 0.95), 1)
+                active &= rng.next_float32(active) < survival
+                weight /= survival
+                sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+                light, rng = direct_light(scene, medium, position, sample, rng, active)
+                scattered += dr.select(active, weight * light, 0)
+                sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+                direction = mi.warp.square_to_uniform_sphere(sample)
+                order += 1
+                active &= order - further < orders
+        return uncollided, scattered
+
     def seconds(self, samples: int) -> float:
         """Predict the time for ``samples`` from one batch at voxels all over the medium."""
         count = self.cache.active_count
@@ -349,65 +384,6 @@ class _Estimator:
         started = perf_counter()
         self.batches(voxels, 0, 1)
         return (perf_counter() - started) * samples / (dr.width(voxels) * BATCH)
-
-
-@symbolic
-def _estimate(
-    scene: mi.Scene,
-    medium: MediumGrid,
-    position: mi.Point3f,
-    batch: mi.UInt32,
-    within: mi.UInt32,
-    voxel: mi.UInt32,
-    seed: mi.UInt32,
-    orders: mi.UInt32,
-    rr_depth: mi.UInt32,
-    multiple: bool,
-    emitters: mi.EmitterPtr | None,
-):
-    """Compute one sample of both layers per lane; the samples ``within`` a batch are stratified
-    over directions.
-    """
-    # docs/primer, eq. (3.1)
-    rng, spread = _random_numbers(batch, within, voxel, seed)
-    always = mi.Bool(True)
-    uncollided, rng = direct_light(
-        scene, medium, position, mi.Point2f(spread[0], spread[1]), rng, always, emitters
-    )
-    scattered, emits = mi.Spectrum(0), medium.emission is not None
-    further = 1 if emits else 0  # flights beyond the last collision
-    if dr.hint(multiple, mode="scalar"):
-        weight = mi.Spectrum(1)
-        direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
-        order = mi.UInt32(1)
-        active = order - further < orders
-        while dr.hint(active, label="scattering orders"):
-            ray = mi.Ray3f(position, direction)
-            hit, near, far = medium.intersect(ray)
-            near = dr.maximum(near, 0)
-            collided, t, weight, rng, light = free_flight(
-                medium, ray, near, far, weight, rng, active & hit
-            )
-            if dr.hint(emits, mode="scalar"):
-                uncollided += dr.select(order == 1, 4 * dr.pi * light, 0)
-                scattered += dr.select(order == 1, 0, 4 * dr.pi * light)
-                active &= order < orders
-            active &= collided
-            position = dr.select(active, ray(t), position)
-            weight *= medium.albedo.at_world(position, active)
-            active &= dr.max(weight) > 0
-            # Russian roulette, as volpath does it.
-            survival = dr.select(order > rr_depth, dr.minimum(dr.max(weight), 0.95), 1)
-            active &= rng.next_float32(active) < survival
-            weight /= survival
-            sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
-            light, rng = direct_light(scene, medium, position, sample, rng, active)
-            scattered += dr.select(active, weight * light, 0)
-            sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
-            direction = mi.warp.square_to_uniform_sphere(sample)
-            order += 1
-            active &= order - further < orders
-    return uncollided, scattered
 
 
 def _random_numbers(
