@@ -48,6 +48,9 @@ MOST_BOUNCES = 6
 #: Distance, in voxels of its cache, over which the radiance of a medium varies: nodes within the
 #: medium need not be closer than a part of it.
 MEDIUM_CELLS = 8.0
+#: Factor of the distance of a medium with a truncated forward peak: what this scatters of narrow
+#: sources is concentrated in a few degrees, so that shadows have edges of a fraction of it.
+PEAK_DISTANCE = 0.25
 #: Height above the surface, over their distance, at which the visibility between a point and a node
 #: is tested: chords of curved surfaces lie below these.
 CHORD = 0.1
@@ -87,6 +90,7 @@ class SurfacePaths:
         self._original_media = media
         if self.narrow is not None:
             self._original_media = Media([grid.original or grid for grid in media.grids])
+        self.peak_distance = dr.opaque(mi.Float, PEAK_DISTANCE)
         #: levels of nodes for points that the camera sees, and for others
         self.levels, self.indirect_levels = (
             dr.opaque(mi.UInt32, n) for n in (LEVELS, INDIRECT_LEVELS)
@@ -289,10 +293,10 @@ class SurfacePaths:
         while dr.hint(active, label="towards a diffuse surface"):
             for projection in self.projections:
                 inside = active & (bounces == 0) & (pointer == projection.medium.pointer)
-                scale = projection.cell * MEDIUM_CELLS
-                nearest = dr.select(
-                    inside, dr.minimum(nearest, dr.maximum(travelled, scale)), nearest
-                )
+                distance = dr.maximum(travelled, projection.cell * MEDIUM_CELLS)
+                if dr.hint(projection.truncates_peak and self.narrow_sources, mode="scalar"):
+                    distance *= self.peak_distance
+                nearest = dr.select(inside, dr.minimum(nearest, distance), nearest)
             si = scene.ray_intersect(ray, active)
             active &= si.is_valid()
             travelled += dr.select(active, si.t, 0)
