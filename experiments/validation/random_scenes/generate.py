@@ -33,8 +33,8 @@ ALBEDOS = ("0", "0.5", "0.9", "0.99", "1", "rgb", "grid", "rgb grid")
 #: Extinction of red : green : blue.
 TINTS = ((1.0, 1.0, 1.0),) * 4 + ((1.0, 0.5, 0.25), (0.1, 0.4, 1.0))
 PHASES = (
-    *("isotropic",) * 8, "hg -0.4", "hg 0.3", "hg 0.58", "hg 0.8", "rayleigh", "blend", "tab",
-    "hg 0.95",
+    *("isotropic",) * 8, "hg -0.4", "hg 0.3", "hg 0.58", "hg 0.7", "hg 0.8", "hg 0.85",
+    "rayleigh", "blend", "tab", "hg 0.95",
 )  # fmt: skip
 BOUNDARIES = (
     "cube", "cube", "rotated cube", "stretched cube", "sphere", "stretched sphere", "mesh",
@@ -46,7 +46,10 @@ EMITTERS = (
     "sphere near", "sphere far", "mesh near", "rectangle inside",
 )  # fmt: skip
 ENVIRONMENTS = {"constant", "sun in envmap", "turned envmap"}
-CAMERAS = ("outside", "outside", "outside", "outside, turned", "close", "inside")
+#: "against the light" has the emitter behind the medium.
+CAMERAS = (
+    "outside", "outside", "outside", "outside, turned", "close", "inside", "against the light",
+)  # fmt: skip
 SURROUNDINGS = (
     "none", "none", "none", "none", "none", "ground", "room", "second medium", "ball beside",
     "ball inside",
@@ -100,7 +103,7 @@ class RandomScene:
         }  # fmt: skip
         if drawn["depth"] > 40 and drawn["albedo"] in ("0.99", "1"):
             drawn["albedo"] = "0.9"  # the paths of volpath would be too long for a reference
-        if drawn["phase"] == "hg 0.8":
+        if drawn["phase"] in ("hg 0.7", "hg 0.8", "hg 0.85"):
             drawn["max_depth"] = -1  # refused at other depths
         case = cls(seed, index, emitter=emitter, **drawn)
         return replace(case, depth=case._renderable_depth())
@@ -269,13 +272,7 @@ class RandomScene:
 
     def _emitters(self, folder: Path) -> dict:
         random = self.stream("emitter")
-        towards = random.normal(size=3)
-        towards[1] = abs(towards[1]) + 0.3  # not from below the ground
-        if self.surroundings == "second medium":
-            towards[0] = -abs(towards[0])
-        elif self.surroundings == "ball beside":
-            towards[0] = abs(towards[0])
-        towards /= np.linalg.norm(towards)
+        towards = self._towards_emitter(random)
         colour = random.uniform(0.4, 1.0, 3)
         kind, _, where = self.emitter.partition(" ")
         found = {}
@@ -350,6 +347,16 @@ class RandomScene:
             light["to_world"] = _rotation(random, 10, 60)
         return light
 
+    def _towards_emitter(self, random: np.random.Generator) -> np.ndarray:
+        """Return the direction of emitters that have one, the first numbers of their stream."""
+        towards = random.normal(size=3)
+        towards[1] = abs(towards[1]) + 0.3  # not from below the ground
+        if self.surroundings == "second medium":
+            towards[0] = -abs(towards[0])
+        elif self.surroundings == "ball beside":
+            towards[0] = abs(towards[0])
+        return towards / np.linalg.norm(towards)
+
     # -- camera and surroundings -------------------------------------------------------------------
 
     def _sensor(self) -> dict:
@@ -359,6 +366,9 @@ class RandomScene:
         if self.camera == "outside, turned":
             angle = random.uniform(0, 2 * np.pi)
             origin = np.array([4.3 * np.sin(angle), 1.5, 4.3 * np.cos(angle)]) * SIDE
+        elif self.camera == "against the light" and self.surroundings not in ("ground", "room"):
+            towards = self._towards_emitter(self.stream("emitter")) + random.normal(size=3) * 0.1
+            origin = -4.5 * SIDE * towards / np.linalg.norm(towards)
         elif self.camera == "close":
             origin, fov = np.array([0.4, 0.5, -2.4]) * SIDE, 45.0
         elif self.camera == "inside":
