@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from enum import Enum
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.core.sequences import GOLDEN_STEP, fibonacci_hemisphere, lattice_points
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 
@@ -20,30 +20,16 @@ SMOOTH_CONTRAST = 4.0
 EVEN, SAMPLES = 1 << 13, 1 << 14
 
 
-class Detail(Enum):
-    """How much the radiance that reaches a medium from outside varies with direction and position.
-
-    It decides how large the voxels of a cache may be, and how many directions are needed.
-    """
-
-    #: the same from all directions, or none
-    UNIFORM = "uniform"
-    #: from environments without bright regions
-    SMOOTH = "smooth"
-    #: all other emitters, which cast shadows with edges
-    SHARP = "sharp"
-
-    @classmethod
-    def of(cls, emitters: Iterable[mi.Emitter]) -> Detail:
-        """Classify the light of all ``emitters`` of a scene."""
-        found = cls.UNIFORM
-        for emitter in emitters:
-            kind = kind_of(emitter)
-            if kind is EmitterKind.ENVIRONMENT_MAP and is_smooth(emitter):
-                found = cls.SMOOTH
-            elif kind is not EmitterKind.CONSTANT_ENVIRONMENT:
-                return cls.SHARP
-        return found
+def detail_of(emitters: Iterable[mi.Emitter]) -> Detail:
+    """Classify the light of all ``emitters`` of a scene."""
+    found = Detail.UNIFORM
+    for emitter in emitters:
+        kind = kind_of(emitter)
+        if kind is EmitterKind.ENVIRONMENT_MAP and is_smooth(emitter):
+            found = Detail.SMOOTH
+        elif kind is not EmitterKind.CONSTANT_ENVIRONMENT:
+            return Detail.SHARP
+    return found
 
 
 def is_smooth(environment: mi.Emitter) -> bool:

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.core.immutable import Immutable
 from mitsuba_irrcache.grids.boundary import Boundary, intersect_slabs
 from mitsuba_irrcache.grids.fields import Field
@@ -27,6 +28,7 @@ class MediumContext(Immutable):
         is_isolated: whether this medium in its boundary is all there is beside emitters.
         has_exact_boundary: whether the medium fills its boundary, which otherwise encloses it.
         refracts: whether radiance passes its boundary other than straight.
+        detail: how much the light that reaches it varies; SHARP if that is not known.
     """
 
     def __init__(
@@ -38,10 +40,11 @@ class MediumContext(Immutable):
         is_isolated: bool = True,
         has_exact_boundary: bool = True,
         refracts: bool = False,
+        detail: Detail = Detail.SHARP,
     ) -> None:
         self.pointer, self.number, self.others = pointer, number, others
         self.is_isolated, self.has_exact_boundary = is_isolated, has_exact_boundary
-        self.refracts = refracts
+        self.refracts, self.detail = refracts, detail
 
     def among(self, others: tuple[MediumGrid, ...]) -> MediumContext:
         """The same with these ``others``."""
@@ -133,6 +136,11 @@ class MediumGrid(Immutable):
     @property
     def refracts(self) -> bool:
         return self.context.refracts
+
+    @property
+    def detail(self) -> Detail:
+        """How much the light that reaches the medium from outside varies."""
+        return self.context.detail
 
     @property
     def is_traced(self) -> bool:

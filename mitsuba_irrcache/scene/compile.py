@@ -13,10 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.grids.boundary import Boundary, boundary_of, rays_through
 from mitsuba_irrcache.lights.emitters import EmittersByKind, check_placement, kind_of
+from mitsuba_irrcache.lights.environments import detail_of
 from mitsuba_irrcache.media.bake import bake, children
 from mitsuba_irrcache.media.delta_m import without_forward_peak
 from mitsuba_irrcache.media.emission import Emission, check_emission_is_within
@@ -72,7 +74,8 @@ def compile_scene(
     is_isolated = boundary is not None
     if is_isolated and _is_isotropic(*media):
         (medium,) = media
-        grids = visible = (bake(medium, boundary).replaced(emission=emission),)
+        context = MediumContext(detail=_detail(scene, emission, max_depth))
+        grids = visible = (bake(medium, boundary).replaced(emission=emission, context=context),)
         if emission is not None:
             check_emission_is_within(emission, [grids[0].frame])
         brightest = None
@@ -92,6 +95,16 @@ def compile_scene(
         corners = grid.frame @ [[0, 1, 0, 0, 1], [0, 0, 1, 0, 1], [0, 0, 0, 1, 1], [1] * 5]
         _check_distance(grid.name, np.abs(corners[:3]).max(), grid.shortest_edge / STEPS_OF_A_VOXEL)
     return SceneDescription(Media(grids), visible, emitters, brightest, _has_surfaces(scene))
+
+
+def _detail(scene: mi.Scene, emission: Emission | None, max_depth: int) -> Detail:
+    """Return how much the light of an isolated medium varies, which may emit itself.
+
+    What is scattered once only has the shadows of the medium itself, which more orders blur.
+    """
+    if emission is not None or max_depth == 2:
+        return Detail.SHARP
+    return detail_of(scene.emitters())
 
 
 def _has_surfaces(scene: mi.Scene) -> bool:
@@ -138,6 +151,7 @@ def _baked(
                 is_isolated=is_isolated,
                 has_exact_boundary=exact is not None,
                 refracts=any(refracts(shape) for shape in filled),
+                detail=_detail(scene, emission, max_depth) if is_isolated else Detail.SHARP,
             ),
         )
         grids.append(grid)

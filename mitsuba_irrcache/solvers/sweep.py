@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
+from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import active_voxels, occupied_box
 from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, kind_of
@@ -35,6 +36,9 @@ EMITTERS = frozenset(
 #: paths add noise of their own. Twice as many for single scattering of irradiance, where each is
 #: less work and blurs less.
 DIRECTIONS, DIRECTIONS_AMONG_SURFACES = 128, 64
+#: The same for all orders of isotropic scattering in uniform light: errors are at most 1.5 times
+#: those with 128.
+DIRECTIONS_IN_UNIFORM_LIGHT = 64
 #: The same among surfaces where the phase function has a forward peak: 128 leave an error of 1.5 %
 #: under a sky with a wide sun, these 0.9 %.
 DIRECTIONS_OF_SHARP_SCATTERING = 256
@@ -46,7 +50,13 @@ class SweepSolver(Solver):
 
     name = "sweep"
     precedence = 10
-    size_rule = SizeRule(TARGET_ERROR, fewest=32, most_by_contrast=64, most_by_border=128)
+    size_rule = SizeRule(
+        TARGET_ERROR,
+        fewest=32,
+        most_by_contrast=64,
+        most_by_border=128,
+        larger_in_smooth_light=True,
+    )
     is_correlated = True
     is_kept = True
     supports_delta_m = True
@@ -106,6 +116,8 @@ class SweepSolver(Solver):
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
         if medium.phase.forward and not medium.is_isolated:
             return DIRECTIONS_OF_SHARP_SCATTERING
+        if medium.detail is Detail.UNIFORM and medium.phase.is_isotropic:
+            return DIRECTIONS_IN_UNIFORM_LIGHT
         once = max_depth == 2 and medium.phase.is_isotropic
         count = DIRECTIONS if medium.is_isolated else DIRECTIONS_AMONG_SURFACES
         return 2 * count if once else count

@@ -150,6 +150,16 @@ CONSTANTS = [
         r"at most (\d+) along the longest side \(`path`: (\d+)\)",
         (SweepSolver.size_rule.most_by_contrast, PathSolver.size_rule.most_by_contrast),
     ),
+    (
+        "7-defaults",
+        r"most ([\d.]+) %: \$([\d.]+) \\, d \+ (\d+) \\, a \\, \\min\(d, ([\d.]+)\)\$ %",
+        (
+            grid_size.SMOOTH_ERROR,
+            grid_size.DEPTH_ERROR,
+            grid_size.DETAIL_ERROR,
+            grid_size.MOST_DETAIL_DEPTH,
+        ),
+    ),
     ("7-defaults", r"\\sigma_B\$, at most (\d+) ", (SweepSolver.size_rule.most_by_border,)),
 ]
 

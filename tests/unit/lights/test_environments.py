@@ -6,7 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.lights.environments import Detail, is_smooth
+from mitsuba_irrcache.core.detail import Detail
+from mitsuba_irrcache.lights.environments import detail_of, is_smooth
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -23,7 +24,7 @@ def sky(of_height, channel: int | None = None) -> dict:
 
 def detail(*emitters: dict) -> Detail:
     scene = mi.load_dict({"type": "scene"} | {f"e{k}": e for k, e in enumerate(emitters)})
-    return Detail.of(scene.emitters())
+    return detail_of(scene.emitters())
 
 
 def gradient(height: np.ndarray) -> np.ndarray:

@@ -6,10 +6,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.fields import ConstantField, GridField
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.media.medium import MediumGrid
+from mitsuba_irrcache.media.medium import MediumContext, MediumGrid
 from mitsuba_irrcache.solvers import grid_size
 from mitsuba_irrcache.solvers.base import solver_named
 from mitsuba_irrcache.solvers.discrete_ordinates import solver as sn_solver
@@ -116,21 +117,57 @@ def test_size_of_batches(samples, batch):
     assert sn_solver.batch_of(samples, sn_solver.BATCH) == batch
 
 
+def soft(count: int, sigma_t: float) -> np.ndarray:
+    """Return a blob whose extinction decays smoothly to all sides."""
+    at = (np.arange(count) + 0.5) / count * 2 - 1
+    x, y, z = np.meshgrid(at, at, at)
+    return sigma_t * np.exp(-8 * (x * x + y * y + z * z))
+
+
+def in_light(values: np.ndarray, detail: Detail, **changes) -> tuple[int, ...]:
+    lit = medium(values).replaced(context=MediumContext(detail=detail), **changes)
+    return choose_grid(lit, 0, solver_named("sweep").size_rule)[0].shape
+
+
+def test_voxels_are_larger_in_smooth_light():
+    """They are where data are smooth and no voxel is dense, in light that has no sharp shadows."""
+    rough = np.random.default_rng(1).uniform(0, 10, (72, 72, 72)) * (soft(72, 1.0) > 0.1)
+    for detail in (Detail.UNIFORM, Detail.SMOOTH):
+        assert in_light(soft(72, 5.0), detail) == (32, 32, 32)
+        assert in_light(np.zeros((72, 96, 80)), detail) == (32, 42, 35)
+        assert in_light(rough, detail) == (72, 72, 72)
+        assert 32 < in_light(soft(72, 150.0), detail)[0] < chosen(soft(72, 150.0))[0]
+    for values in (soft(72, 5.0), rough, soft(72, 150.0)):
+        assert in_light(values, Detail.SHARP) == chosen(values)
+
+
+def test_albedos_with_detail_need_voxels_in_smooth_light():
+    values = np.random.default_rng(2).uniform(0, 1, 72**3).astype(np.float32)
+    grid = Grid((72, 72, 72), np.eye(4))
+    albedo = GridField(grid, mi.Float(values), 1)
+    thin = soft(72, 5.0)
+    assert in_light(thin, Detail.SMOOTH, albedo=albedo)[0] > in_light(thin, Detail.SMOOTH)[0]
+
+
 def test_directions_by_default(scenes):
-    """The default is 128 directions in one batch, twice as many for single scattering.
+    """The default is 128 directions in one batch, twice as many for single scattering, half as many
+    for all orders in uniform light.
 
     If an error estimate is required, there are two batches; directions requested later count.
     """
     shape = scenes.boundary(scenes.medium(scenes.texture((4, 4, 4), 0.5, 3.0, 1), 0.9))
+    uniform = {"emitter": {"type": "constant"}}
     for wanted, asked, expected in (
         ({}, 0, (128, 128)),
         ({"max_depth": 2}, 0, (256, 256)),
+        (uniform, 0, (64, 64)),
+        (uniform | {"max_depth": 2}, 0, (256, 256)),
         ({"filter": "bilateral"}, 0, (128, 64)),
         ({}, 64, (64, 64)),
     ):
-        scene = scenes.load(
-            {"type": "irrcache", "max_depth": -1, "solver": "auto"} | wanted, shape, size=2
-        )
+        settings = {"type": "irrcache", "max_depth": -1, "solver": "auto"} | wanted
+        light = {key: settings.pop(key) for key in uniform if key in settings}
+        scene = scenes.load(settings, shape, size=2, **light)
         if asked:
             scene.integrator().cache_spp = asked
         scene.integrator().prepare(scene)
