@@ -21,6 +21,7 @@ import numpy as np
 
 from mitsuba_irrcache.cache.surface import INDIRECT_LEVELS, LEVELS, SurfaceNodes
 from mitsuba_irrcache.core.jit import symbolic
+from mitsuba_irrcache.lights.emitters import are_distant
 from mitsuba_irrcache.lights.narrow_sources import Source
 from mitsuba_irrcache.render.path_splitting import no_waiting, resumed, split
 from mitsuba_irrcache.render.raymarch import Projection
@@ -167,7 +168,7 @@ class SurfacePaths:
         """
         narrow = mi.Bool(False)
         if dr.hint(self.narrow is not None, mode="scalar"):
-            far = mi.has_flag(record.emitter.flags(), mi.EmitterFlags.Infinite)
+            far = are_distant(record.emitter)
             narrow = straight & self.narrow.hits_source(vertex.p, record.d, far, ~far)
         passed, rng = visibility(
             scene, self.media, vertex, record.p, behind, rng, active & ~narrow, exact

@@ -1,0 +1,1 @@
+"""Errors of media with a sharp forward peak, towards narrow sources and in shadows."""
