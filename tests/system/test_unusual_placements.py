@@ -188,7 +188,8 @@ def test_unbounded_media_are_refused(scenes):
     hole = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "null"}, "exterior": fog}
     described = scenes.description({"type": "irrcache", "solver": "auto"}, None, 4, hole=hole)
     described = {"type": "scene", "smoke": smoke} | described
-    with pytest.raises(RuntimeError, match=r'"smoke" is the exterior.*the interior of none.*null BSDF'):
+    message = r'"smoke" is the exterior.*the interior of none.*null BSDF'
+    with pytest.raises(RuntimeError, match=message):
         mi.render(mi.load_dict(described), spp=1)
 
 
