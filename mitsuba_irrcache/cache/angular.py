@@ -7,11 +7,13 @@ harmonics of low order cannot represent. The radiance scattered towards the came
 
     J = Phi / (4 pi) f,   Phi f = Phi + sum_lm 4 pi g_l Y_lm L_lm + sum_k (4 pi p_k - 1) E_k
 
-where L_lm excludes E_k. (Lamps have an extent: their L_lm includes E_k, and p_k contains only the
-degrees that L_lm lacks, blurred by the lamp's extent.) Emitters whose irradiance camera rays
-evaluate in closed form (`cache/direct_light`, `cache/area_light`) are part of neither Phi nor L_lm
-nor E_k here. Phi is interpolated as in isotropic media. The *factor* f is a ratio of values
-interpolated in the same way, so that voxels with little irradiance have little weight.
+where g_l are the Legendre moments of the phase function, p_k is its value for scattering from
+source k towards the camera, and L_lm excludes E_k. (For area emitters, L_lm includes E_k, and p_k
+contains only the degrees above the order of L_lm, blurred by the emitter's extent.) Emitters whose
+irradiance camera rays evaluate in closed form (`cache/direct_light`, `cache/area_light`) contribute
+to neither Phi nor L_lm nor E_k here. Phi is interpolated as in isotropic media. The *factor* f is a
+ratio of values interpolated in the same way, so that voxels with little irradiance have little
+weight.
 """
 
 from __future__ import annotations
@@ -30,17 +32,17 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.narrow_sources import Source
 from mitsuba_irrcache.media.phase import Phase
 
-#: Largest error [%] of the image, times the root of the number of directions, of media with a
-#: forward peak under bright spots; measured with g = 0.85, 16^3 data voxels, and three spots that
-#: have 96 % of the irradiance.
+#: Largest image error [%] times the square root of the number of directions, for media with a
+#: forward peak in environments with bright spots; measured with g = 0.85, 16^3 data voxels, and
+#: three spots that have 96 % of the irradiance.
 NOISE_OF_SPOTS = 140.0
 #: Legendre series are truncated behind the last coefficient larger than this.
 NEGLIGIBLE_TERM = 1e-3
-#: Maximum order of the moments of direct light, and magnitude of the moments of the phase function
-#: that may be neglected for it: with 0.07, as for scattered radiance, errors next to a lamp are up
-#: to 7 % (g = 0.58), with 0.01 0.5 %.
+#: Maximum order of the moments of direct light, and magnitude below which moments of the phase
+#: function are neglected for it. With 0.07, as for scattered radiance, errors next to an area
+#: emitter are up to 7 % (g = 0.58); with 0.01 they are 0.5 %.
 MAX_DIRECT_ORDER, MAX_DIRECT_TAIL = 8, 0.01
-#: Number of values per load.
+#: Number of values per gather (a packet).
 WIDTH = 4
 
 
@@ -57,8 +59,8 @@ class AngularBasis:
         order: int | None = None,
     ) -> None:
         """``others`` are narrow sources that are neither part of the moments nor of E_k, because
-        camera rays evaluate their irradiance in closed form. ``order`` is by default that which
-        the phase function requires.
+        camera rays evaluate their irradiance in closed form. ``order`` of the spherical harmonics
+        is `Phase.order` by default.
         """
         self.phase, self.sources, self.others = phase, sources, others
         self.order = phase.order if order is None else order
@@ -91,7 +93,8 @@ class AngularBasis:
         """Compute the moments of radiance samples at ``position``.
 
         ``contributions`` are tuples of the direction towards the origin of the radiance, and the
-        uncollided and scattered parts of its irradiance.
+        uncollided and scattered parts of its irradiance. Returns L_lm for l >= 1, ordered by l and
+        m, followed by E_k of the sources.
         """
         smooth = [mi.Spectrum(0)] * len(self._factors)
         narrow = [mi.Spectrum(0)] * len(self.sources)
@@ -110,19 +113,22 @@ class AngularBasis:
     def hits_source(
         self, origin: mi.Point3f, direction: mi.Vector3f, far: mi.Bool, near: mi.Bool
     ) -> mi.Bool:
-        """Whether rays that hit something ``far``, or an emitter ``near``, hit a narrow source."""
+        """Whether rays hit a narrow source.
+
+        ``far`` is the mask of rays that leave the scene, ``near`` of those that hit an emitter.
+        """
         found = mi.Bool(False)
         for source in (*self.sources, *self.others):
             towards, cosine = source.seen_from(origin)
             found |= (far if source.far else near) & (dr.dot(direction, towards) >= cosine)
         return found
 
-    def apart(self, directions: np.ndarray, radiance: np.ndarray) -> list[np.ndarray]:
+    def split_by_source(self, directions: np.ndarray, radiance: np.ndarray) -> list[np.ndarray]:
         """Separate the radiance of narrow distant sources.
 
-        ``radiance`` (n, 2, channels) is that along ``directions`` (n, 3) and their opposites.
-        Returns the remainder, followed by the part of each source (0 for sources that are not
-        distant).
+        ``radiance`` (n, 2, channels) is incident along ``directions`` (n, 3) and their opposites.
+        Returns arrays of this shape: the radiance that comes from none of the sources, followed by
+        the radiance of each source (0 for sources that are not distant).
         """
         towards, parts = np.stack([-directions, directions], axis=1), []
         for source in self.sources:
@@ -132,7 +138,7 @@ class AngularBasis:
         return [radiance, *parts]
 
     def basis(self, direction: mi.Vector3f) -> list[mi.Float]:
-        """Weights of the smooth moments for a ray along ``direction``."""
+        """Return the weights 4 pi g_l Y_lm of the moments L_lm for a ray along ``direction``."""
         values = dr.sh_eval(direction, self.order)[1:]
         return [factor * y for factor, y in zip(self._factors, values, strict=True)]
 
@@ -148,21 +154,23 @@ class AngularBasis:
             return self.phase.gain(p, direction, towards)
         return 1 + self._smooth(dr.dot(direction, towards))
 
-    def has_rest(self, with_peak: bool = True) -> bool:
-        """Whether moments up to `order` leave out a part of the phase function."""
+    def has_residual(self, with_peak: bool = True) -> bool:
+        """Whether moments up to `order` do not represent the phase function completely."""
         if self.phase.forward:
             return with_peak
         return self.phase.tail(self.order) > NEGLIGIBLE_TERM
 
-    def rest(self, p: mi.Point3f, direction: mi.Vector3f, towards: mi.Vector3f) -> mi.Float:
-        """The part of `gain` that moments up to `order` leave out."""
+    def residual_gain(
+        self, p: mi.Point3f, direction: mi.Vector3f, towards: mi.Vector3f
+    ) -> mi.Float:
+        """Return the part of `gain` that moments up to `order` do not represent."""
         smooth = self._smooth(dr.dot(direction, towards))
         return self.phase.gain(p, direction, towards) - 1 - smooth
 
     def gains(
         self, p: mi.Point3f, direction: mi.Vector3f, active: mi.Bool, with_peak: bool = True
     ) -> list[mi.Float]:
-        """Weights of the narrow sources for a ray along ``direction`` at ``p``.
+        """Return the weights of the narrow sources for a ray along ``direction`` at ``p``.
 
         Without ``with_peak`` scattering into a forward peak is excluded.
         """
@@ -182,8 +190,9 @@ class AngularBasis:
     def corrections(
         self, p: mi.Point3f, direction: mi.Vector3f, depths: list[mi.Float]
     ) -> list[mi.Float]:
-        """Differences that several scattering events into the forward peak make to `gains`, where
-        ``depths`` are their mean numbers between each source and the camera.
+        """Return the corrections of `gains` for multiple scattering into the forward peak.
+
+        ``depths`` are, for each source, the mean number of such events between source and camera.
         """
         found = []
         for source, depth in zip(self.sources, depths, strict=True):
@@ -196,10 +205,11 @@ class AngularBasis:
     def _blurred(
         self, gain: mi.Float, cosine: mi.Float, variance: mi.Float, whole: bool
     ) -> mi.Float:
-        """Return 4 pi p of a source with extent, given the ``gain`` 4 pi p of its centre.
+        """Return 4 pi p averaged over a source, given the ``gain`` 4 pi p of its centre.
 
-        A source with this ``variance`` of angles attenuates degree l by exp(-l (l + 1) variance /
-        4). The part represented by the moments is excluded unless ``whole``.
+        ``variance`` is the mean square angle of the source's points from its centre, which
+        attenuates degree l by exp(-l (l + 1) variance / 4). The part represented by the moments is
+        excluded unless ``whole``.
         """
         result, attenuation, ratio = mi.Float(0), mi.Float(1), mi.Float(1)
         blur = dr.exp(-0.5 * variance)
@@ -224,13 +234,13 @@ def _legendre(cosine: mi.Float) -> Iterator[mi.Float]:
         before, here = here, ((2 * degree + 1) * cosine * here - degree * before) / (degree + 1)
 
 
-def nothing(directional: AngularBasis | None) -> list[mi.Spectrum]:
-    """Initial value of the sums computed by `added`."""
+def empty_sums(directional: AngularBasis | None) -> list[mi.Spectrum]:
+    """Return zero sums, to which `with_radiance` adds."""
     moments = 0 if directional is None else directional.count
     return [mi.Spectrum(0) for _ in range(1 + moments)]
 
 
-def added(
+def with_radiance(
     sums: list[mi.Spectrum],
     position: mi.Point3f,
     towards: mi.Vector3f,
@@ -238,9 +248,10 @@ def added(
     scattered: mi.Spectrum,
     directional: AngularBasis | None,
 ) -> list[mi.Spectrum]:
-    """Add the radiance arriving at ``position`` from direction ``towards`` to ``sums``.
+    """Return ``sums`` plus the irradiance at ``position`` from direction ``towards``.
 
     ``sums`` are an irradiance and, for anisotropic media, the moments of `AngularBasis.moments`.
+    ``uncollided`` and ``scattered`` are the parts of the irradiance to be added.
     """
     found = [uncollided + scattered]
     if directional is not None:
@@ -249,26 +260,29 @@ def added(
 
 
 def warn_of_noise(basis: AngularBasis, samples: int, name: str) -> None:
-    """Log a warning if ``samples`` directions have much noise in a medium that scatters a bright
-    spot of an environment forward: what reaches other directions is small differences.
+    """Log a warning if a medium with a forward peak is lit by bright spots of an environment.
+
+    Radiance scattered out of the forward direction is then a small difference of large values, and
+    noisy with ``samples`` directions.
     """
     if not basis.phase.forward or not any(source.is_spot for source in basis.sources):
         return
     mi.Log(
         mi.LogLevel.Warn,
-        f"irrcache: {name} scatters sharply, and the environment has bright spots: with {samples} "
-        f"directions, what is scattered sideways and back has an error of up to about "
-        f"{NOISE_OF_SPOTS / np.sqrt(samples):.0f} %. Raise cache_spp, or take the spots out of the "
-        'map and add "directional" emitters for them.',
+        f"irrcache: {name} has a sharp forward peak, and the environment has bright spots: with "
+        f"{samples} directions, radiance scattered sideways and backward has an error of up to "
+        f"about {NOISE_OF_SPOTS / np.sqrt(samples):.0f} %. Raise cache_spp, or replace the spots "
+        'of the environment map by "directional" emitters.',
     )
 
 
 def warn_of_sharp_shadows(forward: float, name: str, reason: str) -> None:
-    """Log a warning that radiance of narrow sources that a forward peak of this share scatters
-    reaches surfaces unscattered, for this ``reason``.
+    """Log a warning that scattering into the forward peak counts as unscattered on surfaces.
 
-    It is right on average over a surface, and not in shadows: under a cloud with g = 0.85 and a
-    sun, blocks of pixels of the ground are up to 7 % of the image's mean too bright.
+    ``forward`` is the share of the peak in the phase function, ``reason`` says why the irradiance
+    of surfaces is not corrected for it. The irradiance is right on average over a surface, but not
+    in shadows: under a cloud with g = 0.85 and a sun, blocks of pixels of the ground are up to 7 %
+    of the image's mean too bright.
     """
     mi.Log(
         mi.LogLevel.Warn,
@@ -290,7 +304,11 @@ class SourceDepths(Protocol):
 
 
 class AngularField:
-    """The factor f as a field; ``phi`` and ``moments`` are given per voxel, ordered by channel."""
+    """The factor f as a field.
+
+    ``phi`` are the values of Phi at all voxels, one array per channel; ``moments`` those of the
+    moments L_lm and E_k, all channels of each in turn.
+    """
 
     def __init__(
         self,
@@ -301,8 +319,9 @@ class AngularField:
         depths: SourceDepths | None = None,
         extinctions: list[mi.Float] | None = None,
     ) -> None:
-        """``depths`` are those of a forward peak, with their ``extinctions`` on the grid, ordered
-        by channel; without them, every scattering event counts as the only one.
+        """``depths`` are the optical depths of the forward peak to the sources, with their
+        ``extinctions`` at all voxels, all channels of each source in turn. None: multiple
+        scattering into the peak is not corrected.
         """
         self.directional, self.grid, self.channels = directional, grid, len(phi)
         self._depths, self._moments = depths, len(moments) // len(phi)
@@ -323,7 +342,7 @@ class AngularField:
         dr.eval(self.data)
 
     def in_basis(self, directional: AngularBasis) -> AngularField:
-        """The same moments with another phase function."""
+        """Return a field of the same moments for another phase function."""
         field = copy(self)
         field.directional = directional
         return field
@@ -341,7 +360,7 @@ class AngularField:
 
         ``basis`` is the result of `AngularBasis.basis`; ``with_peak`` as in `AngularBasis.gains`.
         ``peak_depth`` is the optical depth of scattering into the forward peak between ``p`` and
-        the camera; None: that is neglected, as is the one between ``p`` and narrow sources.
+        the camera; None: multiple scattering into the peak is not corrected.
         """
         directional = self.directional
         values = self._interpolated(self.grid.coordinates.point(p), active)
@@ -366,8 +385,9 @@ class AngularField:
     def _depths_to_camera(
         self, p: mi.Point3f, rows: list[list[mi.Float]], peak_depth: mi.Float | mi.Color3f
     ) -> list[list[mi.Float]]:
-        """Return the depths of the peak from each source past ``p`` to the camera, in each channel
-        or, where they are alike, in one.
+        """Return the optical depths of the peak from each source via ``p`` to the camera.
+
+        One list over the sources per channel, or a single one if all channels are equal.
         """
         sources, found = len(self.directional.sources), []
         before = [peak_depth] if isinstance(peak_depth, mi.Float) else list(peak_depth)
@@ -394,9 +414,9 @@ class AngularField:
 
 
 def order_of_direct_light(phase: Phase) -> int:
-    """Return the order of the moments that represent the radiance from emitters with extent.
+    """Return the order of the moments for the radiance of emitters with extent.
 
-    Their radiance varies more with the direction than scattered radiance.
+    It is higher than for scattered radiance, which varies less with direction.
     """
     if phase.forward:
         return phase.order

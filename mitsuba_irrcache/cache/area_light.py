@@ -2,15 +2,15 @@
 
 Without a medium and other surfaces the irradiance is E(p) = L Omega(p), in closed form
 (`lights/solid_angle`). It varies by an order of magnitude within a voxel next to the emitter, and
-is zero behind it, so it is not interpolated. Only two smooth factors are:
+is zero behind it, so it is not interpolated. Only two smooth factors are interpolated:
 
-- the mean transmittance of the medium between p and the points of the emitter, as an optical
-  depth, or as that depth over the length of the line to the closest point;
-- the mean visibility of these points past surfaces, weighted by that transmittance.
+- the mean transmittance of the medium between p and points on the emitter, as an optical depth, or
+  as that depth divided by the length of the line to the closest point;
+- the mean visibility of these points past other surfaces, weighted by that transmittance.
 
-Both are ratios of sums over the same points, weighted by the solid angle for which each stands, so
-they have no variance where all points are alike. They are also defined behind a flat emitter, and
-continuous across its plane.
+Both are ratios of sums over the same points, weighted by the solid angle that each point
+represents, so they have no variance where transmittance and visibility of all points are equal.
+They are also defined behind a flat emitter, and continuous across its plane.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
-#: Number of points on an emitter: for all voxels together, and minimum and maximum for each voxel.
+#: Number of points on an emitter: in total over all voxels, and minimum and maximum per voxel.
 SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 1 << 24, 32, 512
-#: Samples of the cache per point on an emitter, above the minimum. The means over these points are
-#: the only part of the cache that further samples do not refine, so that their number determines
-#: how far the error can decrease.
+#: Samples per voxel of the cache for each point on an emitter (above the minimum of points). The
+#: means over these points are the only part of the cache that further samples do not refine, so
+#: their number limits the accuracy that a cache reaches.
 CACHE_SAMPLES_PER_POINT = 4
 #: Largest mean bias of the optical depths due to the number of points; most of it is corrected.
 LARGEST_BIAS = 5e-4
-#: Number of points on an emitter over which the phase function is averaged at a lookup, beyond its
-#: moments; with a forward peak, which the moments exclude.
+#: Number of points on an emitter over which a lookup averages the part of the phase function that
+#: the moments do not represent; the second number for phase functions with a forward peak.
 PHASE_SAMPLES, PEAK_SAMPLES = 4, 16
 #: Weight [sr] added to each point, so that their sum is positive in the plane of a flat emitter.
 SMALL_ANGLE = 1e-6
@@ -54,8 +54,9 @@ SMALL_ANGLE = 1e-6
 TESTS = 2048
 #: Number of positions on an emitter at which it is tested whether it lies in the medium.
 POSITIONS = 64
-#: Maximum number of emitters treated in this way, and of their values at all voxels: about 14 and
-#: the moments for each. The irradiance of further emitters is interpolated.
+#: Maximum number of emitters treated in this way, maximum number of their values at all voxels, and
+#: number of values per voxel and emitter without its moments. The irradiance of further emitters is
+#: interpolated.
 MOST_LIGHTS, MOST_VALUES, VALUES = 8, 14 << 24, 14
 
 
@@ -72,8 +73,10 @@ class AreaLight(DirectLight):
         classes: VoxelClasses | None = None,
         samples: int = 0,
     ) -> None:
-        """Compute the factors; ``classes`` is None if no surface is among the voxels. The cache has
-        this number of ``samples`` per voxel.
+        """Compute the factors.
+
+        ``classes`` is None if there is no surface among the voxels; ``samples`` is the number of
+        samples per voxel of the cache, from which the number of points on the emitter follows.
         """
         #: number of points on the emitter, from which its factors at a voxel are computed
         self.points_per_voxel = 0
@@ -102,9 +105,10 @@ class AreaLight(DirectLight):
     def length(self, p: mi.Point3f) -> mi.Float:
         """Return the length in the medium of the line to the closest point of the emitter, or 1.
 
-        The optical depth over that length is smooth next to the emitter and to the face through
-        which its radiance enters. Where lines to different points leave through different faces,
-        the optical depth itself is smoother; what is better for a scene is measured.
+        The optical depth divided by that length is smooth next to the emitter and to the face
+        through which its radiance enters. Where lines to different points leave through different
+        faces, the optical depth itself is smoother, and this returns 1. `_extinction` chooses the
+        alternative with the smaller error.
         """
         if not self._follows_closest_line:
             return dr.full(mi.Float, 1, dr.width(p))
@@ -126,7 +130,7 @@ class AreaLight(DirectLight):
     def _extinction(
         self, scene: mi.Scene, depth: mi.Float | mi.Color3f, classes: VoxelClasses | None
     ) -> GridField:
-        """As for all direct light, with that `length` which has the smaller error."""
+        """Create the field as in the base class, with the `length` that has the smaller error."""
         by_length = self.extinction = super()._extinction(scene, depth, classes)
         if _is_inside(self._shape, self._medium):
             return by_length
@@ -179,9 +183,11 @@ class AreaLight(DirectLight):
         return depth, passed
 
     def _sample_count(self, scene: mi.Scene) -> int:
-        """Return the number of points for each voxel: as many as `SAMPLES` in all permit, or, where
-        the transmittance varies over the emitter, as many as `LARGEST_BIAS` requires; in any case
-        more for a cache of more samples.
+        """Return the number of points on the emitter per voxel.
+
+        It is `SAMPLES` over the number of voxels, or, if the transmittance varies over the emitter,
+        the larger number that `LARGEST_BIAS` requires; at least `_fewest`, which grows with the
+        samples of the cache.
         """
         most = max(MOST_SAMPLES, self._fewest)
         permitted = np.clip(SAMPLES // dr.width(self._voxels), self._fewest, most)
@@ -203,28 +209,29 @@ class AreaLight(DirectLight):
     def has_one_direction(self) -> bool:
         return False
 
-    def mean_rest(
+    def mean_residual(
         self,
         basis: AngularBasis,
         p: mi.Point3f,
         direction: mi.Vector3f,
         peak_depth: mi.Float | mi.Color3f | None = None,
     ) -> mi.Float | mi.Color3f:
-        """Average `AngularBasis.rest` over the radiance from the emitter, with `Aureole.correction`
-        where the ``peak_depth`` between the emitter and the camera is given.
+        """Average `AngularBasis.residual_gain` over the radiance from the emitter.
 
-        Its points differ between lookups, so that the error of sharp phase functions is noise. The
-        radiance is weighted by the transmittance along each line for the mean extinction.
+        `Aureole.correction` is included if ``peak_depth``, the optical depth of the forward peak
+        between emitter and camera, is given. The points on the emitter differ between lookups, so
+        that the error of sharp phase functions is noise. They are weighted by the transmittance of
+        the mean extinction along the line to each.
         """
         first, second = (dr.reinterpret_array(mi.UInt32, v) for v in (p.x + p.y, p.z))
         rng = random_stream(mi.sample_tea_32(first, second))
         length, depth = self._closest_length(p), self.depth(p)
         depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
-        return self._mean_rest(basis, p, direction, mean, self._phase_samples, rng, peak_depth)
+        return self._mean_residual(basis, p, direction, mean, self._phase_samples, rng, peak_depth)
 
     @symbolic
-    def _mean_rest(
+    def _mean_residual(
         self,
         basis: AngularBasis,
         p: mi.Point3f,
@@ -234,7 +241,7 @@ class AreaLight(DirectLight):
         rng: mi.PCG32,
         peak_depth: mi.Float | mi.Color3f | None,
     ):
-        """See `mean_rest`, with ``count`` points and the mean extinction ``sigma_t``."""
+        """See `mean_residual`, with ``count`` points and the mean extinction ``sigma_t``."""
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))
         vertex.p = p
         shift = mi.Vector2f(rng.next_float32(), rng.next_float32())
@@ -244,7 +251,7 @@ class AreaLight(DirectLight):
         while dr.hint(k < count, label="phase function over an emitter"):
             _, towards, distance, weight = self._sample(vertex, shares, k, shift)
             weight *= dr.exp(-sigma_t * self._length_within(p, towards, distance))
-            rest = basis.rest(p, direction, towards)
+            rest = basis.residual_gain(p, direction, towards)
             if dr.hint(peak_depth is not None, mode="scalar"):
                 cosine = dr.dot(direction, towards)
                 rest = rest + basis.phase.aureole.correction(cosine, peak_depth)
@@ -257,10 +264,12 @@ class AreaLight(DirectLight):
     def _sums(
         self, scene: mi.Scene, p: mi.Point3f, count: mi.UInt32, rng: mi.PCG32, order: int = 0
     ):
-        """Sum over ``count`` points of the emitter: the solid angle for which each stands, times
-        the transmittance of the medium, also times the visibility past others, and alone; the
-        first and the last of these over every other point; and the second, averaged over the
-        channels, times the spherical harmonics of its direction from degree 1 to ``order``.
+        """Sum over ``count`` points of the emitter; W is the solid angle that a point represents.
+
+        Returns six sums: W times the transmittance T of the medium; W times T times the visibility
+        V past surfaces and other media; W; the first and the third sum over every other point; and
+        the list of the sums of W T V, averaged over the channels, times each spherical harmonic of
+        the direction to the point, from degree 1 to ``order``.
         """
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))
         vertex.p = p
@@ -293,10 +302,11 @@ class AreaLight(DirectLight):
     def _sample(
         self, vertex: mi.Interaction3f, shares: list[mi.Float], k: mi.UInt32, shift: mi.Vector2f
     ) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float]:
-        """Sample a point about uniformly by solid angle; ``shares`` are those of `SolidAngle`.
+        """Sample a point on the emitter, approximately uniformly by solid angle.
 
-        Returns the point, its direction and distance, and the solid angle for which it stands, up
-        to a factor. Both sides of flat emitters count, so that the factors continue behind them.
+        ``shares`` is the result of `SolidAngle.shares`. Returns the point, its direction and
+        distance, and the solid angle that it represents, up to a constant factor. Flat emitters
+        are sampled from both sides, so that the factors are continuous across their plane.
         """
         sample = mi.Point2f(kronecker(k, 2, (shift.x, shift.y)))
         if self._solid_angle.kind == "sphere":
@@ -310,17 +320,17 @@ class AreaLight(DirectLight):
     def _field_of_extinction(
         self, mean: mi.Float | mi.Color3f, classes: VoxelClasses | None
     ) -> ExtendedField:
-        """Create the field of the optical depth over `length`, extrapolated beyond the outermost
-        voxels.
+        """Create the field of the optical depth divided by `length`.
 
-        Next to a face that the emitter irradiates from the side it changes within a voxel.
+        It is extrapolated beyond the outermost voxel centres, because it varies within a voxel next
+        to faces that the emitter irradiates at grazing angles.
         """
         field = super()._field_of_extinction(mean, classes)
         known = marked(self._grid, self._voxels)
         return ExtendedField(self._grid, field.data, field.channels, known)
 
     def _field_of_others(self, passed: mi.Spectrum, classes: VoxelClasses | None) -> ExtendedField:
-        """Create the field of visibility; interpolated linearly, shadow edges have no bias."""
+        """Create the field of visibility, interpolated linearly: shadow edges have no bias."""
         channels = list(passed)
         if all(dr.all(c == channels[0])[0] for c in channels[1:]):
             channels = channels[:1]
@@ -339,8 +349,9 @@ def area_lights_of(
     classes: VoxelClasses | None = None,
     samples: int = 0,
 ) -> list[AreaLight]:
-    """Return the direct light of the area emitters of simple shapes, for a cache of this number of
-    ``samples`` per voxel.
+    """Return the direct light of the brightest area emitters of simple shapes.
+
+    ``samples`` is the number of samples per voxel of the cache.
     """
     if medium.is_isolated or not dr.width(voxels):
         return []
@@ -364,8 +375,8 @@ def _mean_and_bias(
     odd_weight: mi.Float,
     angular: list[mi.Float],
 ) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """Return the mean transmittance from the results of `AreaLight._sums`, and the bias of minus
-    its logarithm.
+    """Return the mean transmittance T from the results of `AreaLight._sums`, and the bias of
+    -log(T).
 
     The bias is half the relative variance of the mean. The variance of a mean over n points of a
     lattice is proportional to n^-2, so that the mean over one half of the points differs from that
@@ -380,7 +391,7 @@ def moments_of(
     lights: Sequence[DirectLight], basis: AngularBasis, grid: Grid, voxels: mi.UInt32
 ) -> AngularField | None:
     """Create the field of the moments of the radiance from all ``lights`` with extent, relative to
-    their irradiance at the ``voxels``; None without any.
+    their irradiance at the ``voxels``; return None without such lights.
     """
     lights = [light for light in lights if not light.has_one_direction]
     if not lights:
@@ -397,7 +408,9 @@ def moments_of(
 def _with_harmonics(
     sums: list[mi.Float], direction: mi.Vector3f, weight: mi.Float, order: int
 ) -> list[mi.Float]:
-    """Add the spherical harmonics of a ``direction`` from degree 1 to ``order``, times a weight."""
+    """Return ``sums`` plus the spherical harmonics of ``direction``, degrees 1 to ``order``, times
+    ``weight``.
+    """
     harmonics = dr.sh_eval(direction, order)[1:]
     return [dr.fma(weight, y, total) for y, total in zip(harmonics, sums, strict=True)]
 
@@ -410,7 +423,7 @@ def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:
 
 
 def _radiance(emitter: mi.Emitter) -> mi.Spectrum:
-    """Return the radiance of an emitter that is the same everywhere."""
+    """Return the radiance of an emitter whose radiance is uniform."""
     record = emitter.get_shape().sample_position(0.0, mi.Point2f(0.5))
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.p, si.n, si.uv, si.wi = record.p, record.n, record.uv, mi.Vector3f(0, 0, 1)

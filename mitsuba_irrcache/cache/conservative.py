@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from mitsuba_irrcache.grids.grid import Grid
 
-#: Mean relative variance of voxels from which on their values are conserved in full.
+#: Mean relative variance of voxels above which the correction is applied in full.
 NOISY = 0.5
 
 
@@ -33,7 +33,7 @@ def conserving(
 ) -> mi.Float:
     """Correct square ``roots`` such that interpolation preserves the values of ``known`` voxels.
 
-    ``share`` in [0, 1] (per voxel): the power to which the correction is applied, 1 without it.
+    ``share`` in [0, 1], per voxel, is the power to which the correction factor is raised; None: 1.
 
     The correction acts along axes along which both neighbours are known, and not ``separated`` by
     surfaces (`VoxelClasses`), where interpolation does not mix their values. Noise that differs
@@ -55,7 +55,8 @@ def conserving(
 
 
 def share_of_noise(grid: Grid, variance: mi.Float, known: mi.Bool) -> mi.Float:
-    """Compute the share of `conserving` of noisy voxels from the relative ``variance`` around.
+    """Compute the ``share`` of `conserving` per voxel, from the mean relative ``variance`` of the
+    3^3 voxels around it.
 
     Where the variance is small, the bias of interpolated roots follows from it
     (`root_correction`), and conserving would only amplify the noise. Where few paths reach an
@@ -70,7 +71,7 @@ def share_of_noise(grid: Grid, variance: mi.Float, known: mi.Bool) -> mi.Float:
 
 
 def _sums_around(grid: Grid, values: mi.Float) -> mi.Float:
-    """Sum values over 3^3 voxels around each."""
+    """Return the sum of ``values`` over the 3^3 voxels around each voxel."""
     index, stride = dr.arange(mi.UInt32, grid.voxel_count), mi.UInt32(1)
     for place, side in zip(grid.voxel_indices(index), grid.sides, strict=True):
         dr.eval(values)
@@ -83,7 +84,7 @@ def _sums_around(grid: Grid, values: mi.Float) -> mi.Float:
 
 
 def unbiased(grid: Grid, values: mi.Float, known: mi.Bool, channels: int = 1) -> mi.Float:
-    """Correct ``values`` such that interpolation has no mean error up to fourth order.
+    """Correct ``values`` such that the mean error of trilinear interpolation is of fourth order.
 
     Subtracts 1/12 of the second difference along each axis along which both neighbours are
     ``known``, limited to half of the value.

@@ -43,9 +43,9 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import optical_depth
 
-#: Number of points along each axis of a voxel over which E and exp(-tau) are averaged.
+#: Numbers of points along each axis of a voxel over which E and exp(-tau) are averaged.
 POINTS, DEPTH_POINTS = 8, 3
-#: Part of a segment over which the derivative of a length at its ends is measured.
+#: Step of the finite differences at the ends of a segment, over the length of the segment.
 TANGENT = 1 / 64
 
 
@@ -59,9 +59,11 @@ class DirectLight:
         medium: MediumGrid,
         grid: Grid,
         voxels: mi.UInt32,
-        survey: VoxelClasses | None = None,
+        classes: VoxelClasses | None = None,
     ) -> None:
-        """Compute mean extinctions and irradiance; ``survey`` is None without surfaces."""
+        """Compute mean extinctions and irradiance; ``classes`` is None if there are no surfaces
+        and other media among the voxels.
+        """
         #: order of `angular_means`
         self.order = order_of_direct_light(medium.phase)
         self._kind = kind_of(emitter)
@@ -70,20 +72,21 @@ class DirectLight:
         p = VoxelSamplePoints(scene, grid).of(voxels)
         self._grid, self._voxels, self._centres = grid, voxels, p
         depth, self._passed = self._attenuation(scene, p)
-        #: mean extinction on the line to the emitter, for lookups
-        self.extinction = self._extinction(scene, depth, survey)
-        #: optical depth of the truncated forward peak over that of the medium, in each channel, or
-        #: the field of its mean extinction, if that is not the same everywhere; None without a peak
+        #: field of the mean extinction along the line to the emitter
+        self.extinction = self._extinction(scene, depth, classes)
+        #: optical depth of the truncated forward peak over that of the medium, in each channel; if
+        #: that ratio varies in space, the field of the peak's mean extinction; None without a peak
         self._peak_ratio = self._peak_extinction = None
         if medium.unscattered_exponent is not None:
             ratio = [dr.opaque(mi.Float, float(e - 1)) for e in medium.unscattered_exponent]
             self._peak_ratio = ratio[0] if len(ratio) == 1 else mi.Color3f(ratio)
         elif medium.original is not None:
-            self._peak_extinction = self._extinction_of_peak(survey)
-        # transmittance of surfaces and other media at the voxels; None without any
-        self._others = self._field_of_others(self._passed, survey) if medium.is_traced else None
+            self._peak_extinction = self._extinction_of_peak(classes)
+        # field of the transmittance of surfaces and other media; None without any
+        self._others = self._field_of_others(self._passed, classes) if medium.is_traced else None
         self._means: mi.Spectrum | None = None
-        # E at the voxel centres; for a spot light, which may be narrower, its means over the voxels
+        # E at the voxel centres; for a spot light, whose beam may be narrower than a voxel, the
+        # means of E over the voxels
         self._unobstructed = self.unobstructed(p)
         if self._kind in SPOT_LIKE:
             self._unobstructed = self._mean(grid, voxels, POINTS)
@@ -154,14 +157,16 @@ class DirectLight:
         return self.emitter.sample_direction(at, mi.Point2f(0.5), active)
 
     def past_others(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """Return the transmittance of surfaces and other media on that line."""
+        """Return the transmittance of surfaces and other media between world positions and the
+        emitter.
+        """
         return mi.Float(1) if self._others is None else self._others.at_world(p, active)
 
     def _attenuation(
         self, scene: mi.Scene, p: mi.Point3f
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
-        """Return the optical depth of the medium, and the transmittance of all else, between ``p``
-        and the emitter.
+        """Return the optical depth of the medium, and the transmittance of surfaces and other
+        media, between ``p`` and the emitter.
         """
         ray, near, far = self._line(p)
         depth = optical_depth(self._medium, ray, near, far, near < far, dr.inf)
@@ -173,14 +178,14 @@ class DirectLight:
         return depth, passed
 
     def _extinction(
-        self, scene: mi.Scene, depth: mi.Float | mi.Color3f, survey: VoxelClasses | None
+        self, scene: mi.Scene, depth: mi.Float | mi.Color3f, classes: VoxelClasses | None
     ) -> GridField:
         """Create the field of the mean extinction, given optical depths at the voxels."""
         length, sigma_t = self.length(self._centres), self._medium.sigma_t.at_world(self._centres)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
-        return self._field_of_extinction(mean, survey)
+        return self._field_of_extinction(mean, classes)
 
-    def _extinction_of_peak(self, survey: VoxelClasses | None) -> GridField:
+    def _extinction_of_peak(self, classes: VoxelClasses | None) -> GridField:
         """Create the field of the mean extinction of the forward peak over `length`."""
         ray, near, far = DirectLight._line(self, self._centres)
         depth, length = (
@@ -188,21 +193,21 @@ class DirectLight:
             self.length(self._centres),
         )
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
-        return _on_grid(self._grid, self._voxels, mean, survey)
+        return _on_grid(self._grid, self._voxels, mean, classes)
 
     def _field_of_extinction(
-        self, mean: mi.Float | mi.Color3f, survey: VoxelClasses | None
+        self, mean: mi.Float | mi.Color3f, classes: VoxelClasses | None
     ) -> GridField:
         """Create a field from the mean extinction at the voxels."""
-        return _on_grid(self._grid, self._voxels, mean, survey)
+        return _on_grid(self._grid, self._voxels, mean, classes)
 
-    def _field_of_others(self, passed: mi.Spectrum, survey: VoxelClasses | None) -> GridField:
-        """Create the field of the transmittance of all else."""
-        return _root_field(self._grid, self._voxels, passed, survey)
+    def _field_of_others(self, passed: mi.Spectrum, classes: VoxelClasses | None) -> GridField:
+        """Create the field of the transmittance of surfaces and other media."""
+        return _root_field(self._grid, self._voxels, passed, classes)
 
     def _line(self, p: mi.Point3f) -> tuple[mi.Ray3f, mi.Float, mi.Float]:
         """Return rays from world positions to the emitter, and the distances at which they enter
-        and leave the medium; they do not intersect it unless the first one is smaller.
+        and leave the medium (entry >= exit: they miss it).
         """
         record, _ = self._sample_emitter(p)
         ray = mi.Ray3f(p, record.d)
@@ -254,49 +259,54 @@ def direct_lights_of(
     grid: Grid,
     voxels: mi.UInt32,
     dense: bool,
-    survey: VoxelClasses | None = None,
+    classes: VoxelClasses | None = None,
 ) -> list[DirectLight]:
     """Return the direct light of all spot lights of a scene.
 
-    Includes points and suns if the voxels are ``dense`` and there are no surfaces.
+    Point lights and suns are included if the voxels are optically ``dense`` and the scene has no
+    surfaces. ``voxels`` are flat indices; ``classes`` is None without surfaces and other media.
     """
     if not dr.width(voxels):
         return []
     emitters = spot_lights(scene)
     if dense and medium.is_isolated:
         emitters = EmittersByKind(scene.emitters()).of(EmitterKind.SUN, *POINT_LIKE)
-    return [DirectLight(scene, emitter, medium, grid, voxels, survey) for emitter in emitters]
+    return [DirectLight(scene, emitter, medium, grid, voxels, classes) for emitter in emitters]
 
 
 def _on_grid(
-    grid: Grid, voxels: mi.UInt32, values: mi.Float | mi.Color3f, survey: VoxelClasses | None
+    grid: Grid, voxels: mi.UInt32, values: mi.Float | mi.Color3f, classes: VoxelClasses | None
 ) -> GridField:
     """Create a field from values at the ``voxels``."""
     channels = [values] if isinstance(values, mi.Float) else list(values)
     known = dr.zeros(mi.Bool, grid.voxel_count)
     dr.scatter(known, mi.Bool(True), voxels)
-    values, count = spread(grid, voxels, channels, survey), len(channels)
+    values, count = spread(grid, voxels, channels, classes), len(channels)
     return GridField(grid, unbiased(grid, values, known, count), count)
 
 
 def _root_field(
-    grid: Grid, voxels: mi.UInt32, values: mi.Spectrum, survey: VoxelClasses | None
+    grid: Grid, voxels: mi.UInt32, values: mi.Spectrum, classes: VoxelClasses | None
 ) -> RootField:
-    """Create a field with interpolated square roots; it has one channel if all are equal."""
+    """Create a field whose square roots are interpolated, with one channel if all are equal."""
     channels = [dr.sqrt(c) for c in values]
     if all(dr.all(c == channels[0])[0] for c in channels[1:]):
         channels = channels[:1]
-    return RootField(grid, spread(grid, voxels, channels, survey), len(channels))
+    return RootField(grid, spread(grid, voxels, channels, classes), len(channels))
 
 
 def spread(
-    grid: Grid, voxels: mi.UInt32, channels: list[mi.Float], survey: VoxelClasses | None
+    grid: Grid, voxels: mi.UInt32, channels: list[mi.Float], classes: VoxelClasses | None
 ) -> mi.Float:
-    """Expand values to all voxels of the grid, 0 except at ``voxels`` and inside of surfaces."""
+    """Return an array over all voxels of the grid with these values at ``voxels``.
+
+    Other voxels are 0, except that with ``classes`` voxels inside of surfaces are extrapolated
+    (`VoxelClasses.filled`). Channels are interleaved.
+    """
     values = dr.zeros(mi.Float, grid.voxel_count * len(channels))
     scatter_channels(values, channels, voxels)
     dr.eval(values)
-    return values if survey is None else survey.filled(values, len(channels))
+    return values if classes is None else classes.filled(values, len(channels))
 
 
 def _past_others(
@@ -332,8 +342,9 @@ class DirectLightAlongRays:
         with_peak: bool,
         peak_depth: mi.Float | mi.Color3f | None = None,
     ) -> mi.Float | mi.Color3f:
-        """Mean of `AngularBasis.gain` over the radiance from the emitter; ``peak_depth`` as in
-        `AngularField.factor`.
+        """Average `AngularBasis.gain` over the radiance from the emitter.
+
+        ``with_peak`` and ``peak_depth`` are as in `AngularField.factor`.
         """
         # docs/primer, eq. (2.11)
         light, basis = self._light, self._basis
@@ -345,11 +356,11 @@ class DirectLightAlongRays:
             return maximum(gain + basis.phase.aureole.correction(cosine, depth), 0.0)
         view = direction, basis.basis(direction)
         smooth = self._moments.factor(p, *view, mi.Bool(True), with_peak)
-        if not basis.has_rest(with_peak):
+        if not basis.has_residual(with_peak):
             return smooth
         if peak_depth is not None and basis.phase.forward:
             peak_depth = light.peak_depth(p) + peak_depth
-        return maximum(smooth + light.mean_rest(basis, p, direction, peak_depth), 0.0)
+        return maximum(smooth + light.mean_residual(basis, p, direction, peak_depth), 0.0)
 
     def at(
         self,
@@ -359,9 +370,11 @@ class DirectLightAlongRays:
         with_peak: bool = False,
         peak_depth: mi.Float | mi.Color3f | None = None,
     ) -> mi.Spectrum:
-        """Evaluate the irradiance at world positions, for anisotropic scattering times 4 pi times
-        the phase function for scattering into ``direction``; ``with_peak`` and ``peak_depth`` as in
-        `AngularField.factor`.
+        """Evaluate the irradiance at world positions.
+
+        For anisotropic scattering it is multiplied by 4 pi times the phase function for scattering
+        towards the camera along ``direction``, averaged over the emitter; ``with_peak`` and
+        ``peak_depth`` are as in `AngularField.factor`.
         """
         light = self._light
         passed = dr.exp(-light.depth(p, active)) * light.past_others(p, active)
@@ -386,14 +399,14 @@ class DirectLightAlongRays:
     ) -> mi.Spectrum:
         """Integrate the radiance scattered towards the camera along a segment.
 
-        Given at both ``ends`` (distances along the ray) are the extinction ``sigma``, the mean
-        extinction on the line to the emitter (``means``) and the ``albedo``; ``weights`` are the
-        result of `quadrature.segment`; ``with_peak`` and ``peak_depth`` are as in
-        `AngularField.factor`.
+        ``ends`` are the distances of the segment's ends along the ray. ``sigma``, ``means`` and
+        ``albedo`` are the extinction, the mean extinction on the line to the emitter and the
+        albedo, each at both ends; ``weights`` is the result of `quadrature.segment`; ``with_peak``
+        and ``peak_depth`` are as in `AngularField.factor`.
 
         The segment is divided into parts. In a part with constant extinction c and optical depth C,
         along which the optical depth to the emitter changes linearly from s0 to s0 + S,
-        int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), which holds for any opacity.
+        int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), for any optical depth.
         """
         # docs/primer, eq. (2.6)
         light, (a, b) = self._light, ends
@@ -427,9 +440,10 @@ class DirectLightAlongRays:
     def _parts(
         self, ray: mi.Ray3f, a: mi.Float, b: mi.Float, depth: mi.Float | mi.Color3f
     ) -> list[mi.Float]:
-        """Divide a segment of optical ``depth`` into four parts; return their ends as fractions.
+        """Divide a segment of optical ``depth`` into four parts.
 
-        Three parts absorb equal shares; one of them is divided at the kink.
+        Three parts of equal absorptance, one of which is divided at the kink (see `_kink`). Returns
+        the five ends of the parts as fractions of the segment.
         """
         depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
         absorbed, thin = absorptance(depth), depth < 1e-3
@@ -443,11 +457,11 @@ class DirectLightAlongRays:
         return [mi.Float(0), *inner, mi.Float(1)]
 
     def _kink(self, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> mi.Float:
-        """Locate the kink of the length in the medium between ``a`` and ``b``, as a fraction.
+        """Locate the kink of `DirectLight.length` between the distances ``a`` and ``b``.
 
-        In a box the length is piecewise linear; at a kink the line to the emitter changes to
-        another face of the box. The kink is where the tangents at both ends intersect; 0.5 if they
-        do not.
+        In a box that length is piecewise linear; at a kink the line to the emitter leaves through
+        another face of the box. The kink is where the tangents at both ends intersect. Returns its
+        position as a fraction of the segment, 0.5 without a kink.
         """
         at = [a, dr.lerp(a, b, TANGENT), dr.lerp(b, a, TANGENT), b]
         first, second, third, last = (self._light.length(ray(t)) for t in at)

@@ -1,4 +1,4 @@
-"""Caches as text, and as HTML for notebooks: slices of the irradiance and of its error."""
+"""Describe caches as text, and as HTML for notebooks: slices of the irradiance and its error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 #: `IrradianceCache`, whose module imports this one.
 Cache = Any
-#: Percentile of the irradiance that is shown as white: voxels beside lamps are much brighter.
+#: Percentile of the irradiance that is shown as white: voxels next to emitters are much brighter.
 _WHITE = 99.0
 #: Longest side of a slice on the page, in pixels.
 _PIXELS = 180
@@ -50,6 +50,7 @@ def as_html(cache: Cache) -> str:
 
 
 def _described(cache: Cache) -> dict[str, str]:
+    """Return the properties of a cache as text, by name."""
     x, y, z = cache.grid.resolution
     edges = " x ".join(f"{edge:.4g}" for edge in cache.grid.voxel_size)
     described = {
@@ -63,14 +64,18 @@ def _described(cache: Cache) -> dict[str, str]:
         described["angular moments"] = str(cache.moments)
     if cache.samples and cache.active_count:
         values = np.array(cache.mean_and_error()[0])
-        described["irradiance"] = f"{values.mean():.4g} in the mean, at most {values.max():.4g}"
+        described["irradiance"] = f"mean {values.mean():.4g}, maximum {values.max():.4g}"
         error = cache.relative_error
-        described["relative error"] = "unknown, of one batch" if np.isnan(error) else f"{error:.2%}"
+        unknown = "unknown with a single batch"
+        described["relative error"] = unknown if np.isnan(error) else f"{error:.2%}"
     return described
 
 
 def _row(cache: Cache, title: str, values: np.ndarray, scale: str) -> str:
-    """Return three slices through the middle of ``values`` (z, y, x, channel), 1 being white."""
+    """Return HTML with three slices through the middle of ``values`` (z, y, x, channel).
+
+    A value of 1 is white; ``scale`` is the text that states what white means.
+    """
     longest = float(max(cache.grid.side_lengths))
     sides = dict(zip("xyz", (float(side) for side in cache.grid.side_lengths), strict=True))
     images = []

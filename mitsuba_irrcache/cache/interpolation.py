@@ -1,4 +1,4 @@
-"""Parameters of lookups in a cache, in addition to its values."""
+"""What lookups in a cache need in addition to its values."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 
 
 class Interpolation(Immutable):
-    """How the irradiance between the voxels of a cache follows from that at the voxels.
+    """How the irradiance between the voxel centres of a cache is interpolated.
 
     Attributes:
-        directional: basis of the moments of the radiance; None where scattering is isotropic.
-        falloff: factor of emitters nearby that is divided out before interpolation; None where
-            there are none.
-        direct_lights: emitters whose irradiance camera rays evaluate themselves; the layers of the
-            cache hold its means over voxels.
+        directional: basis of the moments of the radiance; None if scattering is isotropic.
+        falloff: inverse-square factor of nearby emitters, by which Phi is divided before
+            interpolation; None without such emitters.
+        direct_lights: emitters whose irradiance camera rays evaluate in closed form. It is excluded
+            from lookups, although the layers of the cache include its means over voxels.
         peak_depths: optical depths of scattering into a truncated forward peak between the voxels
-            and narrow sources; None where no peak is truncated, or there are no such sources.
-        voxel_classes: where voxels lie among surfaces and media; None where no surface and no other
-            medium is among them.
+            and narrow sources; None if no peak is truncated, or there are no such sources.
+        voxel_classes: position of the voxels relative to surfaces and media; None if there is no
+            surface and no other medium among them.
     """
 
     def __init__(

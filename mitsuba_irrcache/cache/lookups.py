@@ -1,4 +1,4 @@
-"""Fields from which camera rays and paths look up the irradiance of a cache and its moments."""
+"""Fields from which camera rays and paths interpolate the irradiance of a cache and its moments."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def moment_field(
 
 
 def _interpolated_means(sums: BatchSums, interpolation: Interpolation) -> list[mi.Float]:
-    """Phi of the active voxels in each channel, without the direct lights."""
+    """Return Phi of the active voxels in each channel, without the direct lights."""
     means = sums.irradiance()
     for light in interpolation.direct_lights:
         means = [dr.maximum(m - e, 0) for m, e in zip(means, light.irradiance, strict=False)]

@@ -21,15 +21,18 @@ from mitsuba_irrcache.transport.tracking import optical_depth
 
 
 class PeakDepths(Immutable):
-    """Mean extinctions of the forward peak of ``medium``, truncated by delta-M, at voxels."""
+    """Mean extinctions of the truncated forward peak on the lines from voxels to narrow sources."""
 
     def __init__(
         self, medium: MediumGrid, grid: Grid, voxels: mi.UInt32, sources: Sequence[Source]
     ) -> None:
-        """Compute them at the ``voxels`` of ``grid`` for each of the ``sources``."""
+        """Compute them at the ``voxels`` (flat indices) of ``grid`` for each of the ``sources``.
+
+        ``medium`` is scaled by delta-M.
+        """
         self._medium, self.sources = medium, tuple(sources)
         p = grid.world.point(mi.Point3f(*grid.voxel_indices(voxels)) + 0.5)
-        #: per source: the mean extinction [1/scene unit] in each channel at the voxels
+        #: for each source and channel: the mean extinction [1/scene unit] at the voxels
         self.extinctions = [self._mean_extinction(source, p) for source in sources]
 
     @property
@@ -68,8 +71,8 @@ class PeakDepths(Immutable):
 def peak_depth(
     medium: MediumGrid, ray: mi.Ray3f, near: mi.Float, far: mi.Float, active: mi.Bool
 ) -> mi.Float | mi.Color3f:
-    """Return the optical depth of scattering into the truncated forward peak of ``medium``, in each
-    channel of it, between two distances along ``ray``.
+    """Return the optical depth of scattering into the truncated forward peak of ``medium``, per
+    channel, between the distances ``near`` and ``far`` along ``ray``.
     """
     full, scaled = (
         optical_depth(each, ray, near, far, active, dr.inf) for each in (medium.original, medium)

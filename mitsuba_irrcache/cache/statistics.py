@@ -22,12 +22,12 @@ class BatchSums(Immutable):
     """Sums of the means of batches of samples at the active voxels.
 
     The samples of a batch are stratified and hence not independent, but batches are: means and
-    errors are statistics of batch means. More samples make other sums, so that whoever holds some
-    has consistent ones.
+    errors are statistics of batch means. Methods that add samples return a new object, so that a
+    reference to sums remains consistent while another thread adds samples.
 
     Attributes:
         voxels: number of active voxels.
-        channels: of the irradiance.
+        channels: number of channels of the irradiance.
         batch: samples per batch.
         moment_count: angular moments per channel, 0 for isotropic scattering.
         is_correlated: whether all voxels share their samples, and hence their errors.
@@ -45,7 +45,7 @@ class BatchSums(Immutable):
     def __init__(
         self, voxels: int, channels: int, batch: int, moments: int, is_correlated: bool
     ) -> None:
-        """Create sums of no samples; ``moments`` is the number of them per channel."""
+        """Create sums of no samples; ``moments`` is the number of moments per channel."""
         self.voxels, self.channels, self.batch = voxels, channels, batch
         self.moment_count, self.is_correlated = moments, is_correlated
         self.real = mi.Float if is_correlated else dr.float64_array_t(mi.Float)
@@ -68,29 +68,29 @@ class BatchSums(Immutable):
         return sum(self.streams.values())
 
     def means(self, layer: int) -> list[mi.Float]:
-        """Irradiance of one of the `LAYERS` at the active voxels, in each channel."""
+        """Return the irradiance of one of the `LAYERS` at the active voxels, per channel."""
         n, first = self._batch_count, layer * self.channels
         totals = self.totals[first : first + self.channels]
         return [mi.Float(self.zeros if t is None else t / n) for t in totals]
 
     def irradiance(self) -> list[mi.Float]:
-        """Irradiance of both layers at the active voxels, in each channel."""
+        """Return the irradiance of both layers at the active voxels, per channel."""
         return [a + b for a, b in zip(self.means(0), self.means(1), strict=True)]
 
     def moment_means(self) -> list[mi.Float]:
-        """Angular moments at the active voxels, all channels of each in turn."""
+        """Return the angular moments at the active voxels, all channels of each in turn."""
         n = mi.Float(self._batch_count)
         return [mi.Float(0) if m is None else m / n for m in self.moments]
 
     def variance(self, channel: int):
-        """Squared standard error of the irradiance; None with fewer than two batches."""
+        """Return the squared standard error of the irradiance; None with fewer than two batches."""
         if self.samples < 2 * self.batch:
             return None
         n, spread = self._batch_count, self.spreads[channel]
         return self.zeros if spread is None else spread / (n * (n - 1))
 
     def relative_variance(self, mean: mi.Float, channel: int) -> mi.Float:
-        """Variance of the voxels over their squared mean, at most 1; 0 if unknown."""
+        """Return `variance` over the squared ``mean`` per voxel, at most 1; 0 if unknown."""
         variance = self.variance(channel)
         if variance is None:
             return dr.zeros(mi.Float, dr.width(mean))
@@ -111,8 +111,9 @@ class BatchSums(Immutable):
     # ------------------------------------------------------------------ more samples
 
     def with_blocks(self, seed: int, samples: int, blocks: list[tuple]) -> BatchSums:
-        """Add ``samples`` per voxel of the stream ``seed``, evaluated; see `IrradianceCache.add`
-        for the ``blocks``.
+        """Return sums with ``samples`` more per voxel from the stream ``seed``, evaluated.
+
+        See `IrradianceCache.add` for the ``blocks``.
         """
         totals, spreads, *moments = (
             [concatenated(part) for part in zip(*parts, strict=True)]
@@ -123,13 +124,13 @@ class BatchSums(Immutable):
         return self._evaluated(merged, moments, {seed: samples})
 
     def with_sums(self, other: BatchSums) -> BatchSums:
-        """Add all samples of ``other`` sums, evaluated."""
+        """Return sums with all samples of ``other`` added, evaluated."""
         merged = self._merged(other.totals, other.spreads, other.samples // other.batch)
         moments = totals_of_pairs(self.moments, other.moments)
         return self._evaluated(merged, moments, other.streams)
 
     def with_count(self, seed: int, samples: int) -> BatchSums:
-        """Count samples whose contribution is contained already, or is exactly zero."""
+        """Return sums that count samples whose contribution has been added already or is zero."""
         return self._with(streams=self._counted({seed: samples}))
 
     def empty(self) -> BatchSums:
@@ -141,7 +142,7 @@ class BatchSums(Immutable):
     def filled(
         self, streams: dict[int, int], totals: list, spreads: list, moments: list
     ) -> BatchSums:
-        """Return these sums at the same voxels."""
+        """Return sums at the same voxels with these values."""
         return self._with(streams=streams, totals=totals, spreads=spreads, moments=moments)
 
     def _evaluated(self, merged: tuple[list, list], moments: list, streams: dict) -> BatchSums:
@@ -153,7 +154,9 @@ class BatchSums(Immutable):
         return self.streams | more
 
     def _merged(self, totals: list, spreads: list, count: int) -> tuple[list, list]:
-        """Combine the sums with those of ``count`` more batches (Chan et al. 1979)."""
+        """Return totals and spreads combined with those of ``count`` more batches (Chan et al.
+        1979).
+        """
         # docs/primer, eq. (3.5)
         known = self.samples // self.batch
         result = []
@@ -168,29 +171,30 @@ class BatchSums(Immutable):
 
 
 def concatenated(pieces: tuple):
-    """Concatenate the values of all blocks; None if they are None."""
+    """Return the concatenated values of all blocks; None if they are None."""
     if pieces[0] is None:
         return None
     return dr.concat(list(pieces)) if len(pieces) > 1 else pieces[0]
 
 
 def total(terms):
-    """Add arrays, where None stands for 0."""
+    """Return the sum of arrays, where None stands for 0."""
     known = [t for t in terms if t is not None]
     return sum(known[1:], known[0]) if known else None
 
 
 def totals_of_pairs(first: list, second: list) -> list:
-    """Add two lists element by element, where None stands for 0."""
+    """Return the sums of corresponding elements of two lists, where None stands for 0."""
     return [total(pair) for pair in zip(first, second, strict=True)]
 
 
 def root_correction(variance: mi.Float) -> mi.Float:
-    """Factor that removes the bias of interpolated square roots of noisy values.
+    """Return the factor that removes the bias of interpolated square roots of noisy values.
 
-    With relative ``variance`` v of the voxels, E[(sum w_i sqrt(x_i))^2] = mu (1 - (1 - sum w_i^2) v
-    / 4) to first order, and the mean of sum w_i^2 over a cell is (2/3)^3. Without the correction,
-    16 samples yield an irradiance that is about 1 % too small.
+    With the mean mu and the relative ``variance`` v of the voxels x_i, and trilinear weights w_i,
+    E[(sum w_i sqrt(x_i))^2] = mu (1 - (1 - sum w_i^2) v / 4) to first order, and the mean of
+    sum w_i^2 over a cell is (2/3)^3. Without the correction, 16 samples yield an irradiance that is
+    about 1 % too small.
     """
     # docs/primer, eq. (2.3)
     return dr.rsqrt(1 - (1 - 8 / 27) / 4 * variance)

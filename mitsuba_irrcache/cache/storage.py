@@ -1,4 +1,4 @@
-"""File format of caches: an uncompressed npz with a description and digests."""
+"""File format of caches: an uncompressed npz with a JSON description and SHA-256 digests."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class StoredCache:
 
 
 def write_cache(path: str | Path, stored: StoredCache) -> None:
-    """Write a cache with all its statistics; the file appears whole or not at all."""
+    """Write a cache with all its statistics, atomically: a failure leaves no partial file."""
     sums, grid = stored.sums, stored.grid
     moments = sums.moment_count
     description = {
@@ -138,7 +138,7 @@ def _restored(description: dict, arrays: dict[str, np.ndarray]) -> StoredCache:
 
 
 def _known(values: np.ndarray, kind: type) -> list:
-    """Rows as arrays of Dr.Jit, None for zeros."""
+    """Return rows as Dr.Jit arrays, None for rows of zeros."""
     return [kind(row) if row.any() else None for row in values]
 
 
@@ -190,7 +190,7 @@ def samples_by_seed(description: dict) -> dict[int, int]:
 
 
 def digest_of_arrays(arrays: dict[str, np.ndarray]) -> str:
-    """SHA-256 of all arrays of a file except its description."""
+    """Return the SHA-256 of all arrays of a file except its description."""
     sha = hashlib.sha256()
     for name in sorted(arrays.keys() - {"description"}):
         values = np.ascontiguousarray(arrays[name])
@@ -200,7 +200,7 @@ def digest_of_arrays(arrays: dict[str, np.ndarray]) -> str:
 
 
 def digest_of_description(description: dict) -> str:
-    """SHA-256 of the description except its digest."""
+    """Return the SHA-256 of the description without its digest."""
     said = {key: value for key, value in description.items() if key != "digest"}
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 

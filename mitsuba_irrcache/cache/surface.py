@@ -1,4 +1,4 @@
-"""Nodes on surfaces at which irradiance is cached, found by a spatial hash.
+"""Nodes on surfaces at which irradiance is cached, looked up in a spatial hash table.
 
 The nodes are independent of how surfaces are modelled: they need no parametrisation, and neither
 the number of triangles nor the merging of shapes matters. Around a surface point, nodes lie on a
@@ -7,12 +7,13 @@ that axis. Bilinear interpolation between four of them is exact for linear funct
 
 Lattices have spacings of ``spacing / 2^level``. The coarsest level at a point grows with its
 distance from the media. A point uses finer levels until the spacing is small compared to the
-harmonic mean of the distances that its nodes see (Ward, Rubinstein and Clear, "A ray tracing
-solution for diffuse interreflection", 1988), and until the surface is nearly flat between nodes.
+harmonic mean distance of the surfaces visible from its nodes (Ward, Rubinstein and Clear, "A ray
+tracing solution for diffuse interreflection", 1988), and until the surface is nearly flat between
+nodes.
 
 A node is identified by a 64-bit key: axis and side, level, two lattice coordinates, and the
-interval of the third coordinate in which the surface is. So the position of a node depends on its
-key only, not on the point for which it was created.
+interval of the third coordinate in which the surface lies. The position of a node thus depends on
+its key only, not on the point for which it was created.
 """
 
 from __future__ import annotations
@@ -27,15 +28,16 @@ from mitsuba_irrcache.core.jit import concatenated, symbolic
 
 #: Node number of keys that are not in the table.
 NONE = 0xFFFFFFFF
-#: Levels below the coarsest one at a point, and for points that only other nodes see.
+#: Number of levels below the coarsest one for points seen by the camera, and for points seen only
+#: from other nodes.
 LEVELS, INDIRECT_LEVELS = 6, 3
-#: Spacing of the lattice at level 0 over the diagonal of the media's box; the distance from the
-#: box, in units of the spacing, from which on the coarsest level is coarser.
+#: Spacing of the lattice at level 0 over the diagonal of the media's box; distance from the box, in
+#: units of that spacing, beyond which coarser levels than 0 are used.
 COARSEST, COARSER_BEYOND = 0.25, 2.0
 #: Largest spacing over the harmonic mean distance of a node.
 SPACING_PER_DISTANCE = 0.25
 #: Cosine between the normals of a point and a node below which finer levels are used, and below
-#: which the node does not apply.
+#: which the node is not used for the point.
 FLAT, SAME_SIDE = 0.97, 0.8
 #: Largest distance of a node from the tangent plane, over the spacing.
 TANGENT = 0.3
@@ -64,8 +66,8 @@ class SurfaceNodes:
         )
         self.count = 0
         self.keys = mi.UInt64(0)
-        #: position and harmonic mean distance (0 where there is no surface); shading normal and
-        #: distance of the nearest other surface; geometric normal and number of the medium
+        #: per node: position and harmonic mean distance (0 where there is no surface); shading
+        #: normal and distance of the nearest other surface; geometric normal and medium number
         self._places, self._normals = mi.Float([0.0] * 4), mi.Float([0.0] * 4)
         self._geometric = mi.Float([0.0] * 4)
         self._slots, self._mask = mi.UInt32([NONE, NONE]), dr.opaque(mi.UInt32, 1)
@@ -83,9 +85,10 @@ class SurfaceNodes:
         """Find the nodes between which to interpolate at ``p`` with these ``normals``, geometric
         and shading.
 
-        Returns the numbers of four nodes and their weights, whose sum is 1, or 0 where some of
-        them are missing; whether another surface may lie between them; further, the keys at the
-        last level visited and whether any of them is missing.
+        Levels are searched from the coarsest one at ``p``, at most ``most_levels`` finer ones.
+        Returns the numbers of four nodes; their weights, whose sum is 1, or 0 if a node is missing;
+        whether another surface may lie between the nodes; the four keys at the last level visited;
+        and whether any of these keys is missing in the table.
         """
         # docs/primer, eq. (5.7)
         geometric, shading = normals
@@ -124,7 +127,7 @@ class SurfaceNodes:
                 incomplete |= active & ~known
                 corner_numbers.append(number)
                 corner_weights.append(weight)
-            # Coarser nodes than a point asks for would bias it.
+            # Interpolation at a coarser level than the point requires would be biased.
             finer |= divided | (total == 0)
             ends = active & ~incomplete & (~finer | (level >= last)) & (total > 0)
             uncertain |= ends & divided
@@ -140,7 +143,7 @@ class SurfaceNodes:
         return numbers, weights, uncertain, keys, missing
 
     def _coarsest_level(self, p: mi.Point3f) -> mi.Int32:
-        """Level at which the search begins at ``p``."""
+        """Return the level at which the search begins at ``p``."""
         away = dr.maximum(dr.maximum(self._lower - p, p - self._upper), 0)
         ratio = dr.norm(away) / (COARSER_BEYOND * self.spacing)
         exponent = mi.Int32(dr.floor(dr.log2(dr.maximum(ratio, 1))))
@@ -167,10 +170,10 @@ class SurfaceNodes:
     # Growth
 
     def add_keys(self, keys: Sequence[mi.UInt64]) -> tuple[mi.UInt32, mi.UInt32]:
-        """Add those ``keys`` that are not in the table, each once; return their numbers, and the
-        first of the places in ``keys`` where each is.
+        """Add those ``keys`` that are not in the table, each once.
 
-        They have to be completed by `place`.
+        Returns the numbers of the new nodes, and for each the lane of its first occurrence in
+        ``keys``. The nodes have to be completed by `place`.
         """
         parts = [self.keys] if self.count else []
         candidates = concatenated([*parts, *keys])
@@ -217,7 +220,9 @@ class SurfaceNodes:
         return numbers, place % dr.opaque(mi.UInt32, dr.width(keys[0]))
 
     def rays(self, numbers: mi.UInt32) -> tuple[mi.Ray3f, mi.Float]:
-        """Rays on which the nodes with these ``numbers`` have to be found, and their lengths."""
+        """Return rays whose first intersections are the positions of the nodes with these
+        ``numbers``, and their lengths.
+        """
         key = dr.gather(mi.UInt64, self.keys, numbers)
         coordinate = (1 << BITS) - 1
         w, v, u = (
@@ -251,9 +256,11 @@ class SurfaceNodes:
         clearance: mi.Float,
         medium: mi.UInt32,
     ) -> None:
-        """Complete the nodes added last: positions, normals (geometric and shading), harmonic
-        mean distances, 0 where there is no surface, distances of the nearest other surface, and
-        numbers of the media before the surface.
+        """Complete the nodes that `add_keys` added last.
+
+        ``p`` are their positions, ``normals`` the geometric and shading normals, ``distance`` the
+        harmonic mean distances (0 where there is no surface), ``clearance`` the distances of the
+        nearest other surface, and ``medium`` the numbers of the media in front of the surface.
         """
         known = self.count - dr.width(p)
         geometric, shading = normals
@@ -270,7 +277,7 @@ class SurfaceNodes:
     def positions(
         self, numbers: mi.UInt32, active: mi.Bool = True
     ) -> tuple[mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Float]:
-        """Position, geometric and shading normal, and harmonic mean distance of nodes."""
+        """Return position, geometric and shading normal, and harmonic mean distance of nodes."""
         found = dr.gather(mi.Vector4f, self._places, numbers, active)
         geometric = dr.gather(mi.Vector4f, self._geometric, numbers, active)
         shading = dr.gather(mi.Vector4f, self._normals, numbers, active)
@@ -282,11 +289,11 @@ class SurfaceNodes:
         )
 
     def medium_number(self, numbers: mi.UInt32) -> mi.UInt32:
-        """Number of the medium before the surface of nodes, 0 for none."""
+        """Return the number of the medium in front of the surface at nodes, 0 for none."""
         return mi.UInt32(dr.gather(mi.Vector4f, self._geometric, numbers).w)
 
     def streams(self, numbers: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-        """Two random words of each node, which depend on its key only."""
+        """Return two random words per node, which depend on its key only."""
         key = dr.gather(mi.UInt64, self.keys, numbers)
         return mi.sample_tea_32(mi.UInt32(key), mi.UInt32(key >> 32))
 
@@ -294,8 +301,10 @@ class SurfaceNodes:
 def _across(
     normal: mi.Normal3f, place: mi.Vector3f
 ) -> tuple[mi.UInt32, mi.UInt32, mi.Vector3f, mi.Vector2f]:
-    """Return the dominant axis of ``normal``, 1 where it points in the negative direction, the
-    coordinates of ``place`` across the axis and along it, and the slopes of the tangent plane.
+    """Express ``place`` in a frame whose third axis is the dominant axis of ``normal``.
+
+    Returns the number of the axis; 1 where the normal points in its negative direction, else 0; the
+    coordinates of ``place``, that along the axis last; and the slopes of the tangent plane.
     """
     size = dr.abs(mi.Vector3f(normal))
     is_x = (size.x >= size.y) & (size.x >= size.z)
@@ -317,7 +326,7 @@ def _across(
 def _packed(
     axis_and_side: mi.UInt32, level: mi.Int32, u: mi.Float, v: mi.Float, w: mi.Float
 ) -> mi.UInt64:
-    """Pack a key: 3 bits, 6 bits, and three coordinates."""
+    """Pack a key: 3 bits of axis and side, 6 bits of level, and three coordinates of `BITS`."""
     key = mi.UInt64(axis_and_side) << 6 | mi.UInt64(mi.UInt32(level + LEVEL_OFFSET))
     for x in (u, v, w):
         coordinate = mi.UInt32(mi.Int32(dr.clip(x, 1 - OFFSET, OFFSET - 1)) + OFFSET)

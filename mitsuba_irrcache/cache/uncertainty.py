@@ -1,15 +1,15 @@
-"""Error estimates of the cache as fields, which are projected to the screen like the irradiance.
+"""Error estimates of the cache as fields, which are ray marched to the image like the irradiance.
 
 *Noise*: the voxels' errors are independent, so the variance of a pixel is the sum of the voxels'
 variances times the squares of their weights in the pixel. The weights are never computed
-explicitly; instead `PROBES` random fields with values of +- one standard error are projected, whose
-mean square is the variance (Hutchinson's trace estimator).
+explicitly; instead `PROBES` random fields with values of +- one standard error are ray marched. The
+expected square of the resulting pixel values is the variance (Hutchinson's trace estimator).
 
 If voxels share their samples (`IrradianceCache.correlated`), errors do not average out. All probes
 then have the same sign, and their projection is the largest deviation that the voxels' errors
 admit.
 
-*Bias*: for a smooth field, the difference to the field at half the resolution is a known multiple
+*Bias*: for a smooth field, the difference from the field at half the resolution is a known multiple
 of the discretisation error (Richardson extrapolation).
 """
 
@@ -30,18 +30,19 @@ PROBES = 4
 #: Rounds of the random number generator for the signs: after the usual 4 rounds, neighbours are
 #: correlated by up to 0.5.
 ROUNDS = 8
-#: Ratio of the error to its difference to half the resolution. The mean error of trilinear
-#: interpolation of square roots r on voxels of edge h is 1/12 h^2 Laplacian(r). Averages over 2^3
-#: voxels add 1/8, and interpolating them between voxels of edge 2h to the centres of the fine
-#: voxels, where the difference is evaluated, 3/8 (1/3 averaged over all positions).
+#: Ratio of the error to the difference from half the resolution. The mean error of trilinear
+#: interpolation of square roots r on voxels of edge h is 1/12 h^2 Laplacian(r). Averaging over 2^3
+#: voxels adds 1/8 h^2 Laplacian(r), and interpolating the averages between voxels of edge 2h to the
+#: centres of the fine voxels, where the difference is evaluated, adds 3/8 (1/3 averaged over all
+#: positions).
 COARSE_TO_FINE = (1 / 12) / (1 / 8 + 3 / 8)
 #: Approximate factor on this ratio with conservative interpolation (`conservative`): smooth fields
-#: have no error; on a CT head and a cloud 0.5 to 0.7 of the image error remained.
+#: then have no error; on a CT head and a cloud 0.5 to 0.7 times the image error remained.
 CONSERVATIVE_FACTOR = 0.6
 
 
 class UncertaintyField:
-    """Relative errors of the irradiance: `PROBES` random ones and the bias, ``count`` in total.
+    """Relative errors of the irradiance: `PROBES` random fields and the bias, ``count`` in total.
 
     ``data`` stores two values per voxel, the relative standard error and the relative bias, both
     multiplied by sqrt(Phi), because lookups interpolate square roots.
@@ -55,7 +56,7 @@ class UncertaintyField:
         self.grid, self.data = grid, data
 
     def at_world(self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool) -> list:
-        """Relative errors at ``p``, where the irradiance is ``phi``."""
+        """Return the ``count`` relative errors at ``p``, where the irradiance is ``phi``."""
         root = dr.sqrt(phi if isinstance(phi, mi.Float) else dr.sum(phi) / 3)
         sums = [mi.Float(0)] * self.count  # the same array; not modified in place below
         for voxel, weight in self.grid.corners(self.grid.coordinates.point(p)):
@@ -92,7 +93,8 @@ def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
     beyond = sum(dr.select(i != inside, mi.Float(1), 0) for i in extension.inwards(voxel))
     inner = dr.gather(mi.Float, roots, inside)
     growth = extrapolated(extension, roots) / dr.select(inner > 0, inner, 1)
-    # The error of a^2 / b with equally noisy a and b is sqrt(2^2 + 1) times theirs, mostly a's.
+    # Extrapolated roots are a^2 / b (`extrapolated`); their relative error is sqrt(2^2 + 1) times
+    # that of equally noisy a and b.
     deviation = dr.gather(mi.Float, deviations, inside) * growth * 5 ** (0.5 * beyond)
     random, _ = mi.sample_tea_32(inside, mi.UInt32(0x5EED), ROUNDS)
     if cache.correlated:
@@ -104,14 +106,14 @@ def uncertainty_of(cache: IrradianceCache) -> UncertaintyField:
 
 
 def _everywhere(cache: IrradianceCache, values: mi.Float) -> mi.Float:
-    """Expand values of the active voxels to the whole grid, 0 elsewhere."""
+    """Return an array over all voxels with these values at the active voxels, 0 elsewhere."""
     result = dr.zeros(mi.Float, cache.grid.voxel_count)
     dr.scatter(result, values, cache.active)
     return result
 
 
 def _at_half_resolution(cache: IrradianceCache, root: mi.Float) -> mi.Float:
-    """Interpolate averages over 2^3 voxels of the root of the irradiance at the active voxels."""
+    """Average ``root`` over 2^3 voxels, and interpolate the averages back to the active voxels."""
     halves = Grid(tuple(-(-n // 2) for n in cache.grid.shape), np.eye(4))
     corner = halves.voxel_indices(dr.arange(mi.UInt32, halves.voxel_count))
     nx, ny, nz = (mi.UInt32(n) for n in cache.grid.sides)

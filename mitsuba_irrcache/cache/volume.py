@@ -1,7 +1,7 @@
-"""The irradiance cache: a camera-independent field that grows, is merged, saved and looked up.
+"""The irradiance cache: camera-independent, refined by adding samples, merged, saved, looked up.
 
-Its sums and what follows from them are in `statistics`, the fields for lookups in `lookups`, its
-files in `storage`.
+Sums over samples, means and errors are in `statistics`, the fields for lookups in `lookups`, the
+file format in `storage`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 
 
 def _consistent(method: Callable) -> Callable:
-    """Decorate a method such that it sees consistent sums and numbers of samples."""
+    """Decorate a method such that it holds the lock of the cache: its sums and numbers of samples
+    are consistent while other threads add samples.
+    """
 
     @wraps(method)
     def call(self: IrradianceCache, *args: Any, **kwargs: Any) -> Any:
@@ -113,8 +115,9 @@ class IrradianceCache:
         return self.interpolation.voxel_classes
 
     def empty_copy(self, batch: int = 0) -> IrradianceCache:
-        """Return a cache of the same voxels and settings without samples; ``batch``: those of a
-        batch, if they differ.
+        """Return a cache of the same voxels and settings without samples.
+
+        ``batch`` is its number of samples per batch; 0: as in this cache.
         """
         return IrradianceCache(
             self.grid,
@@ -177,7 +180,8 @@ class IrradianceCache:
 
     @_consistent
     def mean_and_error(self) -> tuple[mi.Float, mi.Float]:
-        """Irradiance and its standard error at the active voxels, averaged over the channels.
+        """Return the irradiance and its standard error at the active voxels, averaged over the
+        channels.
 
         Channels share their samples, so their errors add. The error is 0 with fewer than two
         batches.
@@ -190,10 +194,10 @@ class IrradianceCache:
     @property
     @_consistent
     def relative_error(self) -> float:
-        """Root mean square of the voxels' standard errors over the mean irradiance.
+        """Root mean square of the voxels' standard errors, divided by the mean irradiance.
 
-        NaN with fewer than two batches. It is inversely proportional to the root of the number of
-        samples.
+        NaN with fewer than two batches. It is inversely proportional to the square root of the
+        number of samples.
         """
         if self.samples < 2 * self.batch:
             return float("nan")
@@ -236,7 +240,7 @@ class IrradianceCache:
 
     @_consistent
     def moment_means(self) -> list[mi.Float]:
-        """Angular moments at the active voxels, all channels of each in turn."""
+        """Return the angular moments at the active voxels, all channels of each in turn."""
         return self._sums.moment_means()
 
     # ------------------------------------------------------------------ growing
@@ -245,9 +249,10 @@ class IrradianceCache:
     def add(self, seed: int, samples: int, blocks: list[tuple]) -> None:
         """Add ``samples`` per voxel of the stream ``seed``.
 
-        Each block of voxels consists of the sums of batch means for each layer and channel, the
-        squared deviations of the batches' irradiance from their mean for each channel (None, in all
-        blocks, stands for 0), and, if any, the sums of batch means for each moment and channel.
+        ``blocks`` cover the active voxels in turn. Each is a tuple of lists of arrays: the sums of
+        batch means for each layer and channel; for each channel, the sum of squared deviations of
+        the batches' irradiance from its mean; and, for anisotropic scattering, the sums of batch
+        means for each moment and channel. None, in all blocks, stands for 0.
         """
         # One assignment: an interrupt cannot leave inconsistent sums.
         self._sums = self._sums.with_blocks(seed, samples, blocks)
@@ -273,11 +278,12 @@ class IrradianceCache:
         self._take(other)
 
     def append(self, part: IrradianceCache, first: int) -> None:
-        """Add a ``part`` of one random stream whose first batch has the number ``first`` there.
+        """Add the samples of ``part``, which holds consecutive batches of one random stream.
 
-        Parts that `refine` of the solver would add one by one, appended in this order, give the
-        same bits. Raises IrrcacheError if the part belongs to another scene, or does not continue
-        the samples of this cache, so that no batch is counted twice.
+        ``first`` is the index of its first batch in that stream. Appending parts in the order of
+        their batches gives bit by bit the cache that `Solver.refine` computes in one process.
+        Raises IrrcacheError if the part belongs to another scene, or does not begin with the batch
+        that follows those of this cache, so that no batch is counted twice.
         """
         self._require_alike(part, "append")
         (seed,) = part.streams
@@ -317,8 +323,10 @@ class IrradianceCache:
 
     @_consistent
     def save(self, path: str | Path, fingerprint: dict[str, str] | None = None) -> None:
-        """Writes the cache with all its statistics; the file appears whole or not at all.
-        ``fingerprint`` takes the place of the cache's own.
+        """Write the cache with all its statistics, atomically: no partial file remains after a
+        failure.
+
+        ``fingerprint`` is stored in place of ``self.fingerprint`` if it is given.
         """
         fingerprint = self.fingerprint if fingerprint is None else fingerprint
         stored = StoredCache(self.grid, self.active, self.max_depth, fingerprint, self._sums)
@@ -326,8 +334,9 @@ class IrradianceCache:
 
     @classmethod
     def load(cls, path: str | Path, interpolation: Interpolation = PLAIN) -> IrradianceCache:
-        """Reads a cache that ``save`` wrote; a file does not hold its ``interpolation``. Raises
-        CacheFileError, naming the file, for anything else.
+        """Read a cache that ``save`` wrote; its ``interpolation`` is not part of the file.
+
+        Raises CacheFileError, naming the file, for anything else.
         """
         stored = read_cache(path)
         sums = stored.sums

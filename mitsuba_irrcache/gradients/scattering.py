@@ -170,7 +170,7 @@ class AnisotropicScattering(IsotropicScattering):
 
     def parts(self, ordinates: Ordinates) -> list[OrdinatePart]:
         directions, incoming, weights, _ = ordinates
-        masks = self.basis.apart(directions, np.ones((*incoming.shape[:2], 1)))
+        masks = self.basis.split_by_source(directions, np.ones((*incoming.shape[:2], 1)))
         found = []
         for number, mask in enumerate(masks):
             own = incoming * mask

@@ -18,10 +18,10 @@ ORTHONORMAL_TOLERANCE = 2e-3
 class EmitterKind(Enum):
     """Kind of an emitter, by its extent and its directional distribution.
 
-    A new kind is added here and in `kind_of`. It is refused by `sweep` until it is in its
-    ``EMITTERS`` and in `DistantIllumination`, and media under it are not treated as half-spaces
-    until it is in ``half_space.EMITTERS``; ``path`` samples all kinds by Mitsuba's interface, but
-    needs narrow ones in `sources_of` if scattering is anisotropic.
+    To add a kind, extend this class and `kind_of`. The solver ``sweep`` rejects it until
+    ``solvers/sweep.EMITTERS`` and `DistantIllumination` support it, and `half_space` is not used
+    with it until it is in ``half_space.EMITTERS``. The solver ``path`` samples all kinds through
+    Mitsuba's interface; for anisotropic scattering, narrow kinds have to be added to `sources_of`.
     """
 
     #: infinitely far away, with the same radiance from all directions
@@ -99,7 +99,7 @@ def varies_in_space(emitter: mi.Emitter) -> bool:
 
 
 class EmittersByKind(Immutable):
-    """The emitters of a scene, in its order, with their kinds."""
+    """The emitters of a scene, in the order of the scene, with their kinds."""
 
     def __init__(self, emitters: Sequence[mi.Emitter]) -> None:
         self._emitters = tuple((emitter, kind_of(emitter)) for emitter in emitters)
@@ -170,7 +170,7 @@ def _check_shape(emitter: mi.Emitter) -> None:
 
 
 def point_lights(scene: mi.Scene) -> list[mi.Emitter]:
-    """Return the emitters of a scene without extent at a finite position."""
+    """Return the emitters of a scene that have a finite position and no extent."""
     return EmittersByKind(scene.emitters()).of(*POINT_LIKE)
 
 

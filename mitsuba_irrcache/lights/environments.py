@@ -1,4 +1,4 @@
-"""Radiance of environments, and how much detail the light of a scene has."""
+"""Radiance of environments, and angular detail of the emitters of a scene."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from mitsuba_irrcache.core.detail import Detail
 from mitsuba_irrcache.core.sequences import GOLDEN_STEP, fibonacci_hemisphere, lattice_points
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 
-#: Ratio of the largest to the mean radiance up to which an environment is smooth. Even directions
-#: have 0.3 to 0.8 times the error of directions sampled by its luminance up to a ratio of 5.5, and
-#: up to 3 times the error at 8.4.
+#: Ratio of the largest to the mean radiance up to which an environment counts as smooth. Uniformly
+#: distributed directions have 0.3 to 0.8 times the error of directions sampled by its luminance up
+#: to a ratio of 5.5, and up to 3 times the error at a ratio of 8.4.
 SMOOTH_CONTRAST = 4.0
-#: Number of directions by which that ratio is measured: even ones, and samples of the environment.
+#: Number of directions by which that ratio is measured: uniformly distributed ones, and samples of
+#: the environment.
 EVEN, SAMPLES = 1 << 13, 1 << 14
 
 
 def detail_of(emitters: Iterable[mi.Emitter]) -> Detail:
-    """Classify the light of all ``emitters`` of a scene."""
+    """Classify how much the radiance of all ``emitters`` of a scene varies with direction."""
     found = Detail.UNIFORM
     for emitter in emitters:
         kind = kind_of(emitter)
@@ -33,7 +34,9 @@ def detail_of(emitters: Iterable[mi.Emitter]) -> Detail:
 
 
 def is_smooth(environment: mi.Emitter) -> bool:
-    """Whether no direction of an environment is much brighter than its mean, in any channel."""
+    """Whether the maximum radiance of an environment is at most `SMOOTH_CONTRAST` times its mean,
+    in every channel.
+    """
     upper, _ = fibonacci_hemisphere(EVEN // 2)
     even = environment_radiance(environment, np.concatenate([upper, -upper]))
     points = mi.Point2f(np.float32(lattice_points(SAMPLES, GOLDEN_STEP)))
@@ -44,7 +47,9 @@ def is_smooth(environment: mi.Emitter) -> bool:
 
 
 def environment_radiance(environment: mi.Emitter, directions: np.ndarray) -> np.ndarray:
-    """Radiance (n, channels) that travels from the environment along ``directions`` (n, 3)."""
+    """Return the radiance (n, channels) of the environment that propagates along ``directions``
+    (n, 3).
+    """
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
     interaction.wi = mi.Vector3f(directions.T.astype(np.float32))
     channels = environment.eval(interaction)

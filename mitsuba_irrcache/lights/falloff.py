@@ -1,5 +1,7 @@
-"""Small emitters near the voxels of a cache: sample points at a minimum distance from them, and the
-inverse-square factor that is divided out before interpolation.
+"""Treatment of small emitters near the voxels of a cache.
+
+Sample points keep a minimum distance from the emitters, and the inverse-square dependence of the
+irradiance on the distance is divided out before interpolation.
 """
 
 from __future__ import annotations
@@ -19,9 +21,10 @@ from mitsuba_irrcache.lights.emitters import point_lights, position_of
 #: less than half an edge, the distance of voxel centres from an emitter on the face of a box.
 MINIMUM_DISTANCE = 0.25
 #: Maximum distance of an emitter from the voxels, and maximum radius, in voxel edges. The
-#: irradiance of others is smooth enough for interpolation: accurate to 0.3 % between the voxels.
+#: irradiance of emitters that are larger or farther away is smooth enough for interpolation:
+#: accurate to 0.3 % between the voxels.
 REACH, LARGEST = 16.0, 8.0
-#: Maximum number of points that represent an area emitter, and of points of all emitters.
+#: Maximum number of points that represent an area emitter, and that represent all emitters.
 MOST_POINTS = 8
 #: Number of positions at which the strength of a point-like emitter is evaluated.
 POSITIONS = 1024
@@ -98,7 +101,9 @@ class InverseSquareFactor:
     def of(
         cls, scene: mi.Scene, grid: Grid, others: Sequence[mi.Emitter] = ()
     ) -> InverseSquareFactor | None:
-        """Create the factor for emitters near the voxels, except ``others``; None without any."""
+        """Create the factor for emitters near the voxels, except ``others``; return None if there
+        are no such emitters.
+        """
         lights = [e for e in point_lights(scene) if e not in others]
         points = [p for e in lights for p in _of_point(e, grid)]
         shapes = [s for s in scene.shapes() if s.is_emitter() and s.emitter() not in others]
@@ -123,7 +128,11 @@ class InverseSquareFactor:
         return float(dr.max(self.of_voxels(voxel))[0])
 
     def along(self, ray: mi.Ray3f) -> list[tuple]:
-        """Precompute the arguments of `means` for a ray."""
+        """Return the argument ``along`` of `means` for a ray.
+
+        For each emitter point: the distance along the ray of the closest approach, the distance of
+        the point from the ray there, and its strength.
+        """
         found = []
         for position, strength, squared in self._points:
             offset = position - ray.o
@@ -133,8 +142,10 @@ class InverseSquareFactor:
         return found
 
     def means(self, along: list[tuple], a: mi.Float, b: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """Compute means of W between the distances ``a`` and ``b`` along a ray, with linearly
-        falling and rising weights: 2 int_0^1 (1 - u | u) W du.
+        """Compute two weighted means of W between the distances ``a`` and ``b`` along a ray.
+
+        They are 2 int_0^1 (1 - u) W du and 2 int_0^1 u W du, where u runs from 0 at ``a`` to 1 at
+        ``b``.
         """
         near, far = mi.Float(1), mi.Float(1)
         length = b - a
@@ -183,7 +194,9 @@ class InverseSquareFactor:
 
 
 def _of_point(emitter: mi.Emitter, grid: Grid) -> list[tuple[np.ndarray, float, float]]:
-    """Return position, strength and squared radius of a point-like emitter, if it is near."""
+    """Return position, strength and squared radius of a point-like emitter; an empty list if it is
+    not near.
+    """
     position = position_of(emitter)
     if edges_away(position[:, None], grid) > REACH:
         return []
@@ -197,7 +210,9 @@ def _of_point(emitter: mi.Emitter, grid: Grid) -> list[tuple[np.ndarray, float, 
 
 
 def _of_area(shape: mi.Shape, grid: Grid) -> list[tuple[np.ndarray, float, float]]:
-    """Return points that represent the parts of an area emitter, if it is small and near."""
+    """Return points that represent the parts of an area emitter; an empty list if it is not small
+    and near.
+    """
     sample = mi.Point2f(np.float32(kronecker_points(np.arange(MOST_POINTS) + 0.5, 2)))
     found = shape.sample_position(0.0, sample)
     area, edge = float(dr.max(shape.surface_area())[0]), float(grid.voxel_size.max())

@@ -23,11 +23,12 @@ MIN_ANGULAR_RADIUS = 0.005
 MIN_SPOT_RADIUS, MAX_SPOT_RADIUS = float(np.deg2rad(4)), float(np.deg2rad(12))
 #: Their minimum share of the total irradiance (1/400 if it is uniform), and maximum number.
 MIN_SPOT_SHARE, MAX_SPOTS = 0.02, 4
-#: Share of the energy within the maximum radius that the radius of a spot must enclose. What it
-#: leaves out is met by few ordinates, and may still be more than all the rest of an environment.
+#: Share of the energy within the maximum radius that the radius of a spot must enclose. Energy
+#: outside of it is sampled by few ordinates only, and may still exceed that of the remaining
+#: environment.
 ENCLOSED_ENERGY = 0.9995
-#: Ratio of the sampling density of an environment to a uniform one above which it counts as bright
-#: outside of spots, too.
+#: Ratio of the sampling density of an environment to the uniform density above which it counts as
+#: bright, also outside of spots.
 BRIGHT = 8.0
 #: Maximum root mean square radius of spots that are treated as points.
 MAX_POINT_RADIUS = float(np.deg2rad(1))
@@ -40,11 +41,11 @@ TINY = 1e-30
 
 
 class Source:
-    """A narrow source at ``place``, or, if ``far``, in direction ``place``.
+    """A narrow source at the position ``place``, or, if ``far``, in the direction ``place``.
 
-    ``size`` is its radius, or its angular radius if ``far``. ``spread`` is the covariance (3, 3) of
-    the points of a lamp, or the mean square angle of a spot; None for sources that are treated as
-    points.
+    ``size`` is its radius, or its angular radius [rad] if ``far``. ``spread`` is the covariance
+    (3, 3) of the points of a lamp (an area emitter), or the mean square angle [rad^2] of a spot;
+    None for sources that are treated as points.
     """
 
     def __init__(
@@ -82,7 +83,9 @@ class Source:
         return mi.Float(dr.inf) if self.far else dr.norm(self.place - mi.Vector3f(p))
 
     def variance(self, p: mi.Point3f) -> mi.Float:
-        """Mean square angle between the centre of the source and its points, seen from ``p``."""
+        """Return the mean square angle [rad^2] between the centre of the source and its points, as
+        seen from ``p``.
+        """
         if self.far:
             return self._variance
         offset = self.place - mi.Vector3f(p)
@@ -94,7 +97,7 @@ class Source:
         return dr.maximum(total - along_view * inverse, 0) * inverse
 
     def is_same(self, other: Source) -> bool:
-        """Whether ``other`` is at the same place, or in the same direction."""
+        """Whether ``other`` is at the same position, or in the same direction."""
         return self.far == other.far and np.array_equal(self._direction, other._direction)
 
     @property
@@ -110,10 +113,12 @@ class Source:
 def sources_of(
     scene: mi.Scene, known: Sequence[mi.Emitter] = ()
 ) -> tuple[list[Source], list[Source]]:
-    """Find the narrow sources of a scene, and separately those of the ``known`` emitters.
+    """Find the narrow sources of a scene.
 
-    Raises UnsupportedSceneError for emitters of unknown kinds, which may be narrow, unless they
-    have a single direction: moments would represent them wrongly.
+    Returns two lists: the sources of emitters other than ``known``, and those of the ``known``
+    emitters, whose irradiance camera rays evaluate in closed form. Raises UnsupportedSceneError for
+    emitters of unknown kinds, which may be narrow and which moments would then represent wrongly,
+    unless they have a single direction.
     """
     found, others, lamps = [], [], []
     for emitter in scene.emitters():
@@ -152,8 +157,9 @@ def _sampled(emitter: mi.Emitter) -> mi.DirectionSample3f:
 def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
     """Find bright spots of an environment: circles that contain a large share of its irradiance.
 
-    Also returns the irradiance (2 + n, channels) from what is not bright outside of all spots, from
-    each spot, and from what is bright (see `is_bright`) outside of them.
+    Returns the n spots, and an array (2 + n, channels) of irradiances: from directions outside of
+    all spots that are not bright (see `is_bright`), from each spot, and from bright directions
+    outside of all spots.
     """
     rng = np.random.default_rng(3)
     points = lattice_points(SPOT_SAMPLES, GOLDEN_STEP)
@@ -189,7 +195,9 @@ def is_bright(density: np.ndarray) -> np.ndarray:
 
 
 def _extent(angles: np.ndarray, irradiance: np.ndarray) -> tuple[float, float]:
-    """Angular radius and mean square angle of a spot, given ``irradiance`` samples at ``angles``.
+    """Return angular radius [rad] and mean square angle [rad^2] of a spot.
+
+    ``irradiance`` are samples at these ``angles`` from the centre of the spot.
 
     The radiance around the spot is subtracted as background.
     """
@@ -209,7 +217,7 @@ def _extent(angles: np.ndarray, irradiance: np.ndarray) -> tuple[float, float]:
 
 
 def _brightest(directions: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
-    """Direction of the largest concentration of irradiance."""
+    """Return the direction around which the most irradiance is concentrated."""
     z = np.minimum((directions[2] + 1) * 18, 35).astype(int)
     turn = (np.arctan2(directions[1], directions[0]) / (2 * np.pi) % 1 * 72).astype(int) % 72
     cell = z * 72 + turn

@@ -23,9 +23,9 @@ from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of, varies_in_spa
 DISK_SIDES = 16
 #: Tolerated deviation of four corners from a parallelogram, relative to its size.
 FLAT_TOLERANCE = 1e-4
-#: Points are sampled as from this far from the plane of a face at least, relative to the distance
-#: of the closest point and to the size of the face: in the plane, where it is seen under no solid
-#: angle, their distribution would be none.
+#: Minimum distance from the plane of a face for which points on it are sampled, relative to the
+#: distance of the closest point and to the size of the face: in the plane itself the solid angle is
+#: 0, and sampling by solid angle is undefined.
 LOWEST, SMALLEST = 0.1, 1e-3
 #: Corners of the faces of the cube [-1, 1]^3, in order around each face.
 FACES = [
@@ -36,7 +36,7 @@ FACES = [
 
 
 class SolidAngle:
-    """Solid angle of a convex shape that emits from its front, and the closest point of it.
+    """Solid angle under which a convex shape is seen from its front, and its closest point.
 
     ``kind`` is "sphere", "box", "rectangle" (any parallelogram) or "disk"; ``frame`` maps the unit
     sphere, the cube [-1, 1]^3, or the square or unit disk in the plane z = 0 to the world.
@@ -84,7 +84,9 @@ class SolidAngle:
         return total
 
     def closest(self, p: mi.Point3f) -> mi.Point3f:
-        """Return the closest point of the shape; of sheared or uneven ones, a point close by."""
+        """Return the closest point of the shape to ``p``, approximately if its frame has shear or
+        different scales.
+        """
         local = self._local.point(p)
         if self.kind in ("sphere", "disk"):
             if self.kind == "disk":
@@ -96,9 +98,9 @@ class SolidAngle:
         return self._world.point(local)
 
     def shares(self, p: mi.Point3f) -> list[mi.Float]:
-        """Return the solid angle of each face at world positions over that of all, for `sample`.
+        """Return the share of each face in the solid angle at world positions, for `sample`.
 
-        Flat shapes have one face. Within a box all faces are seen, from behind.
+        Flat shapes have one face. From inside of a box all faces are seen, from behind.
         """
         if len(self._polygons) < 2:
             return [mi.Float(1)]
@@ -114,13 +116,14 @@ class SolidAngle:
     def sample(
         self, p: mi.Point3f, shares: list[mi.Float], sample: mi.Point2f
     ) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
-        """Sample a point of any shape but a sphere about uniformly by solid angle, from both sides.
+        """Sample a point of any shape but a sphere, approximately uniformly by solid angle.
 
-        Returns its direction, its distance, and the solid angle for which it stands, which varies
-        by a small factor between the points, smoothly. ``shares`` are those of `shares`.
+        Both sides of a face are sampled alike. ``shares`` is the result of `shares`. Returns the
+        direction and distance of the point, and the solid angle that it represents (the inverse of
+        its density), which varies smoothly and by a small factor between the points.
 
-        The lines parallel to one edge are sampled uniformly by the angle in the plane perpendicular
-        to them, and the points of a line by the solid angle, whose distribution is known.
+        Lines parallel to one edge are sampled uniformly by the angle in the plane perpendicular to
+        them, and points on a line by their solid angle, whose distribution is invertible.
         """
         x, (face, share) = sample.x, (self._faces[0], shares[0])
         begin = mi.Float(0)
@@ -228,8 +231,11 @@ def _polygons(
 
 
 def _faces(kind: str, frame: np.ndarray) -> list[list[mi.Vector3f | mi.Float]]:
-    """Return the placement of each face: its centre, its normal, the two axes in its plane, and
-    half of its extent along the first, of its shear, and of its edge along the second one.
+    """Return the placement of each face.
+
+    Each is a list: centre, normal, two orthonormal axes in the plane of the face, half of the
+    face's extent along the first axis, its shear (the offset along the second axis at that extent),
+    and half the length of its edge along the second axis.
     """
     if kind == "sphere":
         return []
@@ -271,5 +277,5 @@ def _polygon_solid_angle(corners: list[mi.Point3f], p: mi.Point3f) -> mi.Float:
 
 
 def _point(values: np.ndarray) -> mi.Point3f:
-    """Return an opaque point: other values do not compile other kernels."""
+    """Return a point with opaque values, so that different values share one kernel."""
     return mi.Point3f([dr.opaque(mi.Float, float(v)) for v in values])

@@ -1,16 +1,17 @@
 """The aureole: radiance of a narrow source scattered several times into a forward peak.
 
 delta-M (`delta_m`) treats scattering into the forward peak as unscattered, and the TMS correction
-scatters the radiance of narrow sources once with the full phase function, wherever that happens
-along a path. Light that is scattered n times into the peak is thus counted n times, each time with
-the angular distribution of a single scattering event. It should be counted once, with that of n
-events: around the source the image is up to twice too bright, and the aureole too narrow.
+scatters the radiance of narrow sources once with the full phase function, at every position along a
+path. Radiance scattered n times into the peak is thus counted n times, each time with the angular
+distribution of a single scattering event. It should be counted once, with the distribution of n
+events. Without a correction the image around the source is up to twice too bright, and the aureole
+too narrow.
 
 For small angles the number of events along a path is Poisson distributed with mean D, the optical
 depth of scattering into the peak, and the Legendre moments of successive distributions multiply
 (Goudsmit and Saunderson 1940). With the moments q_l of the peak, the sum over all n >= 1 has the
-moments e^-D(1 - q_l) - e^-D. One event per position has D q_l, so the phase function of the peak is
-replaced by that with the moments
+moments e^-D(1 - q_l) - e^-D. The TMS correction alone has the moments D q_l, so the phase function
+of the peak is replaced by the one with the moments
 
     a_l = [e^-D(1 - q_l) - e^-D] / D.
 """
@@ -21,11 +22,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: Number of Legendre moments, and that from which on they are attenuated, so that a series of a
-#: phase function that is sharper than they resolve does not oscillate.
+#: Number of Legendre moments, and degree from which on they are attenuated, so that the series of a
+#: phase function too sharp for that number of moments does not oscillate.
 PEAK_MOMENTS, FIRST_ATTENUATED = 256, 128
-#: Numbers of angles, mean numbers of scattering events, and angular extents of sources in the
-#: table; the largest of the latter two, beyond which the values are those of the largest.
+#: Size of the table: numbers of angles, of mean numbers of scattering events D, and of angular
+#: extents of sources; largest D and extent [rad] in the table, to which arguments are clamped.
 ANGLES, DEPTHS, EXTENTS = 128, 32, 24
 MAX_DEPTH, MAX_EXTENT = 30.0, 1.0
 
@@ -36,8 +37,10 @@ class Aureole:
     # docs/primer, eq. (5.11)
 
     def __init__(self, moments: np.ndarray, scale: float) -> None:
-        """Tabulate it for a peak with the Legendre ``moments`` q_0 = 1, q_1, ..., `PEAK_MOMENTS` in
-        all, and the share f of the phase function; ``scale`` is f / (1 - f).
+        """Tabulate the difference.
+
+        ``moments`` are the `PEAK_MOMENTS` Legendre moments q_0 = 1, q_1, ... of the peak, and
+        ``scale`` is f / (1 - f), where f is the share of the peak in the phase function.
         """
         angles = np.pi * np.linspace(0, 1, ANGLES) ** 2
         depths = MAX_DEPTH * np.linspace(0, 1, DEPTHS) ** 2
@@ -70,14 +73,14 @@ class Aureole:
 
 
 def _centred(place: mi.Float, count: int) -> mi.Float:
-    """Convert a place in [0, 1] between the first and the last texel to one on a texture."""
+    """Map [0, 1] to the texture coordinates from the first to the last texel centre."""
     return dr.fma(place, (count - 1) / count, 0.5 / count)
 
 
 def _differences(
     moments: np.ndarray, angles: np.ndarray, depths: np.ndarray, variances: np.ndarray
 ) -> np.ndarray:
-    """Evaluate the sums over Legendre polynomials, an array (variance, depth, angle)."""
+    """Return the sums over Legendre polynomials, an array (variance, depth, angle)."""
     degrees = np.arange(PEAK_MOMENTS)
     depths = np.maximum(depths, 1e-6)[:, None]
     several = np.exp(-depths) * np.expm1(depths * moments) / depths

@@ -143,9 +143,9 @@ def _placement(volume: mi.Volume) -> np.ndarray:
 
 
 def _clipping_box(volume: mi.Volume, boundary: Boundary) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the world box that Mitsuba clips a heterogeneous medium to.
+    """Return the world box, as (lower, upper), to which Mitsuba clips a heterogeneous medium.
 
-    None if the boundary lies inside of it.
+    Returns None if the boundary lies inside of that box.
     """
     lower, upper = (np.array(p, dtype=np.float64) for p in (volume.bbox().min, volume.bbox().max))
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
@@ -157,10 +157,10 @@ def _clipping_box(volume: mi.Volume, boundary: Boundary) -> tuple[np.ndarray, np
 
 
 def _verify(medium: mi.Medium, grid: MediumGrid, name: str) -> None:
-    """Compare the converted fields with Mitsuba's own at random points.
+    """Compare the converted fields with the coefficients that Mitsuba evaluates at random points.
 
-    This detects properties of volumes that cannot be queried, such as nearest-neighbour filtering
-    and repetition, which would otherwise render incorrectly.
+    This detects properties of volumes that cannot be queried, such as the filter type "nearest" and
+    the wrap mode "repeat", which would otherwise be rendered wrongly.
     """
     rng = mi.PCG32(512)
     frame = Grid((1, 1, 1), grid.frame)
@@ -185,6 +185,6 @@ def volume_error(name: str) -> UnsupportedSceneError:
     return UnsupportedSceneError(
         f"irrcache: {name} does not interpolate as expected. Only trilinear, clamped volumes are "
         'supported: use filter_type "trilinear" and wrap_mode "clamp", or render with "volpath". '
-        "If its data were edited in place, as through a NumPy view, Mitsuba still looks up a copy "
-        'of the old ones: call params.set_dirty("....data") with their key, and params.update().'
+        "If its data were edited in place, as through a NumPy view, Mitsuba still evaluates a copy "
+        'of the old data: call params.set_dirty("....data") with their key, and params.update().'
     )

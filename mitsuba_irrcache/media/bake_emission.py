@@ -12,15 +12,15 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.bake import baked_field, volume_error
 from mitsuba_irrcache.media.emission import Emission
 
-#: Tolerated deviation of baked values from Mitsuba's own, relative to their maximum.
+#: Tolerated deviation of converted values from those that Mitsuba evaluates, over their maximum.
 TOLERANCE = 0.02
 
 
 def bake_emission(value: object, scale: float) -> Emission | None:
-    """The emission that the integrator was given: a number, a colour, or a ``constvolume`` or
-    ``gridvolume`` in world space, times ``scale``. None where it is 0 everywhere.
+    """Convert the integrator's ``emission``, times ``scale``; return None if it is 0 everywhere.
 
-    Raises IrrcacheError for anything else, and for values that are negative or not finite.
+    ``value`` is a number, a colour, or a ``constvolume`` or ``gridvolume`` in world space. Raises
+    IrrcacheError for anything else, and for values that are negative or not finite.
     """
     if not np.isfinite(scale) or scale < 0:
         raise IrrcacheError(
@@ -35,7 +35,9 @@ def bake_emission(value: object, scale: float) -> Emission | None:
 
 
 def _numbers(value: object, scale: float) -> np.ndarray:
-    """One value, or three of a colour; times ``scale`` they are numbers in single precision."""
+    """Return one value, or the three of a colour; raise IrrcacheError if they overflow float32
+    when multiplied by ``scale``.
+    """
     try:
         values = np.array(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
@@ -58,7 +60,7 @@ def _numbers(value: object, scale: float) -> np.ndarray:
 
 
 def _verify(volume: mi.Volume, field: Field, scale: float) -> None:
-    """Compare baked values with Mitsuba's own inside of the volume."""
+    """Compare converted values with those that Mitsuba evaluates inside of the volume."""
     if field.grid is None or not field.maximum > 0:
         return
     rng = mi.PCG32(512)

@@ -6,8 +6,8 @@ The medium
     sigma_t' = sigma_t (1 - f albedo),   albedo' = albedo (1 - f) / (1 - f albedo)
 
 with the phase function moments (g_l - f) / (1 - f) has the same radiance up to a blur of a few
-degrees, and requires as few moments as a broad phase function. f is the first moment that is
-truncated. Single scattering of narrow light sources uses the original phase function over 1 - f.
+degrees, and requires as few moments as a broad phase function. f is the first truncated moment.
+Single scattering of narrow sources uses the original phase function divided by 1 - f.
 
 Transmittance therefore treats scattering into the peak as unscattered, with two exceptions: narrow
 sources seen directly through the medium are attenuated by the original extinction; and paths from
@@ -27,17 +27,19 @@ from mitsuba_irrcache.grids.fields import ConstantField, Field, GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid, Unscaled
 
-#: Numbers of parts, along each axis, of a voxel of the albedo in which the scaled medium is
-#: evaluated, in the order in which they are tried; and the number of voxels that ends that.
+#: Numbers of parts into which a voxel of the albedo is divided along each axis to evaluate the
+#: scaled medium, in the order in which they are tried; and the number of voxels above which no
+#: finer division is tried.
 PARTS, MOST_VOXELS = (1, 3, 5, 9), 1 << 22
-#: Mean relative error of the interpolated extinction and scattering that suffices, and above which
-#: a warning is logged; and the number of random positions that estimate it.
+#: Mean relative error of the interpolated extinction and scattering below which a division
+#: suffices, and above which a warning is logged; number of random positions that estimate it.
 SMALL_ERROR, LARGE_ERROR, CHECKS = 0.002, 0.01, 4096
 
 
 def without_forward_peak(medium: MediumGrid) -> MediumGrid:
-    """``medium``, whose phase function has a forward peak, scaled by delta-M: light scattered into
-    the peak counts as not scattered.
+    """Return ``medium``, whose phase function has a forward peak, scaled by delta-M.
+
+    Radiance scattered into the peak counts as unscattered.
     """
     # docs/primer, eq. (4.12)
     phase = medium.phase.without_peak()
@@ -54,10 +56,11 @@ def without_forward_peak(medium: MediumGrid) -> MediumGrid:
 
 
 def _scaled(medium: MediumGrid, share: float) -> tuple[Field, Field]:
-    """Return the extinction and albedo without a peak of this ``share``.
+    """Return the scaled extinction and albedo, for a peak with this ``share`` f of the phase
+    function.
 
-    They are not linear in those of ``medium``: where its albedo varies, they are evaluated on finer
-    voxels, until their interpolation preserves scattering and absorption.
+    They are not linear in the fields of ``medium``: where its albedo varies, they are evaluated on
+    finer voxels, until their interpolation preserves scattering and absorption.
     """
     sigma_t, albedo = medium.sigma_t, medium.albedo
     for parts in PARTS:
@@ -83,11 +86,11 @@ def _scaled(medium: MediumGrid, share: float) -> tuple[Field, Field]:
 
 
 def _divided(grid: Grid, albedo: Grid | None, parts: int) -> Grid:
-    """Return ``grid`` with voxels of at most a part of those of the ``albedo``, in this number of
-    ``parts`` along each axis.
+    """Return ``grid`` with voxels divided such that their edges are at most 1 / ``parts`` of the
+    edges of the voxels of ``albedo``.
 
-    Each voxel is divided by an odd number, so that fields that are linear between the voxels stay
-    the same.
+    Each voxel is divided into an odd number of parts along each axis: its centre remains a voxel
+    centre, so that fields that are linear between the voxels stay the same.
     """
     if albedo is None or parts == 1:
         return grid
@@ -102,8 +105,8 @@ def _divided(grid: Grid, albedo: Grid | None, parts: int) -> Grid:
 def _error_of_interpolation(
     medium: MediumGrid, share: float, remaining: Field, scattering: Field
 ) -> float:
-    """Estimate the relative error of the extinction and of the scattering of the scaled fields by
-    their mean deviation at random positions in the medium.
+    """Estimate the relative error of the scaled extinction and scattering coefficient, the larger
+    of the two, by their mean deviation at random positions in the medium.
     """
     if medium.albedo.grid is None:
         return 0.0
@@ -126,8 +129,8 @@ def _error_of_interpolation(
 
 
 def _combined(function: Callable, grid: Grid | None, *fields: Field) -> Field:
-    """Apply ``function`` to the values of ``fields`` at the voxels of ``grid``; without one, all of
-    them are constant.
+    """Apply ``function`` to the values of ``fields`` at the voxels of ``grid``; None: all fields
+    are constant. Returns the field of the results.
     """
     channels = max(field.channels for field in fields)
     index = dr.arange(mi.UInt32, 1 if grid is None else grid.voxel_count)

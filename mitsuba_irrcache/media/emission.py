@@ -21,26 +21,27 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.grids.occupancy import active_voxels, marked
 
-#: Voxels around a grid that still count as in it: rays end on the very faces of media.
+#: Tolerance around a grid [voxels] within which positions count as inside: rays end exactly on the
+#: faces of media.
 SLACK = 1e-3
 
 
 class Emission:
-    """Emission coefficient: the value of ``field``, and 0 outside of its grid."""
+    """Emission coefficient j: the value of ``field`` inside of its grid, 0 outside."""
 
     def __init__(self, field: Field) -> None:
         self.field, self.grid = field, field.grid
         self.channels, self.maximum = field.channels, field.maximum
 
     def at_world(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Float | mi.Color3f:
-        """Evaluate at the world position ``p``: a Float for one channel, else a Color3f."""
+        """Evaluate j at world positions; returns a Float for one channel, else a Color3f."""
         if self.grid is None:
             return self.field.value
         inside = self.covers(p)
         return dr.select(inside, self.field.at_world(p, active & inside), 0)
 
     def covers(self, p: mi.Point3f) -> mi.Bool:
-        """Whether world positions are in the emissive grid; all are if there is none."""
+        """Whether world positions are in the emissive grid; always true for constant emission."""
         if self.grid is None:
             return mi.Bool(True)
         u = self.grid.coordinates.point(p)
@@ -61,9 +62,9 @@ class Emission:
     def between(
         self, ray: mi.Ray3f, begin: mi.Float, end: mi.Float, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.PCG32]:
-        """Estimate int j dt, unbiased, from one random position; 0 where not ``active``.
+        """Estimate int j dt from ``begin`` to ``end``, unbiased, from one random position.
 
-        Also returns the advanced random number generator.
+        Returns the estimate, 0 where not ``active``, and the advanced random number generator.
         """
         if self.grid is None:
             return dr.select(active, mi.Spectrum(self.field.value) * (end - begin), 0), rng
@@ -72,7 +73,7 @@ class Emission:
         return dr.select(active, light, 0), rng
 
     def reaches(self, cells: Macrocells) -> mi.Bool:
-        """Whether each macrocell of a medium may contain emission."""
+        """Return for each macrocell of a medium whether it may contain emission."""
         if self.grid is None or cells.count == 1:
             return dr.full(mi.Bool, True, cells.count)
         own = SimpleNamespace(
@@ -85,8 +86,9 @@ class Emission:
 
 
 def check_emission_is_within(emission: Emission, frames: Sequence[np.ndarray]) -> None:
-    """Raises IrrcacheError where no part of the emission lies in a medium; ``frames`` are the
-    ``to_world`` of unit cubes that enclose the media.
+    """Raise IrrcacheError if no part of the emission lies in a medium.
+
+    ``frames`` are the ``to_world`` matrices (4, 4) of unit cubes that enclose the media.
     """
     if not frames:
         raise IrrcacheError(

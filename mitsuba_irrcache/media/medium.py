@@ -17,18 +17,20 @@ from mitsuba_irrcache.media.phase import ISOTROPIC, Phase
 
 
 class MediumContext(Immutable):
-    """Where a medium is in its scene.
+    """Relation of a medium to the rest of its scene.
 
     Attributes:
         pointer: Mitsuba's medium, which identifies the medium of a ray. None if rays are not traced
             through the scene's shapes, because the scene has only an isotropic medium in its
             boundary.
-        number: place in the scene's list of media.
+        number: index in the scene's list of media.
         others: the other media of the scene in the order of that list, before delta-M scaling.
-        is_isolated: whether this medium in its boundary is all there is beside emitters.
-        has_exact_boundary: whether the medium fills its boundary, which otherwise encloses it.
-        refracts: whether radiance passes its boundary other than straight.
-        detail: how much the light that reaches it varies; SHARP if that is not known.
+        is_isolated: whether the scene contains nothing but emitters, this medium and its boundary.
+        has_exact_boundary: whether the medium fills its boundary exactly; otherwise the boundary
+            is a larger shape that encloses the medium.
+        refracts: whether the boundary refracts radiance (a dielectric, not a null interface).
+        detail: how much the incident radiance varies with position and direction; SHARP if
+            unknown.
     """
 
     def __init__(
@@ -47,7 +49,7 @@ class MediumContext(Immutable):
         self.refracts, self.detail = refracts, detail
 
     def among(self, others: tuple[MediumGrid, ...]) -> MediumContext:
-        """The same with these ``others``."""
+        """Return a copy with these ``others``."""
         return MediumContext(**self.attributes() | {"others": others})
 
 
@@ -56,13 +58,14 @@ ALONE = MediumContext()
 
 
 class Unscaled(Immutable):
-    """What delta-M scaling made a medium of (see `delta_m`).
+    """The medium from which delta-M scaling derived another one (see `delta_m`).
 
     Attributes:
-        medium: the medium before.
-        exponent: power of the transmittance of the scaled medium, for each channel of the albedo,
-            that gives the share of light that is not scattered at all, where light scattered into
-            a forward peak counts as transmitted. None where it is not the same everywhere.
+        medium: the medium before scaling.
+        exponent: for each channel of the albedo, the ratio sigma_t / sigma_t' of the extinction
+            before and after scaling: (transmittance of the scaled medium)^exponent is the fraction
+            of the radiance that is not scattered at all, not even into the forward peak. None if
+            the ratio varies in space.
     """
 
     def __init__(self, medium: MediumGrid, exponent: np.ndarray | None) -> None:
@@ -74,11 +77,11 @@ class MediumGrid(Immutable):
 
     Attributes:
         bbox: lower and upper corner; None: unbounded.
-        emission: emission coefficient of the medium; None where it emits nothing.
+        emission: emission coefficient of the medium; None if it does not emit.
         phase: phase function, the same everywhere.
         name: unique among the media of a scene.
-        context: where the medium is in its scene.
-        unscaled: what it was made of by delta-M scaling; None where it is not scaled.
+        context: relation of the medium to the rest of its scene.
+        unscaled: the medium before delta-M scaling; None if it is not scaled.
         macrocells: local majorants of ``sigma_t``.
     """
 
@@ -105,13 +108,13 @@ class MediumGrid(Immutable):
             self._clip = mi.BoundingBox3f(*corners)
 
     def replaced(self, **changes: object) -> MediumGrid:
-        """A medium with other attributes; ``macrocells`` are those of its extinction."""
+        """Return a copy with these attributes; macrocells follow from a changed extinction."""
         attributes = self.attributes()
         if "sigma_t" in changes or "boundary" in changes:
             del attributes["macrocells"]
         return MediumGrid(**attributes | changes)
 
-    # The context, and what the medium was
+    # Attributes of the context and of delta-M scaling
 
     @property
     def pointer(self) -> mi.MediumPtr | None:
@@ -139,7 +142,7 @@ class MediumGrid(Immutable):
 
     @property
     def detail(self) -> Detail:
-        """How much the light that reaches the medium from outside varies."""
+        """How much the incident radiance varies with position and direction."""
         return self.context.detail
 
     @property
@@ -149,19 +152,22 @@ class MediumGrid(Immutable):
 
     @property
     def original(self) -> MediumGrid | None:
-        """The medium before delta-M scaling; None where it is not scaled."""
+        """The medium before delta-M scaling; None if it is not scaled."""
         return self.unscaled.medium if self.unscaled is not None else None
 
     @property
     def unscattered_exponent(self) -> np.ndarray | None:
-        """See `Unscaled.exponent`; None where the medium is not scaled."""
+        """See `Unscaled.exponent`; None if the medium is not scaled."""
         return self.unscaled.exponent if self.unscaled is not None else None
 
     # Geometry
 
     @property
     def frame(self) -> np.ndarray:
-        """``to_world`` of the smallest known unit cube around the medium: extent of its cache."""
+        """Matrix (4, 4) from the unit cube to a box around the medium, the extent of its cache.
+
+        The smaller of the boundary's box and ``bbox``.
+        """
         frames = [self.boundary.frame]
         if self.bbox is not None:
             frames.append(axis_aligned(*self.bbox))
@@ -178,7 +184,7 @@ class MediumGrid(Immutable):
 
     @property
     def shortest_edge(self) -> float:
-        """Edge of a voxel of the extinction [scene units]; infinite where nothing varies."""
+        """Shortest voxel edge of the extinction [scene units]; infinite if it is constant."""
         return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
 
     def contains(self, p: mi.Point3f) -> mi.Bool:

@@ -28,9 +28,10 @@ MAX_ORDER, MAX_TRUNCATED_ORDER = 4, 6
 #: Maximum energy fraction of a truncated forward peak for orders 4 and 5, and for order 6. For
 #: ``hg`` these correspond to g = 0.75 and g = 0.85.
 PEAK, LARGEST_PEAK = 0.25, 0.33
-#: Magnitude of the moments that may be neglected, which weight the neglected radiance, and its
-#: maximum with `MAX_ORDER`, which for ``hg`` limits |g| to 0.58. Under a white sky, on coarse grids
-#: of high contrast, a tail of 0.06 has an error of 0.4 % of the mean, one of 0.03 0.1 %.
+#: Magnitude below which moments g_l are neglected, and the magnitude that neglected moments may
+#: have at most with `MAX_ORDER`, which for ``hg`` limits |g| to 0.58. In a uniform environment, on
+#: coarse grids of high contrast, neglected moments of 0.06 cause an error of 0.4 % of the mean,
+#: moments of 0.03 one of 0.1 %.
 TAIL, MAX_TAIL = 0.03, 0.07
 #: Number of moments computed, and nodes of their Gauss-Legendre quadrature.
 MOMENTS, NODES = 32, 256
@@ -41,9 +42,9 @@ CHECKS = 1024
 class Phase:
     """A phase function.
 
-    ``plugin`` is Mitsuba's (None for `ISOTROPIC`), ``moments`` are g_0 = 1, g_1, ..., and ``peak``
-    is the maximum of 4 pi p. The latter two exclude the fraction ``forward`` that `delta_m` treats
-    as unscattered.
+    ``plugin`` is Mitsuba's phase function (None for `ISOTROPIC`), ``moments`` are the Legendre
+    moments g_0 = 1, g_1, ..., and ``peak`` is the maximum of 4 pi p. ``moments`` and ``peak``
+    exclude the fraction ``forward`` that `delta_m` treats as unscattered.
     """
 
     # docs/primer, eqs. (1.2), (1.5)
@@ -67,7 +68,7 @@ class Phase:
 
     @property
     def is_isotropic(self) -> bool:
-        """Whether it is of order 0: a cache of the irradiance holds all that it needs."""
+        """Whether it is of order 0: the irradiance alone determines the scattered radiance."""
         return not self.tail(0)
 
     @property
@@ -105,7 +106,10 @@ class Phase:
     def gain(
         self, p: mi.Point3f, direction: mi.Vector3f, towards: mi.Vector3f, active: mi.Bool = True
     ) -> mi.Float:
-        """Return 4 pi p at ``p`` from a source in direction ``towards`` for a ray ``direction``."""
+        """Return 4 pi p / (1 - forward) for scattering at ``p`` of radiance from ``towards``.
+
+        ``towards`` points to the source of the radiance, ``direction`` is that of the camera ray.
+        """
         place = interaction(p, direction)
         value, _ = self.plugin.eval_pdf(mi.PhaseFunctionContext(), place, towards, active)
         return 4 * dr.pi / (1 - self.forward) * value[0]
@@ -149,7 +153,10 @@ def legendre_moments(plugin: mi.PhaseFunction, count: int) -> tuple[np.ndarray, 
 
 @cache
 def _gauss_legendre() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights on [-1, 1], stored because computing them dominates the other work here."""
+    """Return nodes and weights on [-1, 1].
+
+    They are cached, because computing them takes longer than all else in `legendre_moments`.
+    """
     return np.polynomial.legendre.leggauss(NODES)
 
 
@@ -162,8 +169,8 @@ def _evaluate(
 ) -> tuple[np.ndarray, float]:
     """Evaluate the phase function for rays along ``direction`` (3, n).
 
-    Returns its values, and the maximum deviation of the colour channels and of the sampling density
-    from them.
+    ``cosines`` (n) and ``azimuth`` are the angles of scattering. Returns the values (n) of the
+    first channel, and the maximum deviation of any channel from the sampling density.
     """
     frame = mi.Frame3f(mi.Vector3f(np.float32(direction)))
     sines = np.sqrt(np.maximum(1 - cosines**2, 0))
@@ -202,7 +209,7 @@ def _check(plugin: mi.PhaseFunction, boundary: Boundary, name: str) -> None:
 
 
 def _rounded_down(limit: float) -> float:
-    """Return a limit with two digits that is within it."""
+    """Round a limit down to two decimals, so that the rounded value is still within it."""
     return int(100 * limit) / 100
 
 

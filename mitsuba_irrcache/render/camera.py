@@ -302,8 +302,8 @@ class TracedCameraRays:
         else:
             start = PathStart(end, pointer, depth=0, pdf=0.0, clear=True)
             depths = self.max_depth, self.rr_depth
-            known = self._is_known if self._ends_in_media else None
-            paths = PathTracer(scene, self.media, *depths, self.hide_emitters, known)
+            is_cached = self._is_cached if self._ends_in_media else None
+            paths = PathTracer(scene, self.media, *depths, self.hide_emitters, is_cached)
             sums, _ = paths.trace(start, rng, traced)
             direct, reflected, interacted = sums.direct, sums.scattered, sums.interacted
             if self._ends_in_media:
@@ -401,7 +401,7 @@ class TracedCameraRays:
         found = scattered, background, transmittance, gathered, segment, pointer, stopped, escaped
         return *found, unscattered
 
-    def _is_known(self, pointer: mi.MediumPtr) -> mi.Bool:
+    def _is_cached(self, pointer: mi.MediumPtr) -> mi.Bool:
         """Whether the radiance in a medium is cached."""
         known = mi.Bool(False)
         for projection in self.projections:

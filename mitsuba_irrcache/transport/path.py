@@ -1,4 +1,4 @@
-"""What paths through surfaces and several media consist of: free flights, visibility, scattering.
+"""Steps of paths through surfaces and several media: free flights, visibility, scattering.
 
 Surfaces, BSDFs and emitters are Mitsuba's; media are sampled on their grids, with local majorants
 and analytic transmittance for homogeneous ones. The loop over vertices is in `path_tracer`.
@@ -72,9 +72,9 @@ class Media(Immutable):
     ) -> tuple[mi.Bool, mi.Float, mi.Spectrum, mi.PCG32, mi.Spectrum]:
         """Sample a free-flight distance up to ``far``.
 
-        Returns whether the ray collides, the distance, the path throughput behind the collision
-        including the albedo, the random number generator, and the weighted emission along the
-        segment.
+        Returns whether the ray collides, the distance, the path throughput after the collision
+        including the albedo, the random number generator, and the emission along the segment times
+        the throughput.
         """
         collided, t, emitted = mi.Bool(False), mi.Float(far), mi.Spectrum(0)
         for grid in self.grids:
@@ -134,18 +134,18 @@ def flags_of(shape: mi.Shape) -> int:
 
 
 def refracts(shape: mi.Shape) -> bool:
-    """Whether radiance passes a shape other than straight, or is reflected by it as well."""
+    """Whether radiance passes a shape, and is deflected or partly reflected by it."""
     flags = flags_of(shape)
     return bool(transmits(flags)) and not is_null(flags)
 
 
 def is_surface(shape: mi.Shape) -> bool:
-    """Whether a shape is more than the boundary of a medium: it scatters, emits or measures."""
+    """Whether a shape is more than a medium boundary: a scatterer, an emitter or a sensor."""
     return not is_null(flags_of(shape)) or shape.is_emitter() or shape.is_sensor()
 
 
 def is_solid(si: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether a surface is more than the boundary of a medium: it scatters or emits."""
+    """Whether hit surfaces are more than the boundary of a medium: they scatter or emit."""
     return ~is_null(si.bsdf().flags()) | (si.shape.emitter() != None)  # noqa: E711
 
 

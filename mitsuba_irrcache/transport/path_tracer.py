@@ -54,10 +54,11 @@ class PathStart:
 
 @dataclass
 class PathEnd:
-    """Final state of paths that end in a medium whose radiance is known.
+    """Final state of paths that end with a collision in a medium whose radiance is cached.
 
-    Position, direction and medium of the collision, and the path throughput ``weight`` including
-    the albedo; 0 for paths that end elsewhere.
+    ``p``, ``direction`` and ``pointer`` are the position, the direction of propagation and the
+    medium of the collision. ``weight`` is the path throughput including the albedo; it is 0 for
+    paths that end elsewhere.
     """
 
     p: mi.Point3f
@@ -78,14 +79,14 @@ class PathSums:
     end: PathEnd
 
     def add(self, radiance: mi.Spectrum, is_direct: mi.Bool) -> None:
-        """Add radiance from emitters before the first vertex, or behind one."""
+        """Add ``radiance`` to the direct or, if the path has a vertex already, scattered part."""
         self.direct += dr.select(is_direct, radiance, 0)
         self.scattered += dr.select(is_direct, 0, radiance)
 
 
 @dataclass
 class _PathState:
-    """State of the loop over vertices."""
+    """Loop state of `PathTracer.trace`."""
 
     ray: mi.Ray3f
     pointer: mi.MediumPtr
@@ -93,7 +94,7 @@ class _PathState:
     crossings: mi.UInt32
     throughput: mi.Spectrum
     eta: mi.Float
-    #: density of the current direction, 0 if emitters were not sampled
+    #: density [1/sr] of the current direction; 0 if emitters were not sampled at the last vertex
     pdf: mi.Float
     #: previous vertex
     last: mi.Interaction3f
@@ -124,8 +125,8 @@ class _Segment:
 class PathTracer:
     """Traces paths through a scene and its media.
 
-    ``known`` is an optional predicate that selects media whose radiance is known; paths end with
-    their first collision in such a medium.
+    ``is_cached`` is an optional predicate on media: paths end with their first collision in a
+    medium for which it holds, and the caller looks up the radiance there in a cache.
     """
 
     def __init__(
@@ -135,11 +136,11 @@ class PathTracer:
         max_depth: mi.UInt32,
         rr_depth: mi.UInt32,
         hide_emitters: bool = False,
-        known: Callable[[mi.MediumPtr], mi.Bool] | None = None,
+        is_cached: Callable[[mi.MediumPtr], mi.Bool] | None = None,
     ) -> None:
         self._scene, self._media = scene, media
         self._max_depth, self._rr_depth = max_depth, rr_depth
-        self._hide_emitters, self._known = hide_emitters, known
+        self._hide_emitters, self._is_cached = hide_emitters, is_cached
 
     @symbolic
     def trace(self, start: PathStart, rng: mi.PCG32, active: mi.Bool):
@@ -189,7 +190,7 @@ class PathTracer:
         path.throughput = dr.select(path.active, path.throughput / survival, path.throughput)
 
     def _next_segment(self, path: _PathState, sums: PathSums, is_direct: mi.Bool) -> _Segment:
-        """Sample a free flight; add emission along it, and end paths in media that are known."""
+        """Sample a free flight, add emission along it, and end paths in cached media."""
         si = self._scene.ray_intersect(path.ray, path.active)
         collided, t, path.throughput, path.rng, emitted = self._media.sample_distance(
             path.pointer, path.ray, si.t, path.throughput, path.rng, path.active & ~path.clear
@@ -198,8 +199,8 @@ class PathTracer:
         path.clear = mi.Bool(False)
         surface = path.active & ~collided
         sums.interacted |= collided
-        if self._known is not None:
-            is_end, end = collided & self._known(path.pointer), sums.end
+        if self._is_cached is not None:
+            is_end, end = collided & self._is_cached(path.pointer), sums.end
             end.p = dr.select(is_end, path.ray(t), end.p)
             end.direction = dr.select(is_end, path.ray.d, end.direction)
             end.pointer = dr.select(is_end, path.pointer, end.pointer)
@@ -217,7 +218,7 @@ class PathTracer:
     ) -> mi.Bool:
         """Add emission of emitters hit by the ray, with multiple importance sampling.
 
-        Returns where the surface is a hidden emitter, which the path passes.
+        Returns the mask of lanes whose surface is a hidden emitter, which the path passes through.
         """
         si = segment.si
         emitter = si.emitter(self._scene, segment.surface)
@@ -284,8 +285,9 @@ class PathTracer:
         scatters: mi.Bool,
         skipped: mi.Bool,
     ) -> mi.Bool:
-        """Sample the BSDF or the phase function and continue the path; return where there is a
-        vertex.
+        """Sample the BSDF or the phase function and continue the path.
+
+        Returns the mask of lanes whose path has a vertex here (not those that pass a null surface).
         """
         si, collided, rng = segment.si, segment.collided, path.rng
         choice = rng.next_float32(path.active)

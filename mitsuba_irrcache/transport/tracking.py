@@ -40,9 +40,9 @@ def free_flight(
 ):
     """Sample a collision between ``near`` and ``far`` by delta tracking (Woodcock et al. 1965).
 
-    Returns whether the ray collides, the distance, the path throughput ``weight``, the random
-    number generator, and the weighted radiance of the medium's emission, an unbiased estimate of
-    int T j dt.
+    ``weight`` is the path throughput. Returns whether the ray collides, the distance, the
+    throughput after it, the random number generator, and the radiance of the medium's emission
+    times the throughput, an unbiased estimate of ``weight`` int T j dt.
 
     Grey extinction leaves the throughput unchanged. With coloured extinction, collisions are
     accepted with a probability that depends on the current throughput, which compensates for the
@@ -99,9 +99,10 @@ def optical_depth(
 ):
     """Integrate sigma_t from ``near`` to ``far``, exactly up to rounding, for each channel.
 
-    Once all channels exceed ``most`` the result is only a lower bound. Between planes through the
-    voxel centres, trilinear extinction is a cubic polynomial of the distance, which two Gauss
-    points integrate exactly, whatever the optical depth of a voxel. Empty macrocells are skipped.
+    Integration stops once all channels exceed ``most``; the result is then only a lower bound.
+    Between planes through the voxel centres, trilinear extinction is a cubic polynomial of the
+    distance, which two Gauss points integrate exactly, whatever the optical depth of a voxel.
+    Empty macrocells are skipped.
     """
     depth = medium.sigma_t.at_world(ray.o, False) * 0
     active = mi.Bool(active) & (near < far)

@@ -95,7 +95,9 @@ class SurfaceBoundary:
     def paths(self) -> PathTracer:
         """Paths in the current scene that end in the medium."""
         own = self.pointer
-        return PathTracer(self.scene, self.media, *self._depths, known=lambda other: other == own)
+        return PathTracer(
+            self.scene, self.media, *self._depths, is_cached=lambda other: other == own
+        )
 
     def crossings(self, tracks: Tracks, ordinates: Ordinates) -> SurfaceCrossings | None:
         """Where tracks along ``ordinates`` cross surfaces among the voxels."""
@@ -124,7 +126,7 @@ class IncomingRadiance:
         self.tracks = tracks
         parts = [incoming]
         if boundary.angular_basis is not None:
-            parts = boundary.angular_basis.apart(directions, incoming)
+            parts = boundary.angular_basis.split_by_source(directions, incoming)
         #: ordinates along which radiance may come straight from emitters; with an angular basis
         #: first from all but narrow sources, then from each of these
         self.has_emitters = [part.any(axis=(1, 2)) for part in parts]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
+from mitsuba_irrcache.cache.angular import AngularBasis, empty_sums, with_radiance
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker_words, random_stream, unit_floats
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -27,7 +27,7 @@ def emission_irradiance(
     place = dr.arange(mi.UInt32, dr.width(position))
     rng = random_stream(mi.sample_tea_32(place, hashed_seed(seed)[0]), 1)
     shift = [rng.next_uint32(), rng.next_uint32()]
-    total, weight = nothing(angular_basis), dr.opaque(mi.Float, 4 * dr.pi / count)
+    total, weight = empty_sums(angular_basis), dr.opaque(mi.Float, 4 * dr.pi / count)
     k, count = mi.UInt32(0), dr.opaque(mi.UInt32, count)
     while dr.hint(k < count, label="emission"):
         ray = mi.Ray3f(position, _direction(shift, k))
@@ -36,7 +36,9 @@ def emission_irradiance(
             medium, ray, dr.maximum(near, 0), far, mi.Spectrum(1), rng, hit
         )
         # Emission is no narrow source.
-        total = added(total, position, ray.d, mi.Spectrum(0), emitted * weight, angular_basis)
+        total = with_radiance(
+            total, position, ray.d, mi.Spectrum(0), emitted * weight, angular_basis
+        )
         k += 1
     dr.eval(total)
     return total

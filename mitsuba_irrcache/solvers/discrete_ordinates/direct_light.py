@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.angular import AngularBasis, added, nothing
+from mitsuba_irrcache.cache.angular import AngularBasis, empty_sums, with_radiance
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import hashed_seed, kronecker, random_stream
 from mitsuba_irrcache.grids.grid import Grid
@@ -136,7 +136,7 @@ class EmitterSampling:
 def _mean_irradiance(sampling, emitters, count, samples, rng):
     """Average samples of the irradiance from all ``count`` emitters, and of its moments."""
     shift = mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-    total, k = nothing(sampling.angular_basis), mi.UInt32(0)
+    total, k = empty_sums(sampling.angular_basis), mi.UInt32(0)
     weight = mi.Float(count) / mi.Float(samples)
     while dr.hint(k < samples, label="area emitters"):
         # Distribute the points evenly among the emitters and over each of them.
@@ -144,7 +144,7 @@ def _mean_irradiance(sampling, emitters, count, samples, rng):
         emitter = dr.gather(mi.EmitterPtr, emitters, dr.minimum(which, count - 1))
         sample = mi.Point2f(kronecker(k, 2, (shift.x, shift.y)))
         irradiance, towards, rng = sampling.sample(emitter, sample, rng)
-        total = added(
+        total = with_radiance(
             total, sampling.p, towards, irradiance * weight, mi.Spectrum(0), sampling.angular_basis
         )
         k += 1

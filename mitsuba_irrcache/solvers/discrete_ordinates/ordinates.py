@@ -65,7 +65,11 @@ class OrdinateSet:
             is_sun = np.concatenate([each._is_sun for each in sets])[:, None, None]
             suns = [np.where(is_sun, incoming, 0)]
             incoming = np.where(is_sun, 0, incoming)
-        parts = [incoming] if angular_basis is None else angular_basis.apart(directions, incoming)
+        parts = (
+            [incoming]
+            if angular_basis is None
+            else angular_basis.split_by_source(directions, incoming)
+        )
         parts += suns
         used = [part.any(axis=(1, 2)) for part in parts]
         return [

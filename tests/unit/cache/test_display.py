@@ -54,7 +54,7 @@ def test_text_states_grid_samples_and_error():
         "voxels = 8 x 6 x 4, of 1 x 2 x 3",
         "active = 192 (100.0%)",
         "samples = 16 per voxel, in 1 stream(s)",
-        "irradiance = 4.5 in the mean, at most 8",
+        "irradiance = mean 4.5, maximum 8",
     ):
         assert part in text
     error = float(re.search(r"relative error = ([\d.]+)%", text)[1])
