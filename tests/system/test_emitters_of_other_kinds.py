@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.cache import angular
+from mitsuba_irrcache.lights import narrow_sources
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.pipeline.defaults import choose_solver, needs_no_cache
@@ -60,7 +60,7 @@ def test_unknown_emitters_without_one_direction_are_refused_where_moments_are_ne
     scenes, monkeypatch
 ):
     """Narrow emitters are no part of the moments, whose truncated series would be far off."""
-    monkeypatch.setattr(angular, "emits_in_one_direction", lambda emitter: False)
+    monkeypatch.setattr(narrow_sources, "emits_in_one_direction", lambda emitter: False)
     medium = scenes.medium(1.0, 0.8, phase={"type": "hg", "g": 0.5})
     beam = {"type": register_beam(mi.variant()), "id": "beam"}
     ours = {"type": "irrcache", "solver": "path", "resolution": 8}
