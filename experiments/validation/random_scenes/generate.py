@@ -45,6 +45,10 @@ EMITTERS = (
     "point far", "spot", "spot inside", "rectangle near", "rectangle far", "disk near",
     "sphere near", "sphere far", "mesh near", "rectangle inside",
 )  # fmt: skip
+#: Distances of area emitters from the centre, beyond every corner of cubes, or a share of the
+#: shortest edge; and their sizes, both in units of `SIDE`.
+LAMP_DISTANCES = {"near": 2.2, "far": 5.0, "inside": 0.45}
+LAMP_SIZES = {"near": 0.4, "far": 0.6, "inside": 0.08}
 ENVIRONMENTS = {"constant", "sun in envmap", "turned envmap"}
 #: "against the light" has the emitter behind the medium.
 CAMERAS = (
@@ -106,7 +110,26 @@ class RandomScene:
         if drawn["phase"] in ("hg 0.7", "hg 0.8", "hg 0.85"):
             drawn["max_depth"] = -1  # refused at other depths
         case = cls(seed, index, emitter=emitter, **drawn)
-        return replace(case, depth=case._renderable_depth())
+        hides = case.hide_emitters and not case._has_lamp_in_front()
+        return replace(case, depth=case._renderable_depth(), hide_emitters=hides)
+
+    def _has_lamp_in_front(self) -> bool:
+        """Whether an area emitter is between the camera and the medium.
+
+        volpath samples the distance to the first collision wrongly behind a hidden one: the medium
+        is up to three times too bright there.
+        """
+        kind, _, where = self.emitter.partition(" ")
+        if where not in LAMP_DISTANCES or kind in ("point", "spot"):
+            return False
+        distance, size = self._lamp_distance(where), LAMP_SIZES[where]
+        lamp = distance * SIDE * self._towards_emitter(self.stream("emitter"))
+        origin = self._view()[0]
+        axis, towards = -origin / np.linalg.norm(origin), lamp - origin
+        sines = 1.8 * SIDE / np.linalg.norm(origin), 1.5 * size * SIDE / np.linalg.norm(towards)
+        angles = np.arcsin(np.minimum(sines, 1)).sum()
+        between = np.arccos(np.clip(axis @ towards / np.linalg.norm(towards), -1, 1))
+        return bool(np.linalg.norm(towards) < np.linalg.norm(origin) and between < angles)
 
     def _renderable_depth(self) -> float:
         """Limit the optical depth where volpath would be wrong.
@@ -314,14 +337,16 @@ class RandomScene:
             return 0.95
         return 1 / (np.linalg.norm(local) if "sphere" in self.boundary else local.max())
 
+    def _lamp_distance(self, where: str) -> float:
+        """Return the distance of an area emitter from the centre in units of `SIDE`."""
+        if where == "near" and ("sphere" in self.boundary or self.boundary == "mesh"):
+            return 1.7
+        if where == "far" and self.surroundings == "room":
+            return 3.0
+        return LAMP_DISTANCES[where] * (self._edges().min() if where == "inside" else 1)
+
     def _lamp(self, kind: str, where: str, towards: np.ndarray, colour, folder: Path) -> dict:
-        round_ = "sphere" in self.boundary or self.boundary == "mesh"
-        distance = {
-            "near": 1.7 if round_ else 2.2,  # beyond every corner
-            "far": 3.0 if self.surroundings == "room" else 5.0,
-            "inside": 0.45 * self._edges().min(),
-        }[where]
-        size = {"near": 0.4, "far": 0.6, "inside": 0.08}[where] * SIDE
+        distance, size = self._lamp_distance(where), LAMP_SIZES[where] * SIDE
         radiance = 6.0 * (distance * SIDE / size / 2) ** 2
         place = _look(distance * SIDE * towards, (0.1, 0.2, 0.0)) @ mi.ScalarTransform4f().scale(
             size
@@ -359,7 +384,8 @@ class RandomScene:
 
     # -- camera and surroundings -------------------------------------------------------------------
 
-    def _sensor(self) -> dict:
+    def _view(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the position of the camera, that at which it looks, and its field of view."""
         random = self.stream("camera")
         target, fov = random.uniform(-0.1, 0.1, 3) * SIDE, 36.0
         origin = np.array([0.8, 0.9, -4.5]) * SIDE
@@ -379,6 +405,10 @@ class RandomScene:
             origin, fov = np.array([0.2, 0.3, -3.4]) * SIDE, 45.0
         if self.surroundings in ("second medium", "ball beside") and self.camera != "inside":
             fov = 58.0  # so that they are visible
+        return origin, target, fov
+
+    def _sensor(self) -> dict:
+        origin, target, fov = self._view()
         film = {
             "type": "hdrfilm", "width": PIXELS, "height": PIXELS, "component_format": "float32",
             "rfilter": {"type": "box"},
