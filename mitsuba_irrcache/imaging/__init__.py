@@ -1,1 +1,1 @@
-"""The plugin's properties, camera rays for the present state of a scene, the composed image."""
+"""The plugin's properties, camera rays for the current state of a scene, the composed image."""

@@ -1,4 +1,4 @@
-"""Camera rays for the current state of a scene, whose caches are completed first."""
+"""Provide camera rays for the current state of a scene, after completing its caches."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from mitsuba_irrcache.scene.consistency import check_sensor
 
 
 class CameraRaySource:
-    """Makes the camera rays for a scene, and keeps them while its caches stay the same.
+    """Creates the camera rays for a scene, and reuses them while its caches do not change.
 
-    Media and caches are those of ``builder``; with a ``tolerance``, those found for a view. A
-    volume in a file takes their place. ``stock`` is told about scenes without a visible medium,
-    for which there are no camera rays; ``stopping`` ends the construction of a cache early.
+    Media and caches are those of ``builder``; with the property ``tolerance``, those that the
+    search finds for a view; with ``sigma_t_file``, those of the volume in that file. For scenes
+    without a visible medium there are no camera rays, and ``stock`` chooses one of Mitsuba's
+    integrators. ``stopping`` ends the construction of a cache early.
     """
 
     def __init__(self, options: Options, stopping: StopCondition, stock: StockIntegrators) -> None:
         self._options, self._stopping, self._stock = options, stopping, stock
         self.builder = options.builder(options.settings)
         self._search = options.tolerance_search()
-        self._step = options.rays.step  # or that of the search
+        self._step = options.rays.step  # replaced by the step that the search finds
         self._mapped: MappedMedium | None = None
         if options.volume is not None:
             whole = not (self._search or options.rays.layered or options.emission is not None)
@@ -38,7 +39,7 @@ class CameraRaySource:
         self.certificate: Certificate | None = None
         #: camera rays of the last scene whose caches are in memory
         self.latest: CameraRays | None = None
-        self._parts: list[CachedMedium] | None = None  # those of `latest`
+        self._parts: list[CachedMedium] | None = None  # the media of `latest`
         self._revision = 0  # revision of the builder for which `latest` was created
 
     @property
@@ -67,8 +68,8 @@ class CameraRaySource:
     ) -> int:
         """Choose cache and step for an image of ``sensor``; return the samples per pixel.
 
-        The timeout starts here, for search and image together. If it ends the search, the image is
-        that of the finest cache so far.
+        The timeout starts here, for search and image together. If it ends the search, the finest
+        cache found so far is used.
         """
         check_sensor(scene, sensor)
         try:
@@ -80,8 +81,8 @@ class CameraRaySource:
                 self.builder.adopt(finest)
             mi.Log(
                 mi.LogLevel.Warn,
-                "irrcache: stopped before the error of the image was known; the tolerance is not "
-                "guaranteed.",
+                "irrcache: stopped before the error of the image was estimated; the tolerance is "
+                "not guaranteed.",
             )
             return spp
         before = self.certificate
@@ -112,7 +113,7 @@ class CameraRaySource:
             return self.latest
 
     def _begin(self, progress: Progress | None) -> Progress:
-        """Start the timeout; return ``progress`` such that it raises `Stopped` when due."""
+        """Start the timeout; return a ``progress`` that raises `Stopped` when it expires."""
         self._stopping.begin(self._options.timeout)
         return self._stopping.raising(progress)
 

@@ -1,4 +1,4 @@
-"""The image: camera samples in the film, its layers, and what is composed of them."""
+"""The image: camera samples on the film, its layers and AOVs, and the composition of the result."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class ImageRenderer:
     def __init__(self, options: Options) -> None:
         self._layered, self._aovs = options.rays.layered, options.aovs
         self._filter = options.illumination_filter
-        #: duration [s] of those stages of the last image that are measured
+        #: duration [s] of the measured stages of the last image, by name
         self.seconds: dict[str, float] = {}
 
     def aov_names(self) -> list[str]:
-        """Names of the channels in addition to colour and alpha, in the film's order."""
+        """Return the names of the channels in addition to colour and alpha, in the film's order."""
         return [f"{name}.{c}" for name, kind in self._aovs.items() for c in AOVS[kind]]
 
     def aov_values(self, layers: Layers | None) -> list[mi.Float]:
-        """Values of these channels."""
+        """Return the values of the channels `aov_names`."""
         return [value for kind in self._aovs.values() for value in layers.aov(kind)]
 
     def sample(
@@ -82,7 +82,10 @@ class ImageRenderer:
     def render_stock(
         self, stock: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int
     ) -> mi.Film:
-        """Render a scene without a visible medium by Mitsuba's own integrator, as background."""
+        """Render a scene without a visible medium with Mitsuba's integrator ``stock``.
+
+        In AOVs its radiance counts as background.
+        """
         film = sensor.film()
         check_film(film, spp or sensor.sampler().sample_count(), 0, at_once=True)
         stock.render(scene, sensor, seed, spp)

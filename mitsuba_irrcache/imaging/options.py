@@ -45,17 +45,17 @@ class RayOptions:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Largest error of the image, in units of the mean radiance of the image or ``volume``."""
+    """Largest error of the image, relative to the mean radiance of ``unit`` (``tolerance_of``)."""
 
     error: float
     unit: str
-    #: taken as it is, unless None
+    #: the step of camera rays if the user set it; None: the search chooses it
     step: float | None
 
 
 @dataclass(frozen=True)
 class Options:
-    """All properties; see the plugin's documentation. What is not set is None."""
+    """All properties of the integrator; see the plugin's documentation. None: not set."""
 
     settings: CacheSettings
     rays: RayOptions
@@ -69,7 +69,9 @@ class Options:
 
     @classmethod
     def of(cls, props: properties.RecordedProperties) -> Options:
-        """Read ``props``; raise IrrcacheError if one is wrong, misspelt, or excludes another."""
+        """Read ``props``; raise IrrcacheError if one is invalid or misspelt, or two exclude each
+        other.
+        """
         max_depth = properties.integer(props, "max_depth", -1, -1, "-1 (all orders) or at least 0")
         hide_emitters = properties.flag(props, "hide_emitters", False)
         illumination_filter = properties.choice(props, "filter", "none", FILTERS)

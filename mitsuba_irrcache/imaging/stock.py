@@ -10,7 +10,7 @@ from mitsuba_irrcache.pipeline.defaults import choose_stock
 class StockIntegrators:
     """Chooses, loads and keeps Mitsuba's integrators.
 
-    ``properties`` are those that all of them share, such as ``max_depth``.
+    ``properties``, such as ``max_depth``, are passed to all of them.
     """
 
     def __init__(self, **properties: object) -> None:
@@ -35,6 +35,6 @@ class StockIntegrators:
         return self._loaded[self._chosen]
 
     def cancel(self) -> None:
-        """End the current rendering, in any thread."""
+        """Cancel the current rendering of all loaded integrators, in any thread."""
         for integrator in self._loaded.values():
             integrator.cancel()

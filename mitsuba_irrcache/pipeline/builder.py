@@ -1,4 +1,4 @@
-"""Builds the caches of a scene, and detects which remain valid when the scene changes."""
+"""Build the caches of a scene, and detect which remain valid when the scene changes."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(eq=False)
 class Stage:
-    """Request of a progressive run: ``samples`` per voxel (0: not begun), and whether the first two
-    batches may be shown while they are incomplete.
+    """Request of a progressive run: a number of ``samples`` per voxel (0: none yet), and whether
+    the first two batches may be rendered while they are incomplete (``early``).
     """
 
     samples: int = 0
@@ -46,14 +46,14 @@ class Stage:
 class CacheBuilder:
     """Keep the media and caches of one scene up to date without repeating work.
 
-    Threads may share it: media and caches change under its ``lock`` only. To read several
-    attributes that have to be consistent, hold the lock.
+    Threads may share it: media and caches change only while its ``lock`` is held. Hold the lock to
+    read several attributes consistently.
     """
 
     def __init__(
         self, settings: CacheSettings, emission: object = None, emission_scale: float = 1.0
     ) -> None:
-        """``emission`` is the argument of `bake_emission`; None: media emit nothing."""
+        """``emission`` is the argument of `bake_emission`; None: media do not emit."""
         self.settings = settings
         self.lock = RLock()
         self._emission, self._emission_scale = emission, emission_scale
@@ -65,21 +65,21 @@ class CacheBuilder:
         self.parts: list[CachedMedium] = []
         self._snapshot: Snapshot | None = None
         self._stages: list[Stage] = []
-        self._checkpointed = 0  # runs that save the caches themselves
-        #: whether the first two batches may be shown while incomplete; see `Solver.preview`
+        self._checkpointed = 0  # number of active `checkpoints` contexts, which save the caches
+        #: whether the first two batches may be rendered while incomplete; see `Solver.preview`
         self.early = False
-        #: its action is called between kernel launches of a solver, which may compute other things
-        #: meanwhile; an exception drops the batch in progress
+        #: callback between kernel launches of a solver, which may launch other kernels; if it
+        #: raises, the batch in progress is discarded
         self.pause = Pause()
 
     @property
     def medium(self) -> MediumGrid | None:
-        """The first medium of the scene, None where there is none."""
+        """The first visible medium of the scene; None without one."""
         return self.parts[0].medium if self.parts else None
 
     @property
     def cache(self) -> IrradianceCache | None:
-        """The cache of the first medium, None where it needs none."""
+        """The cache of the first visible medium; None if it needs none."""
         return self.parts[0].cache if self.parts else None
 
     @property
@@ -109,7 +109,7 @@ class CacheBuilder:
             self.revision += 1
 
     def fit(self, scene: mi.Scene) -> None:
-        """Update the media to ``scene``; invalid caches become empty."""
+        """Update the media to ``scene``; replace caches that are no longer valid by empty ones."""
         with self.lock:
             self._fit(scene)
 
@@ -122,7 +122,7 @@ class CacheBuilder:
             if edited:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
-            # While parameters carry gradients; an objective would jump with the grid.
+            # Keep grids while parameters carry gradients: another grid makes the objective jump.
             grids = _grids(self.parts) if edited and snapshot.carries_gradients else {}
             self.parts, self._snapshot = [], None
             self.revision += 1
@@ -170,7 +170,7 @@ class CacheBuilder:
                 part.save()
 
     def close(self) -> None:
-        """Ends `early` and drops incomplete batches."""
+        """Reset `early`, and discard incomplete batches."""
         with self.lock:
             self.early = False
             if any(stage.early for stage in self._stages):
@@ -180,7 +180,7 @@ class CacheBuilder:
 
     @contextmanager
     def stage(self) -> Iterator[Stage]:
-        """A context whose `Stage` replaces ``samples`` while it lasts."""
+        """Return a context whose `Stage` overrides ``samples`` while it is active."""
         stage = Stage()
         with self.lock:
             self._stages.append(stage)
@@ -198,7 +198,7 @@ class CacheBuilder:
 
     @property
     def done(self) -> int:
-        """Minimum samples per voxel over the caches, including those in incomplete batches."""
+        """Minimum samples per voxel over the caches, including incomplete batches."""
         shown = [p.shown.samples for p in self._nonzero or self.parts if p.shown is not None]
         return min(shown, default=0)
 
@@ -209,7 +209,7 @@ class CacheBuilder:
 
     @property
     def relative_error(self) -> float:
-        """The largest relative error of the caches; 0 where all are zero."""
+        """The largest relative error of the caches; 0 if all are zero."""
         return max((p.shown.relative_error for p in self._nonzero), default=0.0)
 
     @property
@@ -229,8 +229,10 @@ class CacheBuilder:
 
     @contextmanager
     def checkpoints(self) -> Iterator[Callable[[], None]]:
-        """A context in which `update` does not save caches, for runs of many passes. The function
-        it yields saves them when the last time was long ago; leaving the context saves them, too.
+        """Return a context in which `update` does not save caches, for runs of many passes.
+
+        It yields a function that saves them if the last save is long enough ago. They are also
+        saved when the context is left.
         """
         ended, took = perf_counter(), 0.0
 
@@ -253,11 +255,12 @@ class CacheBuilder:
 
 
 def _data_shape(medium: MediumGrid) -> tuple[int, ...]:
+    """Return the shape of the extinction's grid, () for a homogeneous medium."""
     return () if medium.sigma_t.grid is None else medium.sigma_t.grid.shape
 
 
 def _grids(parts: list[CachedMedium]) -> dict[tuple, Grid]:
-    """Grids of caches by the name of the medium and the voxels of its data."""
+    """Return the grids of caches by (name of the medium, shape of its data)."""
     return {
         (part.medium.name, _data_shape(part.medium)): part.cache.grid
         for part in parts
@@ -266,7 +269,7 @@ def _grids(parts: list[CachedMedium]) -> dict[tuple, Grid]:
 
 
 def _progress_of_one(progress: Progress | None, number: int, count: int) -> SolverProgress | None:
-    """``progress`` of all caches together, for the solver of the one with this ``number``."""
+    """Return a callback for the solver of cache ``number`` that reports the ``progress`` of all."""
     if progress is None:
         return None
     return lambda done, total: progress("cache", number * total + done, count * total)

@@ -46,7 +46,7 @@ from mitsuba_irrcache.solvers.grid_size import (
 )
 from mitsuba_irrcache.solvers.half_space import HalfSpace
 
-#: Held by the thread that writes a cache file.
+#: Lock of the thread that writes a cache file.
 _SAVING = Lock()
 
 
@@ -61,17 +61,20 @@ class CacheSettings:
     samples: int = 0
     seed: int = 0
     file: str = ""
-    with_error: bool = False  # enough samples for a standard error: two batches at least
+    with_error: bool = False  # whether a standard error is needed: at least two batches
 
 
 class CachedMedium:
-    """A medium with its cache, which is None where none is needed (``max_depth`` below 2, or a
-    closed form).
+    """A medium with its cache, which is None if none is needed (``max_depth`` below 2, or a closed
+    form).
 
-    ``solver`` is a result of `choose_solver`; ``name`` distinguishes the medium from other visible
-    ones of the scene, "" where there are none; ``edited``: the scene is an edited version of one
-    that had a cache; ``pause`` is as in `CacheBuilder`. ``grid`` is that of the cache before, which
-    is kept while parameters carry gradients: an objective would jump with it.
+    Args:
+        solver: result of `choose_solver`.
+        name: distinguishes the medium from other visible ones of the scene; "" without others.
+        edited: whether the scene is an edited version of one that had a cache.
+        pause: as in `CacheBuilder`.
+        grid: grid of the cache before an edit, which is kept while parameters carry gradients,
+            because an objective would jump if it changed. None: choose a grid.
     """
 
     def __init__(
@@ -123,12 +126,12 @@ class CachedMedium:
 
     @property
     def file(self) -> str:
-        """File of the cache; with several visible media the name contains that of the medium."""
+        """File of the cache; with several visible media it contains the name of the medium."""
         if not self.settings.file or not self.name:
             return self.settings.file
         file = Path(self.settings.file)
-        own = re.sub(r"[^\w.-]", "_", self.name)  # a name in a scene is no path
-        return str(file.with_name(f"{file.stem}.{own}{file.suffix}"))
+        safe = re.sub(r"[^\w.-]", "_", self.name)  # an id may contain path separators
+        return str(file.with_name(f"{file.stem}.{safe}{file.suffix}"))
 
     @property
     def shown(self) -> IrradianceCache | None:
@@ -136,8 +139,8 @@ class CachedMedium:
         return self._preview or self.cache
 
     def target(self, samples: int) -> int:
-        """Samples per voxel to build up to for ``samples`` (0: the default), a multiple of the
-        cache's batch.
+        """Return the target of samples per voxel: ``samples`` (0: the default), rounded up to a
+        multiple of the cache's batch.
         """
         batch = self.cache.batch
         samples = samples or self.solver.default_samples(
@@ -151,8 +154,10 @@ class CachedMedium:
         return self.cache is None or not self.cache.active_count
 
     def refine(self, scene: mi.Scene, samples: int, early: bool, progress: Progress | None) -> bool:
-        """Fills the cache up to ``samples`` (0: the default), the first two batches bit by bit if
-        ``early``; returns whether anything may have changed.
+        """Fill the cache up to ``samples`` per voxel (0: the default).
+
+        If ``early``, the first two batches are built up over several calls, and `shown` is their
+        preview. Returns whether the cache or the preview may have changed.
         """
         if early and self.solver.has_preview and not self.is_dark and not self.cache.samples:
             return self._open(scene, samples, progress)
@@ -176,7 +181,7 @@ class CachedMedium:
         return dropped
 
     def _start_cache(self, scene: mi.Scene, edited: bool) -> IrradianceCache:
-        """Load the cache from its file if that exists, else create an empty one."""
+        """Load the cache from its file if it exists; otherwise create an empty one."""
         settings, medium, solver = self.settings, self.medium, self.solver
         grid, size_reason = self._choose_grid()
         basis = _angular_basis(scene, medium)
@@ -225,14 +230,14 @@ class CachedMedium:
         return self._resume(empty(self._fingerprint(scene, grid, moments)), edited) or empty({})
 
     def _why_shadows_are_too_bright(self) -> str | None:
-        """Return why a forward peak counts as unscattered between emitters and surfaces; None if it
-        does not.
+        """Return why scattering into a forward peak counts as unscattered for the irradiance of
+        surfaces, which makes shadows too bright; None if it does not.
         """
         description = self.description
         if self.medium.original is None or not description.has_surfaces:
             return None
         if len(description.visible) < len(description.media.grids):
-            return "another medium is behind surfaces, so that no irradiance is cached on them"
+            return "another medium is behind surfaces, so no irradiance is cached on surfaces"
         lamps = len(description.emitters.of(EmitterKind.AREA))
         if lamps > MAX_LAMPS:
             return f"there are {lamps} area emitters, and only {MAX_LAMPS} are treated as narrow"
@@ -246,8 +251,8 @@ class CachedMedium:
         return grid, "as before, since parameters carry gradients"
 
     def _active_voxels(self, scene: mi.Scene, grid: Grid) -> tuple[mi.UInt32, VoxelClasses | None]:
-        """Return the voxels whose irradiance is needed and not 0, and their classes among surfaces
-        and media.
+        """Return the flat indices of the voxels whose irradiance is needed and not 0, and the
+        classification of all voxels by surfaces and media (None without any among them).
         """
         medium = self.medium
         active = active_voxels(medium, grid)
@@ -280,15 +285,16 @@ class CachedMedium:
         classes: VoxelClasses | None,
         samples: int,
     ) -> list[DirectLight]:
-        """Return the emitters whose irradiance camera rays evaluate themselves, for a cache of this
-        number of ``samples`` per voxel.
+        """Return the emitters whose irradiance camera rays evaluate in closed form.
+
+        ``samples`` is the number of samples per voxel of the cache.
         """
         medium, lights = self.medium, []
         if self.solver.knows_direct_lights(scene, medium, grid, active):
             dense = border_error(medium, grid) > SMALL_BORDER_ERROR
             lights = direct_lights_of(scene, medium, grid, active, dense, classes)
             lights += area_lights_of(scene, medium, grid, active, classes, samples)
-        if medium.refracts:  # others reach no voxel straight
+        if medium.refracts:  # radiance of emitters outside reaches voxels only by refraction
             lights = [light for light in lights if _is_within(medium, light.emitter)]
         return lights
 
@@ -304,9 +310,10 @@ class CachedMedium:
         return bool(self.description.emitters) or self.medium.emission is not None
 
     def _check_memory(self, grid: Grid, moments: int) -> None:
-        """Refuse a cache that exceeds the available memory while it is filled or looked up.
+        """Raise IrrcacheError if the cache would exceed the available memory while it is filled or
+        looked up.
 
-        The field of its errors needs as much again (experiments/paper/memory).
+        The field of its errors doubles the memory (experiments/paper/memory).
         """
         channels, max_depth = 1 if mi.is_monochromatic else 3, self.settings.max_depth
         numbers = self.solver.numbers_per_voxel(
@@ -320,7 +327,7 @@ class CachedMedium:
         what = f"irrcache: a cache of {' x '.join(map(str, grid.shape[::-1]))} voxels"
         require_memory(needed, what, "lower resolution")
         if grid.voxel_count >= 2**32:
-            raise IrrcacheError(f"{what} has 2^32 of them or more; lower resolution.")
+            raise IrrcacheError(f"{what} exceeds the limit of 2^32 - 1 voxels; lower resolution.")
 
     def _fingerprint(self, scene: mi.Scene, grid: Grid, moments: int) -> dict[str, str]:
         count = f", moments {moments}" if moments else ""
@@ -333,8 +340,9 @@ class CachedMedium:
         """Load the cache from its file if it belongs to the same scene; without a file return the
         empty ``cache``.
 
-        Returns None if the file belongs to the scene before it was ``edited``, so that the file is
-        not overwritten. Raises CacheFileError for the file of another scene.
+        Returns None if the file belongs to the scene before it was ``edited``: the new cache then
+        has no file, so that this one is not overwritten. Raises CacheFileError for the file of
+        another scene.
         """
         file = Path(self.file)
         if not os.path.exists(file):  # returns False where Path.exists may raise
@@ -358,8 +366,8 @@ class CachedMedium:
         if edited:
             mi.Log(
                 mi.LogLevel.Warn,
-                f'irrcache: the scene was edited ({", ".join(others)}): "{file}" keeps the '
-                "irradiance of the scene before.",
+                f'irrcache: the scene was edited ({", ".join(others)}): "{file}" is not updated, '
+                "and keeps the irradiance of the scene before the edit.",
             )
             return None
         detail = (
@@ -375,7 +383,10 @@ class CachedMedium:
         )
 
     def _open(self, scene: mi.Scene, samples: int, progress: Progress | None) -> bool:
-        """Grow the first two batches up to ``samples`` in total; return whether any were added."""
+        """Extend the preview of the first two batches to ``samples`` per voxel in total.
+
+        Complete batches are moved to the cache. Returns whether any samples were added.
+        """
         cache = self.cache
         if self._opening is None:
             self._opening = self.new_solver(scene).preview()
@@ -418,7 +429,9 @@ class CachedMedium:
         )
 
     def use_file(self, scene: mi.Scene, file: str | Path) -> None:
-        """Load the cache from ``file``, or empty it, as if that were the ``cache_file``."""
+        """Use ``file`` as ``cache_file``: load the cache from it, or empty the cache if it does not
+        exist.
+        """
         self.settings = replace(self.settings, file=str(file))
         empty = self.cache.empty_copy()
         empty.fingerprint = self._fingerprint(scene, empty.grid, empty.moments)
@@ -431,8 +444,8 @@ class CachedMedium:
         cache.save(file, self._fingerprint(scene, cache.grid, cache.moments))
 
     def save(self) -> None:
-        """Saves the cache to its file unless the file, possibly updated by another process, already
-        holds at least as many samples. Logs a warning where the file cannot be written.
+        """Save the cache unless its file, possibly updated by another process, already holds at
+        least as many samples. Log a warning if the file cannot be written.
         """
         file, cache = self.file, self.cache
         if not file or cache is None or not cache.fingerprint:
@@ -452,8 +465,9 @@ class CachedMedium:
             )
 
     def _is_ahead(self, file: str) -> bool:
-        """Whether another process has written as many samples of the same scene meanwhile. Raises
-        CacheFileError if the file now belongs to another scene.
+        """Whether another process has written at least as many samples of the same scene.
+
+        Raises CacheFileError if the file now belongs to another scene.
         """
         if not Path(file).exists():
             return False
@@ -468,7 +482,8 @@ def _angular_basis(
 ) -> AngularBasis | None:
     """Create the angular basis of anisotropic scattering in a scene; None if it is isotropic.
 
-    The direct irradiance of the emitters ``known`` is not part of it.
+    The emitters ``known``, whose irradiance camera rays evaluate in closed form, are not among its
+    sources.
     """
     if medium.phase.is_isotropic:
         return None
@@ -492,6 +507,6 @@ def _check_like(cache: IrradianceCache, stored: IrradianceCache, file: Path) -> 
         unlike.append("grid")
     if unlike:
         raise CacheFileError(
-            f'irrcache: cache_file "{file}" contradicts itself: {", ".join(unlike)} do not fit '
-            "its fingerprint. Delete it."
+            f'irrcache: cache_file "{file}" is inconsistent: {", ".join(unlike)} do not fit its '
+            "fingerprint. Delete it."
         )

@@ -54,8 +54,8 @@ def choose_solver(
 ) -> tuple[type[Solver], str]:
     """Choose the solver for a ``medium`` of a scene; also return the reason.
 
-    ``solver`` is a name, or ``auto`` for the first, by `Solver.precedence`, that supports it.
-    Raises IrrcacheError if the named solver, or none at all, supports it.
+    ``solver`` is a name, or ``auto`` for the first one, by `Solver.precedence`, that supports the
+    medium. Raises IrrcacheError if the named solver does not support it, or if none does.
     """
     candidates = registered() if solver == "auto" else (solver_named(solver),)
     reasons = []
@@ -83,8 +83,9 @@ def _check_forward_peak(
 ) -> None:
     """Raise UnsupportedSceneError for a medium whose delta-M scaling cannot be used.
 
-    That is the case if the ``solver``, chosen for a ``reason``, does not support it, or if the
-    orders of scattering are limited: scattering into the forward peak does not count as an order.
+    It cannot be used if the ``solver``, chosen for ``reason``, does not support it, or if
+    ``max_depth`` limits the orders of scattering, because scattering into the forward peak does not
+    count as an order.
     """
     cosine = medium.phase.forward + (1 - medium.phase.forward) * float(medium.phase.moments[1])
     sharp = f'irrcache: medium "{medium.name}" scatters sharply, with a mean cosine of {cosine:.2f}'
@@ -97,8 +98,8 @@ def _check_forward_peak(
         )
     if max_depth >= 0:
         raise UnsupportedSceneError(
-            f"{sharp}: only the sum of all orders is known, not max_depth {max_depth}; set "
-            f"max_depth to -1, {remedy}."
+            f"{sharp}: for such media only the sum of all orders can be computed, not max_depth "
+            f"{max_depth}; set max_depth to -1, {remedy}."
         )
 
 
@@ -107,7 +108,7 @@ def needs_no_cache(
 ) -> str | None:
     """Return why `HalfSpace` is more accurate than a cache for ``medium``.
 
-    None if it is not, or if ``resolution`` is set, which requests a cache.
+    Returns None if it is not more accurate, or if ``resolution`` is set, which requests a cache.
     """
     if resolution or max_depth > half_space.MOST_ORDERS:
         return None

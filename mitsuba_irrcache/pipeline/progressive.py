@@ -3,8 +3,8 @@
     for frame in render_progressive(scene, seconds=10):
         mi.util.write_bitmap("image.png", frame.image)
 
-Passes refine the cache, frames render it. The length of a pass and the time of the next frame
-follow from the measured times of earlier passes and frames alone.
+A *pass* adds samples to the cache, a *frame* is an image rendered with the cache. The length of a
+pass and the time of the next frame follow from the measured times of earlier passes and frames.
 """
 
 from __future__ import annotations
@@ -24,32 +24,34 @@ from mitsuba_irrcache.pipeline.builder import CacheBuilder, Progress, Stage
 
 #: Samples per voxel of the first pass: two for each of two batches, for a standard error.
 FIRST = 4
-#: Samples up to which passes may be smaller than a batch.
+#: Number of samples per voxel up to which passes may be smaller than a batch.
 OPENING = 2 * BATCH
-#: First frames, which follow each other as fast as the samples double; later ones are spaced.
+#: Number of first frames, one after each doubling of the samples; later ones have a minimum
+#: interval.
 EARLY_FRAMES = 3
-#: Interval between frames, at least: the time of an image over this share, ...
+#: Minimum interval between frames: the time to render an image, divided by this share, ...
 IMAGE_SHARE = 0.2
-#: ... and this part of the time so far: later images differ less.
+#: ... and the elapsed time times this factor, because later images differ less.
 GROWTH = 0.25
-#: Factor by which a prediction may be exceeded within a time limit.
+#: Assumed ratio of the actual to the predicted duration, when a time limit has to be kept.
 SAFETY = 1.1
-#: Part of its time from which on a frame may be rendered, since passes have a minimum length.
+#: Fraction of the time requested for a frame at which it may be rendered already, since passes have
+#: a minimum length.
 REACHED = 0.97
 
 
 @dataclass(frozen=True)
 class Targets:
-    """When a progressive run ends: at the first target reached of those given; without any, at the
-    integrator's own ``cache_spp``.
+    """When a progressive run ends: as soon as one of the given targets is reached; if none is
+    given, at the integrator's ``cache_spp``.
 
     Attributes:
         cache_spp: samples per voxel, rounded up to batches; math.inf for a run without end.
-        standard_error: of the cache, relative, see `IrradianceCache.relative_error`.
-        seconds: for cache and images; the last image is complete by then. The first one is
-            rendered however long it takes.
-        times: seconds at which frames are wanted, instead of the usual spacing. Each is finished
-            as soon after its time as passes allow; the last one ends the run.
+        standard_error: relative standard error of the cache, see `IrradianceCache.relative_error`.
+        seconds: time limit for cache and images, by which the last image is complete. The first
+            image is rendered even if it takes longer.
+        times: times [s] at which frames are requested, instead of the default intervals. Each frame
+            is finished as soon after its time as passes allow; the last one ends the run.
     """
 
     cache_spp: float = 0
@@ -86,10 +88,10 @@ class Frame:
 
     Attributes:
         image: (height, width, channel), as ``mi.render`` gives it.
-        samples: per cache voxel so far; 0 where no cache is needed.
-        standard_error: of the cache, relative, see `IrradianceCache.relative_error`.
-        seconds: since the beginning by stage: "cache", "image" (of all frames), and "filter" where
-            the integrator reports one. Time of the caller between frames does not count.
+        samples: samples per voxel of the cache so far; 0 if no cache is needed.
+        standard_error: relative standard error of the cache, see `IrradianceCache.relative_error`.
+        seconds: time spent so far by stage: "cache", "image" (of all frames), and "filter" if the
+            integrator filters images. Time that the caller spends between frames does not count.
     """
 
     image: mi.TensorXf
@@ -114,14 +116,13 @@ def render_progressive(
     seconds: float = math.inf,
     times: Sequence[float] = (),
 ) -> Iterator[Frame]:
-    """Frames of a ``scene`` with the integrator ``irrcache``, of increasing quality; see `Targets`
-    for when the run ends.
+    """Render a ``scene`` whose integrator is ``irrcache``; return frames of increasing quality.
 
-    Every frame is rendered with ``spp`` samples per pixel and ``seed``; the last one uses the final
-    cache. A ``cache_file`` is written at intervals, and at the end, also after an exception; the
-    cache stays with the integrator, and another run continues with it. ``cancel()`` of the
-    integrator ends the run without another frame. Raises IrrcacheError for another integrator and
-    for invalid targets.
+    See `Targets` for the last four arguments, which determine when the run ends. Every frame is
+    rendered with ``spp`` samples per pixel and ``seed``; the last one uses the final cache. A
+    ``cache_file`` is written at intervals and at the end, also after an exception. The integrator
+    keeps the cache, and another run continues to refine it. ``cancel()`` of the integrator ends the
+    run without another frame. Raises IrrcacheError for other integrators and for invalid targets.
     """
     integrator = scene.integrator()
     if not hasattr(integrator, "progressive"):
@@ -145,8 +146,10 @@ def frames(
     targets: Targets,
     progress: Progress | None = None,
 ) -> Iterator[Frame]:
-    """The frames of a run. ``image`` renders one with the cache as it is; it returns the image and
-    the seconds of it spent on a filter.
+    """Yield the frames of a run.
+
+    ``image`` renders one with the current cache; it returns the image, and how many seconds of its
+    duration the filter took.
     """
     with builder.checkpoints() as checkpoint, builder.stage() as stage:
         try:
@@ -181,7 +184,7 @@ class _Run:
         self._is_last = False  # whether the last frame fulfils the targets
 
     def begin(self) -> None:
-        """Makes or loads the cache, with a first pass if it needs one."""
+        """Create or load the cache, with a first pass if it has no samples."""
         goal = self.targets.cache_spp if self.targets.given else self.builder.samples
         self.stage.early = not 0 < goal < OPENING
         self._update(FIRST if self.stage.early else goal, lambda: None)
@@ -195,11 +198,11 @@ class _Run:
                 self.goal, self.stage.samples = self.builder.target, first
 
     def refine(self, samples: int, checkpoint: Callable[[], None]) -> None:
-        """A pass until the cache has so many ``samples`` per voxel."""
+        """Run a pass, after which the cache has ``samples`` per voxel."""
         self._update(samples, checkpoint)
 
     def frame(self, image: Callable[[], tuple[mi.TensorXf, float]]) -> Frame:
-        """An image of the cache as it is."""
+        """Render an image with the current cache."""
         with self.builder.lock:
             started = perf_counter()  # without the time spent waiting for other threads
             tensor, filtering = image()
@@ -211,7 +214,7 @@ class _Run:
         return Frame(tensor, samples, self.error, dict(self.schedule.seconds))
 
     def next_pass(self) -> int:
-        """Samples per voxel after the next pass; 0 when it is time for an image."""
+        """Return the samples per voxel after the next pass; 0 if a frame is due."""
         # Another thread may refine the cache between two reads, and a pass on top of its samples
         # would exceed the target.
         done = self._samples
@@ -226,12 +229,12 @@ class _Run:
         samples = self.schedule.next_pass(done, needed)
         if samples == 0:
             return 0
-        # A larger pass than the first two batches lack would have a kernel size of its own.
+        # A pass beyond the first two batches would compile kernels of another size.
         return done + samples if done >= self._opening else min(done + samples, self._opening)
 
     @property
     def is_over(self) -> bool:
-        """Whether the frame that was just made is the last one."""
+        """Whether the latest frame is the last one."""
         return self._is_last or self.schedule.is_over
 
     @property
@@ -239,7 +242,7 @@ class _Run:
         return self.builder.done
 
     def _is_fulfilled_by(self, samples: int) -> bool:
-        """Whether a cache with so many samples per voxel fulfils the targets."""
+        """Whether a cache with ``samples`` per voxel meets the targets."""
         wanted = self.targets.standard_error
         exact = wanted > 0 and self.error <= wanted
         return exact or samples >= self.goal or self.builder.is_dark
@@ -265,7 +268,7 @@ class Schedule:
         self.seconds = {"cache": 0.0, "image": 0.0}
         self._passes: list[tuple[int, float]] = []
         self._frames = 0
-        self._last_frame = 0.0  # time at which it was finished
+        self._last_frame = 0.0  # time at which the last frame was finished
         self._image = 0.0  # seconds that it took
         self._fresh = False  # whether there has been a pass since the last frame
         #: samples of the first pass, and of a batch; later passes are whole batches
@@ -284,14 +287,14 @@ class Schedule:
         return not wanted or self._samples_within(self._left) < self._grain
 
     def note_pass(self, samples: int, seconds: float) -> None:
-        """Records the ``seconds`` of a pass of ``samples`` per voxel; 0: loaded from a file."""
+        """Record the ``seconds`` of a pass of ``samples`` per voxel; 0: loaded from a file."""
         self.seconds["cache"] += seconds
         if samples:
             self._passes.append((samples, seconds))
         self._fresh = True
 
     def note_image(self, seconds: float, filtering: float = 0.0) -> None:
-        """Records the ``seconds`` of an image, of which a filter took ``filtering``."""
+        """Record the ``seconds`` of an image, of which a filter took ``filtering``."""
         self.seconds["image"] += seconds - filtering
         if filtering:
             self.seconds["filter"] = self.seconds.get("filter", 0.0) + filtering
@@ -299,8 +302,10 @@ class Schedule:
         self._image, self._last_frame, self._fresh = seconds, self.elapsed, False
 
     def next_pass(self, done: int, needed: float) -> int:
-        """Samples per voxel of the next pass, whole batches after the first two, if there are
-        ``done`` and ``needed`` more are asked for; 0 when it is time for an image.
+        """Return the samples per voxel that the next pass should add; 0 if a frame is due.
+
+        The cache has ``done`` samples per voxel, and ``needed`` more are required. After the first
+        two batches passes consist of complete batches.
         """
         self._grain = grain = self.batch if done >= 2 * self.batch else self.first
         possible = self._samples_within(self._left)
@@ -336,8 +341,10 @@ class Schedule:
         return math.inf if last else self._last_frame + interval
 
     def _samples_within(self, seconds: float) -> float:
-        """Samples per voxel that take at most so long, predicted from earlier passes: on the line
-        through the shortest and the longest one, beyond the longest in proportion to it.
+        """Predict how many samples per voxel a pass can add in ``seconds``, from earlier passes.
+
+        The prediction is linear between the shortest and the longest pass, and proportional to the
+        duration beyond the longest one.
         """
         if seconds == math.inf:
             return math.inf

@@ -1,8 +1,8 @@
-"""Parts of the random stream of a cache, computed apart from each other, for several machines.
+"""Parts of the random stream of a cache, computed independently of each other on several machines.
 
-A batch is a function of the seed and of its number. Solvers add a number of batches to the cache at
-once (`Solver.batches_at_once`); a part consists of so many. Appended in the order of their numbers,
-parts give the same bits as one run that computes them all (`IrradianceCache.append`).
+A batch is determined by the seed and its index in the stream. Solvers add several batches to the
+cache at once (`Solver.batches_at_once`), and a part consists of that many. Parts that are appended
+in the order of their batches give bit by bit the cache of a single run (`IrradianceCache.append`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 
 
 class _Collector(IrradianceCache):
-    """Looks to a solver like a cache that has the batches before a part already, and collects what
-    the solver adds in another one.
+    """Stand-in for the cache of a solver: it reports the batches before a part as present, and
+    collects the batches that the solver adds in another cache, ``found``.
     """
 
     def __init__(self, like: IrradianceCache, fingerprint: dict[str, str]) -> None:
@@ -36,7 +36,7 @@ class _Collector(IrradianceCache):
         self.found: IrradianceCache | None = None
 
     def begin(self, seed: int, batches: int) -> None:
-        """Forget what was collected; the stream ``seed`` has so many ``batches``."""
+        """Discard collected batches, and pretend that the stream ``seed`` has ``batches``."""
         self._sums = self._sums.empty().with_count(seed, batches * self.batch)
         self.found = self.empty_copy()
 
@@ -46,8 +46,8 @@ class _Collector(IrradianceCache):
 
 
 def missing_parts(cached: CachedMedium) -> Iterator[tuple[int, int]]:
-    """Yield the first batch and the number of batches of each part that the cache of a medium needs
-    up to the samples of its settings.
+    """Yield (index of the first batch, number of batches) of each part that the cache of a medium
+    lacks to have the samples of its settings.
     """
     cache = cached.cache
     at_once = cached.solver.batches_at_once(cache)
@@ -59,7 +59,7 @@ def missing_parts(cached: CachedMedium) -> Iterator[tuple[int, int]]:
 class StreamParts:
     """Computes parts of the random stream of the cache of one medium, in any order.
 
-    ``cached`` keeps its cache as it is. A solver that holds tables is made once.
+    The cache of ``cached`` is not changed. One solver, with its tables, serves all parts.
     """
 
     def __init__(self, scene: mi.Scene, cached: CachedMedium) -> None:
@@ -68,7 +68,7 @@ class StreamParts:
         self._solver = cached.new_solver(scene, self._collector)
 
     def compute(self, first: int, count: int) -> IrradianceCache:
-        """Return ``count`` batches that begin with number ``first``."""
+        """Return a cache with ``count`` batches, starting with the batch of index ``first``."""
         collector = self._collector
         collector.begin(self._seed, first)
         self._solver.refine(count * collector.batch)

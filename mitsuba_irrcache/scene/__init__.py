@@ -1,1 +1,1 @@
-"""A Mitsuba scene as the solvers see it: checks, fingerprint, surfaces among voxels."""
+"""Description of a Mitsuba scene for the solvers: checks, fingerprint, surfaces among voxels."""

@@ -1,8 +1,8 @@
 """Convert Mitsuba's scene to its description, and refuse unsupported scenes.
 
-A medium is *isolated* if the scene has no other medium and no surface, it fills a box or sphere,
-and all emitters are distant or points: then no ray has to be intersected with shapes. In all other
-scenes Mitsuba's ray tracing finds surfaces and boundaries.
+A medium is *isolated* if it fills a box or sphere, the scene has no other medium and no surface,
+and all emitters are distant or point-like: then no ray has to be intersected with shapes. In all
+other scenes Mitsuba's ray tracing finds surfaces and boundaries.
 """
 
 from __future__ import annotations
@@ -41,19 +41,22 @@ from mitsuba_irrcache.transport.path import (
     transmits,
 )
 
-#: The offset of Mitsuba's secondary rays from a surface should not exceed this part of the shortest
-#: side of a medium.
+#: Offset of Mitsuba's secondary rays from a surface, over the shortest side of a medium, above
+#: which a warning is logged.
 LARGEST_OFFSET = 0.002
-#: Number of positions in single precision that a side of a medium, and a voxel, must have.
+#: Minimum number of distinct single-precision coordinates within a side of a medium, and within a
+#: voxel.
 STEPS_OF_A_SIDE, STEPS_OF_A_VOXEL = 256, 8
 
 
 def compile_scene(
     scene: mi.Scene, emission: Emission | None = None, max_depth: int = -1
 ) -> SceneDescription:
-    """Create the description of ``scene``, whose media emit ``emission``, for images of this depth.
+    """Create the description of ``scene``.
 
-    Raises UnsupportedSceneError, naming the object, for scenes that would be rendered incorrectly.
+    ``emission`` is the emission coefficient of its media, ``max_depth`` the property of the
+    integrator. Raises UnsupportedSceneError, naming the object, for scenes that would be rendered
+    incorrectly.
     """
     emitters = EmittersByKind(scene.emitters())
     media = media_of(scene)
@@ -98,9 +101,10 @@ def compile_scene(
 
 
 def _detail(scene: mi.Scene, emission: Emission | None, max_depth: int) -> Detail:
-    """Return how much the light of an isolated medium varies, which may emit itself.
+    """Return how much the radiance in an isolated medium varies.
 
-    What is scattered once only has the shadows of the medium itself, which more orders blur.
+    Emission and single scattering count as sharp: single scattering has the shadows that the medium
+    casts on itself, which higher orders blur.
     """
     if emission is not None or max_depth == 2:
         return Detail.SHARP
@@ -133,8 +137,10 @@ def _baked(
     is_isolated: bool,
     max_depth: int,
 ) -> tuple[list[MediumGrid], set[str], str]:
-    """Convert all media to grids, without delta-M scaling; also return the visible ones' names, and
-    why one is not visible, if there is any.
+    """Convert all media to grids, without delta-M scaling.
+
+    Returns the grids, the names of the visible media, and the reason why another one is not
+    visible ("" if all are).
     """
     grids: list[MediumGrid] = []
     visible, reason = set(), ""
@@ -175,29 +181,35 @@ def _is_visible(scene: mi.Scene, medium: mi.Medium) -> bool:
 
 
 def _around(scene: mi.Scene, medium: mi.Medium) -> list[mi.Shape]:
+    """Return the shapes that have ``medium`` on either side."""
     return [s for s in scene.shapes() if medium in (s.interior_medium(), s.exterior_medium())]
 
 
 def _why_not_through_glass(
     scene: mi.Scene, medium: mi.Medium, phase: Phase, max_depth: int
 ) -> str | None:
-    """Return why a ``medium`` behind surfaces gets no cache; None if it is seen through them.
+    """Return why a ``medium`` behind surfaces gets no cache; None if it gets one.
 
-    Camera paths through glass end where they enter the medium, with the sum of all orders there.
+    Camera paths through glass end with their first collision in the medium, where the cache holds
+    the sum of all orders of scattering only.
     """
     name = f'medium "{medium.id()}" ({medium.class_name()})'
     if not any(transmits(flags_of(s)) for s in _around(scene, medium)):
         return f"{name} is behind surfaces that transmit nothing"
     if max_depth >= 0:
-        return f"behind glass only the sum of all orders is known, not max_depth {max_depth}"
+        return (
+            f"{name} is behind glass, where only all orders together (max_depth -1) are supported, "
+            f"not max_depth {max_depth}"
+        )
     if phase.order is None:
-        return f"{name} scatters too sharply for a cache behind glass"
+        return f"{name} is behind glass, and its phase function is too sharp for a cache there"
     return None
 
 
 def _among_others(grids: list[MediumGrid], number: int, visible: set[str]) -> MediumGrid:
-    """The medium with this number in the list of all, delta-M scaled if a cache holds its radiance
-    and its phase function has a forward peak.
+    """Return the medium with this number, with the others as context.
+
+    It is scaled by delta-M if it is visible and its phase function has a forward peak.
     """
     medium = grids[number]
     others = tuple(grid for grid in grids if grid is not medium)
@@ -283,8 +295,8 @@ def _unique_name(medium: mi.Medium, taken: list[str]) -> str:
 
 
 def _extent(medium: mi.Medium, filled: list[mi.Shape]) -> np.ndarray:
-    """``to_world`` of the cube [-1, 1]^3 over the world box of ``medium``: the intersection of the
-    boxes of the shapes that it fills and of its own grid.
+    """Return the map (4, 4) from the cube [-1, 1]^3 to the world box of ``medium``, the
+    intersection of the bounding boxes of the shapes that it fills and of its grid.
     """
     boxes = []
     if filled:
@@ -330,7 +342,7 @@ def _check_shape(scene: mi.Scene, shape: mi.Shape) -> None:
         _refuse(
             f"{described(shape)} is an instance of shapes with media, whose positions Mitsuba does "
             "not report",
-            " Place these shapes in the scene themselves.",
+            " Put these shapes into the scene without an instance.",
         )
 
 

@@ -30,10 +30,10 @@ WALKS, WALKS_PER_SHAPE, MOST_WALKS, SENSOR_WALKS = 2048, 256, 1 << 16, 1024
 EVENTS, TURNS = 24, 0.25
 #: Maximum number of suspected positions that are tested, and number of rays from each.
 PLACES, RAYS = 64, 64
-#: Positions are sampled on a flight as close to its ends as exp(-NEAREST) of its length.
+#: Positions are sampled on a flight down to a distance of exp(-NEAREST) of its length to its ends.
 NEAREST = 6.0
-#: A position is disputed if this many of its rays contradict the others, and a scene is refused if
-#: this many positions are disputed. Single rays may be wrong at edges.
+#: A position is disputed if at least `DISSENT` of its rays contradict the others, and a scene is
+#: refused if at least `DISPUTED` positions are disputed. Single rays may be wrong at edges.
 DISSENT, DISPUTED = 3, 2
 #: Tolerated share of contradictory walks if no position is disputed; some occur at edges. The share
 #: is larger if surfaces are closer together than the offset of rays.
@@ -47,7 +47,8 @@ INWARDS = 0.6
 #: Offset of Mitsuba's secondary rays from a surface, relative to 1 + the largest coordinate.
 RAY_OFFSET = 9e-5
 
-#: Results of a straight ray that looks for the medium at its origin.
+#: Results of a straight ray that determines the medium at its origin: no shape with media, a shape
+#: with media, the ray leaves the scene.
 _NOTHING, _CLAIM, _ESCAPE = 0, 1, 2
 
 
@@ -108,10 +109,10 @@ def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
     named = Counter(np.array(number)[np.array(wrong)].tolist()).most_common(1)[0][0]
     by = _Names(shapes, scene.shapes()).shape(named)
     raise UnsupportedSceneError(
-        f'irrcache: sensor "{sensor.id()}" has the medium "{medium.id()}", but it is not in it, by '
-        f"{by}. Take the medium away from the sensor, name the one that it is in, or move it. "
-        'Otherwise render this scene with "volpath", where the medium then reaches up to the next '
-        "shape."
+        f'irrcache: sensor "{sensor.id()}" has the medium "{medium.id()}", but is not located in '
+        f"it, according to {by}. Remove the medium from the sensor, name the one in which it is "
+        'located, or move it. Otherwise render this scene with "volpath", which then extends the '
+        "medium up to the next shape."
     )
 
 

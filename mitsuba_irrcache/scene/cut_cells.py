@@ -32,9 +32,9 @@ EDGE = 0.9
 
 
 class CutCells:
-    """The cells of a cache over ``grid`` that surfaces intersect, and their planes, one or two.
+    """The cells of a cache over ``grid`` that surfaces intersect, with one or two planes each.
 
-    Surfaces that bound ``medium``, if given, do not count.
+    Surfaces that bound ``medium``, if given, are ignored.
     """
 
     def __init__(self, scene: mi.Scene, grid: Grid, medium: mi.MediumPtr | None = None) -> None:
@@ -55,7 +55,7 @@ class CutCells:
         self._number = dr.zeros(mi.UInt32, count)
         dr.scatter(self._number, number, found)
         nearest, other, _ = self._plane(scene, found, dr.gather(mi.Normal3f, normal, found))
-        # A plane that all positions are in front of, where there is no edge.
+        # Without an edge, the second plane is one that has all positions in front of it.
         everywhere = mi.Vector4f(0, 0, 0, 1)
         other = dr.select(nearest < dr.inf, other, everywhere)
         planes = dr.gather(mi.Vector4f, plane, found), other
@@ -66,10 +66,12 @@ class CutCells:
 
     @symbolic
     def _plane(self, scene: mi.Scene, cell: mi.UInt32, known: mi.Normal3f):
-        """The planes g s + c = 0 tangent to the surfaces at the points nearest to the cells'
-        centres, among those whose normals are not about parallel to the ``known`` ones (0: all); s
-        is in voxels, 0 at the centre of the first one. Also returns the distances of these points,
-        infinite where there is none, and the normals.
+        """Find the tangent planes of the surface points nearest to the centres of cells.
+
+        Points whose normals are nearly parallel to ``known`` are ignored (0: none is). Returns the
+        distances of the points from the centres, infinite where there is no point; the planes
+        (g, c), with g s + c = 0 for coordinates s in voxels that are 0 at the centre of the first
+        voxel; and the normals.
         """
         sides = [Divisor(int(n) - 1) for n in self.grid.resolution[:2]]
         first = mi.Point3f(*unravelled(cell, sides)) + 0.5
@@ -141,8 +143,10 @@ class CutCells:
         lower: mi.Vector3i,
         phi: mi.Float | mi.Color3f,
     ) -> mi.Float | mi.Color3f:
-        """Return the mean of the voxels on the side of ``s`` with trilinear weights: with respect
-        to both planes, to the first one if there are none, ``phi`` if there are none then.
+        """Return the mean, with trilinear weights, of the voxels on the same side as ``s``.
+
+        Voxels on the same side of both planes are used; if there are none, those on the same side
+        of the first plane; if there are none either, the result is ``phi``.
         """
         ahead = [_is_ahead(plane, s) for plane in planes]
         fraction = s - mi.Point3f(lower)
@@ -180,6 +184,7 @@ def _table(end: int) -> mi.UInt32:
 
 
 def _roots(field: RootField | ExtendedField, voxel: mi.UInt32) -> mi.Float | mi.Color3f:
+    """Return the stored values, square roots for a `RootField`, of voxels."""
     n = field.channels
     values = [dr.gather(mi.Float, field.data, voxel * n + c) for c in range(n)]
     return values[0] if n == 1 else mi.Color3f(values)

@@ -1,4 +1,4 @@
-"""Description of a scene: the result of `compile_scene`, from which all later stages work."""
+"""Description of a scene: the result of `compile_scene`, and the input of all later stages."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ class SceneDescription:
 
     Attributes:
         media: all media, in the order in which the scene's shapes name them.
-        visible: those that a camera may see other than through a surface; each gets a cache.
+        visible: the media that get a cache: those that camera rays can reach without crossing a
+            surface, or through glass if all orders of scattering are requested.
         emitters: the emitters by their kind.
-        brightest: radiance that no emitter exceeds; None where no rays are traced, see
+        brightest: estimated maximum radiance of all emitters; None if rays are not traced, see
             `MediumGrid.is_traced`.
         has_surfaces: whether any shape is more than the boundary of a medium.
     """

@@ -1,4 +1,4 @@
-"""Inputs of a cache, compared by object identity within a process and by digests in files."""
+"""Inputs of a cache: compared within a process by identity (`Snapshot`), in files by `digests`."""
 
 from __future__ import annotations
 
@@ -15,36 +15,35 @@ from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import Media
 
-#: Maximum number of bytes of an array, and of all arrays of a scene, whose contents are compared;
-#: number of values compared in larger arrays.
+#: Maximum number of bytes of an array, and of all arrays of a scene together, up to which whole
+#: contents are compared; number of values compared in larger arrays.
 SMALL, SMALL_IN_ALL, SAMPLED = 1 << 17, 1 << 19, 1 << 12
 
 
-#: The ingredient of `digests` that is compared with a tolerance, the number of rays for each shape,
-#: and the tolerance of their means.
+#: Name of the input in `digests` that is compared with a tolerance, the number of its rays per
+#: shape, and the tolerance of their means.
 RESPONSES, PROBES, TOLERANCE = "responses of surfaces", 512, 1e-4
-#: Parts of a description that are not properties of the object: mesh name, scene bounds, address.
+#: Parts of ``str(object)`` that are not properties of the object: mesh name, scene bounds, address.
 _ELSEWHERE = re.compile(
     r"\A\w+\[\s*name = [^\n]*|\bbsphere = \w+\[.*?\n *\],?|0x[0-9a-f]+", re.DOTALL
 )
 
 
 class Snapshot:
-    """The objects and parameters of a scene that its caches depend on, as they are now. Comparing
-    two snapshots launches no kernel unless a parameter was edited in between.
+    """Objects and parameters of a scene on which its caches depend, at one time.
 
-    It holds references of its own to Dr.Jit's variables, not to Mitsuba's members, which change
-    with the scene. As long as it does, no other variable can get the index of one of them, and
-    whatever writes to such an array (``dr.scatter``, ``params[key][i] = x``) writes to a copy,
-    which has another index.
+    Comparing two snapshots launches no kernel unless a parameter was edited in between. A snapshot
+    references Dr.Jit variables directly, not the members of Mitsuba's objects, which change with
+    the scene. While it holds a variable, no other variable can get the same index, and all
+    operations that write to such an array (``dr.scatter``, ``params[key][i] = x``) write to a copy
+    with another index.
 
-    Only memory that is written to through a NumPy view of an array keeps its index. So contents are
-    compared, too, up to a size for which this takes no time; of larger arrays a few thousand values
-    are. Who edits a larger array through a view has to call ``params.set_dirty``, as Mitsuba
-    itself demands.
+    Only writes through a NumPy view of an array keep its index. Therefore the contents of small
+    arrays are compared too, and a few thousand values of larger ones. Code that edits a large array
+    through a view has to call ``params.set_dirty``, which Mitsuba requires as well.
 
-    A snapshot keeps the old arrays of an edited scene until the next rendering, which releases them
-    before it makes the new cache.
+    A snapshot keeps the old arrays of an edited scene alive until the next rendering, which
+    releases them before it creates the new cache.
     """
 
     def __init__(
@@ -53,8 +52,9 @@ class Snapshot:
         emission: mi.Volume | None = None,
         previous: Snapshot | None = None,
     ) -> None:
-        """``emission`` belongs to the integrator, which may not be the scene's. What has not
-        changed since the ``previous`` snapshot is shared with it, which makes comparing them quick.
+        """``emission`` is a volume of the integrator, which need not be part of the scene. Values
+        that have not changed since the ``previous`` snapshot are shared with it, so that comparing
+        the two is fast.
         """
         params = mi.traverse(scene)
         camera_side = (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.ReconstructionFilter)
@@ -98,7 +98,7 @@ def _is_transform(value: Any) -> bool:
 
 
 class _Budget:
-    """Number of bytes whose contents may still be compared."""
+    """Number of bytes, ``left``, up to which contents may still be compared."""
 
     __slots__ = ("left",)
 
@@ -107,7 +107,7 @@ class _Budget:
 
 
 class _Kept:
-    """A one-dimensional Dr.Jit array that is held for comparison."""
+    """A one-dimensional Dr.Jit array kept for comparison."""
 
     __slots__ = ("_array", "_bytes", "_kind", "_view", "_whole", "_width", "index")
 
@@ -165,8 +165,9 @@ def _kept(value: Any, previous: Any, budget: _Budget) -> Any:
 
 
 def digests(scene: mi.Scene, media: Media, medium: MediumGrid) -> dict[str, str]:
-    """SHA-256 of the contents of each ingredient of the irradiance in ``medium``, which is one of
-    the ``media`` of the scene.
+    """Return the SHA-256 of each input of the irradiance in ``medium``, by the input's name.
+
+    ``medium`` is one of the ``media`` of the scene. `RESPONSES` is not a digest, see `responses`.
     """
     boundary = medium.boundary
     found = {
@@ -193,7 +194,7 @@ def digest_of_surfaces(scene: mi.Scene) -> str:
 
 
 def differing(mine: dict[str, str], theirs: dict[str, str]) -> list[str]:
-    """Return the names of the ingredients that differ between two results of `digests`."""
+    """Return the names of the inputs that differ between two results of `digests`."""
     names = sorted(mine.keys() | theirs.keys())
     return [n for n in names if not _agree(n, mine.get(n), theirs.get(n))]
 
@@ -209,12 +210,12 @@ def _agree(name: str, mine: str | None, theirs: str | None) -> bool:
 
 
 def responses(scene: mi.Scene) -> str:
-    """Responses of the shapes of a scene to random rays: numbers in [0, 1] for each shape.
+    """Return statistics of random rays that hit each shape of a scene, as text: numbers in [0, 1].
 
-    Some options of Mitsuba's plugins are neither parameters nor in their descriptions (the filter
-    of a bitmap, the normals of an sdfgrid, invalid normals of a bump map, ...). They show in how
-    surfaces respond. These numbers are results of floating point arithmetic, which other machines
-    round otherwise, so they are compared with a tolerance, not digested.
+    Some options of Mitsuba's plugins are neither traversed parameters nor part of ``str(plugin)``
+    (the filter of a bitmap, the normals of an sdfgrid, invalid normals of a bump map, ...), but
+    they change normals, BSDF values and emission at intersections. Rounding of these numbers
+    differs between machines, so they are compared with a tolerance instead of being digested.
     """
     shapes = sorted(scene.shapes(), key=_shape_digest)
     if not shapes:
@@ -273,7 +274,7 @@ def _medium_digest(medium: MediumGrid) -> str:
 
 
 def _shape_digest(shape: mi.Shape) -> str:
-    """A shape with its BSDF and emitter, and which media are on its sides."""
+    """Return the SHA-256 of a shape with its BSDF and emitter, and the names of its media."""
     sides = [m.id() if m else "" for m in (shape.interior_medium(), shape.exterior_medium())]
     flags = shape.has_flipped_normals(), shape.is_mesh() and shape.has_face_normals()
     media = ("interior_medium", "exterior_medium")
@@ -281,8 +282,8 @@ def _shape_digest(shape: mi.Shape) -> str:
 
 
 def _object_digest(node: mi.Object, without: tuple[str, ...] = ()) -> str:
-    """All that an object says of itself: the values of its parameters but those ``without`` these
-    prefixes, exactly, and its description, which names nested objects and options.
+    """Return the SHA-256 of an object: of the exact values of its traversed parameters, except
+    those ``without`` these prefixes, and of ``str(node)``, which names nested objects and options.
     """
     values = [
         (key, np.array(_plain(value)))

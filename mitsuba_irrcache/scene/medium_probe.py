@@ -11,14 +11,14 @@ from mitsuba_irrcache.transport.path import MOST_CROSSINGS
 
 
 def medium_at(scene: mi.Scene, position: np.ndarray) -> mi.MediumPtr:
-    """The medium that a world position (3) is in, found along a direction of no axis."""
+    """Return the medium at a world position (3), found along a direction that is no axis."""
     return probe(scene, mi.Point3f(position), mi.Vector3f(0.48, 0.64, 0.6))
 
 
 @symbolic
 def probe(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f):
-    """The medium at ``p`` according to the first shape along ``direction`` that has a medium; none
-    where there is no such shape.
+    """Return the medium at ``p`` according to the first shape with a medium along ``direction``;
+    null where there is no such shape.
     """
     ray, pointer = mi.Ray3f(p, direction), dr.zeros(mi.MediumPtr, dr.width(p))
     crossings, active = mi.UInt32(0), mi.Bool(True)

@@ -27,10 +27,9 @@ _PICK = np.array(list(np.ndindex(2, 2, 2)), dtype=bool)  # corners of a box
 def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> str | None:
     """Return the name of a shape, other than null boundaries, in a box of voxels; None without any.
 
-    The box lies between ``lower`` and ``upper`` (x, y, z).
-
-    Exact for shapes whose bounds do not meet the box, for vertices, and for shapes within the box;
-    of other shapes, rays find parts about as large as a voxel.
+    The box lies between ``lower`` and ``upper`` (x, y, z). The result is exact for shapes whose
+    bounding boxes do not overlap the box, for shapes with a vertex in the box, and for shapes
+    inside of it; parts of other shapes are found by rays if they are about as large as a voxel.
     """
     near = [s for s in scene.shapes() if is_surface(s) and _may_meet(s, grid, lower, upper)]
     for shape in near:
@@ -55,8 +54,8 @@ def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray)
 
 
 def boxes_meet(grid: Grid, lower: np.ndarray, upper: np.ndarray, corners: np.ndarray) -> bool:
-    """Whether a box with these ``corners`` (8, 3; world) may meet that of the voxels between
-    ``lower`` and ``upper``: whether their bounds do, along the axes of the world and of the grid.
+    """Whether a box with these world ``corners`` (8, 3) may overlap the box of the voxels between
+    ``lower`` and ``upper``: whether their extents along the axes of world and grid overlap.
     """
     own = np.where(_PICK, upper, lower)
     slack = SLACK * grid.voxel_size.min()
@@ -71,7 +70,7 @@ def boxes_meet(grid: Grid, lower: np.ndarray, upper: np.ndarray, corners: np.nda
 
 
 def corners_of(frame: np.ndarray) -> np.ndarray:
-    """Return the corners (8, 3) of the image of the unit cube."""
+    """Return the corners (8, 3) of the unit cube mapped by ``frame``."""
     return _mapped(frame, _PICK)
 
 
@@ -141,8 +140,9 @@ def _shapes_between(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f):
 
 @symbolic
 def first_surface(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: mi.Bool):
-    """Find the distance from ``start`` to the first surface before ``stop`` that is not a null
-    boundary (0 without one), its normal, and whether there is one.
+    """Find the first surface between ``start`` and ``stop`` that is not a null boundary.
+
+    Returns its distance from ``start`` (0 without one), its normal, and whether there is one.
     """
     length = dr.norm(stop - start)
     ray = mi.Ray3f(start, (stop - start) / dr.maximum(length, 1e-30))
@@ -165,9 +165,9 @@ def first_surface(scene: mi.Scene, start: mi.Point3f, stop: mi.Point3f, active: 
 
 
 def hole_in(scene: mi.Scene, medium: MediumGrid, grid: Grid, box: tuple) -> str | None:
-    """Return the name of a null shape inside of ``medium`` that encloses something else.
+    """Return the name of a null shape that has ``medium`` as its exterior: a hole in the medium.
 
-    Only shapes in the ``box`` of voxels of ``grid`` count; None without any.
+    Only shapes in the ``box`` (lower, upper) of voxels of ``grid`` count; None without any.
     """
     for shape in scene.shapes():
         outer = shape.exterior_medium()

@@ -23,20 +23,21 @@ RAYS = 16
 
 
 class VoxelClasses(Immutable):
-    """Where the voxels of ``grid``, that of a cache of ``medium``, lie among ``media``.
+    """Position of the voxels of ``grid``, a cache's grid over ``medium``, relative to media and
+    surfaces.
 
     Attributes:
-        medium_number: 0 for a voxel whose centre is in no medium, else 1 for the first of
-            ``media``, and so on (see `Media.pointer_of`).
-        readable: the voxels that a lookup in ``medium`` can read: those with a part in the medium,
-            and their neighbours.
-        enclosed: the voxels from whose centres only backs of surfaces are visible.
-        cut_cells: cells between voxels that surfaces cut; None where there are none.
-        separated: for x, y, z, whether a surface lies between the centre of a voxel and that of the
-            next one along this axis; None where there are no cut cells.
-        inside: the voxels whose centres are in the medium, where its boundary refracts: values on
-            both sides have nothing to do with each other, and lookups extrapolate from inside. None
-            for other boundaries.
+        medium_number: per voxel, the number of the medium at its centre: 0 for none, 1 for the
+            first of ``media``, and so on (see `Media.pointer_of`).
+        readable: mask of the voxels that a lookup in ``medium`` can read: voxels that overlap the
+            medium, and their neighbours.
+        enclosed: mask of the voxels from whose centres only backs of surfaces are visible.
+        cut_cells: cells between voxel centres that surfaces intersect; None without any.
+        separated: for x, y, z, a mask of the voxels that a surface separates from the next voxel
+            along this axis; None if there are no cut cells.
+        inside: mask of the voxels whose centres are in the medium, if its boundary refracts: values
+            on both sides of it are unrelated, and lookups extrapolate from inside. None for other
+            boundaries.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class VoxelClasses(Immutable):
         grid: Grid,
         by_centre: bool = False,
     ) -> None:
-        """``by_centre``: values are those of the centres of voxels, not means over them."""
+        """``by_centre`` states that values are those at voxel centres, not means over voxels."""
         self.grid = grid
         index = dr.arange(mi.UInt32, grid.voxel_count)
         box = np.zeros(3, int), grid.resolution
@@ -80,11 +81,11 @@ class VoxelClasses(Immutable):
         dr.eval(self.readable)
 
     def filled(self, values: mi.Float, channels: int) -> mi.Float:
-        """Replace zeros of enclosed voxels in ``values`` by the means of their neighbours, and
-        values outside of a boundary that refracts by extrapolation.
+        """Return ``values`` with extrapolated ones in enclosed voxels and outside of glass.
 
-        Near a curved surface, lookups that `cut_cells` restrict to one side still read some of
-        these voxels.
+        Zeros in enclosed voxels are replaced by the mean of their neighbours, and values outside of
+        a refracting boundary are extrapolated from inside. Near curved surfaces, lookups read some
+        of these voxels although `cut_cells` restricts them to one side.
         """
         if self.inside is not None:
             values = extended(self.grid, values, self.inside, channels)
@@ -112,10 +113,14 @@ def _probed(
     exact: bool,
     glass: bool,
 ):
-    """Numbers of rays from each voxel: those whose origin, the voxel's centre, is in no medium and
-    in each medium; those whose origin, a random position in the voxel, is in ``medium``; those that
-    hit the back of a surface first. ``exact``: positions within the medium's boundary, and only
-    these, are in it, whatever the rays meet. ``glass``: there are shapes that transmit, whose backs
+    """Count rays from each voxel by their results.
+
+    Returns a list of counts per voxel: rays according to which the voxel's centre is in no medium,
+    and in each medium in turn; random positions in the voxel that are in ``medium``; rays from the
+    centre that hit the back of a surface first.
+
+    ``exact`` states that a position is in the medium exactly if it is within its boundary, so that
+    no rays are needed for this. ``glass`` states that there are transmissive shapes, whose backs
     do not count for positions in ``medium``.
     """
     corner = mi.Point3f(*grid.voxel_indices(index))
@@ -144,7 +149,7 @@ def _probed(
 def _medium_at(
     scene: mi.Scene, medium: MediumGrid, p: mi.Point3f, direction: mi.Vector3f, exact: bool
 ) -> mi.MediumPtr:
-    """The medium at ``p``; if ``exact``, by the boundary of ``medium``, which is the only one."""
+    """Return the medium at ``p``, with ``exact`` from the boundary of ``medium``, the only one."""
     if not exact:
         return probe(scene, p, direction)
     none = dr.zeros(mi.MediumPtr, dr.width(p))
@@ -153,8 +158,9 @@ def _medium_at(
 
 @symbolic
 def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f, is_medium: mi.Bool):
-    """Whether rays hit the first surface that is not null from behind; not if it transmits and
-    ``p`` is in the medium.
+    """Whether rays hit the first surface that is not null from behind.
+
+    Transmissive surfaces do not count if ``p`` is in the medium.
     """
     ray, back = mi.Ray3f(p, direction), mi.Bool(False)
     crossings, active = mi.UInt32(0), mi.Bool(True)
@@ -171,8 +177,8 @@ def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f, is_mediu
 
 
 def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
-    """Whether a surface lies between each voxel's centre and that of the next one along ``axis``;
-    false for the last voxels.
+    """Return for each voxel whether a surface lies between its centre and that of the next voxel
+    along ``axis``; false for the last voxels.
     """
     index = dr.arange(mi.UInt32, grid.voxel_count)
     at = list(grid.voxel_indices(index))
@@ -186,9 +192,10 @@ def _separated(scene: mi.Scene, grid: Grid, axis: int) -> mi.Bool:
 
 
 def extended(grid: Grid, values: mi.Float, valid: mi.Bool, channels: int = 1) -> mi.Float:
-    """Extrapolate ``values``, which are not negative, from valid voxels to two layers around these.
+    """Extrapolate non-negative ``values`` from ``valid`` voxels to two layers of voxels around.
 
-    The result is the mean over all straight lines through two valid neighbours, or one.
+    A new value is the mean of linear extrapolations through two valid voxels in a row, in each of
+    26 directions, or of the nearest one alone if only that is valid.
     """
     index = dr.arange(mi.UInt32, grid.voxel_count * channels)
     voxel = index // channels
@@ -225,7 +232,7 @@ def _directions() -> Iterator[tuple[list[int], int]]:
 
 
 def _neighbour(grid: Grid, voxel: mi.UInt32, offset: list[int]) -> tuple[mi.UInt32, mi.Bool]:
-    """The voxels so many along each axis away, and whether they exist."""
+    """Return the flat indices of voxels at an ``offset`` (x, y, z), and whether they exist."""
     at = [mi.Int32(p) + o for p, o in zip(grid.voxel_indices(voxel), offset, strict=True)]
     inside = mi.Bool(True)
     for a, side in zip(at, grid.sides, strict=True):
@@ -237,8 +244,8 @@ def _neighbour(grid: Grid, voxel: mi.UInt32, offset: list[int]) -> tuple[mi.UInt
 def neighbourhood(
     grid: Grid, values: mi.Float, valid: mi.Bool, channels: int = 1
 ) -> tuple[mi.Float, mi.Float]:
-    """Sums of ``values`` over the valid ones of the 26 neighbours of each voxel, nearer ones
-    weighing more, and the sums of weights.
+    """Return weighted sums of ``values`` over the valid ones of the 26 neighbours of each voxel,
+    and the sums of the weights, which are inverse squared distances.
     """
     index = dr.arange(mi.UInt32, grid.voxel_count * channels)
     voxel = index // channels

@@ -1,5 +1,6 @@
-"""Solvers, each of which fills caches. Importing a module registers its solver; ``auto`` tries them
-by their ``precedence``.
+"""Solvers, which compute the values of caches.
+
+Importing a module registers its solver; ``auto`` tries them in the order of their ``precedence``.
 """
 
 from mitsuba_irrcache.solvers import sweep

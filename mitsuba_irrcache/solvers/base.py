@@ -24,8 +24,8 @@ from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.solvers.grid_size import SizeRule
 from mitsuba_irrcache.transport.path import Media
 
-#: called with (samples done, samples in all), both in voxels times samples, which are directions in
-#: ``sweep``
+#: Callback (done, total), in voxels times samples per voxel; a sample is a path in ``path``, and a
+#: direction in ``sweep``.
 Progress = Callable[[int, int], None]
 
 
@@ -39,12 +39,12 @@ class SolverTask:
 
     Attributes:
         scene: Mitsuba's scene.
-        description: what `compile_scene` found in it.
+        description: result of `compile_scene` for this scene.
         medium: one of its visible media.
-        cache: the cache over this medium that is to be filled.
-        seed: number of the random stream.
-        rr_depth: depth from which Russian roulette ends paths.
-        pause: called often between kernel launches; what it raises ends the work on a batch.
+        cache: the cache of this medium that the solver fills.
+        seed: seed of the random stream.
+        rr_depth: depth above which Russian roulette ends paths.
+        pause: called often between kernel launches; if it raises, the batch in progress is lost.
     """
 
     scene: mi.Scene
@@ -71,23 +71,23 @@ class Preview(ABC):
 
 
 class Solver(ABC):
-    """Fills a cache. Methods that are needed before the cache exists are class methods."""
+    """Computes the values of a cache. Methods needed before the cache exists are class methods."""
 
     #: value of the integrator's property ``solver``
     name: ClassVar[str]
-    #: place among the candidates of ``auto``, which tries low numbers first: by default after
-    #: ``sweep`` and before ``path``, which supports all scenes
+    #: order in which ``auto`` tries solvers, low numbers first; the default is after ``sweep`` and
+    #: before ``path``, which supports all scenes
     precedence: ClassVar[int] = 50
-    #: voxels of a cache with ``resolution`` 0
+    #: rule for the grid of a cache with ``resolution`` 0
     size_rule: ClassVar[SizeRule]
     #: whether all voxels share their samples, and so their errors
     is_correlated: ClassVar[bool] = False
-    #: whether one instance should be kept for all samples, since it holds tables that take a while
-    #: to be made, see `use`; the others do not outlive a call, so that they do not hold the scene
+    #: whether one instance is kept for all samples, because it holds tables that take long to
+    #: build, see `use`; other instances are released after each call, and so is the scene
     is_kept: ClassVar[bool] = False
-    #: whether the first batches may be shown while they are incomplete, see `preview`
+    #: whether the first batches may be rendered while they are incomplete, see `preview`
     has_preview: ClassVar[bool] = False
-    #: whether it solves for media with delta-M scaling (see `delta_m`)
+    #: whether it supports media with delta-M scaling (see `delta_m`)
     supports_delta_m: ClassVar[bool] = False
     #: whether it finds emitters behind glass by chance only, as ``volpath`` does
     finds_refracted_by_chance: ClassVar[bool] = False
@@ -127,8 +127,9 @@ class Solver(ABC):
     def voxel_classes(
         cls, scene: mi.Scene, media: Media, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> VoxelClasses | None:
-        """Classify the voxels of ``grid``, of which lookups in the medium read the ``active`` ones;
-        None if there cannot be surfaces among them.
+        """Classify the voxels of ``grid``; return None if there are no surfaces among them.
+
+        ``active`` are the flat indices of the voxels that lookups in the medium can read.
         """
         return None
 
@@ -136,17 +137,18 @@ class Solver(ABC):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        """Whether the uncollided layer holds, for each of ``cache.direct_lights``, exactly its
-        ``irradiance``, which lookups subtract.
+        """Whether the uncollided layer includes exactly ``light.irradiance`` for each direct light.
 
-        Otherwise the cache gets no direct lights.
+        Lookups subtract it, and camera rays evaluate it in closed form. Otherwise the cache gets no
+        direct lights.
         """
         return False
 
     @classmethod
     def batches_at_once(cls, cache: IrradianceCache) -> int:
-        """Return how many batches `refine` adds to ``cache`` at once, at most: several machines
-        that compute so many each can give the same bits as one.
+        """Return the maximum number of batches that `refine` adds to ``cache`` at once.
+
+        Machines that compute that many batches each, appended in order, give the same bits as one.
         """
         return 1
 
@@ -157,19 +159,20 @@ class Solver(ABC):
     def refine(self, samples: int, progress: Progress | None = None) -> None:
         """Add ``samples`` per voxel, a multiple of the cache's batch.
 
-        The random stream goes on where it stopped. If ``progress`` raises, batches that are
-        complete stay in the cache.
+        The random stream continues after the samples already in the cache. If ``progress`` raises,
+        complete batches remain in the cache.
         """
 
     def use(self, scene: mi.Scene | None) -> None:  # noqa: B027 (most hold nothing)
-        """Refine in this ``scene`` from now on; hold none between calls, where it is None.
+        """Set the scene for `refine`; None: release it.
 
-        A scene holds its integrator, and that a kept solver. If this held the scene, neither would
-        ever be freed: garbage collection does not see references within Mitsuba.
+        A scene references its integrator, which references a kept solver. If the solver referenced
+        the scene between calls, none of them would be freed: Python's garbage collection does not
+        see references within Mitsuba.
         """
 
     def preview(self) -> Preview:
-        """Return the first two batches without samples, if it `has_preview`."""
+        """Return a `Preview` without samples; only for solvers with `has_preview`."""
         raise NotImplementedError
 
 

@@ -15,24 +15,26 @@ import numpy as np
 
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 
-#: Smaller than any quantity that is divided by.
+#: Lower bound of denominators, to avoid division by 0.
 TINY = 1e-300
-#: Times the last change of the images by which a step may extrapolate beyond its own image.
+#: Maximum extrapolation beyond the image of the last step, in units of the last change of images.
 MAX_EXTRAPOLATION = 20.0
 
 
 class AndersonAcceleration:
-    """Acceleration of depth 1 for large arrays: the two last steps tell how the slowest error
-    decays, and so what remains of it.
+    """Anderson acceleration of depth 1 for large arrays.
+
+    The residuals of the last two steps determine the decay of the slowest error, and from that its
+    remaining size.
     """
 
     def __init__(self, sums: Callable[..., np.ndarray]) -> None:
-        """``sums``: (weighted) sums of a function of some arrays for each interleaved channel."""
+        """``sums(function, *arrays)``: (weighted) sums of ``function(*arrays)`` per channel."""
         self._sums = sums
         self._last: tuple[mi.Float, mi.Float] | None = None
 
     def next(self, phi: mi.Float, image: mi.Float) -> mi.Float:
-        """The point to continue from, after a step from ``phi`` to its ``image``."""
+        """Return the next iterate, after a fixed-point step from ``phi`` to its ``image``."""
         # docs/primer, eq. (4.11)
         residual = image - phi
         dr.eval(residual)
@@ -46,7 +48,7 @@ class AndersonAcceleration:
         # Squares of very large radiance are not finite.
         share = np.clip(np.where(np.isfinite(share), share, 0), -0.5, MAX_EXTRAPOLATION)
         channel = voxel_and_channel(dr.width(phi) // len(share), len(share))[1]
-        # One more, since kernels that read an array of a single value are different ones.
+        # One more value: arrays of a single value compile other kernels.
         factor = dr.gather(mi.Float, mi.Float([*share, 0.0]), channel)
         result = dr.fma(image - last[1], factor, image)
         dr.eval(result)
@@ -54,8 +56,10 @@ class AndersonAcceleration:
 
 
 def accelerated(history: list, channel: int) -> np.ndarray:
-    """The combination of images with the smallest residual, in one channel of a short history of
-    points and their images: acceleration of any depth, for small arrays.
+    """Return the combination of images with the smallest residual: Anderson acceleration of any
+    depth, for small arrays.
+
+    ``history`` is a list of (iterate, image), each (channels, n), of which one channel is used.
     """
     points, images = (np.array([x[channel] for x in xs]) for xs in zip(*history, strict=True))
     residuals = images - points

@@ -1,13 +1,14 @@
 """Angular quadrature: ordinates (directions) spread evenly over the sphere, and their weights.
 
 Ordinates come in pairs of opposite directions. A set is a Fibonacci spiral on a hemisphere, rotated
-at random, so that every ordinate alone is uniformly distributed. Weights are the nearest to equal
-ones that integrate all polynomials of degree 2 in the direction exactly, and, with the opposite
-ordinates, of degree 3: inside dense matter radiance has no higher terms, whatever the rotation.
-(If one of them would be below a quarter of the mean, as in some sets of few pairs, all are equal.)
+at random, so that every single ordinate is uniformly distributed. The weights are those nearest to
+equal ones that integrate all polynomials of degree 2 in the direction exactly and, with the
+opposite ordinates, of degree 3. In the diffusive interior of dense media radiance has no higher
+degrees, so it is integrated exactly for any rotation. (If a weight would be below a quarter of the
+mean, as in some sets of few pairs, all weights are equal.)
 
-The sets of several passes are parts of one larger spiral. Each is even, and so is their union:
-independent rotations would leave three times the noise.
+The sets of several passes are parts of one larger spiral. Each set is evenly distributed, and so is
+their union; independent rotations would have three times the noise.
 """
 
 from __future__ import annotations
@@ -29,37 +30,37 @@ ROUNDS = 8
 
 
 class Ordinates(NamedTuple):
-    """Pairs of opposite ordinates, and what enters the medium along them."""
+    """Pairs of opposite ordinates, and the irradiance that enters the medium along them."""
 
-    #: (n, 3), in which radiance travels; that of the opposite ordinate is the negative
+    #: (n, 3), direction of propagation of one ordinate of each pair; the other one is its negative
     directions: np.ndarray
     #: (n, 2, channels), irradiance that enters along an ordinate and along its opposite
     incoming: np.ndarray
-    #: (n), solid angle [sr] for radiance from the voxels; 0 where only emitters use the ordinate
+    #: (n), solid angle [sr] for radiance from the voxels; 0 if only emitters use the ordinate
     weights: np.ndarray
     #: (n, 2), random shifts of the tracks in [0, 1)
     offsets: np.ndarray
 
     def scattering(self) -> Ordinates:
-        """Those along which voxels emit and scatter, with nothing that enters."""
+        """Return the ordinates along which voxels emit and scatter, without incoming radiance."""
         used = self.weights != 0
         none = np.zeros_like(self.incoming)
         parts = (self.directions, none, self.weights, self.offsets)
         return Ordinates(*(part[used] for part in parts))
 
     def without_incoming(self) -> Ordinates:
-        """The same ordinates where a `BoundarySource` tells what enters."""
+        """Return the same ordinates for use with a `BoundarySource`, with ``incoming`` 0."""
         return self._replace(incoming=np.zeros((len(self.directions), 2)))
 
 
 def merged(sets: list[Ordinates]) -> Ordinates:
-    """Several sets as one."""
+    """Concatenate several sets."""
     return Ordinates(*(np.concatenate(parts) for parts in zip(*sets, strict=True)))
 
 
 def hemisphere_ordinates(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` directions (n, 3), one of each pair, and the solid angle (n) that each of them and
-    each of their opposites stands for.
+    """Return ``count`` directions (n, 3), one of each pair, and the weights (n) [sr] of each of
+    them and each of their opposites.
     """
     return joint_ordinates(1, count, rng)[0]
 
@@ -67,7 +68,7 @@ def hemisphere_ordinates(count: int, rng: np.random.Generator) -> tuple[np.ndarr
 def joint_ordinates(
     sets: int, count: int, rng: np.random.Generator
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """As many ``sets`` of `hemisphere_ordinates`, whose union is evenly spread, too."""
+    """Return ``sets`` results of `hemisphere_ordinates` whose union is evenly distributed, too."""
     points, members = _divided_spiral(sets, count)
     points = points @ _rotation(rng).T
     return [(points[own], _weights(points[own])) for own in members]
@@ -75,7 +76,9 @@ def joint_ordinates(
 
 @lru_cache(maxsize=32)
 def _divided_spiral(sets: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of one hemisphere on a Fibonacci spiral, and the numbers of those in each set."""
+    """Return directions (n, 3) of one hemisphere on a Fibonacci spiral, and the indices (sets, n)
+    of the directions in each set.
+    """
     points, turn = fibonacci_hemisphere(sets * count)
     members = strata(sets, turn, 1 / GENERALISED_GOLDEN_RATIOS[1])
     # The squared error of a set's integrals is the sum of this over all pairs of its points, by the
@@ -102,10 +105,10 @@ def _divided_spiral(sets: int, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def strata(sets: int, coordinate: np.ndarray, step: float) -> np.ndarray:
-    """Numbers (sets, n) of the points in each of so many ``sets``.
+    """Divide points among ``sets``; return the indices (sets, n) of the points in each set.
 
-    Of each ``sets`` consecutive points every set gets one, by the order of their ``coordinate`` in
-    [0, 1), which is rotated by ``step`` from one run of points to the next.
+    Every run of ``sets`` consecutive points has one point for each set, assigned in the order of
+    their ``coordinate`` in [0, 1), which is shifted by ``step`` (modulo 1) from run to run.
     """
     rows = coordinate.reshape(-1, sets) - step * np.arange(len(coordinate) // sets)[:, None]
     order = np.argsort(rows % 1, axis=1)
@@ -113,7 +116,9 @@ def strata(sets: int, coordinate: np.ndarray, step: float) -> np.ndarray:
 
 
 def _weights(points: np.ndarray) -> np.ndarray:
-    """The weights nearest to equal ones that integrate all products of two coordinates exactly."""
+    """Return the weights nearest to equal ones that integrate all products of two coordinates of
+    the direction exactly.
+    """
     # docs/primer, eq. (4.1)
     count = len(points)
     x, y, z = points.T
@@ -126,7 +131,7 @@ def _weights(points: np.ndarray) -> np.ndarray:
 
 
 def _rotation(rng: np.random.Generator) -> np.ndarray:
-    """A uniformly random rotation matrix."""
+    """Return a uniformly distributed random rotation matrix (3, 3)."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.linalg.det(q)

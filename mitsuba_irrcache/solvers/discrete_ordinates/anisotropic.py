@@ -1,4 +1,4 @@
-"""The solver ``sweep`` for anisotropic phase functions: the same passes for moments of radiance."""
+"""The solver ``sweep`` for anisotropic phase functions: passes of `solver` for angular moments."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
 from mitsuba_irrcache.solvers.discrete_ordinates.solver import Sweep
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Ordinates of a pass for moments up to order 4, and beyond. They have to integrate products of
-#: these: under a sun, with g = 0.5 and 0.85, half as many left twice and five times the error.
+#: Ordinates of a pass for moments up to order 4, and of higher order. They have to integrate
+#: products of two moments: under a sun, half as many have twice the error for g = 0.5, and five
+#: times the error for g = 0.85.
 DIRECTIONS, MORE_DIRECTIONS = 32, 64
 
 
 def directions_of(order: int) -> int:
-    """Ordinates of a pass for moments up to ``order``."""
+    """Return the number of ordinates of a pass for moments up to ``order``."""
     return DIRECTIONS if order <= 4 else MORE_DIRECTIONS
 
 
 def minimum_batch(order: int) -> int:
-    """Minimum number of ordinates in a batch for moments up to ``order``: those of two passes."""
+    """Return the minimum number of ordinates of a batch for moments up to ``order``: two passes."""
     return 2 * directions_of(order)
 
 
@@ -52,8 +53,10 @@ class AnisotropicSweep(Sweep):
         return AnisotropicMultigridLevel(sigma_t, albedo, tracks, all_axes, moments=self._moments)
 
     def _solve(self, sets: list[OrdinateSet], channels: tuple[int, ...]) -> list[tuple]:
-        """As `Sweep._solve`; the moments of the uncollided radiance do not include narrow sources,
-        whose irradiance is returned beside them.
+        """Solve as `Sweep._solve`.
+
+        The moments of the uncollided radiance do not include narrow sources; their irradiance is
+        returned after the moments.
         """
         several, count = self.cache.max_depth != 2, len(channels)
         used = sets[1:] if several else sets
@@ -76,12 +79,15 @@ class AnisotropicSweep(Sweep):
         scattered: mi.Float | None,
         *own: mi.Float | None,
     ) -> tuple:
-        """The results of `_solve` for a channel, from moments: of the uncollided radiance without
-        that of narrow sources, with it, of what is scattered, and of each narrow source.
+        """Return the results of `_solve` for a channel from swept moments.
+
+        ``smooth`` are the moments of the uncollided radiance without narrow sources, ``swept`` with
+        them, ``scattered`` those of the scattered radiance, and ``own`` those of each narrow
+        source.
         """
         moments = self._moments
-        # Found voxel by voxel: irradiance of known emitters, which their moments exclude, and of
-        # point-like lights; moments of other sources.
+        # Sampled voxel by voxel: irradiance of direct lights of the cache (``known``), which are
+        # not part of the moments; irradiance of point-like emitters; moments of other sources.
         known, unknown = [], []
         for found in (*self._direct, *self._emission):
             (known if id(found[0]) in self._known_lights else unknown).append(
@@ -106,8 +112,10 @@ class AnisotropicSweep(Sweep):
     def _narrow_sources(
         self, swept: Sequence[mi.Float | None], points: list, others: list
     ) -> list[mi.Float]:
-        """Irradiance of each narrow source: swept, from a point-like light, and its part of the
-        ``others``.
+        """Return the irradiance of each narrow source, the sum of three parts.
+
+        They come from ``swept`` moments, from point-like emitters (``points``), and from the
+        narrow part of the ``others``.
         """
         points, found = iter(points), []
         for number, (source, values) in enumerate(zip(self._sources, swept, strict=True)):
@@ -120,7 +128,7 @@ class AnisotropicSweep(Sweep):
         return found
 
     def _sampled(self, channel: int) -> list[mi.Float]:
-        """As `Sweep._sampled`, with moments."""
+        """Return the result of `Sweep._sampled`, with moments."""
         count, found = self._moments.count, []
         directions = iter(self._point_directions)
         for irradiance, *more in self._direct:

@@ -1,17 +1,19 @@
 """The boundary condition among surfaces: radiance that enters the medium's box along each track.
 
-Where there are surfaces around a medium, what enters is no function of the direction alone. It is
-found by Monte Carlo paths that begin where a track enters the box and run back along it: one for
-each track and way, or one for a few neighbouring tracks (a cell) where there are many. Radiance
-that emitters send straight along a track is known without paths, except for its visibility.
+If there are surfaces around a medium, the incoming radiance depends on position and direction. It
+is estimated by Monte Carlo paths that start where a track enters the box, against the direction of
+propagation: one path for each track and for both of its directions (*ways*), or one for a square
+block of neighbouring tracks (a *cell*) if there are many. Radiance that comes straight from
+emitters along a track needs only a visibility test.
 
-A path that meets the medium again ends at its first collision there. The radiance scattered towards
-it from that voxel is known only when the solver has found it. So what enters is
-``emitted + reflected phi(voxel)``, linear in phi, with voxels and factors that are constant while
-the solver iterates: surfaces become part of the operator A of phi = A phi + b (`multigrid`).
+A path that enters the medium ends at its first collision there. The radiance scattered towards the
+path from that voxel is proportional to the unknown phi of the solver. The incoming radiance is
+therefore ``emitted + reflected phi(voxel)``, linear in phi, with voxels and factors that are
+constant during the iteration: surfaces become part of the operator A of phi = A phi + b
+(`multigrid`).
 
-Where tracks cross surfaces among the voxels (`crossings`), radiance that leaves these enters in the
-same way, along one path for each crossing.
+Where tracks cross surfaces among the voxels (`crossings`), the radiance that leaves these surfaces
+is found in the same way, by one path for each crossing and way.
 """
 
 from __future__ import annotations
@@ -41,13 +43,13 @@ from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 from mitsuba_irrcache.transport.path import Media, trace_to_infinity
 from mitsuba_irrcache.transport.path_tracer import PathStart, PathTracer
 
-#: Cells of an ordinate, at most about: a path is traced for one track in each; rays that only test
-#: the visibility of emitters are cheaper. Radiance from surfaces varies more from one direction to
-#: the next than between neighbouring tracks.
+#: Approximate maximum number of cells of an ordinate, for paths (one per cell), and for ordinates
+#: along which only the visibility of emitters is tested, which is cheaper. Radiance from surfaces
+#: varies more between ordinates than between neighbouring tracks.
 PATH_CELLS, EMITTER_CELLS = 1 << 11, 1 << 16
 #: Paths begin at this distance inside the box [voxels]: surfaces may lie on its faces.
 INSET = 1e-3
-#: Number that is added to that of a random stream for paths from surfaces among the voxels.
+#: Offset of the random streams of paths from surfaces among the voxels.
 CROSSING_STREAM = 0x5F00
 #: Parameters of an ordinate that the kernel reads, see `IncomingRadiance._parameters`.
 _INTEGERS = ("first", "width", "axis", "axis_b")
@@ -58,11 +60,12 @@ _REALS = (
 
 
 class SurfaceBoundary:
-    """The surroundings of a medium, as far as they send radiance into it.
+    """The surroundings of a medium, from which radiance enters it.
 
-    ``area_emitters`` are those that tracks meet by chance; what other emitters send straight to a
-    voxel is computed otherwise. ``rr_depth`` is that of paths. ``angular_basis`` is None where the
-    medium scatters isotropically. ``surfaces`` are the voxels near surfaces, if any.
+    ``area_emitters`` are the emitters that tracks hit by chance; radiance that comes straight from
+    other emitters is sampled from the voxels instead. ``rr_depth`` applies to paths.
+    ``angular_basis`` is None for isotropic scattering. ``surfaces`` are the voxels near surfaces,
+    None without any.
     """
 
     def __init__(
@@ -77,30 +80,30 @@ class SurfaceBoundary:
         self.surfaces = surfaces
         self.scene, self.medium, self.media = scene, medium, Media.around(medium)
         self.pointer, self.area_emitters = medium.pointer, list(area_emitters)
-        #: without this medium, which is convex: a ray that leaves it straight never meets it again
+        #: the other media; ``medium`` is convex, so a straight ray that leaves it never returns
         self.other_media = self.media.without(medium)
         self.angular_basis = angular_basis
-        #: whether radiance enters the medium refracted, and is reflected within it
+        #: whether radiance is refracted when it enters the medium, and reflected inside
         self.refracts = medium.refracts
-        #: whether tracks carry what glass refracts from emitters; else see `refracted_light`
+        #: whether tracks carry refracted radiance of emitters; otherwise see `refracted_light`
         self.carries_refracted = True
         self._depths = dr.opaque(mi.UInt32, 0xFFFFFFFF), dr.opaque(mi.UInt32, rr_depth)
 
     @property
     def has_sources(self) -> bool:
-        """Whether tracks meet emitters or emissive media by chance."""
+        """Whether tracks may hit emitters or emissive media by chance."""
         return bool(self.area_emitters) or self.other_media.is_emissive
 
     @property
     def paths(self) -> PathTracer:
-        """Paths in the current scene that end in the medium."""
+        """Tracer of paths in the current scene that end at their first collision in the medium."""
         own = self.pointer
         return PathTracer(
             self.scene, self.media, *self._depths, is_cached=lambda other: other == own
         )
 
     def crossings(self, tracks: Tracks, ordinates: Ordinates) -> SurfaceCrossings | None:
-        """Where tracks along ``ordinates`` cross surfaces among the voxels."""
+        """Return the crossings of tracks along ``ordinates`` with surfaces among the voxels."""
         if self.surfaces is None:
             return None
         geometry = tracks.table(*ordinates).geometry
@@ -108,10 +111,11 @@ class SurfaceBoundary:
 
 
 class IncomingRadiance:
-    """What enters along ``tracks`` in the directions of ``ordinates``.
+    """Incoming radiance along ``tracks`` in the directions of ``ordinates``.
 
-    Radiance from surfaces enters along ordinates with a weight; without ``paths``, only radiance
-    that comes straight from emitters. Everything is multiplied by solid angle (irradiance).
+    Radiance from surfaces enters only along ordinates with a non-zero weight; without ``paths``,
+    only radiance that comes straight from emitters enters. All values are radiance times solid
+    angle (irradiance).
     """
 
     def __init__(
@@ -137,9 +141,9 @@ class IncomingRadiance:
         self.crossings = boundary.crossings(tracks, ordinates)
         parameters = self._parameters(directions, parts, weights)
         found = _trace_cells(boundary, self, *parameters, paths, seed)
-        #: for each channel: straight from emitters, in the parts of `has_emitters`; all that does
-        #: not depend on phi; factors of phi. And the voxels of phi, and the directions in which
-        #: radiance leaves these (None for isotropic scattering).
+        #: Per channel: ``unscattered``, straight from emitters, for each part of `has_emitters`;
+        #: ``emitted``, all that does not depend on phi; ``reflected``, factors of phi. The voxels
+        #: of phi, and the directions in which radiance leaves them (None if isotropic).
         self.unscattered, self.emitted, self.reflected, self.voxel, self._direction = found
         if boundary.refracts and not _any_positive(self.unscattered):
             self.has_emitters = [np.zeros_like(each) for each in self.has_emitters]
@@ -147,14 +151,16 @@ class IncomingRadiance:
 
     @property
     def spectra(self) -> list[list]:
-        """All spectra that have been found."""
+        """All computed spectra, each a list of channels."""
         return [*self.unscattered, self.emitted, self.reflected]
 
     def emitter_source(
         self, channels: Sequence[int], table: TrackTable, numbers: np.ndarray, part: int = 0
     ) -> BoundarySource:
-        """The boundary source of radiance straight from emitters, that ``part`` of it, for a
-        ``table`` of the same tracks with these ``numbers`` of the ordinates.
+        """Return the boundary source of radiance straight from emitters.
+
+        ``part`` is an index of `has_emitters`; ``table`` has the same tracks, for the ordinates
+        with the indices ``numbers``.
         """
         values = concatenated([self.unscattered[part][c] for c in channels])
         cells = self._cells_of(self.tracks, table, numbers)
@@ -175,9 +181,10 @@ class IncomingRadiance:
         numbers: np.ndarray,
         emitted: bool,
     ) -> ReflectedBoundarySource:
-        """The boundary source of all radiance, with or without what is ``emitted``, for a ``table``
-        with these consecutive ``numbers`` of the ordinates, of the same tracks or of those of a
-        coarser ``level``.
+        """Return the boundary source of all radiance, with or without the ``emitted`` part.
+
+        ``table`` has the tracks of ``level``, the same ones or those of a coarser grid, for the
+        ordinates with the consecutive indices ``numbers``.
         """
         tracks, grid = level.tracks, level.grid
         if grid.shape not in self._voxels:
@@ -197,7 +204,7 @@ class IncomingRadiance:
             concatenated([dr.gather(mi.Float, kind[c], here) for c in channels])
             for kind in (self.reflected, *([self.emitted] if emitted else []))
         ]
-        # All matter is in active voxels: others reflect nothing.
+        # All extinction is in active voxels: no radiance is scattered in others.
         at = tracks.active_index(dr.gather(mi.UInt32, self._voxels[grid.shape], here))
         first = dr.minimum(at, dr.opaque(mi.UInt32, tracks.active_count - 1)) * len(channels)
         dr.eval(first)
@@ -214,9 +221,11 @@ class IncomingRadiance:
     def sample_rays(
         self, parameters: tuple[mi.UInt32, mi.Float], seed: tuple[int, int, int]
     ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Ray3f, mi.PCG32]:
-        """Sample a track of each cell, for both ways: number of the way (two for each ordinate),
-        ordinate weight, whether the track meets the box, the ray from its entry against the
-        direction of travel, and a random generator.
+        """Sample a track of each cell, for both ways.
+
+        Returns the index of the way (two for each ordinate), the ordinate weight, whether the track
+        intersects the box, the ray from its entry point against the direction of propagation, and
+        the random number generator.
         """
         lanes = dr.arange(mi.UInt32, self._count)
         ordinate, read = self._read(parameters, lanes)
@@ -243,9 +252,7 @@ class IncomingRadiance:
         return ordinate * 2 + dr.select(back, 1, 0), read.weight, hit, ray, rng
 
     def _lay_out_cells(self, most: np.ndarray) -> None:
-        """Lays out cells: square blocks of tracks, as small as leaves at most about ``most`` cells
-        in an ordinate.
-        """
+        """Divide the tracks of each ordinate into square cells, at most about ``most`` of them."""
         geometry = self._geometry
         length = geometry.sizes[:, 2:]
         # The first slice passes the middle of the first voxels.
@@ -261,10 +268,12 @@ class IncomingRadiance:
     def _parameters(
         self, directions: np.ndarray, parts: list[np.ndarray], weights: np.ndarray
     ) -> tuple[tuple[mi.UInt32, mi.Float], list[mi.Float]]:
-        """For each ordinate what `sample_rays` reads: `_INTEGERS` (index of the first value, cells
-        along b, axes) and `_REALS` (direction along the axis, slopes, first track, size of the box,
-        tracks along the edge of a cell, ordinate weight); and the ``parts`` of what enters from
-        distant emitters, for both ways.
+        """Return the parameters of each ordinate for `sample_rays`, and the ``parts`` of the
+        irradiance from distant emitters for both ways.
+
+        The parameters are `_INTEGERS` (index of the first value, cells along b, axes) and `_REALS`
+        (direction along the axis, slopes, first track, size of the box, tracks along the edge of a
+        cell, ordinate weight).
         """
         geometry = self._geometry
         axes = [geometry.axis, geometry.transverse[:, 0]]
@@ -280,7 +289,7 @@ class IncomingRadiance:
     def _read(
         self, parameters: tuple[mi.UInt32, mi.Float], lanes: mi.UInt32
     ) -> tuple[mi.UInt32, SimpleNamespace]:
-        """The ordinate of each value, and its parameters by their names."""
+        """Return the index of the ordinate of each lane, and its parameters by name."""
         integers, reals = parameters
         ordinate = dr.binary_search(
             0,
@@ -295,7 +304,7 @@ class IncomingRadiance:
     def _cells_of(
         self, tracks: Tracks, table: TrackTable, numbers: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The first arguments of `BoundarySource`."""
+        """Return the arguments ``transforms`` and ``cells`` of `BoundarySource`."""
         mine, geometry = self.tracks, table.geometry
         ratio = float(round((tracks.grid.voxel_size / mine.grid.voxel_size)[0]))
         lower, across, n = mine.lower, geometry.transverse, np.arange(len(numbers))
@@ -309,8 +318,9 @@ class IncomingRadiance:
 
 
 class ReflectedBoundarySource(BoundarySource):
-    """A boundary source ``emitted + reflected phi(index)``, with the radiance of phi in a
-    ``direction``.
+    """A boundary source ``emitted + reflected phi(index)``.
+
+    For anisotropic scattering, phi(index) stands for the radiance scattered into ``direction``.
     """
 
     def __init__(
@@ -329,7 +339,7 @@ class ReflectedBoundarySource(BoundarySource):
         self._reflected, self._emitted = reflected, emitted
 
     def update(self, phi: mi.Float | None) -> None:
-        """Sets the values for a mean irradiance of collisions ``phi`` (None: 0)."""
+        """Set the values for a mean irradiance of collisions ``phi`` (None: 0)."""
         # docs/primer, eq. (4.13)
         values = dr.zeros(mi.Float, dr.width(self._index))
         if phi is not None:
@@ -341,8 +351,10 @@ class ReflectedBoundarySource(BoundarySource):
 
 @symbolic
 def _sample_track(read, cell_b, cell_c, rng):
-    """Choose one of those tracks of a cell that meet the box, uniformly (reservoir sampling): where
-    it passes the first slice, and where along the axis it enters the box and leaves it.
+    """Sample one of the tracks of a cell that intersect the box, uniformly (reservoir sampling).
+
+    Returns its coordinates b and c in the first slice, the coordinates along the axis where it
+    enters and leaves the box (entry >= exit: no track intersects it), and the generator.
     """
     b, c = mi.Float(0), mi.Float(0)
     near, far = mi.Float(1) + 0 * read.slices, 0 * read.slices
@@ -364,14 +376,14 @@ def _sample_track(read, cell_b, cell_c, rng):
 
 
 def _clipped(begin, end, at, slope, size) -> tuple[mi.Float, mi.Float]:
-    """The part of a track between two opposite sides of the box."""
+    """Clip the interval of a track to two opposite sides of the box."""
     first, last = -at / slope + 0.5, (size - at) / slope + 0.5
     begin = dr.maximum(begin, dr.minimum(first, last))
     return begin, dr.minimum(end, dr.maximum(first, last))
 
 
 def _coarse_voxels(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
-    """The voxels of a coarser grid of the hierarchy that contain those of the fine one."""
+    """Return the voxels of a coarser grid of the hierarchy that contain voxels of the fine one."""
     ratio = Divisor(round((coarse.voxel_size / fine.voxel_size)[0]))
     result = coarse.index(*(ratio.split(place)[0] for place in fine.voxel_indices(voxel)))
     dr.eval(result)
@@ -393,8 +405,8 @@ def _trace_cells(
     paths: bool,
     seed: tuple[int, int, int],
 ) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
-    """What enters along the tracks of all cells and then of all crossings, both ways in turn; see
-    `IncomingRadiance`.
+    """Trace the incoming radiance along the tracks of all cells, then of all crossings, both ways
+    in turn; see `IncomingRadiance` for the result.
     """
     way, weight, hit, ray, rng = incoming.sample_rays(parameters, seed)
     pointer = probe(boundary.scene, ray.o, ray.d)
@@ -412,7 +424,7 @@ def _crossing_rays(
     parameters: tuple[mi.UInt32, mi.Float],
     seed: tuple[int, int, int],
 ) -> tuple[mi.UInt32, mi.Float, mi.Bool, mi.Ray3f, mi.PCG32, mi.MediumPtr]:
-    """What `_trace` needs where tracks leave surfaces among the voxels."""
+    """Return the ``rays`` of `_trace` for tracks that leave surfaces among the voxels."""
     way, hit, ray = crossings.rays()
     weight = dr.gather(mi.Float, parameters[1], (way >> 1) * len(_REALS) + _REALS.index("weight"))
     *batch, use = seed
@@ -425,7 +437,7 @@ def _crossing_rays(
 
 
 def _joined(first: tuple, second: tuple) -> tuple:
-    """The results of `_trace` for one set of rays after the other."""
+    """Concatenate the results of `_trace` for two sets of rays."""
     unscattered, emitted, reflected, voxel, direction = (
         zip(a, b, strict=True) if isinstance(a, list) else (a, b)
         for a, b in zip(first, second, strict=True)
@@ -448,10 +460,14 @@ def _trace(
     distant: list[mi.Float],
     paths: bool,
 ) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
-    """Radiance along rays with these numbers of the ways, weights, and media."""
+    """Trace the incoming radiance along ``rays``.
+
+    ``rays`` are a tuple of way indices, ordinate weights, hit masks, rays, random generators, and
+    media. See `IncomingRadiance` for the result.
+    """
     if not boundary.refracts:
         return _trace_all(boundary, incoming, rays, distant, paths)
-    # Half of the rays begin outside of the glass, from where nothing enters straight.
+    # Skip rays that begin outside of the glass: no radiance enters there without refraction.
     _, _, hit, ray, *_ = rays
     index = dr.compress(hit & boundary.medium.contains(ray.o))
     if not dr.width(index):
@@ -461,7 +477,10 @@ def _trace(
 
 
 def _expanded(found: object, index: mi.UInt32, count: int) -> object:
-    """Put values, or those in a structure of lists, at these places of so many, 0 elsewhere."""
+    """Return arrays of width ``count`` with the values of ``found`` at ``index``, 0 elsewhere.
+
+    ``found`` is an array or nested lists and tuples of arrays.
+    """
     if found is None:
         return None
     if isinstance(found, (list, tuple)):
@@ -479,7 +498,7 @@ def _trace_all(
     distant: list[mi.Float],
     paths: bool,
 ) -> tuple[list, list, list, mi.UInt32, mi.Vector3f | None]:
-    """As `_trace`, for all of the rays."""
+    """Trace as `_trace`, without skipping rays."""
     way, weight, hit, ray, rng, pointer = rays
     parts = [dr.gather(mi.Spectrum, each, way) for each in distant]
     visible = hit & (dr.max(sum(parts)) > 0)

@@ -1,13 +1,13 @@
-"""Surfaces among the voxels: where the tracks of ordinates cross them.
+"""Surfaces among the voxels: intersections of the tracks of ordinates with them.
 
 In every slice each voxel has exactly one track of an ordinate (`tracks`), so the segment of a track
 in a voxel is identified by the ordinate and the voxel. For all voxels near surfaces and all
-ordinates, these segments are intersected with the scene once, before sweeps. A track that crosses
-surfaces between the positions ``first`` and ``last`` of a segment ends at ``first`` and begins
-anew at ``last``, with the radiance that leaves the surface there (`boundary_condition`).
+ordinates, these segments are intersected with the scene once, before the sweeps. A track that
+crosses surfaces between the positions ``first`` and ``last`` of a segment ends at ``first`` and
+restarts at ``last``, with the radiance that leaves the surface there (`boundary_condition`).
 
-A voxel that a surface cuts has one value, which is that of the side on which its centre lies: only
-parts of segments that see the centre are tallied (primer, section 4.8).
+The value of a voxel that a surface cuts is that on the side of its centre: only parts of segments
+from which the centre is visible are tallied (primer, section 4.8).
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_solid
 
 #: Rays along each edge of a voxel's face that detect surfaces in it.
 RAYS_PER_EDGE = 6
-#: Segments end at this distance inside the box [slices]: surfaces on its faces belong to the
-#: radiance that enters.
+#: Segments end at this distance inside the box [slices]: surfaces on its faces are part of the
+#: boundary condition.
 INSET = 1e-3
-#: By this length consecutive segments overlap, so that no surface is between them [slices].
+#: Overlap of consecutive segments [slices], so that no surface is missed between them.
 OVERLAP = 1e-4
-#: Segments that are intersected in one launch, at most.
+#: Maximum number of segments that are intersected in one launch.
 LANES = 1 << 22
-#: A position that no segment reaches [slices from its middle].
+#: Position outside of every segment [slices from its middle].
 BEYOND = 2.0
 
 
 class SurfaceVoxels:
     """The voxels near surfaces, in the box of ``grid`` between ``lower`` and ``upper`` (x, y, z).
 
-    ``medium`` is given if its boundary refracts, with the ``active`` voxels. Then those that it
-    cuts are voxels of the medium, wherever their centres are: nothing outside counts.
+    ``medium`` is given if its boundary refracts, with the ``active`` voxels. Voxels that this
+    boundary cuts then represent the medium only, even if their centres are outside of it.
 
     Attributes:
         voxels: flat indices of the voxels that surfaces cut and of their neighbours, ascending.
-        number: for each voxel of the grid, 1 + its place in ``voxels``; 0 for others.
+        number: for each voxel of the grid, 1 + its index in ``voxels``; 0 if it is not among them.
         is_cut: for each voxel of the grid, whether a surface cuts it.
     """
 
@@ -69,7 +69,7 @@ class SurfaceVoxels:
             dr.eval(marks)
         self.is_cut = self._within(marks > 0)
         dr.eval(self.is_cut)
-        #: voxels of the medium whose centres are beyond its boundary
+        #: mask of the voxels of the medium whose centres are outside of its boundary
         self._beyond = mi.Bool(False)
         if medium is not None:
             centre = grid.centers(dr.arange(mi.UInt32, grid.voxel_count))
@@ -87,15 +87,17 @@ class SurfaceVoxels:
         return dr.gather(mi.Bool, self.is_cut, voxel)
 
     def is_beyond(self, voxel: mi.UInt32, active: mi.Bool = True) -> mi.Bool:
-        """Whether these are voxels of a medium whose centres are beyond its boundary."""
+        """Whether these are voxels of a medium whose centres are outside of its boundary."""
         if self.medium is None:
             return mi.Bool(False)
         return dr.gather(mi.Bool, self._beyond, voxel, active)
 
     @symbolic
     def nearest(self, p: mi.Point3f, active: mi.Bool):
-        """The voxel whose value applies at world positions: that which contains them, or the
-        nearest of its neighbours whose centre is on the same side of surfaces.
+        """Return the voxel whose value applies at world positions.
+
+        It is the voxel that contains the position or, if a surface cuts that, the nearest of it and
+        its neighbours whose centre is on the same side of surfaces.
         """
         u = self.grid.coordinates.point(p)
         own = voxel_at(self.grid, p)
@@ -123,13 +125,13 @@ class SurfaceVoxels:
 
 
 class SurfaceCrossings:
-    """Crossings of the tracks of n ordinates with surfaces, with ``geometry`` of these tracks.
+    """Crossings of the tracks of n ordinates with surfaces; ``geometry`` is that of the tracks.
 
-    ``records`` has four values for each: the positions ``first`` and ``last`` along the dominant
-    axis, in slices from the middle of the segment, and whether the parts before and behind them
-    see the centre of the voxel. ``first`` > ``last`` where the segment is on the far side of a
-    surface but does not cross it. ``sources`` has two values for each, the voxels whose source
-    applies to the parts.
+    ``records`` has four values per crossing: the positions ``first`` and ``last`` along the
+    dominant axis, in slices from the middle of the segment, and whether the centre of the voxel is
+    visible from the parts before ``first`` and behind ``last``. ``first`` > ``last`` marks a
+    segment that does not cross a surface but is separated from the centre by one. ``sources`` has
+    two values per crossing, the voxels whose source applies to the two parts.
     """
 
     def __init__(self, surfaces: SurfaceVoxels, lower: np.ndarray, geometry: TrackGeometry) -> None:
@@ -140,7 +142,7 @@ class SurfaceCrossings:
         self.slots = dr.zeros(mi.UInt32, ordinates * count)
         records, sources, found_at, total = [], [], [], 0
         most = max(1, LANES // max(count, 1))
-        #: number of the first crossing of each ordinate, and of all
+        #: index of the first crossing of each ordinate, and the number of all crossings
         self.starts = np.zeros(ordinates + 1, np.int64)
         for begin in range(0, ordinates, most):
             number, place = layer_and_index(count, min(most, ordinates - begin))
@@ -172,15 +174,17 @@ class SurfaceCrossings:
             self.starts[1:] = np.cumsum(np.bincount(ordinate, minlength=ordinates))
 
     def of_table(self, numbers: np.ndarray) -> TrackCrossings:
-        """For a table of the same tracks, with these ``numbers`` of the ordinates."""
+        """Return the crossings for a table of the same tracks, whose ordinates have the indices
+        ``numbers`` here.
+        """
         first = numbers * self.surfaces.count
         data = self.slots, self.records, self.sources
         return TrackCrossings(self.surfaces.number, first, *data)
 
     def rays(self) -> tuple[mi.UInt32, mi.Bool, mi.Ray3f]:
-        """For each crossing, both ways in turn: the number of the way (two for each ordinate),
-        whether there is radiance that leaves the surface, and the ray to the surface, against the
-        direction of travel.
+        """Return for each crossing, both ways in turn: the index of the way (two for each
+        ordinate), whether radiance leaves a surface there, and the ray to the surface, against the
+        direction of propagation.
         """
         lane = dr.arange(mi.UInt32, 2 * self.count)
         back, slot = (lane & 1) == 1, lane >> 1
@@ -194,8 +198,8 @@ class SurfaceCrossings:
 
 
 class _Segment:
-    """The segments of tracks in voxels near surfaces: lane by lane the ``number`` of the ordinate
-    and the ``place`` of the voxel.
+    """Segments of tracks in voxels near surfaces, one per lane, given by the index ``number`` of
+    the ordinate and the index ``place`` of the voxel in `SurfaceVoxels.voxels`.
     """
 
     def __init__(self, crossings: SurfaceCrossings, number: mi.UInt32, place: mi.UInt32) -> None:
@@ -252,12 +256,12 @@ class _Segment:
         self.centre = world.point(mi.Point3f(*at) + 0.5)
 
     def at(self, position: mi.Float) -> mi.Point3f:
-        """World position, so many slices from the middle."""
+        """Return the world position at a ``position`` [slices from the middle]."""
         return self.middle + self.step * position
 
 
 def _intersect(crossings: SurfaceCrossings, number: mi.UInt32, place: mi.UInt32) -> tuple:
-    """Intersect segments with surfaces; see `SurfaceCrossings`."""
+    """Intersect segments with surfaces; return records and sources as in `SurfaceCrossings`."""
     segment, scene = _Segment(crossings, number, place), crossings.surfaces.scene
     slice_length = dr.norm(segment.step)
     near, _, hit = first_surface(scene, segment.start, segment.end, mi.Bool(True))
@@ -277,9 +281,10 @@ def _intersect(crossings: SurfaceCrossings, number: mi.UInt32, place: mi.UInt32)
 def _side(
     crossings: SurfaceCrossings, segment: _Segment, position: mi.Float, active: mi.Bool
 ) -> tuple[mi.Float, mi.UInt32]:
-    """Whether a position on a segment is on the same side of surfaces as the centre of its voxel,
-    and the voxel whose source applies there: else a neighbour on the far side, a voxel away from
-    the surface.
+    """Return whether a position on a segment is on the same side of surfaces as the centre of its
+    voxel (1 or 0), and the voxel whose source applies there.
+
+    On the other side that is a neighbouring voxel, one voxel away from the surface.
     """
     surfaces, p = crossings.surfaces, segment.at(position)
     _, normal, hidden = first_surface(surfaces.scene, segment.centre, p, active)
@@ -294,7 +299,7 @@ def _side(
 
 
 def _parameters(geometry: TrackGeometry) -> tuple[mi.Int32, mi.Float]:
-    """What `_Segment` reads for each ordinate."""
+    """Return the integers (7 per ordinate) and reals (2 per ordinate) that `_Segment` reads."""
     fixed = [np.rint(x * FIXED_POINT_ONE) for x in (geometry.slopes, geometry.starts)]
     columns = [geometry.axis, geometry.transverse[:, 0], *fixed, geometry.sizes[:, 2]]
     integers = np.column_stack(columns).astype(np.int64)
@@ -305,8 +310,8 @@ def _parameters(geometry: TrackGeometry) -> tuple[mi.Int32, mi.Float]:
 def _lattice(
     grid: Grid, lower: np.ndarray, upper: np.ndarray, axis: int
 ) -> tuple[mi.Point3f, mi.Vector3f, float]:
-    """Rays along an axis of the grid, several in each row of voxels of the box: where they start,
-    their direction, and their length.
+    """Return rays along an axis of the grid, `RAYS_PER_EDGE`^2 in each row of voxels of the box:
+    origins, direction, and length.
     """
     across = [k for k in range(3) if k != axis]
     count = [int(upper[k] - lower[k]) * RAYS_PER_EDGE for k in across]
@@ -345,7 +350,7 @@ def _mark_hits(
 
 
 def _neighbour(grid: Grid, u: mi.Point3f, k: mi.UInt32) -> tuple[mi.Point3f, mi.UInt32]:
-    """Number ``k`` of the 27 voxels around voxel coordinates ``u``: its centre and flat index."""
+    """Return centre (voxel coordinates) and flat index of voxel ``k`` of the 27 around ``u``."""
     shifts = k % 3, (k // 3) % 3, k // 9
     at = [
         mi.Int32(dr.clip(dr.floor(v) + mi.Float(s) - 1, 0, mi.Float(n - 1)))
@@ -355,7 +360,7 @@ def _neighbour(grid: Grid, u: mi.Point3f, k: mi.UInt32) -> tuple[mi.Point3f, mi.
 
 
 def voxel_at(grid: Grid, p: mi.Point3f) -> mi.UInt32:
-    """Flat index of the voxel that contains a world position, or of the nearest one."""
+    """Return the flat index of the voxel that contains a world position, or of the nearest one."""
     u = grid.coordinates.point(p)
     at = (
         mi.Int32(dr.clip(dr.floor(v), 0, mi.Float(n - 1)))
@@ -365,7 +370,7 @@ def voxel_at(grid: Grid, p: mi.Point3f) -> mi.UInt32:
 
 
 def _dilated(grid: Grid, marks: mi.Bool) -> mi.Bool:
-    """The marked voxels and their 26 neighbours."""
+    """Return a mask of the marked voxels and their 26 neighbours."""
     values = dr.select(marks, mi.UInt32(1), 0)
     at = [mi.Int32(i) for i in grid.voxel_indices(dr.arange(mi.UInt32, grid.voxel_count))]
     for axis in range(3):

@@ -20,9 +20,11 @@ def emission_irradiance(
     seed: tuple[int, int],
     angular_basis: AngularBasis | None = None,
 ) -> list[mi.Spectrum]:
-    """Irradiance at ``position`` from the emission of ``medium``, then its moments if there is an
-    angular basis: unbiased estimates from ``count`` directions, a Kronecker sequence with a random
-    shift at each position. ``seed`` ends with the number of the batch.
+    """Estimate the irradiance at ``position`` from the emission of ``medium``, unbiased.
+
+    Returns the irradiance, followed by its moments if there is an angular basis. The ``count``
+    directions are a Kronecker sequence with a random shift at each position. ``seed`` is the seed
+    of the cache and the index of the batch.
     """
     place = dr.arange(mi.UInt32, dr.width(position))
     rng = random_stream(mi.sample_tea_32(place, hashed_seed(seed)[0]), 1)
@@ -35,7 +37,7 @@ def emission_irradiance(
         *_, rng, emitted = free_flight(
             medium, ray, dr.maximum(near, 0), far, mi.Spectrum(1), rng, hit
         )
-        # Emission is no narrow source.
+        # As the scattered part: emission does not come from narrow sources.
         total = with_radiance(
             total, position, ray.d, mi.Spectrum(0), emitted * weight, angular_basis
         )
@@ -45,5 +47,5 @@ def emission_irradiance(
 
 
 def _direction(shift: list[mi.UInt32], k: mi.UInt32) -> mi.Vector3f:
-    """Direction ``k`` of the sequence with this random shift."""
+    """Return direction ``k`` of the sequence with this random shift."""
     return mi.warp.square_to_uniform_sphere(mi.Point2f(unit_floats(kronecker_words(k, shift))))

@@ -1,10 +1,11 @@
-"""Direct illumination among surfaces by small area emitters and point-like lights, sampled from
+"""Direct illumination by small area emitters and point-like emitters among surfaces, sampled from
 each voxel (next event estimation).
 
-Tracks, which all voxels share, hit a small emitter rarely, and then contribute to many voxels at
-once. Points on small emitters are therefore sampled from each voxel, and tracks ignore them.
-Emitters of a large solid angle are left to the tracks: a voxel close by would need many points.
-Emitters near the medium whose solid angle is known (`cache/area_light`) are not part of either.
+Tracks, which all voxels share, rarely hit a small emitter, and then contribute to many voxels at
+once. Points on small emitters are therefore sampled from each voxel, and tracks ignore these
+emitters. Emitters of a large solid angle are hit by tracks instead, because voxels close to them
+would need many sample points. Emitters near the medium whose solid angle has a closed form
+(`cache/area_light`) are treated in neither way.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.transport.path import Media, visibility
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
-#: Mean solid angle [sr] of an emitter, seen from the voxels, above which it is left to the tracks.
+#: Mean solid angle [sr] of an emitter, seen from the voxels, above which tracks hit it.
 LARGE_SOLID_ANGLE = 2.0
 #: Number of pairs of a point in the voxels' box and one on the emitter for this estimate.
 POINTS = 1024
@@ -67,7 +68,7 @@ def _solid_angle(emitter: mi.Emitter, grid: Grid, lower: np.ndarray, upper: np.n
 
 
 class EmitterSampling:
-    """Irradiance at world positions ``p`` in ``medium``: from ``small`` area emitters, with moments
+    """Irradiance at world positions ``p`` in ``medium`` from ``small`` area emitters, with moments
     if there is an angular basis, and from ``point_lights``.
     """
 
@@ -93,8 +94,8 @@ class EmitterSampling:
         self._from_points = [self._from(light) for light in point_lights]
 
     def irradiance(self, seed: tuple[int, int]) -> list[list[mi.Spectrum]]:
-        """Irradiance from each point-like light; and a random estimate of that from all small area
-        emitters, and of its moments.
+        """Return a list: the irradiance from each point-like emitter, [irradiance]; then an
+        unbiased estimate for all small area emitters, [irradiance, *moments].
         """
         if not self._small:
             return self._from_points
@@ -109,8 +110,9 @@ class EmitterSampling:
     def sample(
         self, emitter: mi.EmitterPtr, sample: mi.Point2f, rng: mi.PCG32
     ) -> tuple[mi.Spectrum, mi.Vector3f, mi.PCG32]:
-        """One sample of the irradiance straight from an emitter, the direction it comes from, and
-        the random generator.
+        """Sample the irradiance straight from an emitter.
+
+        Returns the irradiance, the direction towards the emitter, and the random generator.
         """
         medium, p = self.medium, self.p
         vertex = dr.zeros(mi.Interaction3f, dr.width(p))

@@ -1,4 +1,4 @@
-"""Empty space that tracks skip in one step, found by a distance transform."""
+"""Empty space that tracks skip in one step, from a distance transform."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ WORTHWHILE = 0.5
 
 
 class EmptySpace:
-    """How far tracks may advance between ``lower`` and ``upper`` (x, y, z) of a grid without
-    passing a voxel that is needed.
+    """Number of slices that tracks may advance in a box of voxels without passing a needed voxel.
 
-    ``slices`` holds for each cell, x fastest, the slices that a track may advance from any voxel in
-    it, 0 where it contains a voxel that is needed. Tracks move by at most one voxel along each
-    transverse axis for each slice, so this is a Chebyshev distance. Cells at the sides of the box
-    count as needed, since tracks enter there.
+    ``slices`` holds for each cell of `CELL`^3 voxels, x fastest, the number of slices that a track
+    may advance from any voxel in it; 0 if the cell contains a needed voxel. Tracks move by at most
+    one voxel along each transverse axis per slice, so this is a Chebyshev distance. Cells at the
+    sides of the box count as needed, because tracks enter there. ``shape`` (z, y, x) is that of the
+    cells.
     """
 
     def __init__(self, slices: mi.UInt32, shape: tuple[int, int, int]) -> None:
@@ -35,7 +35,10 @@ class EmptySpace:
     def find(
         grid: Grid, needed: mi.UInt32, lower: np.ndarray, upper: np.ndarray
     ) -> EmptySpace | None:
-        """``needed``: flat indices of voxels of ``grid``. None where skipping gains too little."""
+        """Create it for the box between ``lower`` and ``upper`` (x, y, z) of ``grid``.
+
+        ``needed`` are flat indices of voxels. Returns None if too few cells are empty to save time.
+        """
         sides = np.array(upper) - np.array(lower)
         shape = tuple(int(n) for n in -(-sides // CELL))[::-1]
         count = int(np.prod(shape))
@@ -55,7 +58,7 @@ class EmptySpace:
 def _occupied_cells(
     grid: Grid, needed: mi.UInt32, lower: np.ndarray, shape: tuple[int, ...]
 ) -> mi.UInt32:
-    """1 for each cell that contains a needed voxel, 0 for others."""
+    """Return 1 for each cell that contains a needed voxel, 0 for others."""
     _, ny, nx = (dr.opaque(mi.UInt32, n) for n in shape)
     occupied = dr.opaque(mi.UInt32, 0, int(np.prod(shape)))
     first = [dr.opaque(mi.UInt32, int(n)) for n in lower]
@@ -65,7 +68,9 @@ def _occupied_cells(
 
 
 def _distances(occupied: mi.UInt32, sides: np.ndarray, shape: tuple[int, ...]) -> mi.UInt32:
-    """Chebyshev distance of each cell to the nearest occupied one or to the outside of the box."""
+    """Return the Chebyshev distance of each cell to the nearest occupied one, or to the outside of
+    the box.
+    """
     _, ny, nx = (dr.opaque(mi.UInt32, n) for n in shape)
     # With a layer around that is outside, as is part of the last cell of an odd side.
     outer = [n + 2 for n in shape]

@@ -1,5 +1,7 @@
-"""The extinction as tracks read it: dithered to 16 bits, in the same way for all batches, with the
-neighbours of each value beside it, so that one memory access suffices for bilinear interpolation.
+"""The extinction in the form that tracks read.
+
+Values are dithered to 16 bits, in the same way for all batches, and stored together with their
+neighbours, so that bilinear interpolation needs a single memory access.
 """
 
 from __future__ import annotations
@@ -19,22 +21,22 @@ from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     strides_of,
 )
 
-#: Largest optical depth of a voxel that the quantised extinction distinguishes; values beyond are
-#: clamped. Between 0 and the largest value they are rounded up or down (`_dithered`).
+#: Largest optical depth of a voxel that the quantised extinction represents; larger values are
+#: clamped. Others are rounded up or down (`_dithered`) to one of LEVELS + 1 levels.
 MAX_OPTICAL_DEPTH = 16.0
 LEVELS = (1 << 16) - 1
-#: Optical depth of a voxel from which on sweeps with a source distinguish the extinction of its two
-#: halves. With one value for both, multiple scattering in a CT head of 1.2 per voxel was too bright
-#: by 0.5 %.
+#: Optical depth of a voxel above which sweeps with a source use separate extinctions for its two
+#: halves along the track. With one value for both, multiple scattering in a CT head with an optical
+#: depth of 1.2 per voxel was too bright by 0.5 %.
 DENSE = 0.5
 
 
 class ExtinctionLayout:
-    """Where tracks through the voxels of ``grid`` find the extinction, whose values are those of
-    the voxels of ``values_grid``, which lies over the same box.
+    """Layout of the extinction on ``values_grid`` for tracks through the voxels of ``grid``, a grid
+    over the same box.
 
-    Values are integers below 2^16, in units of ``quantum`` [1/scene unit]. ``is_dense``: collisions
-    depend on how the extinction changes within a voxel.
+    Values are integers below 2^16, in units of ``quantum`` [1/scene unit]. ``is_dense`` states that
+    the extinction of both halves of a voxel is needed (see `DENSE`).
     """
 
     def __init__(self, grid: Grid, values_grid: Grid, quantum: float, is_dense: bool) -> None:
@@ -46,14 +48,17 @@ class ExtinctionLayout:
         return self.values_grid.shape == self.grid.shape and not (has_source and self._is_dense)
 
     def sides(self, axis: int) -> np.ndarray:
-        """Values along x, y, z: one slice for each of the grid's along ``axis``."""
+        """Return the number of values along x, y, z, for tracks with the dominant ``axis``.
+
+        Along this axis there is one value per slice of the grid.
+        """
         sides = self.values_grid.resolution.copy()
         sides[axis] = self.grid.resolution[axis]
         return sides
 
     def words(self, has_source: bool, by_rows: bool) -> int:
-        """How many words `Extinction.corners` holds for each value: one (by rows) or two where
-        sweeps read one value for each voxel, four for both halves of slices.
+        """Return the number of 32-bit words per value in `Extinction.corners`: one (``by_rows``) or
+        two if sweeps read one value per voxel, four for both halves of slices.
         """
         return (1 if by_rows else 2) if self.is_read_by_voxel(has_source) else 4
 
@@ -70,12 +75,12 @@ class Extinction:
         self._halves: dict[int, mi.UInt32] = {}  # of slices, by axis
 
     def corners(self, axis: int, words: int) -> mi.UInt32:
-        """For each value in all slices along ``axis`` the four values around a track: itself and
-        its upper neighbours along both transverse axes.
+        """Return, for each value in all slices along ``axis``, the four values around a track: the
+        value and its upper neighbours along both transverse axes.
 
-        Two ``words`` hold two values each; four words hold the means over both halves of a slice; a
-        single word holds the row of two, and the row above is read separately, which takes half as
-        much memory in all.
+        Two ``words`` hold two values each; four words hold the means over both halves of a slice. A
+        single word holds the two values of one row, and kernels read the row above separately,
+        which needs half the memory.
         """
         sides = self.layout.sides(axis)
         if words < 4:
@@ -103,8 +108,8 @@ class Extinction:
 
 
 def largest_extinction(grid: Grid, largest: float) -> tuple[float, bool]:
-    """The largest extinction that is distinguished where the ``largest`` one is this, and whether
-    voxels are so dense that their halves differ.
+    """Return the extinction of the highest level, given the ``largest`` extinction, and whether
+    voxels are dense (see `DENSE`).
     """
     slices = np.linalg.norm(grid.coordinates.matrix[:3, :3], axis=1).max()
     top = float(min(largest, MAX_OPTICAL_DEPTH * slices))
@@ -112,15 +117,18 @@ def largest_extinction(grid: Grid, largest: float) -> tuple[float, bool]:
 
 
 def quantised(sigma_t: mi.Float, top: float, first: int = 0) -> mi.UInt32:
-    """The extinction of the voxels from number ``first`` on, in units of the quantum, of which
-    ``top`` are `LEVELS`.
+    """Return the extinction as dithered integers, `LEVELS` for the extinction ``top``.
+
+    ``first`` is the index of the first value in the dither sequence.
     """
     levels = sigma_t * dr.opaque(mi.Float, LEVELS / top if top else 0)
     return _dithered(dr.minimum(levels, LEVELS), first=first)
 
 
 def _packed(values: mi.UInt32) -> mi.UInt32:
-    """Two integers below 2^16 in each word: the first half of ``values``, and the second one."""
+    """Pack integers below 2^16 into words: the first half of ``values`` in the lower 16 bits, the
+    second half in the upper ones.
+    """
     dr.eval(values)
     half = (dr.width(values) + 1) // 2
     index = dr.arange(mi.UInt32, half)
@@ -132,7 +140,7 @@ def _packed(values: mi.UInt32) -> mi.UInt32:
 
 
 def _level(words: mi.UInt32, index: mi.UInt32) -> mi.UInt32:
-    """Value ``index`` of those that `_packed` has packed."""
+    """Return value ``index`` of the result of `_packed`."""
     half = dr.opaque(mi.UInt32, dr.width(words))
     later = index >= half
     word = dr.gather(mi.UInt32, words, dr.select(later, index - half, index))
@@ -140,10 +148,11 @@ def _level(words: mi.UInt32, index: mi.UInt32) -> mi.UInt32:
 
 
 def _dithered(values: mi.Float, shift: float = 0.0, first: int = 0) -> mi.UInt32:
-    """Integers, rounded up or down by a golden-ratio sequence (not at random): correct on average
-    over any few neighbours, where rounding to the nearest would lose thin matter beside dense.
+    """Round to integers, up or down by a golden-ratio sequence (not at random).
 
-    ``first`` is the number of the first value in the sequence.
+    The result is correct on average over a few neighbours; rounding to the nearest integer would
+    lose optically thin regions next to dense ones. ``first`` is the index of the first value in the
+    sequence, ``shift`` in [0, 1) an offset of the sequence.
     """
     index = dr.arange(mi.UInt32, dr.width(values))
     index = index + dr.opaque(mi.UInt32, first & 0xFFFFFFFF) if first else index
@@ -152,8 +161,10 @@ def _dithered(values: mi.Float, shift: float = 0.0, first: int = 0) -> mi.UInt32
 
 
 def _slice_halves(levels: mi.UInt32, grid: Grid, count: int, axis: int) -> mi.UInt32:
-    """``levels`` of the voxels of ``grid``, resampled to ``count`` slices along ``axis``: the mean
-    over the first half of each slice's thickness, and over the second one in the upper 16 bits.
+    """Resample the packed ``levels`` of the voxels of ``grid`` to ``count`` slices along ``axis``.
+
+    Returns words with the mean over the first half of each slice's thickness in the lower, and over
+    the second half in the upper 16 bits.
     """
     sides, strides = grid.resolution.copy(), strides_of(grid.resolution)
     before, sides[axis] = int(sides[axis]), count

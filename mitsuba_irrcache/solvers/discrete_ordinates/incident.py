@@ -1,9 +1,9 @@
-"""Radiance that enters the medium from distant emitters: suns and environments, and the ordinates
-that their directions add to a set.
+"""Irradiance from distant emitters (suns and environments), and additional ordinates for them.
 
-Suns have ordinates of their own. An environment map with bright regions is sampled in proportion to
-its luminance beside the even ordinates (balance heuristic, Veach and Guibas 1995). Without any the
-even ordinates alone have a smaller error: their weights integrate smooth functions.
+Suns have separate ordinates. An environment map with bright regions is sampled in proportion to its
+luminance, in addition to the uniformly distributed (*even*) ordinates (balance heuristic, Veach and
+Guibas 1995). Without bright regions the even ordinates alone have a smaller error, because their
+weights integrate smooth functions well.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import (
 )
 from mitsuba_irrcache.transport.tracking import medium_transmittance
 
-#: What the second coordinate of lattices of points advances by.
+#: Step of the second coordinate of lattices of points.
 STEP = kronecker_steps(2)[0]
-#: Pairs of ordinates of a pass for each set of tracks of a sun, and for each direction that is
-#: sampled from an environment.
+#: Number of pairs of ordinates of a pass per set of tracks of a sun, and per direction sampled from
+#: an environment.
 PAIRS_PER_SUN_TRACKS, PAIRS_PER_SAMPLE = 8, 2
 
 
 class DistantIllumination:
-    """The emitters of a scene, seen from the medium: an environment, suns (infinitely distant, of
-    one direction), and point-like lights nearby, which are left to others, as area emitters are.
+    """Distant emitters of a scene: an environment, and suns (infinitely distant, one direction).
 
-    Raises UnsupportedSceneError for an emitter of any other kind, which would be left out.
+    Point-like emitters are listed in ``point_lights``; they and area emitters are sampled by other
+    modules. Raises UnsupportedSceneError for an emitter of any other kind, which would be ignored.
     """
 
     def __init__(self, scene: mi.Scene, has_other_sources: bool = False) -> None:
-        """``has_other_sources``: the medium emits, in colours of its own."""
+        """``has_other_sources`` states that the medium emits, possibly with another colour."""
         self._has_other_sources = has_other_sources
         self._environment = scene.environment()
         self._has_bright_regions = (
@@ -69,9 +69,11 @@ class DistantIllumination:
     def factored_ordinates(
         self, passes: int, pairs: int, channels: int, rng: np.random.Generator, first: int = 0
     ) -> tuple[list[Ordinates], np.ndarray]:
-        """Ordinates of a number of passes, as `ordinates` returns them; before these, on request,
-        those of a ``first`` pass of so many pairs. And factors (channels) of their results: where
-        channels differ by a factor only, ``incoming`` has a single one.
+        """Return the ordinates of all passes, and factors (channels) of their results.
+
+        If ``first`` is not 0, there is an additional first pass with ``first`` pairs. If the
+        channels of the incoming irradiance differ by a factor only, ``incoming`` has a single
+        channel; otherwise all factors are 1.
         """
         sets = self.ordinates(1, first, rng) if first else []
         sets += self.ordinates(passes, pairs, rng)
@@ -87,8 +89,8 @@ class DistantIllumination:
         return sets, np.ones(channels)
 
     def ordinates(self, passes: int, pairs: int, rng: np.random.Generator) -> list[Ordinates]:
-        """Ordinates of each pass: an even set, which radiance of the voxels uses too, then those
-        that only emitters use.
+        """Return the ordinates of each pass: an even set, along which voxels emit and scatter, too,
+        followed by the ordinates that only emitters use.
         """
         even = joint_ordinates(passes, pairs, rng)
         if self._has_bright_regions:
@@ -103,14 +105,14 @@ class DistantIllumination:
         return len(self._suns)
 
     def sun_ordinates(self, pairs: int) -> int:
-        """How many of the last ordinates of a pass are those of suns."""
+        """Return how many ordinates of a pass, the last ones, belong to suns."""
         return len(self._suns) * self._tracks_per_sun(pairs)
 
     def point_irradiance(
         self, medium: MediumGrid, position: mi.Point3f, known: Sequence[DirectLight] = ()
     ) -> list[mi.Spectrum]:
-        """Irradiance at ``position`` from each point-like light; for those ``known`` already, their
-        values.
+        """Return the irradiance at ``position`` from each point-like emitter, taken from ``known``
+        if the emitter is among these direct lights.
         """
         values = {id(light.emitter): light.irradiance for light in known}
         return [
@@ -119,7 +121,9 @@ class DistantIllumination:
         ]
 
     def _even_irradiance(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """What enters along even ordinates from a smooth environment, or none: (n, 2, channels)."""
+        """Return the irradiance (n, 2, channels) of an environment along even ordinates, 0 without
+        an environment.
+        """
         if self._environment is None:
             return np.zeros((len(directions), 2, dr.size_v(mi.Spectrum)))
         return self._both_ways(directions) * weights[:, None, None]
@@ -132,7 +136,7 @@ class DistantIllumination:
         incoming: np.ndarray,
         rng: np.random.Generator,
     ) -> Ordinates:
-        """These ordinates, and several sets of tracks in the direction of each sun."""
+        """Append several sets of tracks in the direction of each sun to these ordinates."""
         colours, parts = dr.size_v(mi.Spectrum), [(directions, incoming, weights)]
         count = self._tracks_per_sun(pairs)
         for direction, irradiance in self._suns:
@@ -154,11 +158,11 @@ class DistantIllumination:
     def _with_samples(
         self, even: list[tuple], count: int, rng: np.random.Generator
     ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """The ``even`` ordinates and weights of each pass, ``count`` directions that are sampled by
-        the luminance of an environment, and what enters along all.
+        """Add ``count`` directions sampled from the environment to the ``even`` ordinates of each
+        pass; return directions, weights, and the irradiance along all of them.
 
-        A direction may result from either strategy, and as the opposite of one: the solid angle it
-        stands for is one over the sum of all densities (balance heuristic).
+        A direction may result from either strategy, and as the opposite of a sampled one: the solid
+        angle that it represents is one over the sum of all densities (balance heuristic).
         """
         # docs/primer, eq. (4.2)
         sets = []
@@ -174,12 +178,12 @@ class DistantIllumination:
         return sets
 
     def _normalise_regions(self, sets: list[tuple]) -> None:
-        """Scale what enters from each bright region, and from outside all of them, to its exact
-        irradiance: how many directions hit a region is random.
+        """Scale the sampled irradiance of each bright region, and of all else, to its exact value.
 
-        Outside of spots, what is bright is scaled apart from the rest, which would else make up for
-        the bright directions that are missing or too many. Where no direction is bright there, the
-        spots make up for it, which are most likely around.
+        The number of directions that hit a region is random. Bright directions outside of the spots
+        are scaled separately from dark ones, which would otherwise compensate for a random excess
+        or lack of bright ones. If no direction outside of the spots is bright, that irradiance is
+        assigned to the spots, which are most likely close to it.
         """
         if self._bright_regions is None:
             self._bright_regions = spots_of(self._environment)
@@ -207,13 +211,13 @@ class DistantIllumination:
                 incoming[number == k] *= factor
 
     def _both_ways(self, directions: np.ndarray) -> np.ndarray:
-        """Radiance (n, 2, channels) along directions and their opposites."""
+        """Return the radiance (n, 2, channels) along ``directions`` and their opposites."""
         both = [environment_radiance(self._environment, s * directions) for s in (1, -1)]
         return np.stack(both, axis=1)
 
     def _samples(self, sets: int, count: int, rng: np.random.Generator) -> list[np.ndarray]:
-        """Sets of directions (n, 3) from the environment's own sampling density; their union is
-        evenly spread, too.
+        """Sample sets of directions (n, 3) from the environment; the union of the sets is
+        stratified, too.
         """
         points = lattice_points(sets * count, STEP)
         members = strata(sets, points[1], STEP)
@@ -225,8 +229,8 @@ class DistantIllumination:
         return [directions[own] for own in members]
 
     def _densities(self, directions: np.ndarray) -> np.ndarray:
-        """Densities (n, 2) with which the environment samples directions and their opposites
-        [1/sr].
+        """Return the densities (n, 2) [1/sr] with which the environment samples ``directions`` and
+        their opposites.
         """
         found = []
         for sign in (1, -1):
@@ -239,13 +243,13 @@ class DistantIllumination:
 
 
 def _values(spectrum: mi.Spectrum, count: int) -> np.ndarray:
-    """A spectrum as an array (count, channels), float64."""
+    """Return a spectrum as a float64 array (count, channels)."""
     channels = [np.broadcast_to(np.array(v, dtype=np.float64), count) for v in spectrum]
     return np.stack(channels, axis=1)
 
 
 def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -> mi.Spectrum:
-    """Irradiance from a point-like emitter, attenuated by the medium."""
+    """Return the irradiance from a point-like emitter, attenuated by the medium."""
     at = dr.zeros(mi.Interaction3f, dr.width(position))
     at.p = position
     record, irradiance = emitter.sample_direction(at, mi.Point2f(0.5))
@@ -258,7 +262,7 @@ def _from_point(emitter: mi.Emitter, medium: MediumGrid, position: mi.Point3f) -
 
 
 def _sun(emitter: mi.Emitter) -> tuple[np.ndarray, np.ndarray]:
-    """Direction (3) and irradiance (channels) of an emitter that is infinitely distant."""
+    """Return direction of propagation (3) and irradiance (channels) of a sun."""
     record, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1), mi.Point2f(0.5))
     direction = -np.array(record.d, dtype=np.float64).ravel()
     return direction / np.linalg.norm(direction), _values(weight, 1)[0]

@@ -6,7 +6,7 @@ tau, L' = L e^-tau + S (1 - e^-tau), the step characteristic scheme (Lewis and M
 *Computational Methods of Neutron Transport*, 1984).
 
 All radiance in this module is multiplied by the solid angle of its ordinate (ordinate weight), so
-that adding it up over ordinates gives irradiance (fluence rate).
+that sums over ordinates are irradiance (fluence rate).
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
 
 @dataclass(frozen=True)
 class SweptMedium:
-    """What tracks read of the medium.
+    """The arrays of the medium that tracks read.
 
-    ``corners`` and ``words`` are those of `Extinction.corners`; ``empty`` holds the slices that may
-    be skipped (`EmptySpace`), None where none are.
+    ``corners`` is the result of `Extinction.corners` with this number of ``words``; ``empty`` is
+    `EmptySpace.slices`, None if no slices are skipped.
     """
 
     corners: mi.UInt32
@@ -43,19 +43,19 @@ class SweptMedium:
 
 @dataclass(frozen=True)
 class SweptVolume:
-    """Where a sweep writes, and the source that it reads.
+    """The array to which a sweep writes, and the source that it reads.
 
-    Without ``source`` (no voxel emits or scatters), ``values`` has one value for each voxel and
-    channel, to which the irradiance is added. With a source, it has the four values of
-    `Tracks.sweep`; ``source`` is this same volume, or another one where ``values`` is a copy that
-    begins at voxel ``begin``. Channels of a voxel are next to each other.
+    Without ``source`` (no voxel emits or scatters), ``values`` has one value per voxel and channel,
+    to which the irradiance is added. With a source, it has the four values of `Tracks.sweep`;
+    ``source`` is the same array, or another one if ``values`` holds copies, in which case the copy
+    of a lane starts at voxel ``begin``. Channels of a voxel are adjacent.
 
-    With ``begin_backward`` the two ways of a pair are separate: values of the ordinates against the
-    axis are written from that voxel on and nothing is added; ``source`` has one value for each
-    voxel and way in the same layout; optical depths are not multiplied by solid angles, and the
-    irradiance does not include what the voxel itself emits. With ``collisions`` there are two
-    values instead of four: the radiance of collisions, without what the voxel itself emits, and the
-    optical depth.
+    With ``begin_backward`` the two ways of a pair are stored separately: the ordinate against the
+    axis writes its values from that voxel on, and values are replaced instead of added to;
+    ``source`` has one value per voxel and way in the same layout; optical depths are not multiplied
+    by solid angles, and the irradiance excludes the source of the voxel itself. With ``collisions``
+    there are two values instead of four: the radiance of collisions without the source of the
+    voxel, and the optical depth.
     """
 
     values: mi.Float
@@ -67,11 +67,11 @@ class SweptVolume:
 
 
 class CarriedRadiance:
-    """What the tracks of one pair carry from one part of a volume to the next: for either way, the
-    radiance in each channel and the extinction passed last, one array for each.
+    """State of the tracks of one pair between two parts of a volume that is swept in parts.
 
-    ``before`` is the ``after`` of the part before, None in the first part. Where tracks are follows
-    from the table, the fields of which are those of the part.
+    For either way it holds the radiance in each channel and the extinction of the last slice, one
+    array each. ``before`` is ``after`` of the previous part, None in the first part. The positions
+    of the tracks follow from the table, whose fields are those of the current part.
     """
 
     def __init__(self, before: tuple[list[mi.Float], list[mi.Float]] | None) -> None:
@@ -87,10 +87,10 @@ def sweep_tracks(
     track: mi.UInt32,
     carried: CarriedRadiance | None = None,
 ):
-    """Sweep pairs of opposite ordinates: lane by lane the ``track`` of a ``pair`` of the table,
-    both ways at once. Two independent chains of arithmetic hide each other's latency.
+    """Sweep pairs of opposite ordinates; each lane sweeps one ``track`` of a ``pair`` of the table.
 
-    With ``carried``, the volume is a part of a larger one, whose tracks go on.
+    Both ways are swept at once: two independent chains of arithmetic hide each other's latency.
+    With ``carried``, the volume is a part of a larger one, and tracks continue from part to part.
     """
     sweep = _PairSweep(medium, volume, table, pair)
     # An array that the loop reads and writes has to be one of its variables.
@@ -103,8 +103,8 @@ def sweep_tracks(
 
 @symbolic
 def add_copies(volume: mi.Float, copies: mi.Float, voxels: int, count: int, kind: type) -> None:
-    """Adds ``count`` copies, one after the other, to the ``voxels`` of ``volume``, whose values are
-    of this ``kind``.
+    """Add ``count`` consecutive ``copies`` to ``volume``, which has ``voxels`` values of this
+    ``kind``.
     """
     index = dr.arange(mi.UInt32, voxels)
     step, end = dr.opaque(mi.UInt32, voxels), dr.opaque(mi.UInt32, voxels * count)
@@ -120,7 +120,7 @@ def add_copies(volume: mi.Float, copies: mi.Float, voxels: int, count: int, kind
 
 @dataclass
 class _TrackState:
-    """Where the tracks of one way are, and what they carry: the state of the loop over slices."""
+    """Loop state of the sweep over slices, for one way: positions and radiance of the tracks."""
 
     #: voxels along the transverse axes, and positions within them (fixed point)
     b: mi.Int32
@@ -150,7 +150,7 @@ class _TrackState:
 
 
 class _TransverseMotion:
-    """How tracks of one way move along one of the transverse axes."""
+    """Motion of the tracks of one way along one of the transverse axes."""
 
     def __init__(self, fields: TransverseFields, slope: mi.Int32) -> None:
         self.size, self.slope = fields.size, slope
@@ -166,16 +166,20 @@ class _TransverseMotion:
         self.scale = FIXED_POINT_ONE / mi.Float(dr.abs(slope))
 
     def since_entry(self, position: mi.Int32) -> mi.Float:
-        """Slices since the side of entry, for tracks in the voxel next to it."""
+        """Return the slices since the side of entry, for tracks in the voxel next to it."""
         return dr.fma(mi.Float(position), self.sign, self.zero) * self.scale
 
     def start(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
-        """Slices since entry in the first slice: half of one, or less through a side."""
+        """Return the slices since entry in the first slice: 0.5, or less if a track entered
+        through a side.
+        """
         nearest = self.since_entry(position)
         return dr.select(voxel == self.entry, minimum(nearest, 0.5), 0.5)
 
     def advance(self, voxel: mi.Int32, position: mi.Int32, slices: mi.Int32 | int) -> tuple:
-        """Voxel and position after some ``slices``, and the slices since entry: 1 unless new."""
+        """Return voxel and position after some ``slices``, and the slices since entry, which are 1
+        unless the track has just entered through a side.
+        """
         moved = position + self.slope * slices
         position = moved & (FIXED_POINT_ONE - 1)
         voxel = voxel + (moved >> FIXED_POINT_BITS)
@@ -184,9 +188,10 @@ class _TransverseMotion:
         return voxel, position, dr.select(outside, self.since_entry(position), 1.0)
 
     def since_last_slice(self, voxel: mi.Int32, position: mi.Int32) -> mi.Float:
-        """What `advance` returned last for tracks that are here: slices since entry, 1 unless new.
+        """Return the slices since entry that `advance` returned for tracks at this position.
 
-        As new tracks are those that have moved less far from the side than tracks do in a slice.
+        Tracks that have just entered are those whose distance from the side is less than the
+        motion in one slice; for others the result is 1.
         """
         new = dr.select(
             self.slope > 0, position < self.slope, position >= self.slope + FIXED_POINT_ONE
@@ -194,8 +199,10 @@ class _TransverseMotion:
         return dr.select((voxel == self.entry) & new, self.since_entry(position), 1.0)
 
     def lower(self, voxel: mi.Int32, position: mi.Int32, per_voxel: bool) -> tuple:
-        """Index of the lower of the two extinction values around the track, and the weight of the
-        upper one. ``per_voxel``: each voxel has exactly one value.
+        """Return the index of the lower of the two extinction values around the track, and the
+        interpolation weight of the upper one.
+
+        ``per_voxel`` states that each voxel has exactly one value.
         """
         if per_voxel:
             before = position < FIXED_POINT_ONE // 2
@@ -208,13 +215,17 @@ class _TransverseMotion:
         return lower * self.extinction_stride, u - mi.Float(lower)
 
     def to_upper(self, index: mi.Int32) -> mi.Int32:
-        """Step from the ``index`` of the lower value to the upper one; 0 at the grid's end."""
+        """Return the step from the ``index`` of the lower value to the upper one; 0 at the grid's
+        end.
+        """
         last = mi.Int32(self.last) * self.extinction_stride
         return dr.select(index < last, self.extinction_stride, 0)
 
 
 class _Way:
-    """One of the two opposite ordinates of a pair: ``number`` 0 runs along the axis, 1 against."""
+    """One of the two opposite ordinates of a pair: ``number`` 0 propagates along the dominant axis,
+    1 against it.
+    """
 
     def __init__(self, record: TrackRecord, number: int) -> None:
         self.number, self.record = number, record
@@ -225,8 +236,10 @@ class _Way:
     def begin(
         self, track: mi.Int32, channels: int, restarts: bool, carried: CarriedRadiance | None
     ) -> _TrackState:
-        """The state before the first slice that this way crosses; ``restarts``: with
-        ``since_surface``; ``carried`` is as in `sweep_tracks`.
+        """Return the state before the first slice that this way crosses.
+
+        ``restarts`` states that tracks may restart at surfaces, so that ``since_surface`` is
+        needed; ``carried`` is as in `sweep_tracks`.
         """
         record, (fields_b, fields_c) = self.record, self.record.transverse
         # The divisor is 0 where a vector of lanes is not filled.
@@ -277,7 +290,9 @@ class _Way:
         previous: mi.Float,
         since_surface: mi.Float | None,
     ) -> _TrackState:
-        """The state some ``slices`` on, with what tracks carry behind this one."""
+        """Return the state after some ``slices``, with the radiance, last extinction and distance
+        from a surface behind the current slice.
+        """
         record = self.record
         b, position_b, since_b = self.b.advance(state.b, state.position_b, slices)
         c, position_c, since_c = self.c.advance(state.c, state.position_c, slices)
@@ -302,22 +317,22 @@ class _Way:
         )
 
     def slice_of(self, state: _TrackState) -> mi.Int32:
-        """Number of the slice along the axis."""
+        """Return the index of the slice along the axis."""
         return self.record.slices - 1 - state.crossed if self.number else state.crossed
 
     def voxel(self, state: _TrackState) -> mi.UInt32:
-        """Flat index of the voxel."""
+        """Return the flat index of the voxel in the swept volume."""
         b, c = self.record.transverse
         return mi.UInt32(state.b * b.stride + state.c * c.stride + state.offset)
 
     def grid_voxel(self, state: _TrackState) -> mi.UInt32:
-        """Flat index of the voxel in the grid, whatever the layout of the swept volume."""
+        """Return the flat index of the voxel in the grid, independent of the volume's layout."""
         (b, c), record = self.record.transverse, self.record
         place = state.b * b.voxel_stride + state.c * c.voxel_stride + record.first_voxel
         return mi.UInt32(place + self.slice_of(state) * record.voxel_stride)
 
     def empty_slices(self, empty: mi.UInt32, state: _TrackState) -> mi.Int32:
-        """Slices that may be skipped from here on, 0 where this one is needed."""
+        """Return the number of slices that may be skipped from here on; 0 if this one is needed."""
         b, c = self.record.transverse
         strides = b.empty_stride, c.empty_stride, self.record.empty_stride
         at = state.b, state.c, self.slice_of(state)
@@ -325,8 +340,8 @@ class _Way:
         return mi.Int32(dr.gather(mi.UInt32, empty, mi.UInt32(cell), state.active))
 
     def extinction(self, medium: SweptMedium, state: _TrackState, active: mi.Bool) -> tuple:
-        """Quantised extinction in the half of the slice that this way crosses first, and in the
-        other one; bilinear across the track.
+        """Return the quantised extinction in the half of the slice that this way crosses first, and
+        in the other half, interpolated bilinearly across the track.
         """
         lower, upper = self._extinction(medium, state, active)
         return (upper, lower) if self.number else (lower, upper)
@@ -358,29 +373,30 @@ class _Way:
 
 
 class _Visit:
-    """The voxels in which the tracks of one way are: their indices, in the whole volume and in the
-    copy that is written, and whether they are needed. Values of all channels of a voxel are next to
-    each other.
+    """The current voxels of the tracks of one way.
+
+    ``voxel`` are their indices in the whole volume, ``copy`` those in the copy that is written,
+    ``active`` masks the voxels that are needed. Channels of a voxel are adjacent.
     """
 
     def __init__(self, voxel: mi.UInt32, copy: mi.UInt32, active: mi.Bool) -> None:
         self.voxel, self.copy, self.active = voxel, copy, active
 
     def read(self, kind: type, volume: mi.Float, channels: int) -> list:
-        """The values of the copy."""
+        """Return the values of the copy, one per channel."""
         return [
             dr.gather(kind, volume, self._at(self.copy, c), self.active) for c in range(channels)
         ]
 
     def read_sources(self, volume: mi.Float, channels: int) -> list:
-        """The first of the four values of the voxels of a whole volume."""
+        """Return the first of the four values, the source, of the whole volume, per channel."""
         return [
             dr.gather(mi.Float, volume, self._at(self.voxel, c) * 4, self.active)
             for c in range(channels)
         ]
 
     def write(self, volume: mi.Float, values: list) -> None:
-        """Replaces the values of the copy."""
+        """Replace the values of the copy."""
         for c, value in enumerate(values):
             dr.scatter(volume, value, self._at(self.copy, c), self.active)
 
@@ -413,7 +429,7 @@ class _PairSweep:
             self._first_crossing = self.crossings.first(pair)
         self._source_elsewhere = volume.source is not volume.values
         self.weight, self.scale = record.weight, record.quantum * record.length
-        # Cross section of the tube for which a track stands over the volume of a voxel: the tubes
+        # Cross section of the tube that a track represents, over the volume of a voxel: the tubes
         # of an ordinate fill the volume.
         self.area = dr.rcp(record.length)
         #: what optical depths are multiplied by
@@ -430,8 +446,8 @@ class _PairSweep:
     def cross_slice(
         self, values: mi.Float, forward: _TrackState, backward: _TrackState
     ) -> tuple[_TrackState, _TrackState]:
-        """Cross a slice, or skip empty ones, both ways; read and write the ``values`` of its voxels
-        in the volume.
+        """Cross a slice, or skip empty ones, both ways; read and write the ``values`` of its
+        voxels. Returns the new states.
         """
         states = forward, backward
         slices, needed = self._needed(states)
@@ -466,7 +482,7 @@ class _PairSweep:
         return forward, backward
 
     def _needed(self, states: tuple) -> tuple[list, list]:
-        """For both ways the slices to advance by, and whether this one is not skipped."""
+        """Return for both ways the slices to advance by, and whether this slice is needed."""
         if self.medium.empty is None:
             return [1, 1], [state.active for state in states]
         empty = [
@@ -477,7 +493,7 @@ class _PairSweep:
         return [dr.maximum(n, 1) for n in empty], needed
 
     def _entered(self, way: _Way, state: _TrackState) -> list[mi.Float]:
-        """Radiance before the slice: that of the boundary for tracks that have just entered."""
+        """Return the radiance before the slice; at the boundary for tracks that just entered."""
         entered = state.since_entry < 1
         if self.boundary_source is None:
             return _select(entered, self.incoming[way.number], state.radiance)
@@ -496,8 +512,10 @@ class _PairSweep:
         visits: list[_Visit],
         middle: mi.Bool,
     ) -> tuple[list[list[mi.Float]], list]:
-        """Attenuates the radiance up to the middle of the slice and adds it to the voxels; returns
-        what tracks carry on, and slices since they left a surface.
+        """Attenuate the radiance up to the middle of the slice, and add it to the voxels.
+
+        Returns, for both ways, the radiance carried on, and the slices since the track left a
+        surface (None without surfaces).
         """
         radiance = [
             _scale(light, _transmittance(state, first, self.scale))
@@ -529,8 +547,8 @@ class _PairSweep:
         visits: list[_Visit],
         middle: mi.Bool,
     ) -> list[list[mi.Float]]:
-        """Carries the radiance through the slice, whose voxels emit, and adds up irradiance and
-        collisions.
+        """Propagate the radiance through the slice, whose voxels emit or scatter, and tally
+        irradiance and collisions; return the radiance behind it for both ways.
         """
         source, channels = self.volume.source, self.volume.channels
         if self.separate:
@@ -571,7 +589,10 @@ class _PairSweep:
     def _add_both(
         self, values: mi.Float, before: list, added: list, visits: list[_Visit], middle: mi.Bool
     ) -> None:
-        """Writes what both ways add to the values ``before``."""
+        """Write the values ``before`` plus what both ways have ``added``.
+
+        Where ``middle``, both ways are in the same voxel, and the first one writes the sum.
+        """
         forward, backward = visits
         both = _add(added[0], _select(middle, added[1], self.volume.channels * [0]))
         forward.write(values, _add(before[0], both))
@@ -581,17 +602,19 @@ class _PairSweep:
     def _cross_voxel(
         self, state: _TrackState, radiance: list, source: list, extinction: tuple
     ) -> tuple[list, list]:
-        """Radiance behind a slice, and what its voxel adds up: (0, irradiance in its middle,
-        radiance lost, optical depth), for a source that is constant in it.
+        """Propagate radiance through a voxel with a constant source.
+
+        Returns per channel the radiance behind it, and the tally (0, irradiance in its middle,
+        radiance lost, optical depth).
         """
         # docs/primer, eqs. (4.6), (4.7)
-        # Tubes are the narrower the longer their tracks are in a voxel.
+        # The longer a track is in a voxel, the narrower is its tube.
         area, count = self.area, self.solid_angle
         first, second = (half * self.scale for half in extinction)
         to_middle = dr.select(state.since_entry < 1, state.since_entry, 0.5) * first
         tau = dr.fma(second, 0.5, to_middle)
         transmittance = decay(tau)
-        # Thin voxels lose little, but what they scatter is known from just that.
+        # Little is lost in thin voxels, but their scattering is computed from just that loss.
         share = absorbed(tau, transmittance)
         to_centre = decay(to_middle)
         behind, tally = [], []
@@ -604,13 +627,15 @@ class _PairSweep:
     # Surfaces among the voxels
 
     def _slot(self, way: _Way, state: _TrackState, active: mi.Bool) -> mi.UInt32:
-        """1 + the index of the crossing with a surface in this slice; 0 without one."""
+        """Return 1 + the index of the crossing with a surface in this slice; 0 without one."""
         return self.crossings.slot(self._first_crossing, way.grid_voxel(state), active)
 
     def _crossing(self, way: _Way, slot: mi.UInt32, active: mi.Bool) -> tuple:
-        """Where this way crosses surfaces, first and last, in slices from the middle, whether the
-        parts before and behind them belong to the voxel, the radiance behind, and the voxels whose
-        source applies to the parts.
+        """Return the crossing with surfaces as seen along this way.
+
+        That is: the first and last position, in slices from the middle; whether the parts before
+        and behind them belong to the voxel; the radiance behind the last surface, per channel; and
+        the voxels whose source applies to the two parts.
         """
         first, last, before, behind = self.crossings.record(slot, active)
         voxels = tuple(self.crossings.source_voxels(slot, active))
@@ -684,7 +709,7 @@ class _PairSweep:
         return carried, tallies
 
     def _source(self, volume: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """The source at an index of voxels and channels, times the solid angle."""
+        """Return the source at an ``index`` of voxels and channels, times the solid angle."""
         return dr.gather(mi.Float, volume, index * 4, active) * self.weight
 
 
@@ -692,9 +717,11 @@ class _PairSweep:
 def _attenuate_at_surface(
     sweep: _PairSweep, way: _Way, radiance: list, extinction: mi.Float, slot: mi.UInt32
 ):
-    """What a voxel receives from ``radiance``, attenuated to the middle of the slice, where a
-    surface is near; what the track carries on, and how many slices ago it left a surface in the
-    next one. ``extinction`` is that of the first half.
+    """Correct the radiance at the middle of a slice for surfaces in the voxel.
+
+    ``radiance`` is attenuated to the middle of the slice, ``extinction`` is that of its first half,
+    ``slot`` is 0 where there is no surface. Returns the radiance that the voxel receives, the
+    radiance that the track carries on, and the slices since the track left a surface.
     """
     received, carried, since = list(radiance), list(radiance), mi.Float(1)
     if slot > 0:
@@ -714,9 +741,11 @@ def _collide_at_surface(
     slot: mi.UInt32,
     source: mi.Float,
 ):
-    """``carried`` and ``tallies``, the results of `_PairSweep._cross_voxel`, where no surface is
-    near; else the same for the parts of the track that belong to the voxel. ``source`` is a volume
-    with that of all voxels.
+    """Correct the results of `_PairSweep._cross_voxel` for surfaces in the voxel.
+
+    Returns ``carried`` and ``tallies`` unchanged where ``slot`` is 0, and otherwise those of the
+    parts of the track that belong to the voxel. ``source`` is the volume with the source of all
+    voxels.
     """
     if slot > 0:
         carried, tallies = sweep._cross_parts(way, state, radiance, extinction, slot, source)
@@ -724,16 +753,18 @@ def _collide_at_surface(
 
 
 def _depth(a: mi.Float, b: mi.Float, lower: mi.Float, upper: mi.Float) -> mi.Float:
-    """Optical depth between two positions, in slices from the middle, where the extinction differs
-    in both halves.
+    """Return the optical depth between positions ``a`` and ``b`` [slices from the middle], with
+    different extinctions in the ``lower`` and ``upper`` half.
     """
     below, above = dr.minimum(b, 0) - dr.minimum(a, 0), dr.maximum(b, 0) - dr.maximum(a, 0)
     return dr.fma(lower, below, upper * above)
 
 
 def _transmittance(state: _TrackState, here: mi.Float, scale: mi.Float) -> mi.Float:
-    """Transmittance from the middle of the previous slice to that of this one, or from the point of
-    entry; ``here`` is the extinction in the half of this one that is crossed first.
+    """Return the transmittance from the middle of the previous slice, or from the point of entry,
+    to the middle of this slice.
+
+    ``here`` is the extinction in the half of this slice that is crossed first.
     """
     # docs/primer, eq. (4.4)
     since = state.since_entry
@@ -746,8 +777,9 @@ def _transmittance(state: _TrackState, here: mi.Float, scale: mi.Float) -> mi.Fl
 
 
 def collisions(tallies: list) -> list:
-    """The radiance that is lost per optical depth, and the depth; without any, the radiance in the
-    middle, which is the limit.
+    """Return (radiance lost per optical depth, optical depth) for each tally of four values.
+
+    If the optical depth is 0, the first value is its limit, the radiance in the middle.
     """
     return [mi.Vector2f(dr.select(t.w > 0, t.z / t.w, t.y), t.w) for t in tallies]
 

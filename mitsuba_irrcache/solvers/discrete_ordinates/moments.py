@@ -1,8 +1,8 @@
 """Anisotropic scattering: spherical-harmonic moments of the radiance (S_N with P_L scattering).
 
-Where the phase function is not isotropic, the unknown is not the irradiance alone but all moments
-of the radiance up to the order of the phase function's Legendre expansion: as many times the voxels
-in one array, degree by degree; channels that are swept together are next to each other. The first
+For anisotropic phase functions, the unknowns are not the irradiance alone but all moments of the
+radiance up to the order of the phase function's Legendre expansion. They are stored in one array,
+moment after moment, ordered by degree; channels that are swept together are adjacent. The first
 moment is the irradiance; scattering multiplies a moment of degree l by the phase function's moment
 g_l (see `phase`; Lewis and Miller 1984, chapter 4).
 """
@@ -39,30 +39,30 @@ class Moments:
     """Spherical-harmonic moments of the radiance, in the basis of an `AngularBasis`."""
 
     def __init__(self, angular_basis: AngularBasis, order: int | None = None) -> None:
-        """Up to degree ``order`` (None: all that the phase function needs)."""
+        """Use moments up to degree ``order`` (None: the order of ``angular_basis``)."""
         self.angular_basis = angular_basis
         self.order = angular_basis.order if order is None else order
         #: degree of each moment
         self.degrees = [n for n in range(self.order + 1) for _ in range(2 * n + 1)]
         factors = [angular_basis.phase.moments[n] for n in self.degrees]
-        #: what scattering multiplies each moment by
+        #: factor g_l of each moment in scattering
         self.factors = mi.Float([float(g) for g in factors])
 
     @property
     def count(self) -> int:
-        """How many moments there are."""
+        """Number of moments."""
         return len(self.degrees)
 
     def basis(self, direction: mi.Vector3f) -> list[mi.Float]:
-        """The moments of an irradiance of 1 that comes from ``direction``."""
+        """Return the moments of an irradiance of 1 from ``direction``."""
         return [mi.Float(1), *dr.sh_eval(direction, self.order)[1:]]
 
     def from_direction(self, irradiance: mi.Float, direction: mi.Vector3f) -> mi.Float:
-        """The moments of an irradiance that comes from ``direction``, at each position."""
+        """Return the moments of an irradiance from ``direction``, at each position."""
         return concatenated([irradiance * y for y in self.basis(direction)])
 
     def moment(self, values: mi.Float, number: int) -> mi.Float:
-        """One of the moments at all positions."""
+        """Return the moment with this ``number`` at all positions."""
         width = dr.width(values) // self.count
         index = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, number * width)
         return dr.gather(mi.Float, values, index)
@@ -75,7 +75,9 @@ class Moments:
         offsets: np.ndarray,
         boundary_source: Callable | None = None,
     ) -> mi.Float:
-        """Moments at the centres of the active voxels of what `Tracks.uncollided` finds."""
+        """Return the moments, at the centres of the active voxels, of the radiance whose irradiance
+        `Tracks.uncollided` computes.
+        """
         none = np.zeros(len(incoming))
         table = tracks.table(directions, incoming, none, offsets, by_slice=True)
         table.boundary_source = boundary_source(table) if boundary_source is not None else None
@@ -90,15 +92,17 @@ class Moments:
         return concatenated(sums)
 
     def zeros(self, width: int) -> list[mi.Float]:
-        """Zero moments, at so many positions."""
+        """Return moments of 0 at ``width`` positions."""
         return [dr.opaque(mi.Float, 0, width) for _ in range(self.count)]
 
     def uncollided(
         self, sets: list[OrdinateSet] | list[BoundaryOrdinateSet], tracks: Tracks, channels: int
     ) -> list[mi.Float | None]:
-        """Moments of the uncollided radiance along tracks at the active voxels, the sum of all
-        ordinate ``sets``, without that of narrow sources; and those of each narrow source (None
-        where it is not distant). In so many ``channels``, of which what enters may have one only.
+        """Compute the moments of the uncollided radiance along tracks at the active voxels, summed
+        over all ordinate ``sets``.
+
+        Returns the moments of the radiance without narrow sources, followed by those of each narrow
+        source (None if it is not distant), with interleaved ``channels``.
         """
         width, found = self.count * tracks.active_count, []
         for arguments in sets[0].uncollided(sets, self.angular_basis):
@@ -128,13 +132,13 @@ class AnisotropicMultigridLevel(MultigridLevel):
     def _new_level(
         self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks
     ) -> AnisotropicMultigridLevel:
-        # Errors that converge slowly are smooth in space, and so in direction.
+        # Errors that converge slowly are smooth in space, and hence in direction.
         smooth = Moments(self.moments.angular_basis, min(self.moments.order, COARSE_ORDER))
         return AnisotropicMultigridLevel(sigma_t, albedo, tracks, self.all_axes, moments=smooth)
 
     @property
     def _measured(self) -> int:
-        # What converges slowly is smooth in direction.
+        # Slowly converging errors are smooth in direction.
         return min(self.moments.count, (COARSE_ORDER + 1) ** 2)
 
     def restrict(self, values: mi.Float) -> mi.Float:
@@ -148,7 +152,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
         return result
 
     def prolong(self, values: mi.Float) -> mi.Float:
-        """As `MultigridLevel.prolong`; moments that the coarser level does not have are 0."""
+        """Prolong as `MultigridLevel.prolong`; moments that the coarser level lacks are 0."""
         moment, place, channel = self._indices(self.coarser.moments.count)
         begin = moment * dr.opaque(mi.UInt32, self.coarser._width) + channel
         known = self._interpolated(values, place, self.channels, begin)
@@ -158,7 +162,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
         return result
 
     def sweep(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
-        """As `MultigridLevel.sweep`, for all moments."""
+        """Sweep as `MultigridLevel.sweep`, for all moments."""
         return self._swept(phi, table, with_irradiance=True)
 
     def collisions(self, phi: mi.Float | None, table: TrackTable) -> mi.Float:
@@ -167,7 +171,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
     def _swept(
         self, phi: mi.Float | None, table: TrackTable, with_irradiance: bool
     ) -> tuple[mi.Float | None, mi.Float]:
-        """The results of `sweep`, of which the irradiance can be left out."""
+        """Return the results of `sweep`; the first one is None without ``with_irradiance``."""
         moments, scattered = self.moments, None
         if phi is not None:
             scattered = self._scattered(phi)
@@ -186,11 +190,11 @@ class AnisotropicMultigridLevel(MultigridLevel):
             sums = received, collided, lost, depth
             received, collided, lost, depth = _add_collided(moments, *sums, copies, group, *where)
             dr.eval(received, collided, lost, depth)
-        # Weighting by optical depth makes scattering conserve the collided energy.
+        # Weighting by optical depth makes scattering conserve the energy of collisions.
         weighted = 4 * dr.pi * lost / dr.select(depth > 0, depth, 1)
         collided[0] = self.collided_irradiance(depth, weighted, collided[0])
         if scattered is not None:
-            # Ordinates integrate the difference from a voxel's source, whose moments are known.
+            # Ordinates integrate the difference L - S from a voxel's source S; add its moments.
             own = [moments.moment(scattered, k) for k in range(moments.count)]
             collided = [a + b for a, b in zip(collided, own, strict=True)]
             if received is not None:
@@ -198,8 +202,8 @@ class AnisotropicMultigridLevel(MultigridLevel):
         return None if received is None else concatenated(received), concatenated(collided)
 
     def source_along(self, scattered: mi.Float | None, group: PairGroup) -> mi.Float:
-        """Radiance that ``scattered`` moments (None for 0) have along both ways of all pairs of a
-        group, pair by pair.
+        """Evaluate the radiance with the moments ``scattered`` (None for 0) along both ways of all
+        pairs of a group, pair by pair.
         """
         count = self._swept_values
         values = dr.opaque(mi.Float, 0, 2 * len(group) * count)
@@ -211,7 +215,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
     def scattered_radiance(
         self, phi: mi.Float, index: mi.UInt32, direction: mi.Vector3f | None
     ) -> mi.Float:
-        """As `MultigridLevel.scattered_radiance`."""
+        """Evaluate as `MultigridLevel.scattered_radiance`."""
         step = dr.opaque(mi.UInt32, self._width)
         result = dr.gather(mi.Float, phi, index)
         basis = self.moments.angular_basis.basis(direction)
@@ -221,7 +225,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
         return result
 
     def _scattered(self, phi: mi.Float) -> mi.Float:
-        """Moments of the scattered radiance, per optical depth."""
+        """Return the moments of the scattered radiance, per optical depth."""
         moment, place = layer_and_index(self._width, self.moments.count)
         factor = dr.gather(mi.Float, self.moments.factors, moment)
         scattered = phi * factor * dr.gather(mi.Float, self.albedo, place)
@@ -232,21 +236,21 @@ class AnisotropicMultigridLevel(MultigridLevel):
 
     @property
     def _width(self) -> int:
-        """Values of one moment: of all channels of the active voxels."""
+        """Number of values of one moment: active voxels times channels."""
         return self.tracks.active_count * self.channels
 
     @property
     def _swept_values(self) -> int:
-        """Values that an ordinate leaves: in all channels of all voxels."""
+        """Number of values that the sweep of one ordinate writes: all voxels times channels."""
         return self.grid.voxel_count * self.channels
 
     def _slots(self) -> mi.UInt32:
-        """Indices of the active voxels and their channels among the values of an ordinate."""
+        """Return the indices of the active voxels and channels among the values of an ordinate."""
         place, channel = voxel_and_channel(self.tracks.active_count, self.channels)
         return dr.gather(mi.UInt32, self.tracks.active, place) * self.channels + channel
 
     def _indices(self, moments: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Moment, active voxel and channel of each value of an array of so many ``moments``."""
+        """Return moment, active voxel and channel of each value of an array of ``moments``."""
         moment, place = layer_and_index(self._width, moments)
         if self.channels == 1:
             return moment, place, mi.UInt32(0)
@@ -258,8 +262,8 @@ class AnisotropicMultigridLevel(MultigridLevel):
 def _add_uncollided(
     moments, sums: list, copies, group, axis: int, grid, lower, upper, voxel, channel, channels: int
 ):
-    """``sums`` and the moments of the irradiance that a sweep of a group has left in ``copies``, at
-    each ``voxel`` in this ``channel``.
+    """Return ``sums`` plus the moments of the irradiance that a sweep of a group has written to
+    ``copies``, at each ``voxel`` in this ``channel``.
     """
     voxels = dr.opaque(mi.UInt32, grid.voxel_count)
     k, begin = mi.UInt32(0), mi.UInt32(0)
@@ -278,17 +282,19 @@ def _add_uncollided(
 def _add_collided(
     moments, received: list | None, collided: list, lost, depth, copies, group, slots, values: int
 ):
-    """Adds the results of a sweep of a group, in ``copies``, at these ``slots`` of the ``values``
-    of each ordinate, without the voxels' own source: to the moments of the radiance in the middle
-    of voxels, ``received`` (None: not known), and of collisions, to the radiance ``lost``, and to
-    the optical ``depth`` times solid angles.
+    """Return the sums of moments plus the results of a sweep of a group.
+
+    The results, without the voxels' own source, are in ``copies``, at these ``slots`` of the
+    ``values`` of each ordinate. The sums are the moments of the radiance in the middle of voxels,
+    ``received`` (None: not computed), and of collisions, ``collided``; the radiance ``lost``; and
+    the optical ``depth`` times solid angle.
     """
     step = dr.opaque(mi.UInt32, values)
     k, place = mi.UInt32(0), mi.UInt32(slots)
     while dr.hint(k < group.count, label="collided pairs"):
         basis = moments.basis(-group.direction(k))
-        # Per depth of each track: with the sum of depths, tracks without matter would be missing
-        # from the integral over directions, and the operator would have a norm above 1.
+        # Divide by the depth of each track: with the sum of depths, tracks through empty voxels
+        # would be missing from the integral over directions, and the operator norm would exceed 1.
         if dr.hint(received is None, mode="scalar"):
             forward = dr.gather(mi.Vector2f, copies, place)
             backward = dr.gather(mi.Vector2f, copies, place + step)
@@ -307,7 +313,9 @@ def _add_collided(
 def _add_pair(
     moments: Moments, sums: list, basis: list, forward: mi.Float, backward: mi.Float
 ) -> list:
-    """Sums with what comes from the direction of ``basis``, and from its opposite."""
+    """Return ``sums`` plus the moments of irradiance from the direction of ``basis``
+    (``forward``) and from its opposite (``backward``).
+    """
     even, odd = forward + backward, forward - backward
     return [
         dr.fma(y, odd if degree % 2 else even, value)
@@ -317,8 +325,8 @@ def _add_pair(
 
 @symbolic
 def _write_source(moments, source, scattered, group, slots, values: int):
-    """Writes the radiance per optical depth that is scattered along the ordinates of a group, and
-    along their opposites, at these ``slots`` of the ``values`` of each ordinate.
+    """Write the radiance scattered along the ordinates of a group and their opposites, per optical
+    depth, to these ``slots`` of the ``values`` of each ordinate.
     """
     parts = [moments.moment(scattered, i) for i in range(moments.count)]
     step = dr.opaque(mi.UInt32, values)

@@ -1,14 +1,15 @@
 """Multiple scattering: source iteration on a hierarchy of grids (multigrid).
 
-The mean irradiance of collisions phi solves phi = A phi + b. The operator A is one transport sweep
-over a fixed set of ordinates with the source albedo phi / (4 pi); b is the uncollided irradiance,
-averaged over collisions (order 0). Source iteration (phi <- A phi + b) adds one order of scattering
-per sweep: in dense media with an albedo near 1, thousands. The slowly converging errors are smooth,
-and are corrected on coarser grids by the same operator: a sweep, then the correction of its error
-from the next coarser grid, where one sweep more finds the right side (multigrid; for acceleration
-of discrete-ordinates methods in general see Adams and Larsen, *Fast iterative methods for
-discrete-ordinates particle transport calculations*, Progress in Nuclear Energy 40, 2002). Anderson
-acceleration (`anderson`) combines the cycles.
+The mean irradiance of collisions phi (the mean over the collisions in a voxel) solves phi = A phi +
+b. The operator A is one transport sweep over a fixed set of ordinates with the source albedo phi /
+(4 pi); b is the uncollided irradiance, averaged over collisions (order 0). Source iteration (phi <-
+A phi + b) adds one order of scattering per sweep; dense media with an albedo near 1 need thousands.
+The slowly converging errors are smooth, and are corrected on coarser grids with the same operator:
+a cycle is a sweep, followed by a correction from the next coarser grid, where one more sweep
+computes the right-hand side (multigrid; for acceleration of discrete-ordinates methods in general
+see Adams and Larsen, *Fast iterative methods for discrete-ordinates particle transport
+calculations*, Progress in Nuclear Energy 40, 2002). Anderson acceleration (`anderson`) combines the
+cycles.
 """
 
 from __future__ import annotations
@@ -32,29 +33,30 @@ from mitsuba_irrcache.solvers.discrete_ordinates.layout import voxel_and_channel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Voxels along the longest side of the coarsest grid, at most.
+#: Maximum number of voxels along the longest side of the coarsest grid.
 COARSEST = 20
-#: Multigrid cycles on the finest grid, at most; there is one on the others.
+#: Maximum number of multigrid cycles on the finest grid; one cycle is run on the others.
 MAX_CYCLES = 12
-#: Optical depth of a voxel from which on the radiance that tracks lose in it tells its collisions.
+#: Optical depth of a voxel above which collisions are computed from the loss of radiance in it.
 THIN = 1e-2
-#: Relative error that remains in the finest solution; and changes at which the iteration on the
-#: coarsest grid ends, if that is the only one, and if it only corrects finer ones.
+#: Relative error of the solution on the finest grid; relative changes at which the iteration on the
+#: coarsest grid ends, if that is the only grid, and if it only corrects finer ones.
 TOLERANCE = 2e-3
 COARSEST_TOLERANCE, CORRECTION_TOLERANCE = 2e-4, 3e-2
-#: Iterations on the coarsest grid, at most, and points from which each is accelerated.
+#: Maximum number of iterations on the coarsest grid, and of iterates that Anderson acceleration
+#: combines.
 MAX_ITERATIONS, HISTORY = 200, 6
 
 
 class MultigridLevel:
     """A grid of the hierarchy: extinction, albedo, tracks, and the next coarser level.
 
-    ``sigma_t`` and ``albedo``, as all fields of irradiance, have a value for each active voxel of
-    the ``tracks``, outside of which there is no matter. Where several channels are swept together,
-    albedo and irradiance have those of a voxel next to each other. Coarser levels have half the
-    voxels along those axes along which voxels are shortest, or along all axes (``all_axes``):
-    sweeps reduce errors that vary over long distances along an ordinate, and only coarser grids
-    those between near voxels.
+    ``sigma_t`` and ``albedo``, like all fields of irradiance, have a value for each active voxel of
+    the ``tracks``; the extinction of other voxels is 0. If several channels are swept together,
+    albedo and irradiance have adjacent channels. Coarser levels have half as many voxels along the
+    axes along which voxels are shortest, or along all axes (``all_axes``): sweeps reduce errors
+    that vary along an ordinate over optically long distances, and only coarser grids reduce errors
+    between voxels that are optically close.
     """
 
     def __init__(
@@ -82,7 +84,7 @@ class MultigridLevel:
 
     @property
     def coarser(self) -> MultigridLevel:
-        """The next level, made when it is first asked for."""
+        """The next coarser level, created at the first access."""
         if self._coarser is None:
             grid, fine = _coarse_grid(self.grid, self._ratio), self.tracks
             active = None if fine.all_active else self._interpolated_from(grid)
@@ -114,13 +116,13 @@ class MultigridLevel:
 
     @property
     def _measured(self) -> int:
-        """How many of the unknowns of a voxel the size of an error is measured by."""
+        """Number of unknowns of a voxel, the first ones, from which the error is estimated."""
         return 1
 
     # Transfer between levels
 
     def _interpolated_from(self, coarse: Grid) -> mi.UInt32:
-        """The voxels of a ``coarse`` grid from which active ones are interpolated."""
+        """Return the voxels of a ``coarse`` grid from which active voxels are interpolated."""
         marks = dr.opaque(mi.Bool, False, coarse.voxel_count)
         axes = [ends for ends, _ in self._stencil(coarse, self.tracks.active)]
         for at in product(*axes):
@@ -128,8 +130,8 @@ class MultigridLevel:
         return dr.compress(marks)
 
     def _stencil(self, coarse: Grid, voxel: mi.UInt32) -> list[tuple]:
-        """Along x, y, z the two voxels of a ``coarse`` grid around each ``voxel``, and the weight
-        of the upper.
+        """Return, for x, y, z, the coordinates of the two voxels of a ``coarse`` grid around each
+        ``voxel``, and the interpolation weight of the upper one.
         """
         axes, places = [], self.grid.voxel_indices(voxel)
         for at, n, sides in zip(places, self._ratio, coarse.sides, strict=True):
@@ -138,7 +140,7 @@ class MultigridLevel:
         return axes
 
     def restrict(self, values: mi.Float) -> mi.Float:
-        """Means over the voxels of the coarser level, weighted by extinction."""
+        """Return means over the voxels of the coarser level, weighted by extinction."""
         return self._restricted(values, self.coarser.tracks)
 
     def _restricted(self, values: mi.Float, coarse: Tracks) -> mi.Float:
@@ -151,15 +153,15 @@ class MultigridLevel:
         return result
 
     def prolong(self, values: mi.Float) -> mi.Float:
-        """Values of the coarser level at the voxels of this one, by trilinear interpolation."""
+        """Interpolate values of the coarser level trilinearly at the voxels of this one."""
         place, channel = voxel_and_channel(self.tracks.active_count, self.channels)
         return self._interpolated(values, place, self.channels, channel)
 
     def _interpolated(
         self, values: mi.Float, place: mi.UInt32, step: int, begin: mi.UInt32
     ) -> mi.Float:
-        """Every ``step``-th of the coarser level's values, from ``begin`` on, at active voxels of
-        this level, by trilinear interpolation.
+        """Interpolate values of the coarser level, at index ``voxel * step + begin``, trilinearly
+        at the active voxels of this level.
         """
         coarse = self.coarser.tracks
         voxel = dr.gather(mi.UInt32, self.tracks.active, place)
@@ -174,10 +176,10 @@ class MultigridLevel:
     # The operator A
 
     def sweep(self, phi: mi.Float | None, table: TrackTable) -> tuple[mi.Float, mi.Float]:
-        """A phi and what enters along the ``table``: the irradiance, and the mean irradiance of
-        collisions, which is what is scattered again.
+        """Compute A phi plus the irradiance due to radiance that enters along the ``table``.
 
-        ``phi``, a mean irradiance of collisions, may be None for 0.
+        ``phi`` is a mean irradiance of collisions; None: 0. Returns the irradiance at voxel
+        centres, and the mean irradiance of collisions, which determines the next order.
         """
         # docs/primer, eq. (4.8)
         tracks = self.tracks
@@ -195,28 +197,29 @@ class MultigridLevel:
         # Radiance of collisions times 4 pi, the integral of 1 over directions.
         collided = 4 * dr.pi * (source + lost / dr.select(depth > 0, depth, 1))
         if self._is_cut is not None and tracks.surfaces.medium is not None:
-            # Their centres may be outside, where no irradiance is known.
+            # Centres of cut voxels may be outside of the medium, where irradiance is not computed.
             phi = dr.select(self._is_cut & (depth > 0), collided, phi)
         collided = self.collided_irradiance(depth, collided, phi)
         if self._is_cut is not None:
-            # The middles of tracks may lie behind the surface: the mean over their parts.
+            # Middles of tracks may lie behind the surface: use the mean over parts of tracks.
             phi = dr.select(self._is_cut, collided, phi)
         dr.eval(phi, collided)
         return phi, collided
 
     def collisions(self, phi: mi.Float | None, table: TrackTable) -> mi.Float:
-        """The second result of `sweep`."""
+        """Return the second result of `sweep`."""
         return self.sweep(phi, table)[1]
 
     def collided_irradiance(
         self, depth: mi.Float, collided: mi.Float, irradiance: mi.Float
     ) -> mi.Float:
-        """The mean irradiance of collisions: from what tracks lose, ``collided``, or, where they
-        find hardly any matter, the ``irradiance``; ``depth`` is their optical depth integrated over
-        directions.
+        """Return the mean irradiance of collisions, blended from two estimates.
 
-        In such voxels the tracks of suns find other matter than those of the quadrature, so that
-        their ratio is unreliable; and the irradiance is nearly constant there.
+        ``collided`` is computed from the loss of radiance along tracks; in voxels that are nearly
+        empty it is replaced by the ``irradiance`` at the centre. ``depth`` is the optical depth of
+        a voxel, integrated over directions. In nearly empty voxels the tracks of suns and of the
+        quadrature pass through different extinction, so that loss over depth is unreliable, while
+        the irradiance is nearly constant.
         """
         size = float(self.grid.voxel_size.min()) / (4 * np.pi * THIN)
         found = dr.square(depth * dr.opaque(mi.Float, size))
@@ -225,14 +228,14 @@ class MultigridLevel:
     def scattered_radiance(
         self, phi: mi.Float, index: mi.UInt32, direction: mi.Vector3f | None
     ) -> mi.Float:
-        """4 pi times the radiance scattered from ``phi`` that reaches rays along ``direction`` from
-        active voxel ``index``, divided by the albedo.
+        """Return 4 pi times the radiance scattered into ``direction`` in the active voxel
+        ``index``, divided by the albedo; for isotropic scattering that is ``phi``.
         """
         return dr.gather(mi.Float, phi, index)
 
     def propagated_change(self, phi: mi.Float, ordinates: Ordinates, sets: int) -> mi.Float:
-        """About A phi, irradiance, along the ``ordinates`` of so many ``sets``: found on the
-        coarser level, if there is one.
+        """Approximate the irradiance A phi along the ``ordinates`` of several ``sets``, on the
+        coarser level if there is one.
         """
         directions, incoming, weights, offsets = ordinates
         coarse = self if self.coarsest else self.coarser
@@ -244,8 +247,10 @@ class MultigridLevel:
     def tables(
         self, ordinates: Ordinates, boundary_source: Callable | None = None
     ) -> list[TrackTable]:
-        """Tables of this level and all coarser ones for ``ordinates`` along which nothing enters,
-        or what ``boundary_source`` makes of a level and its table, depending on phi.
+        """Return the track tables of this level and all coarser ones for ``ordinates``.
+
+        ``boundary_source(level, table)`` returns the boundary source of a table; None: no radiance
+        enters.
         """
         tables, level = [], self
         while True:
@@ -277,8 +282,8 @@ class MultigridLevel:
             image = self.cycle(phi, b, tables)
             scale = self._scattered_sums(dr.abs, image)
             last, change = change, self._scattered_sums(lambda a, b: dr.abs(a - b), image, phi)
-            # Errors decay by about the same factor each time. It is bounded from below, since the
-            # first factors may be small: what converges slowest shows last.
+            # Errors decay by about the same factor in each cycle. It is bounded from below, because
+            # the first factors may be small: slowly converging errors dominate only later.
             factor = np.clip(change / np.maximum(last, TINY), 0.5, 0.95)
             error = (change * factor / (1 - factor) / np.maximum(scale, TINY)).max()
             mi.Log(mi.LogLevel.Debug, f"irrcache: multiple scattering, relative error {error:.1e}")
@@ -295,7 +300,7 @@ class MultigridLevel:
         return phi
 
     def _scattered_sums(self, integrand: Callable, *fields: mi.Float) -> np.ndarray:
-        """Sums of the ``integrand`` of some ``fields`` for each channel, weighted by the scattering
+        """Return sums of ``integrand(*fields)`` per channel, weighted by the scattering
         coefficient.
         """
         channels, voxels = self.channels, dr.opaque(mi.UInt32, self.tracks.active_count)
@@ -310,14 +315,15 @@ class MultigridLevel:
         return np.array([float(total[0]) for total in sums])
 
     def cycle(self, phi: mi.Float, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
-        """A multigrid cycle: a step of source iteration, and the coarse correction of its error."""
+        """Run a multigrid cycle: a step of source iteration, and the coarse-grid correction."""
         return self.coarse_corrected(phi, self.collisions(phi, tables[0]) + b, tables[1:])
 
     def coarse_corrected(
         self, phi: mi.Float, swept: mi.Float, coarse: list[TrackTable]
     ) -> mi.Float:
-        """The result ``swept`` of a sweep of ``phi``, with the remaining error corrected on the
-        coarser level; ``coarse`` are the tables of that and those below.
+        """Add the coarse-grid correction to ``swept``, the result of a sweep of ``phi``.
+
+        ``coarse`` are the track tables of the coarser levels.
         """
         # docs/primer, eq. (4.10)
         if self.coarsest:
@@ -328,23 +334,23 @@ class MultigridLevel:
         return result
 
     def _approximate_solution(self, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
-        """About the solution, by a single cycle on each level."""
+        """Approximate the solution by a single cycle on each level."""
         return self._source_iteration(b, tables[0]) if self.coarsest else self.cycle(b, b, tables)
 
     def _initial_guess(self, b: mi.Float, tables: list[TrackTable]) -> mi.Float:
-        """The solution of the coarser level; on the coarsest, the solution."""
+        """Return the interpolated solution of the coarser level; on the coarsest, the solution."""
         if self.coarsest:
             return self._source_iteration(b, tables[0])
         coarser = self.coarser  # made before anything is restricted to it
         return self.prolong(coarser._approximate_solution(self.restrict(b), tables[1:]))
 
     def _source_iteration(self, b: mi.Float, table: TrackTable) -> mi.Float:
-        """Source iteration with Anderson acceleration, for few voxels."""
+        """Solve by source iteration with Anderson acceleration, for few voxels."""
         first = np.array(b, dtype=np.float64).reshape(-1, self.channels).T
         phi, history = first.copy(), []
         scale = np.abs(first).mean(axis=1)
         for _ in range(MAX_ITERATIONS):
-            # As lists: NumPy's memory would be borrowed, and kernels differ with its alignment.
+            # Pass lists: Dr.Jit references NumPy's memory, and kernels depend on its alignment.
             scattered = np.array(self.collisions(mi.Float(phi.T.ravel().tolist()), table))
             image = scattered.reshape(-1, self.channels).T + first
             history.append((phi, image))
@@ -363,8 +369,9 @@ class MultigridLevel:
 
 
 def _coarsening(grid: Grid) -> np.ndarray:
-    """Voxels along x, y, z that one voxel of the next level replaces: two where they are less than
-    twice as long as the shortest, of those axes that have several.
+    """Return the number of voxels along x, y, z that one voxel of the next level replaces.
+
+    It is 2 along axes with several voxels whose edge is less than twice the shortest one, else 1.
     """
     several = grid.resolution > 1
     shortest = grid.voxel_size[several].min() if several.any() else 0.0
@@ -372,15 +379,15 @@ def _coarsening(grid: Grid) -> np.ndarray:
 
 
 def _coarse_grid(grid: Grid, ratio: np.ndarray) -> Grid:
-    """The grid of voxels so many times as large; it may reach beyond the end of ``grid``."""
+    """Return the grid with voxels enlarged by ``ratio``; it may extend beyond ``grid``."""
     sides = -(-grid.resolution // ratio)
     scale = ratio * sides / grid.resolution
     return Grid(tuple(int(n) for n in sides[::-1]), grid.to_world @ np.diag([*scale, 1.0]))
 
 
 def _children_of(fine: Grid, coarse: Grid, ratio: np.ndarray) -> list[tuple[mi.UInt32, mi.Bool]]:
-    """For each position of a fine voxel within a coarse one: the fine voxels there, and whether
-    they exist.
+    """Return, for each position of a fine voxel within a coarse one, the fine voxels of all coarse
+    voxels, and whether they exist.
     """
     at = coarse.voxel_indices(dr.arange(mi.UInt32, coarse.voxel_count))
     nx, ny, nz = (int(n) for n in fine.resolution)
