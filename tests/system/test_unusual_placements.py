@@ -261,7 +261,7 @@ def test_sensors_that_are_not_in_their_medium_are_refused(scenes, build):
     shape = scenes.boundary(medium) | {"interior": fog}
     settings = {"type": "irrcache", "solver": "auto", "resolution": 8, "cache_spp": 32}
     inside, outside = (sensor((0.1, 0.2, z), medium=fog) for z in (-0.7, -5.0))
-    told = r'sensor "sensor" has the medium "fog".*not in it.*Take'
+    told = r'sensor "sensor" has the medium "fog".*not located in it.*Remove'
 
     def load(where: dict) -> mi.Scene:
         described = scenes.description(settings, None, 4, **more, default_solver="path")
