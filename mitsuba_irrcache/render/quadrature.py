@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.core.fast_math import absorbed, absorptance, decay, maximum
-
-QUADRATURES = ("riemann", "trapezoid", "exponential")
-
 
 #: Nodes and weights of three-point Gauss-Legendre quadrature over [0, 1].
 GAUSS_LEGENDRE = (
@@ -36,25 +36,58 @@ def curved(previous, a, b, ratio: mi.Float) -> tuple:
 def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
     """Weights of the source albedo Phi / (4 pi) at both ends of a segment, and its transmittance.
 
-    ``sigma`` is the extinction at both ends. ``riemann`` (the paper's rule, order 1) uses the start
-    only. ``trapezoid`` (order 2) interpolates extinction and sigma_s Phi / (4 pi) linearly in
-    distance; the weights are limited to the absorptance, which they would exceed by the optical
-    depth of opaque segments. ``exponential`` interpolates extinction and source linearly in
-    distance (order 3 for smooth fields with ``curved`` ends) and uses the exact transmittance, so
-    that opaque and long segments remain accurate.
+    ``quadrature`` is a name in `RULES`, and ``sigma`` the extinction at both ends.
     """
-    # docs/primer, eqs. (5.2), (5.3)
-    sigma_a, sigma_b = sigma
-    if quadrature == "riemann":
-        absorbed = absorptance(sigma_a * length)
-        return (absorbed, dr.zeros(type(absorbed))), decay(sigma_a * length)
+    return RULES[quadrature].scattering(*sigma, length)
+
+
+def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
+    """Weights of the emission at both ends: int_0^1 (1 - u | u) e^-tau(u) du times ``length``.
+
+    ``quadrature`` is a name in `RULES`, and ``sigma`` the extinction at both ends.
+    """
+    return RULES[quadrature].emission(*sigma, length)
+
+
+def _riemann(sigma_a, sigma_b, length: mi.Float) -> tuple:
+    """Use the start only: the paper's rule, of order 1."""
+    # docs/primer, eq. (5.2)
+    absorbed = absorptance(sigma_a * length)
+    return (absorbed, dr.zeros(type(absorbed))), decay(sigma_a * length)
+
+
+def _riemann_emission(sigma_a, sigma_b, length: mi.Float) -> tuple:
+    zero = dr.zeros(type(sigma_a * length))
+    return zero + length, zero
+
+
+def _trapezoid(sigma_a, sigma_b, length: mi.Float) -> tuple:
+    """Interpolate sigma_s Phi / (4 pi) times the transmittance linearly in distance: order 2.
+
+    The weights are limited to the absorptance, which they would exceed by the optical depth of
+    opaque segments.
+    """
+    # docs/primer, eq. (5.3)
     tau_a, tau_b = sigma_a * length, sigma_b * length
     transmittance = decay(0.5 * (tau_a + tau_b))
-    if quadrature == "trapezoid":
-        near, far = 0.5 * tau_a, 0.5 * transmittance * tau_b
-        total, absorbed = near + far, absorptance(0.5 * (tau_a + tau_b))
-        share = dr.select(total > absorbed, absorbed / total, 1)
-        return (near * share, far * share), transmittance
+    near, far = 0.5 * tau_a, 0.5 * transmittance * tau_b
+    total, absorbed = near + far, absorptance(0.5 * (tau_a + tau_b))
+    share = dr.select(total > absorbed, absorbed / total, 1)
+    return (near * share, far * share), transmittance
+
+
+def _trapezoid_emission(sigma_a, sigma_b, length: mi.Float) -> tuple:
+    mean = 0.5 * (sigma_a + sigma_b) * length
+    return dr.zeros(type(mean)) + 0.5 * length, 0.5 * length * dr.exp(-mean)
+
+
+def _exponential(sigma_a, sigma_b, length: mi.Float) -> tuple:
+    """Interpolate extinction and source linearly in distance, with the exact transmittance.
+
+    The order is 3 for smooth fields with `curved` ends. Opaque and long segments remain accurate.
+    """
+    tau_a, tau_b = sigma_a * length, sigma_b * length
+    transmittance = decay(0.5 * (tau_a + tau_b))
     return exponential_weights(tau_a, tau_b, transmittance), transmittance
 
 
@@ -75,22 +108,15 @@ def exponential_weights(tau_a, tau_b, transmittance) -> tuple:
     return near, maximum(absorbed(0.5 * (tau_a + tau_b), transmittance) - near, 0.0)
 
 
-def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
-    """Weights of the emission at both ends: int_0^1 (1 - u | u) e^-tau(u) du times ``length``.
+def _exponential_emission(sigma_a, sigma_b, length: mi.Float) -> tuple:
+    """Interpolate extinction and emission linearly in distance.
 
-    ``sigma`` is the extinction at both ends. ``exponential`` interpolates both linearly.
     Substituting s with ds proportional to e^-m u du, where m is the optical depth, leaves the
     integrand e^-(tau(u) - m u), which is 1 for constant extinction: the rule is exact there, and
-    has an error of at most 4 % if extinction rises from 0 to 20. ``riemann`` and ``trapezoid`` are
-    as for scattering.
+    has an error of at most 4 % if extinction rises from 0 to 20.
     """
-    sigma_a, sigma_b = sigma
     mean = 0.5 * (sigma_a + sigma_b) * length
     zero = dr.zeros(type(mean))
-    if quadrature == "riemann":
-        return zero + length, zero
-    if quadrature == "trapezoid":
-        return zero + 0.5 * length, 0.5 * length * dr.exp(-mean)
     absorbed, thin = absorptance(mean), mean < 1e-3
     bend = 0.5 * (sigma_a - sigma_b) * length
     near, far = zero, zero
@@ -100,3 +126,29 @@ def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
         near, far = near + part * (1 - u), far + part * u
     scale = length * dr.select(thin, 1 - 0.5 * mean, absorbed / dr.select(thin, 1, mean))
     return scale * near, scale * far
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A quadrature rule.
+
+    Attributes:
+        scattering: called with the extinction at the start and at the end of a segment, and its
+            length; returns the weights of the source at both, and the transmittance.
+        emission: called with the same; returns the weights of the emission at both.
+        is_third_order: whether the values at both ends are corrected by `curved`, and steps may be
+            longer where little radiance remains to be added.
+    """
+
+    scattering: Callable
+    emission: Callable
+    is_third_order: bool = False
+
+
+#: The rules by the values of the property ``quadrature``.
+RULES = {
+    "riemann": Rule(_riemann, _riemann_emission),
+    "trapezoid": Rule(_trapezoid, _trapezoid_emission),
+    "exponential": Rule(_exponential, _exponential_emission, is_third_order=True),
+}
+QUADRATURES = tuple(RULES)

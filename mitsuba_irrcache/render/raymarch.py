@@ -33,7 +33,7 @@ from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.render.aovs import Layers
 from mitsuba_irrcache.render.empty_space import Clearance
-from mitsuba_irrcache.render.quadrature import curved, emission_weights, segment
+from mitsuba_irrcache.render.quadrature import RULES, curved, emission_weights, segment
 from mitsuba_irrcache.scene.cut_cells import CutCells
 from mitsuba_irrcache.transport.tracking import optical_depth
 
@@ -534,13 +534,13 @@ class _RayMarch:
     def _curved(
         self, state: _MarchState, before: tuple, there: _FieldSample, length: mi.Float
     ) -> tuple[tuple, tuple]:
-        """Extinctions and sources at both ends, corrected for their curvature in the exponential
-        rule.
+        """Extinctions and sources at both ends, corrected for their curvature where the
+        quadrature rule is of third order.
         """
         here, ratio = state.here, length / state.previous_length
         # Ignore the curvature behind a short first step.
         ratio = dr.select(ratio < 2, ratio, 0)
-        if self._projection.quadrature != "exponential":
+        if not RULES[self._projection.quadrature].is_third_order:
             return (here.extinction, there.extinction), (here.source, there.source)
         return (
             curved(before[0], here.extinction, there.extinction, ratio),
@@ -597,7 +597,7 @@ class _RayMarch:
         remaining = dr.max(mi.Spectrum(state.transmittance)) * self._max_radiance
         accumulated = dr.select(self._dark, 1, dr.max(state.radiance + state.emitted))
         state.active &= remaining > EARLY_STOP * accumulated
-        if self._projection.quadrature == "exponential":
+        if RULES[self._projection.quadrature].is_third_order:
             stride = dr.select(remaining > COARSER * accumulated, mi.Float(1), 2)
             state.stride = dr.select(remaining > COARSEST * accumulated, stride, 4)
 

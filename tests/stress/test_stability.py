@@ -14,6 +14,7 @@ from experiments.robustness.stability.case import SETTINGS, Case
 from experiments.robustness.stability.hazards import cases
 from experiments.robustness.stability.run import described, run_case
 from experiments.robustness.stability.worlds import Camera, Matter, World, scene
+from mitsuba_irrcache.render.quadrature import QUADRATURES
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -91,7 +92,7 @@ def matters(draw) -> Matter:
     matter=matters(),
     scale=st.sampled_from([1e-6, 1e-2, 1.0, 1e3, 1e6]),
     origin=st.tuples(*[st.sampled_from([-3.0, -1.0, 0.0, 1e-40, 0.5, 1.0, 4.0])] * 3),
-    quadrature=st.sampled_from(["riemann", "trapezoid", "exponential"]),
+    quadrature=st.sampled_from(QUADRATURES),
 )
 def test_any_medium_under_a_white_sky(matter, scale, origin, quadrature):
     """Under a white sky, images are finite, nonnegative and at most 1, at any scale and from any

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import CacheFileError, IrrcacheError
+from mitsuba_irrcache.render.quadrature import QUADRATURES
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -51,7 +52,7 @@ def test_homogeneous_slab(scenes, sigma, emission):
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=2e-5)
 
 
-@pytest.mark.parametrize("quadrature", ["riemann", "trapezoid", "exponential"])
+@pytest.mark.parametrize("quadrature", QUADRATURES)
 def test_heterogeneous_slab(scenes, quadrature):
     """A slab whose coloured extinction and emission vary along the ray agrees with quadrature."""
     z = (np.arange(24) + 0.5) / 24

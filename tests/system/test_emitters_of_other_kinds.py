@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_irrcache.lights import narrow_sources
 from mitsuba_irrcache.errors import IrrcacheError, UnsupportedSceneError
+from mitsuba_irrcache.lights import narrow_sources
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.pipeline.defaults import choose_solver, needs_no_cache
 from mitsuba_irrcache.scene.compile import compile_scene

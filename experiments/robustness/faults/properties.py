@@ -14,6 +14,8 @@ import numpy as np
 
 from experiments.robustness.faults.fuzz import files_here, own_folder
 from mitsuba_irrcache.errors import IrrcacheError, original_message
+from mitsuba_irrcache.imaging.options import SOLVERS
+from mitsuba_irrcache.render.quadrature import QUADRATURES
 
 #: Limits that make rendering fast whatever else is changed.
 VALID = {"solver": "sweep", "resolution": 4, "cache_spp": 32, "timeout": 0.5}
@@ -22,11 +24,11 @@ PROPERTIES = {
     "max_depth": [-1, 0, 1, 2, 5],
     "rr_depth": [1, 5, 100],
     "hide_emitters": [True, False],
-    "solver": ["auto", "path", "sweep"],
+    "solver": list(SOLVERS),
     "resolution": [0, 1, 9],
     "cache_spp": [0, 1, 64],
     "cache_seed": [0, 7],
-    "quadrature": ["riemann", "trapezoid", "exponential"],
+    "quadrature": list(QUADRATURES),
     "step": [0.5, 2.0, 1],
     "filter": ["none", "bilateral", "fixed"],
     "aovs": ["noise", "colour,depth", "a:transmittance", ""],

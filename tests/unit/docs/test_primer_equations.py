@@ -108,6 +108,7 @@ def test_quadrature_rules(a, b, length):
         "trapezoid": (0.5 * tau_a * share, 0.5 * tau_b * np.exp(-tau) * share, np.exp(-tau)),
         "exponential": (near, -np.expm1(-tau) - near, np.exp(-tau)),
     }
+    assert expected.keys() == quadrature.RULES.keys()
     for rule, (first, second, passed) in expected.items():
         weights, through = quadrature.segment(rule, (mi.Float(a), mi.Float(b)), mi.Float(length))
         found = [float(x[0]) for x in (*weights, through)]

@@ -24,9 +24,10 @@ PACKAGE = Path(mitsuba_irrcache.__file__).parent
 @pytest.fixture
 def constant(rgb, monkeypatch) -> type[Solver]:
     """A third solver, which is registered while the test runs: irradiance 1 everywhere, in grey
-    media only.
+    media only. There are no others than ``sweep`` and ``path`` beside it.
     """
-    monkeypatch.setattr(base, "_REGISTRY", dict(base._REGISTRY))
+    others = {name: solver_named(name) for name in ("sweep", "path")}
+    monkeypatch.setattr(base, "_REGISTRY", others)
 
     @register
     class Constant(Solver):
