@@ -114,7 +114,10 @@ class Solver(ABC):
     def batch_size(
         cls, medium: MediumGrid, max_depth: int, samples: int, basis: AngularBasis | None
     ) -> int:
-        """Return the samples per batch of a cache with ``samples`` per voxel (0: the default)."""
+        """Return the samples per batch of a cache with ``samples`` per voxel (0: the default).
+
+        It must be `cache.statistics.BATCH`, which cache files require, unless it `is_correlated`.
+        """
 
     @classmethod
     @abstractmethod
