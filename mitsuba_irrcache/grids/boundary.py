@@ -23,7 +23,7 @@ MAX_VERTICES = 256
 #: rays that hit a back face, which occurs at edges.
 ORIENTATION_RAYS, MAX_CROSSINGS, MAX_INWARD_SHARE = 256, 256, 0.02
 
-#: Radius at which positions lie that are moved into the boundary, in units of its own.
+#: Relative radius at which `Boundary.drawn_inside` places positions.
 INSIDE = 0.999
 
 
@@ -162,7 +162,7 @@ def sphere_frame(shape: mi.Shape) -> np.ndarray:
 
 
 def _box_area(frame: np.ndarray) -> float:
-    """Surface area of the image of [-1, 1]^3."""
+    """Return the surface area of the cube [-1, 1]^3 mapped by ``frame``."""
     x, y, z = 2 * frame[:3, :3].T
     return 2 * sum(float(np.linalg.norm(np.cross(*pair))) for pair in ((x, y), (y, z), (z, x)))
 
@@ -249,7 +249,7 @@ def box_frame(vertices: np.ndarray) -> np.ndarray | None:
 
 
 def _distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Chebyshev distances between points (n, 3) and (m, 3), as an array (n, m)."""
+    """Return the Chebyshev distances (n, m) between points (n, 3) and (m, 3)."""
     return np.abs(a[:, None] - b[None]).max(axis=-1)
 
 

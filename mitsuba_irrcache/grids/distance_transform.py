@@ -1,4 +1,4 @@
-"""Chebyshev distance transform: the number of cells a ray may cross before it can reach matter."""
+"""Chebyshev distance transform: how many cells a ray may cross before an occupied one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
 
 
 def chebyshev(occupied: mi.Bool, shape: tuple[int, int, int], reach: int) -> mi.UInt32:
-    """Chebyshev distance of each grid cell to the nearest ``occupied`` cell, at most ``reach``.
+    """Return the Chebyshev distance of each grid cell to the nearest ``occupied`` one, at most
+    ``reach``.
 
     ``shape`` is (z, y, x); distances are in cells.
     """

@@ -74,7 +74,7 @@ class Grid:
         return self
 
     def centers(self, index: mi.UInt32) -> mi.Point3f:
-        """World positions of the voxel centres with the flat indices ``index`` (x fastest)."""
+        """Return the world positions of the voxel centres with flat indices ``index``."""
         return self.world.point(mi.Point3f(*self.voxel_indices(index)) + 0.5)
 
     def voxel_indices(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
@@ -87,7 +87,7 @@ class Grid:
         return (mi.UInt32(z) * ny + mi.UInt32(y)) * nx + mi.UInt32(x)
 
     def corners(self, u: mi.Point3f) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Flat indices and trilinear weights of the eight voxels around voxel coordinates ``u``."""
+        """Return flat indices and trilinear weights of the eight voxels around ``u``."""
         axes = []
         for c, n in zip(u, self.sides, strict=True):
             lower, weight, more = stencil(c, n)
@@ -108,7 +108,7 @@ class Grid:
 
 
 class Affine:
-    """An affine map of points and vectors with opaque entries: a new placement reuses kernels.
+    """An affine map of points and vectors with opaque entries: another map reuses kernels.
 
     Points are first taken relative to the centre of the unit cube, so that a grid far from the
     world origin loses no more precision than its float32 positions already have.

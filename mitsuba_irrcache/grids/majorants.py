@@ -76,7 +76,7 @@ class Walk:
         self.rcp = safe_rcp(self.direction)
 
     def cell(self, t: mi.Float) -> mi.Vector3i:
-        """The cell that contains the point at distance ``t``."""
+        """Return the cell that contains the point at distance ``t``."""
         u = dr.fma(self.direction, t, self.origin)
         limits = mi.Vector3i(*self.cells.sides) - 1
         # Clamp before the conversion: floats beyond 2^31 cannot be converted to integers.
@@ -118,7 +118,9 @@ class Walk:
 def _block_bounds(
     sigma_t: GridField, size: int, shape: tuple[int, int, int]
 ) -> tuple[mi.Float, mi.Float]:
-    """Minimum and maximum of each block, grown by one voxel, which trilinear stencils may read."""
+    """Return minimum and maximum over each block and the voxels next to it, which trilinear
+    stencils may read.
+    """
     channels = sigma_t.channels
     least = largest = sigma_t.data
     # Reduce the channels first, then axis by axis: windows overlap, so this reads less than blocks
@@ -141,7 +143,7 @@ def _block_bounds(
 def _window_bounds(
     least: mi.Float, largest: mi.Float, sides: list[int], axis: int, size: int, count: int
 ) -> tuple[mi.Float, mi.Float]:
-    """Bounds of ``count`` windows of ``size`` + 2 values along one axis.
+    """Return the bounds of ``count`` windows of ``size`` + 2 values along one axis.
 
     ``least`` and ``largest`` are the same array for the first axis.
     """

@@ -24,7 +24,8 @@ def marked(grid: Grid, voxels: mi.UInt32) -> mi.Bool:
 
 
 def active_voxels(medium, grid: Grid) -> mi.UInt32:
-    """Flat indices, ascending, of the voxels of ``grid`` that lookups where sigma_t > 0 can read.
+    """Return the ascending flat indices of the voxels of ``grid`` that lookups at positions with
+    sigma_t > 0 can read.
 
     Every macrocell that is not empty marks the voxels whose trilinear support may overlap it. If
     these are few, the computation is repeated with smaller macrocells.
@@ -43,14 +44,14 @@ def active_voxels(medium, grid: Grid) -> mi.UInt32:
 
 
 def occupied_box(grid: Grid, active: mi.UInt32) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest box of voxels (x, y, z; lower end, upper end) around all ``active`` ones."""
+    """Return the smallest box, (lower, upper) in (x, y, z), around the ``active`` voxels."""
     ends = [(dr.min(p), dr.max(p)) for p in grid.voxel_indices(active)]
     dr.eval(ends)
     return np.array([int(e[0][0]) for e in ends]), np.array([int(e[1][0]) + 1 for e in ends])
 
 
 def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], list[mi.Int32]]:
-    """First and last voxel along x, y, z whose trilinear support overlaps each macrocell."""
+    """Return first and last voxel along x, y, z whose trilinear support overlaps each macrocell."""
     nz, ny, nx = cells.shape
     index = unravelled(occupied, [Divisor(nx), Divisor(ny)])
     to_voxels = grid.coordinates.matrix @ np.linalg.inv(cells.coordinates.matrix)
@@ -80,7 +81,7 @@ def _supports(cells, occupied: mi.UInt32, grid: Grid) -> tuple[list[mi.Int32], l
 
 @symbolic
 def _mark(cells: Macrocells, occupied: mi.UInt32, grid: Grid) -> mi.UInt32:
-    """The voxels that a lookup in the ``occupied`` cells can read."""
+    """Return the voxels that a lookup in the ``occupied`` cells can read."""
     (x0, y0, z0), (x1, y1, z1) = _supports(cells, occupied, grid)
     marks = dr.zeros(mi.UInt32, grid.voxel_count)
     x, y, z = mi.Int32(x0), mi.Int32(y0), mi.Int32(z0)

@@ -35,9 +35,9 @@ MIN_SCALE = 1e-37
 class Packets:
     """Packed copy of several `GridField` on one ``grid``, at most `MAX_VALUES` per voxel.
 
-    ``planes`` maps flat voxel indices to their non-negative values, one array for each value, and
-    ``largest`` holds the maximum representable value of each. Of a grid that does not fit into
-    memory, some ``slices`` (first, end) along z are packed, whose voxels ``planes`` counts.
+    ``planes(index)`` returns the non-negative values at flat voxel indices, one array per value,
+    and ``largest`` is the maximum representable value of each. For a grid that exceeds the memory,
+    only ``slices`` (first, end) along z are packed; ``index`` then counts from the first of them.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Packets:
         first, end = slices or (0, grid.shape[0])
         voxels = (end - first) * grid.shape[1] * grid.shape[2]
         self._first = None if slices is None else dr.opaque(mi.Int32, first)
-        #: whether a word holds a value and that of the neighbour along x
+        #: whether a word holds a value of a voxel and that of its neighbour along x
         self.paired = self.count in PAIRED_COUNTS
         sides = [int(n) for n in grid.resolution]
         self._last = [dr.opaque(mi.Float, n - 1) for n in sides]
@@ -143,8 +143,8 @@ def _decode(word: mi.UInt32) -> tuple[mi.Float, mi.Float]:
 class Lookups:
     """Simultaneous lookups in several fields.
 
-    Fields on the same grid are packed as far as they fit (see `Packets`); the original arrays are
-    not needed any more. Other fields, and constants, are looked up separately. Values of a field
+    Fields on the same grid are packed together if they fit (see `Packets`), and their original
+    arrays may be released. Other fields and constants are looked up separately. Values of a field
     above its entry in ``limits`` are clamped.
     """
 
@@ -180,7 +180,7 @@ class Lookups:
 
 
 class AlongRay:
-    """Lookups along a ``ray``, which is straight in voxel coordinates, too."""
+    """Lookups along a ``ray``, with origin and direction in the voxel coordinates of each group."""
 
     def __init__(self, lookups: Lookups, ray: mi.Ray3f) -> None:
         self.ray, self._lookups = ray, lookups

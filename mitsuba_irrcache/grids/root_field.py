@@ -14,7 +14,7 @@ STEEPEST = 4.0
 
 
 class RootField(GridField):
-    """Non-negative values whose square *roots*, which it is made of, are interpolated trilinearly.
+    """Non-negative values of which the square *roots* are stored and interpolated trilinearly.
 
     Irradiance decays about exponentially inside dense media. Interpolating such a convex function
     overestimates it: by +1.3 % of the mean radiance on a CT head, against +0.4 % for square roots
@@ -52,7 +52,8 @@ class ExtendedField(GridField):
     """Values interpolated trilinearly on a grid with an `Extension`.
 
     Unlike `RootField` it interpolates the values themselves. Beyond the outermost voxel centres
-    they are extrapolated linearly from ``known`` voxels, and clamped to 0; constant without.
+    they are extrapolated linearly from ``known`` voxels, and clamped to 0; without ``known`` the
+    extrapolation is constant.
     """
 
     def __init__(
@@ -94,11 +95,11 @@ class Extension:
         self.inner, self.grid = grid, Grid(tuple(n + 2 for n in grid.shape), place)
 
     def inside(self, voxel: mi.UInt32) -> mi.UInt32:
-        """The nearest voxels of the original grid."""
+        """Return the nearest voxels of the original grid."""
         return self.inner.index(*(nearest for nearest, _ in self._nearest(voxel)))
 
     def inwards(self, voxel: mi.UInt32) -> list[mi.UInt32]:
-        """For each axis, the neighbour of the nearest original voxel in inward direction.
+        """Return for each axis the neighbour of the nearest original voxel in inward direction.
 
         It equals the nearest voxel unless the extended voxel lies outside the grid along that axis.
         """
@@ -111,7 +112,7 @@ class Extension:
         return found
 
     def _nearest(self, voxel: mi.UInt32) -> list[tuple[mi.UInt32, mi.Int32]]:
-        """For each axis, the index of the nearest original voxel, and the inward step."""
+        """Return for each axis the index of the nearest original voxel, and the inward step."""
         found = []
         for place, side in zip(self.grid.voxel_indices(voxel), self.inner.sides, strict=True):
             at = mi.Int32(place) - 1

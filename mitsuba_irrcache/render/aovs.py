@@ -75,18 +75,18 @@ class Layers:
 
     @property
     def valid(self) -> list[mi.Bool]:
-        """Where the illumination is defined, for each colour channel."""
+        """Return for each colour channel whether the illumination is defined."""
         return [c > LEAST_COLOUR for c in self.colour]
 
     @property
     def illumination(self) -> mi.Spectrum:
-        """I = E / C: weighted mean of Phi / (4 pi) along the ray; 0 where undefined."""
+        """Return I = E / C, the weighted mean of Phi / (4 pi) along the ray; 0 where undefined."""
         pairs = zip(self.scattered, self.colour, self.valid, strict=True)
         return mi.Spectrum(*(dr.select(ok, e / dr.select(ok, c, 1), 0) for e, c, ok in pairs))
 
     @property
     def noise(self) -> mi.Float:
-        """Standard error of the luminance caused by the noise of the cache."""
+        """Return the standard error of the luminance caused by the noise of the cache."""
         if not self.probes:
             return dr.zeros(mi.Float, dr.width(self.depth))
         return dr.sqrt(sum(dr.square(p) for p in self.probes) / len(self.probes))

@@ -1,11 +1,11 @@
-"""Radiance along camera rays: in-scattering from the caches, and what lies behind the media.
+"""Radiance along camera rays: in-scattered radiance from the caches, and radiance behind the media.
 
-In a simple scene (see `compile`) the segment inside the medium is known in closed form. In all
-others the ray continues straight through null surfaces and several media, each of which is ray
-marched with its own cache, until it hits a surface or leaves the scene. From there one path per
-camera sample ends at the first diffuse surface, whose irradiance is cached (`surface_irradiance`).
-With a limited depth, or where the radiance of a medium is not known, the path is traced as in
-``volpath`` instead; of all orders, it ends at its first collision in a medium with a cache.
+For an isolated medium (see `compile`) the segment inside the medium has a closed form. In all other
+scenes the ray continues straight through null surfaces and several media, each of which is ray
+marched with its cache, until it hits a surface or leaves the scene. From there one path per camera
+sample is followed to the first diffuse surface, whose irradiance is cached (`surface_irradiance`).
+With a limited depth, or if some medium has no cache, the path is traced as in ``volpath`` instead;
+if all orders are requested, it then ends at its first collision in a medium with a cache.
 """
 
 from __future__ import annotations
@@ -105,9 +105,9 @@ def _along_rays(cache: IrradianceCache) -> list[DirectLightAlongRays]:
 class RayResult:
     """Result of tracing camera rays.
 
-    ``scattered`` is the in-scattered radiance of the media, ``background`` that of emitters,
-    surfaces and volumetric emission, attenuated by the media; further the ``transmittance``,
-    ``alpha``, and the sums from which `Projection.layers` creates `Layers`.
+    ``scattered`` is the in-scattered radiance of the media, ``background`` the radiance of
+    emitters, surfaces and volumetric emission, attenuated by the media. ``transmittance`` is that
+    of the media, and ``gathered`` are the sums from which `Projection.layers` creates `Layers`.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class RayResult:
 
 
 class ClosedFormCameraRays:
-    """Camera rays through the single medium of a simple scene."""
+    """Camera rays through an isolated medium."""
 
     def __init__(
         self,
@@ -175,8 +175,9 @@ class ClosedFormCameraRays:
         and its weights for the transmittance of the medium and for that of the medium with the
         forward peak of its phase function (see `delta_m`).
 
-        Narrow sources are attenuated by the latter, since what the peak scatters of them is part of
-        the scattered radiance. Of a hidden environment only what the peak scatters is left.
+        Narrow sources are attenuated by the latter, because their radiance that the peak scatters
+        is part of the scattered radiance. Of a hidden environment, only radiance scattered by the
+        peak remains.
         """
         environment, truncates = scene.environment(), self.projection.truncates_peak
         visible = environment is not None and not self.hide_emitters and self.shows_emitters
@@ -195,8 +196,8 @@ class ClosedFormCameraRays:
         return visible, environment.eval(escaped, active), through, straight
 
     def span(self, ray: mi.Ray3f, medium: mi.Medium | None) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Whether ``ray``, which starts in ``medium``, passes through the medium with a cache, and
-        the distances between which it does.
+        """Return whether ``ray``, which starts in ``medium``, intersects the medium with a cache,
+        and the distances of entry and exit.
         """
         hit, near, far = self.medium.intersect(ray)
         # As in volpath, a sensor is inside the medium only if the scene says so, and rays enter
@@ -228,7 +229,8 @@ class TracedCameraRays:
         self.narrow = next(
             (p.directional.directional for p in projections if p.truncates_peak), None
         )
-        #: whether paths may end in media; caches contain all orders, so not with a limited depth
+        #: whether paths may end in media: not with a limited depth, because caches hold the sum of
+        #: all orders
         self._ends_in_media = max_depth < 0
         self.max_depth = dr.opaque(mi.UInt32, max_depth if max_depth >= 0 else 0xFFFFFFFF)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
@@ -244,7 +246,7 @@ class TracedCameraRays:
         self.caches_surfaces = False
 
     def adopt(self, earlier: TracedCameraRays) -> None:
-        """Use the nodes on surfaces of an ``earlier`` state of the caches of the same scene."""
+        """Reuse the surface nodes of camera rays for an ``earlier`` state of the same caches."""
         if earlier._surfaces is not None:
             self._surfaces = earlier._surfaces.renewed(self._paths(earlier._surfaces.nodes))
 
@@ -253,8 +255,8 @@ class TracedCameraRays:
         return SurfacePaths(self.media, self.projections, self._emitters, *rest)
 
     def prepare_view(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, seed: int = 0) -> None:
-        """Cache the irradiance on the surfaces that ``sensor`` sees, if it is used for an image of
-        ``spp`` samples per pixel (0: the sampler's number).
+        """Cache the irradiance on the surfaces that ``sensor`` sees, if an image with ``spp``
+        samples per pixel (0: the sampler's number) uses it.
         """
         width, height = (int(n) for n in sensor.film().crop_size())
         samples = width * height * (spp or sensor.sampler().sample_count())
@@ -334,8 +336,8 @@ class TracedCameraRays:
     ):
         """March straight up to the first surface that is not null.
 
-        Returns scattered radiance, background, transmittance and gathered sums; the ray that ends
-        at the surface and its medium; whether it hit a surface, or left the scene; and the
+        Returns scattered radiance, background, transmittance and gathered sums; the last segment of
+        the ray and its medium; masks of rays that hit a surface, and that left the scene; and the
         transmittance for narrow sources.
         """
         scattered, background, transmittance = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(1)
@@ -423,7 +425,7 @@ CameraRays = ClosedFormCameraRays | TracedCameraRays
 
 
 def _added(gathered: list, sums: list, transmittance: mi.Spectrum, scale: mi.Float) -> list:
-    """Add the sums of a medium that is seen through this ``transmittance``."""
+    """Add the sums of a medium, attenuated by the ``transmittance`` in front of it."""
     if not sums:
         return gathered
     colour, *rest = gathered

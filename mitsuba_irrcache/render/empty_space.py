@@ -1,4 +1,4 @@
-"""Distances to matter, by which rays skip empty space."""
+"""Distances to the nearest non-empty macrocell, by which rays skip empty space."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Sample the sensor and accumulate on the film, for integrators written in Python.
 
-Mitsuba's own render loop supports only masks as alpha, but media need fractional alpha; and it
-supports only images that are final once all samples are accumulated, while here the samples may be
-developed and filtered before they are put on the film.
+Mitsuba's render loop for Python integrators supports only masks as alpha, but media need fractional
+alpha. It also writes samples to the film as they are, while here an image may be developed and
+filtered before it is put on the film.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from mitsuba_irrcache.render.sampled_emitters import EmitterSample
 
 #: Maximum number of camera samples per kernel launch, to limit the memory of samples and sampler.
 LANES = 1 << 22
-#: Pixels are refined whose variance exceeds the mean of all by this factor: by at most so many new
-#: samples for each one, and with at most this share of all samples.
+#: Refinement of pixels: ratio of a pixel's variance to the mean variance above which it is refined,
+#: maximum number of new samples per original one, maximum number of new samples over that of all.
 OUTLIER, MOST_FURTHER, FURTHER_SHARE = 2.0, 64, 0.5
-#: Variance below which samples are alike; it must be positive for the threshold to be raised.
+#: Lower bound of the threshold of the variance; positive, so that it can be raised by a factor.
 LEAST_VARIANCE = 1e-30
-#: Fewest new samples in place of one; if there were less, the threshold of the variance is raised
-#: by this factor.
+#: Minimum number of new samples that replace one; if fewer were available, the threshold of the
+#: variance is raised by this factor.
 FEWEST_FURTHER, RAISED = 4, 1.5
 #: Where pixels are refined, the samples of each in a launch are a multiple of this number, so that
 #: each half consists of pairs.
@@ -78,8 +78,8 @@ def render_film(
 ) -> mi.Film:
     """Render ``radiance`` to the sensor's film with ``spp`` samples per pixel.
 
-    With ``spp`` 0 the sampler's own count is used; ``channels`` names those in addition to radiance
-    and alpha. To ``refine`` means to take more samples in the pixels of largest variance. Raises
+    With ``spp`` 0 the sampler's count is used; ``channels`` are the names of channels in addition
+    to radiance and alpha. With ``refine``, pixels of large variance get more samples. Raises
     IrrcacheError for a film without pixels, and for one that exceeds the memory.
     """
     film, sampler = sensor.film(), sensor.sampler().clone()
@@ -194,8 +194,9 @@ def largest_divisor(n: int, limit: int) -> int:
 
 
 class SampledFilm:
-    """The pixels of a ``film`` that are sampled, with those beside the image that its filter needs,
-    and how many of the ``spp`` samples of each are taken in one launch of at most ``most``.
+    """The sampled pixels of a ``film``, including a border that its filter needs, and the number of
+    samples per pixel in one launch, which has at most ``most`` of the ``spp`` samples of all
+    pixels.
     """
 
     def __init__(self, film: mi.Film, spp: int, most: int) -> None:
@@ -208,14 +209,14 @@ class SampledFilm:
         self.lanes = self.pixels * self.per_pass
 
     def positions(self, spread: PixelPositions) -> tuple[mi.Point2f, mi.UInt32, mi.UInt32]:
-        """Positions on the film of the samples of a launch; their pixels, and their numbers within
-        these.
+        """Return the film positions of the samples of a launch, the flat indices of their pixels,
+        and the number of each sample within its pixel.
         """
         index, sample = Divisor(self.per_pass).split(dr.arange(mi.UInt32, self.lanes))
         return self.corner(index) + spread.next(index, sample), index, sample
 
     def around(self, values: mi.Float) -> mi.Float:
-        """For both halves of each pixel, half the mean ``values`` of the pixels around it."""
+        """Return for both halves of each pixel half the mean ``values`` of the pixels around."""
         dr.eval(values)
         pixel = dr.arange(mi.UInt32, 2 * self.pixels) // 2
         place, height = pixel_of(pixel, self.width), self.pixels // self.width
@@ -253,9 +254,10 @@ class AntitheticPairs:
     def words(
         self, number: mi.UInt32, shifts: Sequence[mi.UInt32], permuted: bool = False
     ) -> tuple[list[mi.UInt32], mi.Bool, mi.Bool]:
-        """Coordinates times 2^32 of a point of the sequence with these ``shifts``; whether it is
-        the second one of a pair; and whether it belongs to a pair. Sequences of one pixel are
-        independent of each other if one of them has a ``permuted`` order of pairs.
+        """Return a point of the sequence with these ``shifts`` as coordinates times 2^32; whether
+        it is the second one of a pair; and whether it belongs to a pair.
+
+        Two sequences of one pixel are independent if one of them has a ``permuted`` order of pairs.
         """
         pair, is_second, is_paired = number // 2, number % 2 == 1, number < self._paired
         if permuted:
@@ -275,7 +277,7 @@ class PixelPositions:
     """
 
     def __init__(self, sampler: mi.Sampler, seed: int, count: int) -> None:
-        """Each ``count`` samples of a pixel are a sequence that is independent of the others."""
+        """Every ``count`` samples of a pixel form a sequence, independent of other sequences."""
         self.sampler = sampler
         self.independent = sampler.class_name() == "IndependentSampler"
         # Wrapping integrators pass the seed as an array.
@@ -335,8 +337,8 @@ def camera_ray(
 
 
 def scattered_rays(sensor: mi.Sensor, least: int) -> mi.Ray3f:
-    """Rays from the centre of the aperture, evenly scattered over all pixels of the film: one for
-    each pixel, or more, up to 16, if there would be fewer than ``least``.
+    """Return rays from the centre of the aperture, evenly distributed over the film: one per pixel,
+    or up to 16 if there would be fewer than ``least`` rays.
     """
     film = sensor.film()
     width, height = (int(n) for n in film.crop_size())
@@ -373,8 +375,9 @@ def _sampled(
 
 
 def _known(sampler: mi.Sampler, position: mi.Point2f, sample: EmitterSample) -> EmitterSample:
-    """Evaluate what differs between the first samples of a pixel and further ones, so that one
-    kernel traces both: those of scenes with surfaces take many seconds to compile.
+    """Evaluate the arguments that are computed differently for the first samples of a pixel and for
+    further ones, so that one kernel traces both: kernels for scenes with surfaces take many seconds
+    to compile.
     """
     sampler.schedule_state()
     dr.eval(position, sample.u, sample.sign)
@@ -409,15 +412,14 @@ def _refined(
     position: mi.Point2f,
     values: list[mi.Float],
 ) -> tuple[tuple[mi.Point2f, list[mi.Float]], FurtherSamples | None]:
-    """Take new samples where the variance of a pixel is above the mean of all, such as at the edge
-    of a lamp, in place of those that were taken; return all samples, evaluated, and the new ones,
-    if there are any.
+    """Replace samples by more numerous ones in pixels of large variance, such as at the edge of an
+    area emitter.
 
-    About a half of a pixel's samples decides the variance of the other half and of the pixels
-    around. If it decided itself, the image would be too dark: samples that miss rare bright paths
-    would remain.
-    The ``seeds``, of the sampler and of positions, differ between the passes of an image, whose
-    samples are independent.
+    Returns all original samples, evaluated, and the new ones (None without any). Whether one half
+    of a pixel's samples is replaced depends on the variance of the other half and of the pixels
+    around. If it depended on its own variance, the image would be too dark, because halves that
+    miss rare bright paths would be kept. The ``seeds`` of sampler and positions differ between the
+    passes of an image, whose samples are independent.
     """
     # docs/primer, eq. (5.10)
     count, half = dr.width(position), frame.per_pass // 2
@@ -460,9 +462,10 @@ def _refined(
 
 
 def _most_needed(variance: mi.Float, threshold: mi.Float) -> tuple[mi.UInt32, int]:
-    """The numbers of the parts of pixels whose ``variance`` is above the ``threshold``, or above
-    one so much larger that enough new samples are left for each; and how many these are in place of
-    one.
+    """Choose the halves of pixels to refine: those whose ``variance`` is above the ``threshold``,
+    which is raised until enough new samples are available for each.
+
+    Returns their numbers, and the number of new samples that replace one.
     """
     dr.eval(variance, threshold)
     while True:
@@ -475,8 +478,8 @@ def _most_needed(variance: mi.Float, threshold: mi.Float) -> tuple[mi.UInt32, in
 
 
 class PixelCells:
-    """Cells of a pixel of equal area, which stratify its samples: ``count`` of them in rows that
-    differ by one cell at most.
+    """Division of a pixel into ``count`` cells of equal area, which stratify its samples, in rows
+    whose numbers of cells differ by at most one.
     """
 
     def __init__(self, count: int) -> None:

@@ -1,8 +1,8 @@
-"""Splitting of paths at glass: both what it reflects and what it transmits are followed.
+"""Splitting of paths at glass: both the reflected and the transmitted path are followed.
 
-A path that chose one of them would be noisy, although both are known without noise where they end
-in media that are ray marched. Paths are split at the first vertices, as long as a place is free in
-which the reflected one can wait until the other has ended.
+Choosing one of them at random would add noise, although paths that end in ray-marched media have
+none. Paths are split at their first vertices, as long as there is free storage in which the
+reflected path waits until the transmitted one has ended.
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ import mitsuba as mi
 
 from mitsuba_irrcache.transport.path import medium_after, sample_bsdf
 
-#: Reflected paths that can wait.
+#: Maximum number of reflected paths that wait, per lane.
 PLACES = 2
-#: Throughput of a reflected path below which a path is not split, but chooses.
+#: Throughput of the reflected path below which one of both is chosen at random instead.
 NEGLIGIBLE = 2e-3
 
 
 def no_waiting(ray: mi.Ray3f, pointer: mi.MediumPtr) -> list[list]:
-    """Return the places in which paths wait, all free: for each whether one does, its ray, medium,
-    throughput, relative refractive index, last vertex, and the density of its direction.
+    """Return empty storage for waiting paths.
+
+    Each place holds whether it is in use, and the path's ray, medium, throughput, relative
+    refractive index, last vertex, and density of its direction.
     """
     last = dr.zeros(mi.Interaction3f)
     last.p = ray.o
@@ -35,11 +37,12 @@ def split(
     samples: tuple[mi.Float, mi.Point2f],
     active: mi.Bool,
 ) -> tuple[list[list], list]:
-    """Sample the BSDF as `sample_bsdf`, and split paths at surfaces that reflect and transmit, and
-    scatter nothing diffusely.
+    """Sample the BSDF as `sample_bsdf`, and split paths at surfaces that both reflect and transmit,
+    without a diffuse lobe.
 
     ``state`` is the medium, throughput, relative refractive index and vertex of a path. Returns the
-    places, and the result of `sample_bsdf`, of the transmitted part where a path was split.
+    updated ``waiting`` and the result of `sample_bsdf`, for split paths that of the transmitted
+    part.
     """
     found = sample_bsdf(si, *samples, active)
     pointer, throughput, eta, vertex = state
@@ -70,8 +73,8 @@ def _lobe(
     active: mi.Bool,
     lobes: int,
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool, mi.Float]:
-    """Sample some ``lobes`` as `sample_bsdf`, with the density of all: emitters are sampled for all
-    lobes, and the weights of both ways add up to 1.
+    """Sample some ``lobes`` as `sample_bsdf`, but return the density of all lobes: emitters are
+    sampled for all lobes, and the weights of multiple importance sampling have to sum to 1.
     """
     direction, f, scale, is_vertex, density = sample_bsdf(si, *samples, active, lobes)
     wo = si.to_local(direction)
@@ -84,7 +87,7 @@ def resumed(waiting: list[list], state: list, active: mi.Bool) -> tuple[list[lis
     """Replace paths that are not ``active`` any more by waiting ones.
 
     ``state`` is the ray, medium, throughput, relative refractive index, last vertex and density.
-    Returns the places, the state, and which paths are new.
+    Returns the updated ``waiting``, the state, and the mask of lanes with a resumed path.
     """
     new, result = mi.Bool(False), []
     for taken, *path in waiting:

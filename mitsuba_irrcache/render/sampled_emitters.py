@@ -20,8 +20,8 @@ MOST_EMITTERS = 16
 class SampledEmitters:
     """Emitters that are sampled at the vertices of paths: all but smooth environments.
 
-    Of an environment with a peak, such as a sun in a map of the sky, only the excess over
-    ``threshold`` (a luminance) is sampled; the remainder is gathered along all directions. Each
+    Of an environment with a peak, such as a sun in a sky map, only the excess over the luminance
+    ``threshold`` is sampled; the remaining radiance is gathered along all directions. Each
     point-like or distant emitter is sampled once, an environment `ENVIRONMENT_SAMPLES` times.
     """
 
@@ -54,7 +54,7 @@ class SampledEmitters:
         dr.eval(self._emitters, self._first, self._share)
 
     def excess(self, emitter: mi.EmitterPtr, radiance: mi.Spectrum) -> mi.Float:
-        """The part of a ``radiance`` of an emitter that is sampled."""
+        """Return the share of the ``radiance`` of an emitter that is sampled."""
         peak = dr.maximum(1 - self.threshold / dr.maximum(luminance(radiance), 1e-30), 0)
         return dr.select(emitter == self._environment, peak, 1)
 
@@ -91,7 +91,7 @@ class EmitterSample:
 
 
 def peak_threshold(environment: mi.Emitter) -> float:
-    """The luminance beyond which an environment counts as a peak; infinite without peaks."""
+    """Return the luminance above which an environment is sampled; infinite without peaks."""
     u = np.random.default_rng(1).random((2, 1 << 14), dtype=np.float32)
     si = dr.zeros(mi.SurfaceInteraction3f, u.shape[1])
     si.wi = -mi.warp.square_to_uniform_sphere(mi.Point2f(u))

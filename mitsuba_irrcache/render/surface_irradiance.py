@@ -1,12 +1,12 @@
-"""Irradiance cached on the surfaces that a camera sees, and on those that these receive it from.
+"""Irradiance cached on the surfaces that a camera sees, and on the surfaces visible from these.
 
-Nodes (`SurfaceNodes`) are created where camera rays meet diffuse surfaces, and then where rays from
+Nodes (`SurfaceNodes`) are created where camera rays hit diffuse surfaces, and then where rays from
 these nodes do. Each node gathers the radiance of all directions along cosine-distributed rays:
-in-scattered radiance of the media by ray marching, emission, and light that other surfaces reflect,
-which is linear in the irradiance of their nodes. So the irradiances are the solution of
-E = E_0 + H E, found by iteration (Goral et al., "Modeling the interaction of light between diffuse
-surfaces", 1984). Emitters that cast sharp shadows are excluded: they are sampled where camera rays
-end.
+in-scattered radiance of the media by ray marching, emission, and radiance reflected by other
+surfaces, which is linear in the irradiance of their nodes. The irradiances are therefore the
+solution of E = E_0 + H E, found by iteration (Goral et al., "Modeling the interaction of light
+between diffuse surfaces", 1984). Emitters that cast sharp shadows are excluded: they are sampled
+where camera rays end.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ class SurfaceIrradiance:
         self._gathered = 0  # groups
 
     def renewed(self, paths: SurfacePaths) -> SurfaceIrradiance:
-        """The same nodes, with irradiance that is gathered anew along ``paths``."""
+        """Return the same nodes, with irradiance gathered again along ``paths``."""
         return SurfaceIrradiance(paths, self.seed, self._groups)
 
     def prepare(self, scene: mi.Scene, ray: mi.Ray3f, pointer: mi.MediumPtr) -> None:
-        """Create the nodes that camera rays like these need, and compute their irradiance."""
+        """Create the nodes that these camera rays need, and compute their irradiance."""
         rng = random_stream(mi.sample_tea_32(dr.arange(mi.UInt32, dr.width(ray)), self._seed))
         place, found, _ = self.paths.walk(scene, ray, pointer, rng, mi.Bool(True))
         self._cover(scene, place, found)
@@ -79,8 +79,8 @@ class SurfaceIrradiance:
     # Placement
 
     def _cover(self, scene: mi.Scene, place: tuple, active: mi.Bool) -> None:
-        """Create all nodes for interpolation at places (results of `SurfacePaths.walk`), and then
-        those for the places that rays from these nodes meet.
+        """Create all nodes for interpolation at ``place`` (a result of `SurfacePaths.walk`), and
+        then those for the positions that rays from these nodes hit.
         """
         first = seen = self.nodes.count
         dr.eval(place, active)  # otherwise each lookup below evaluates one array by itself
@@ -162,7 +162,7 @@ class SurfaceIrradiance:
     # Irradiance
 
     def _gather(self, scene: mi.Scene, first: int, end: int, rays: int) -> None:
-        """Gather radiance along so many ``rays`` from each of the nodes ``first`` to ``end``."""
+        """Gather radiance along ``rays`` rays from each of the nodes ``first`` to ``end``."""
         per_launch = LANES // rays
         for begin in range(first, end, per_launch):
             count = min(per_launch, end - begin)
@@ -190,8 +190,8 @@ class SurfaceIrradiance:
     def _gather_around(
         self, scene: mi.Scene, source: Source, numbers: mi.UInt32, place: tuple
     ) -> list[mi.Float]:
-        """Return the irradiance at nodes by what truncated forward peaks scatter of the radiance of
-        a narrow ``source``.
+        """Return the irradiance at nodes due to radiance of a narrow ``source`` that truncated
+        forward peaks scatter.
 
         Rays are distributed around the direction of the source like the Henyey-Greenstein phase
         function, the more broadly the larger the source.
@@ -243,8 +243,8 @@ class SurfaceIrradiance:
 
 
 class Exchange:
-    """What consecutive nodes receive: ``own`` irradiance, and the ``factors`` of the irradiance of
-    the ``other`` nodes that their rays meet, so many ``rays`` for each node.
+    """Rows of E = E_0 + H E for consecutive nodes: ``own`` is E_0, and ``factors`` are those of the
+    irradiance of the ``other`` nodes that their rays hit, ``rays`` per node.
     """
 
     def __init__(
@@ -253,7 +253,7 @@ class Exchange:
         self.rays, self.own, self.other, self.factors = rays, own, other, factors
 
     def gathered(self, total: list[mi.Float]) -> list[mi.Float]:
-        """The irradiance in each channel, where that of all nodes is ``total``."""
+        """Return the irradiance per channel, given the irradiance ``total`` of all nodes."""
         received = [
             factor * dr.gather(mi.Float, values, self.other)
             for factor, values in zip(self.factors, total, strict=True)

@@ -5,9 +5,9 @@ glossy surfaces are sampled as in path tracing. Between surfaces the in-scattere
 media is integrated by ray marching of their caches, which is free of the noise of sampled
 collisions.
 
-Where a medium has a forward peak that counts as unscattered (`media/delta_m`), narrow sources reach
-surfaces attenuated by the original extinction, so that their shadows are sharp. What the peak
-scatters of their radiance is gathered by the nodes along rays of their own.
+If a medium has a forward peak that counts as unscattered (`media/delta_m`), the radiance of narrow
+sources on surfaces is attenuated by the original extinction, so that shadows are sharp. Their
+radiance that the peak scatters is gathered by the nodes along separate rays.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ UNIT_CUBE = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0
 class SurfacePaths:
     """Paths in a scene with caches of its media (``projections``) and on its surfaces.
 
-    Irradiance at the ``nodes`` excludes what comes straight from the `SampledEmitters`, which are
-    sampled wherever a path ends.
+    Irradiance at the ``nodes`` excludes radiance that comes straight from the `SampledEmitters`,
+    which are sampled wherever a path ends.
     """
 
     def __init__(
@@ -181,8 +181,8 @@ class SurfacePaths:
         return passed, rng
 
     def met_by_bsdf(self, scene, si, pointer, rng, active, exact: bool):
-        """Return the radiance reflected at ``si`` from a sampled emitter that a ray meets which is
-        sampled from the BSDF, with multiple importance sampling.
+        """Sample a ray from the BSDF at ``si``; return the reflected radiance of a sampled emitter
+        that it hits, with multiple importance sampling.
         """
         choice = rng.next_float32(active)
         u = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
@@ -384,7 +384,7 @@ class _PathFollower:
     def begin(
         self, ray: mi.Ray3f, pointer: mi.MediumPtr, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[_FollowedPath, _PathSums]:
-        """The state before the first surface, and sums of nothing."""
+        """Return the state before the first surface, and sums of 0."""
         ray, pointer, last = mi.Ray3f(ray), mi.MediumPtr(pointer), dr.zeros(mi.Interaction3f)
         last.p = ray.o
         path = _FollowedPath(
@@ -407,7 +407,7 @@ class _PathFollower:
         return path, _PathSums(black, mi.Spectrum(0), mi.Bool(False), none, mi.Spectrum(0))
 
     def advance(self, path: _FollowedPath, sums: _PathSums) -> None:
-        """Follow paths to their next surface, and into a direction from there."""
+        """Trace paths to their next surface, and sample the direction in which they continue."""
         self._apply_roulette(path)
         si = self._scene.ray_intersect(path.ray, path.active)
         self._march_media(path, sums, si)
@@ -492,7 +492,7 @@ class _PathFollower:
         si: mi.SurfaceInteraction3f,
         surface: mi.Bool,
     ) -> mi.Bool:
-        """End paths at diffuse surfaces with nodes; return where."""
+        """End paths at diffuse surfaces with nodes; return the mask of paths that end."""
         # docs/primer, eq. (5.9)
         paths = self._paths
         diffuse, factor = lambertian(si, surface)
@@ -568,7 +568,7 @@ class _PathFollower:
         path.active &= goes_on & (path.crossings < MOST_CROSSINGS)
 
     def _resume(self, path: _FollowedPath) -> None:
-        """Go on with paths that were split off where others have ended."""
+        """Continue with waiting reflected paths in lanes whose path has ended."""
         state = [path.ray, path.pointer, path.throughput, path.eta, path.last, path.pdf]
         path.waiting, state, new = resumed(path.waiting, state, path.active)
         path.ray, path.pointer, path.throughput, path.eta, path.last, path.pdf = state

@@ -1,4 +1,4 @@
-"""Surfaces that rays meet: the first opaque one, its normals, and whether it is diffuse."""
+"""Surfaces that rays hit: the first one that is not null, its normals, whether it is diffuse."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def unobstructed(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
 
 
 def vertex_at(si: mi.SurfaceInteraction3f) -> mi.Interaction3f:
-    """The interaction from which emitters are sampled."""
+    """Return the interaction from which emitters are sampled."""
     vertex = dr.zeros(mi.Interaction3f)
     vertex.p, vertex.n = si.p, si.n
     vertex.time, vertex.wavelengths = si.time, si.wavelengths
@@ -81,7 +81,7 @@ def vertex_at(si: mi.SurfaceInteraction3f) -> mi.Interaction3f:
 
 
 def facing(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> tuple[mi.Normal3f, mi.Normal3f]:
-    """Geometric and shading normal on the side from which a ray arrives in ``direction``."""
+    """Return geometric and shading normal on the side that a ray in ``direction`` hits."""
     geometric, shading = si.n, si.sh_frame.n
     geometric = dr.select(dr.dot(geometric, direction) < 0, geometric, -geometric)
     shading = dr.select(dr.dot(shading, direction) < 0, shading, -shading)
@@ -89,9 +89,10 @@ def facing(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> tuple[mi.Norm
 
 
 def lambertian(si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
-    """Whether the BSDF reflects alike in all directions, and its value f = reflectance / pi.
+    """Return whether the BSDF is Lambertian, and its value f = reflectance / pi.
 
-    By flags and, since the normals of bump maps differ from those of the surface, by its values.
+    This is decided by flags and, because the normals of bump maps differ from those of the surface,
+    by values of the BSDF.
     """
     bsdf, context = si.bsdf(), mi.BSDFContext()
     flags = bsdf.flags() & int(mi.BSDFFlags.All)

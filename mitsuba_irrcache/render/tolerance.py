@@ -1,4 +1,4 @@
-"""Choice of cache, march and samples such that an image has at most a given error.
+"""Choose cache, step and samples per pixel such that an image has at most a given error.
 
 The error of an image has independent parts, each of which gets a share of the tolerance. All are
 measured on the image itself, along probe rays that are spread over the film:
@@ -6,11 +6,11 @@ measured on the image itself, along probe rays that are spread over the film:
 - *Voxels*: caches of increasing resolution. If the error is C h^p, where h is the voxel edge, the
   images for h and r h differ by C h^p (r^p - 1). The order p follows from three resolutions
   (Richardson extrapolation); from two, a low one is assumed.
-- *Directions*, or samples per voxel: the scatter between coarse caches of other seeds. With
-  `sweep` all voxels share their ordinates, so that the scatter hardly depends on the resolution;
-  with `path` it is the larger, the coarser the cache.
-- *Steps*: the march with half the step.
-- *Pixels*: the scatter between pixels of other seeds, for some pixels of the film.
+- *Directions*, or samples per voxel: the variance between coarse caches with different seeds. With
+  `sweep` all voxels share their ordinates, so that the variance hardly depends on the resolution;
+  with `path` it is larger for coarser caches.
+- *Steps*: the difference from ray marching with half the step.
+- *Pixels*: the variance between renderings with different seeds, for some pixels of the film.
 
 Resolutions grow geometrically, so that all coarser caches together cost a fraction of the last.
 """
@@ -74,12 +74,12 @@ class Certificate:
     """Estimated error of an image: RMSE over its pixels, in units of the mean radiance.
 
     Attributes:
-        tolerance: the error that was asked for.
+        tolerance: the requested error.
         tolerance_of: "image", or "volume" if the unit is the mean radiance of the media alone.
         parts: estimated RMSE by "voxels", "directions", "steps" and "pixels"; parts that do not
             exist for a scene are 0. Empty if there is no estimate.
-        settings: what was chosen: "resolution", "cache_spp", "step" and "spp".
-        open_points: what the estimate does not include, or why the tolerance was not reached.
+        settings: the chosen "resolution", "cache_spp", "step" and "spp".
+        open_points: errors that the estimate does not include, or why the tolerance is not met.
     """
 
     tolerance: float
@@ -123,7 +123,7 @@ class Level:
         self._revision = -1
 
     def camera_rays(self, step: float) -> CameraRays:
-        """Return the camera rays for the cache as it is."""
+        """Return the camera rays for the current cache."""
         if self._revision != self.builder.revision:
             self._camera_rays, self._revision = {}, self.builder.revision
         if step not in self._camera_rays:
@@ -146,8 +146,8 @@ class ToleranceSearch:
         new_builder: Callable[[CacheSettings], CacheBuilder],
         camera_rays: MakeCameraRays,
     ) -> None:
-        """Store settings. Those of ``settings`` that are not 0, and the ``step`` if it is not None,
-        are taken as they are.
+        """Store settings. Values of ``settings`` that are not 0, and ``step`` if it is not None,
+        are fixed; the others are searched for.
         """
         self.tolerance, self._of = tolerance, tolerance_of
         self._settings, self._step = settings, step
@@ -447,7 +447,7 @@ class ToleranceSearch:
 
 
 class _Middle:
-    """A sampler that always returns the middle, so that images of two caches can be compared."""
+    """A sampler that always returns 0.5, so that images of two caches can be compared."""
 
     def next_1d(self, active: mi.Bool = True) -> mi.Float:
         return mi.Float(0.5)
@@ -477,7 +477,7 @@ def _pixel_samples(
 ) -> np.ndarray:
     """Return means of ``spp`` samples (group, pixel, channel) in pixels spread over the film.
 
-    The groups have seeds of their own.
+    The groups have different seeds.
     """
     spp = _rounded(sensor, spp)
     film, medium = sensor.film(), sensor.get_medium()
@@ -517,7 +517,7 @@ def _sampler(sensor: mi.Sensor, spp: int) -> mi.Sampler:
 
 
 def _values_of(rays: Rays) -> tuple:
-    """Return all that distinguishes these rays from others."""
+    """Return the values of rays that identify them, to detect a change of the sensor."""
     ray, weight, medium = rays
     arrays = mi.Vector3f(ray.o), mi.Vector3f(ray.d), ray.time, mi.Spectrum(weight)
     return (*(np.array(a).tobytes() for a in arrays), medium)

@@ -38,21 +38,22 @@ BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
 #: Mean optical depth of a cache voxel above which a warning is logged, and the error that was
 #: measured there: opaque bone of 100 mean free paths per data voxel, 16 per cache voxel.
 OPAQUE_VOXEL, OPAQUE_ERROR = 10.0, "1 % of the mean, and up to 6 % of it in small regions,"
-#: Maximum number of voxels along the longest side that a boundary of glass can require: glass
-#: reflects most of the radiance inside, which varies less towards the boundary, and voxels are more
-#: work there. At an optical depth of 40 the error is 0.5 % (ball) and 0.7 % (cube) with so many.
+#: Maximum number of voxels along the longest side that a boundary of glass can require. Glass
+#: reflects most of the radiance inside, which then varies less towards the boundary, and voxels are
+#: more expensive. At an optical depth of 40 this number has an error of 0.5 % (ball) and 0.7 %
+#: (cube).
 MOST_IN_GLASS = 64
 #: Maximum number of voxels of a cache that is finer than its data: all orders of scattering then
 #: take half a minute on two cores.
 MOST_REFINED = 8_000_000
 
-#: Error [%] that larger voxels than those of the data may cause in smooth light, and estimates of
-#: it, fits to images of 32 scenes (experiments/validation/defaults): for a voxel of the optical
-#: depth d and data of which a part a is lost between its voxels, DEPTH_ERROR d +
-#: DETAIL_ERROR a min(d, MOST_DETAIL_DEPTH).
+#: Error [%] that voxels larger than those of the data may cause under smooth illumination, and
+#: coefficients of its estimate, fits to images of 32 scenes (experiments/validation/defaults): with
+#: the optical depth d of a voxel, and the part a of the data that interpolation between voxels
+#: loses, it is DEPTH_ERROR d + DETAIL_ERROR a min(d, MOST_DETAIL_DEPTH).
 SMOOTH_ERROR, DEPTH_ERROR, DETAIL_ERROR, MOST_DETAIL_DEPTH = 0.4, 0.3, 7.0, 0.25
-#: Ratio between the sizes that are tried, the largest one in units of the usual one, and number of
-#: positions at which detail is measured.
+#: Ratio between the resolutions that are tried, the largest of them in units of the resolution
+#: chosen otherwise, and number of positions at which detail is measured.
 SIZE_RATIO, LARGEST_SHARE, POSITIONS = 2**0.25, 0.9, 1 << 20
 
 
@@ -81,10 +82,10 @@ class SizeRule:
             or homogeneous.
         refines_dense_data: whether voxels may be smaller than those of dense data.
         most: maximum number of voxels along the longest side.
-        larger_in_smooth_light: whether voxels may be larger than those of smooth data where no
-            emitter casts shadows with edges.
+        larger_in_smooth_light: whether voxels may be larger than those of smooth data if all
+            emitters are smooth environments, which cast no sharp shadows.
         among_surfaces: limits for media in which rays are traced through the scene's shapes; None:
-            the same rule as for other media.
+            the same rule as for isolated media.
     """
 
     target_error: float
@@ -180,9 +181,11 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
 def _size_in_smooth_light(
     medium: MediumGrid, least: np.ndarray, most: np.ndarray
 ) -> np.ndarray | None:
-    """Return the smallest numbers of voxels along x, y, z whose estimated error is SMOOTH_ERROR; at
-    least ``least`` along the longest side, in the ratio of ``most``. None if that is not smaller,
-    or where shadows have edges.
+    """Return the smallest numbers of voxels along x, y, z whose estimated error is at most
+    SMOOTH_ERROR.
+
+    They are proportional to ``most``, and not below ``least``. Returns None if they are not smaller
+    than ``most``, or if the illumination is not smooth.
     """
     if medium.detail is Detail.SHARP or medium.phase.forward:
         return None
@@ -201,9 +204,11 @@ def _size_in_smooth_light(
 
 
 def _lost_detail(medium: MediumGrid, sides: np.ndarray) -> float:
-    """Return the part of a medium's extinction, or of its scattering if that has more detail, that
-    is lost by interpolation between this number of voxels along x, y, z: root mean square of the
-    second difference over half a voxel in units of that of the values.
+    """Return the part of a medium's data that is lost by interpolation between this number of
+    voxels along x, y, z.
+
+    It is the root mean square of second differences over half a voxel, divided by the root mean
+    square of the values; of the extinction or the scattering coefficient, whichever is larger.
     """
     grid = medium.sigma_t.grid
     stride = max(-(-grid.voxel_count // POSITIONS), 1)

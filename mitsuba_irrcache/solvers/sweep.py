@@ -32,21 +32,21 @@ EMITTERS = frozenset(
         EmitterKind.AREA,
     )
 )
-#: Directions per voxel by default: for all orders of scattering, and among surfaces, where camera
-#: paths add noise of their own. Twice as many for single scattering of irradiance, where each is
-#: less work and blurs less.
+#: Default number of directions per voxel: for isolated media, and among surfaces, where camera
+#: paths add noise. It is doubled for single isotropic scattering, where directions are cheaper and
+#: their noise is not blurred by further orders.
 DIRECTIONS, DIRECTIONS_AMONG_SURFACES = 128, 64
-#: The same for all orders of isotropic scattering in uniform light: errors are at most 1.5 times
-#: those with 128.
+#: The same for isotropic scattering in a constant environment: errors are at most 1.5 times those
+#: with 128.
 DIRECTIONS_IN_UNIFORM_LIGHT = 64
-#: The same among surfaces where the phase function has a forward peak: 128 leave an error of 1.5 %
-#: under a sky with a wide sun, these 0.9 %.
+#: The same among surfaces for a phase function with a forward peak: 128 directions have an error of
+#: 1.5 % under a sky with a wide sun, and 256 one of 0.9 %.
 DIRECTIONS_OF_SHARP_SCATTERING = 256
 
 
 @register
 class SweepSolver(Solver):
-    """Solves for all voxels at once, in media that no surface and no other medium reaches into."""
+    """Solves for all voxels at once, in media that fill a box or sphere."""
 
     name = "sweep"
     precedence = 10
@@ -70,8 +70,8 @@ class SweepSolver(Solver):
             if kind_of(emitter) not in EMITTERS:
                 kind = f'"{emitter.id()}" ({emitter.class_name()})'
                 return (
-                    f"emitter {kind} is neither far away (with an even beam) nor a point nor an "
-                    "area that emits in all directions"
+                    f"emitter {kind} is neither distant (with a uniform beam) nor point-like nor "
+                    "an area emitter that emits in all directions"
                 )
         if medium.is_isolated:
             return None
@@ -79,8 +79,8 @@ class SweepSolver(Solver):
             return f"{name} is bounded by other shapes than one box or sphere"
         if max_depth > 2:
             return (
-                "among surfaces it finds one or all orders of scattering, not those of max_depth "
-                f"{max_depth}"
+                "among surfaces it computes single scattering (max_depth 2) or all orders (-1), "
+                f"not max_depth {max_depth}"
             )
         grid, _ = choose_grid(medium, resolution, cls.size_rule)
         active = active_voxels(medium, grid)
@@ -97,8 +97,8 @@ class SweepSolver(Solver):
             return None
         if medium.refracts and not medium.phase.is_isotropic and is_needed(scene):
             return (
-                f"{name} scatters anisotropically behind glass, where it finds the radiance of a "
-                "constant environment only"
+                f"{name} scatters anisotropically behind glass, where only constant environments "
+                "are supported"
             )
         # Emission without extinction must not be occluded either.
         box = box if medium.emission is None else (np.zeros(3, int), grid.resolution)
@@ -109,7 +109,7 @@ class SweepSolver(Solver):
     @classmethod
     def why(cls, medium: MediumGrid) -> str:
         if medium.is_isolated:
-            return "all emitters are far away or points"
+            return "all emitters are distant or point-like"
         return "no surface and no other medium is among the voxels"
 
     @classmethod

@@ -358,7 +358,7 @@ def test_the_choice_of_solver(scenes):
         scene = scenes.load({"type": "irrcache", "solver": "auto"}, soft_cloud(scenes), **objects)
         (medium,) = compile_scene(scene).visible
         solver, reason = choose_solver(scene, medium, "auto")
-        assert solver.name == "sweep" and "far away or points" in reason
+        assert solver.name == "sweep" and "distant or point-like" in reason
         assert choose_solver(scene, medium, "path") == (solver_named("path"), "as requested")
         scene.integrator().prepare(scene)
         assert scene.integrator().cache.correlated

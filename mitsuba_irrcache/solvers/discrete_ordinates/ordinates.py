@@ -1,7 +1,8 @@
 """Ordinate sets: the directions of one pass of the solver, and the sweeps along them.
 
-A pass sweeps one set of ordinates. `OrdinateSet` is for a medium with distant emitters only;
-`BoundaryOrdinateSet` for a medium among surfaces, whose radiance enters track by track.
+A pass sweeps one set of ordinates. `OrdinateSet` is for a medium with distant and point-like
+emitters only; `BoundaryOrdinateSet` for a medium among surfaces, where the incoming radiance
+differs from track to track.
 """
 
 from __future__ import annotations
@@ -30,21 +31,20 @@ from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Ordinates of a pass along which radiance enters among surfaces: it varies more from one direction
-#: to the next than the radiance between voxels.
+#: Number of ordinates of a pass along which radiance enters among surfaces. It varies more between
+#: directions than the radiance scattered between voxels.
 BOUNDARY_ORDINATES = 64
-#: The same in boxes of glass, where all tracks of an ordinate meet a face at the same angle and are
-#: reflected totally or not: with 64 the mean irradiance under a lamp has a noise of 1.3 %.
+#: The same in boxes of glass, where all tracks of an ordinate hit a face at the same angle, so that
+#: all or none are totally reflected: with 64 ordinates the mean irradiance under an area emitter
+#: has a noise of 1.3 %.
 BOUNDARY_ORDINATES_IN_GLASS = 256
 
 
 class OrdinateSet:
-    """Ordinates along which both the radiance of distant emitters and that of voxels travel, in
-    some ``channels``, or alike in all.
-    """
+    """Ordinates for the radiance of distant emitters and of voxels, in some ``channels``."""
 
     def __init__(self, ordinates: Ordinates, channels: Sequence[int], suns: int = 0) -> None:
-        """``suns`` of the last ordinates are those of suns, whose irradiance is to be separate."""
+        """The last ``suns`` ordinates belong to suns whose irradiance is to be kept separate."""
         count, incoming = len(ordinates.weights), ordinates.incoming
         self._is_sun = np.arange(count) >= count - suns if suns else None
         own = incoming if incoming.shape[-1] == 1 else incoming[..., list(channels)]
@@ -54,10 +54,11 @@ class OrdinateSet:
     def uncollided(
         sets: Sequence[OrdinateSet], angular_basis: AngularBasis | None = None
     ) -> list[tuple]:
-        """Arguments of `Tracks.uncollided` for the radiance of distant emitters along all ``sets``.
+        """Return arguments of `Tracks.uncollided` for the radiance of distant emitters along all
+        ``sets``.
 
-        With an ``angular_basis``, first for all but the narrow sources, then for each of these;
-        where the irradiance of suns is to be separate, it comes last.
+        With an ``angular_basis``, the first tuple is for all but the narrow sources, and the
+        following ones for each of these. If the irradiance of suns is separate, it comes last.
         """
         directions, incoming, _, offsets = merged([each.ordinates for each in sets])
         suns = []
@@ -78,17 +79,19 @@ class OrdinateSet:
         ]
 
     def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
-        """`MultigridLevel.sweep` with the radiance that enters."""
+        """Run `MultigridLevel.sweep` with the incoming radiance."""
         return level.sweep(phi, level.tracks.table(*self.ordinates))
 
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
-        """All orders of scattering, given the uncollided ``b``. The error that may remain is the
-        larger the more ``passes`` follow, each of which reduces it and their mean, too.
+        """Solve for all orders of scattering, given the uncollided ``b``.
+
+        The tolerance grows with the number of ``passes`` that follow, because each of them reduces
+        the error of the solution, and so does their mean.
         """
         return level.solve(b, self.scattering, tolerance=max(1.0, passes / 2))
 
     def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
-        """`MultigridLevel.coarse_corrected` for a sweep along the ordinates of this set."""
+        """Apply `MultigridLevel.coarse_corrected` to a sweep along the ordinates of this set."""
         coarse = [] if level.coarsest else level.coarser.tables(self.scattering)
         return level.coarse_corrected(phi, swept, coarse)
 
@@ -99,14 +102,14 @@ class OrdinateSet:
 
 
 class BoundaryOrdinateSet:
-    """Among surfaces: radiance enters along more ordinates than it is exchanged between voxels
-    along, the ``scattering`` ones.
+    """Ordinates of a pass among surfaces: radiance enters along ``ordinates``, and voxels exchange
+    radiance along fewer ordinates, ``scattering``.
 
-    ``incoming`` is the radiance that enters along the ``ordinates``, which begin at number
-    ``start`` there. ``reflected`` is that which leaves the medium and returns to it along the
-    scattering ordinates while all orders are solved for, if this set does so. ``crossings`` are
-    those of the tracks of scattering ordinates with surfaces among the voxels. Some ``channels``
-    are taken of ``incoming`` and ``reflected``.
+    ``incoming`` is the incoming radiance of all passes; that along the ``ordinates`` of this one
+    starts at index ``start``. ``reflected`` is the radiance that leaves the medium and returns to
+    it along the ``scattering`` ordinates while this set solves for all orders (None for sets that
+    do not). ``crossings`` are those of the tracks of ``scattering`` with surfaces among the voxels.
+    ``channels`` are the channels of ``incoming`` and ``reflected`` to use.
     """
 
     def __init__(
@@ -127,7 +130,7 @@ class BoundaryOrdinateSet:
     def uncollided(
         sets: Sequence[BoundaryOrdinateSet], angular_basis: AngularBasis | None = None
     ) -> list[tuple]:
-        """As `OrdinateSet.uncollided`."""
+        """Return arguments as `OrdinateSet.uncollided`."""
         directions, unused, _, offsets = merged([each.ordinates for each in sets])
         incoming, channels = sets[0].incoming, sets[0].channels
         numbers = np.concatenate([each.numbers for each in sets])
@@ -139,27 +142,27 @@ class BoundaryOrdinateSet:
         return parts
 
     def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
-        """`MultigridLevel.sweep` with the radiance that enters."""
+        """Run `MultigridLevel.sweep` with the incoming radiance."""
         table = self._table(level)
         table.boundary_source.update(phi)
         found = level.sweep(None, table)
         if phi is None:
             return found
-        # Separately: the collisions of either balance what its own tracks lose.
+        # Sweep both separately: the collisions of each balance the loss along its own tracks.
         scattered = self.exchanged(level, phi)
         both = tuple(a + b for a, b in zip(found, scattered, strict=True))
         dr.eval(both)
         return both
 
     def exchanged(self, level: MultigridLevel, phi: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """`MultigridLevel.sweep` of radiance between voxels alone."""
+        """Run `MultigridLevel.sweep` without incoming radiance."""
         table = level.tracks.table(*self.scattering)
         if self._crossings is not None:
             table.crossings = self._crossings.of_table(np.arange(len(self.scattering.directions)))
         return level.sweep(phi, table)
 
     def uncollided_collisions(self, level: MultigridLevel) -> mi.Float:
-        """The mean irradiance of collisions due to radiance straight from emitters."""
+        """Return the mean irradiance of collisions due to radiance straight from emitters."""
         if not any(part.any() for part in self.incoming.has_emitters):
             return dr.zeros(mi.Float, level.tracks.active_count * level.channels)
         table = level.tracks.table(*self.ordinates)
@@ -168,18 +171,22 @@ class BoundaryOrdinateSet:
         return level.sweep(None, table)[1]
 
     def _table(self, level: MultigridLevel) -> TrackTable:
-        """The ordinates, with the radiance that enters along them."""
+        """Return the track table of the ordinates, with the incoming radiance along them."""
         table = level.tracks.table(*self.ordinates)
         of_table = self.channels, level, table, self.numbers
         table.boundary_source = self.incoming.reflected_source(*of_table, emitted=True)
         return table
 
     def corrected(self, level: MultigridLevel, phi: mi.Float, swept: mi.Float) -> mi.Float:
-        """The sweep unchanged: what differs between passes here is the radiance that enters."""
+        """Return ``swept`` unchanged: passes differ by their incoming radiance, which a coarse grid
+        does not correct.
+        """
         return swept
 
     def solve(self, level: MultigridLevel, b: mi.Float, passes: int) -> mi.Float:
-        """All orders, given the uncollided ``b``; between two, radiance may leave the medium."""
+        """Solve for all orders, given the uncollided ``b``; radiance may leave the medium and
+        return from surfaces.
+        """
         numbers = np.arange(len(self.scattering.directions))
         return level.solve(
             b,
@@ -191,9 +198,11 @@ class BoundaryOrdinateSet:
 
 
 class JointOrdinateSet(BoundaryOrdinateSet):
-    """Radiance that enters and radiance of voxels use the same ordinates, so that quadrature errors
-    of both cancel where their sum is isotropic: for anisotropic scattering, and behind glass, which
-    reflects most of the radiance inside and so multiplies such errors.
+    """The same ordinates for incoming radiance and radiance of voxels, so that quadrature errors of
+    both cancel where their sum is isotropic.
+
+    It is used for anisotropic scattering, and for media in glass, which reflects most of the
+    radiance inside and thus multiplies such errors.
     """
 
     def sweep(self, level: MultigridLevel, phi: mi.Float | None) -> tuple[mi.Float, mi.Float]:
@@ -219,16 +228,18 @@ def boundary_ordinate_sets(
     rng: np.random.Generator,
     seed: tuple[int, int],
 ) -> tuple[Callable[[Sequence[int]], list[BoundaryOrdinateSet]], list[list[mi.Float]]]:
-    """Ordinate sets of passes among surfaces, as a function of the channels that are swept
-    together; and all spectra that may differ between channels. If there are several passes, the
-    first one can solve for all orders. ``pairs`` are those of scattering ordinates.
+    """Create the ordinate sets of all passes among surfaces.
+
+    Returns a function from the channels that are swept together to the ordinate sets, and all
+    spectra that may differ between channels. With several passes, the first one can solve for all
+    orders. ``pairs`` is the number of pairs of scattering ordinates.
     """
     several = passes > 1
     joint = boundary.angular_basis is not None or boundary.refracts
     flat = boundary.refracts and boundary.surfaces is None
     many = BOUNDARY_ORDINATES_IN_GLASS if flat else BOUNDARY_ORDINATES
     many = max(many // 2, pairs) if several else pairs
-    # The first one is independent, the union of the others is even.
+    # The first set is independent; the union of the others is evenly distributed.
     sets = illumination.ordinates(1, many, rng)
     if several:
         sets += illumination.ordinates(passes - 1, many, rng)
@@ -239,7 +250,7 @@ def boundary_ordinate_sets(
     incoming = IncomingRadiance(boundary, tracks, merged(sets), several, (*seed, 0))
     reflected, crossings = None, [None] * passes
     if several and boundary.refracts:
-        # The same paths: what they find of emitters and of voxels adds up without noise.
+        # Use the same paths, so that radiance of emitters and of voxels adds up without noise.
         reflected = incoming
     elif several:
         reflected = IncomingRadiance(boundary, tracks, scattering[0], several, (*seed, 1))
@@ -269,7 +280,7 @@ def boundary_ordinate_sets(
 
 
 def _scattering_ordinates(passes: int, pairs: int, rng: np.random.Generator) -> list[Ordinates]:
-    """Ordinates for each pass of the radiance between voxels, along which nothing enters."""
+    """Return, for each pass, the ordinates of the radiance between voxels, with ``incoming`` 0."""
     none = np.zeros((pairs, 2, dr.size_v(mi.Spectrum)))
     sets = [hemisphere_ordinates(pairs, rng)]
     if passes > 1:

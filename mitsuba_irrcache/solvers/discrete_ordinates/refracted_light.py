@@ -1,8 +1,9 @@
-"""Irradiance from emitters that glass around a medium refracts, voxel by voxel.
+"""Irradiance from emitters that is refracted by glass around a medium, voxel by voxel.
 
-Lamps and bright regions of an environment are seen through glass in few directions, which a set of
-ordinates would miss or exaggerate everywhere alike (ray effects). Their radiance is therefore found
-along paths from the voxels, which end at the first collision in the medium.
+Area emitters and bright regions of an environment are visible through glass in few directions,
+which a set of ordinates would miss or overestimate in all voxels alike (ray effects). Their
+irradiance is therefore estimated by paths from the voxels, which end at the first collision in the
+medium.
 """
 
 from __future__ import annotations
@@ -19,17 +20,20 @@ from mitsuba_irrcache.solvers.discrete_ordinates.boundary_condition import Surfa
 from mitsuba_irrcache.transport.path import flags_of
 from mitsuba_irrcache.transport.path_tracer import PathStart
 
-#: Paths of a batch for all voxels together, and for each one, at least and at most; of a launch.
+#: Number of paths of a batch for all voxels together; its minimum and maximum per voxel; maximum
+#: number of paths of a launch.
 PATHS, FEWEST, MOST, LANES = 1 << 24, 16, 1024, 1 << 21
 #: Weight of positions outside of the medium, which are moved to its boundary.
 OUTSIDE = 1e-4
-#: Number that is added to that of the random stream.
+#: Offset of the random streams of these paths.
 STREAM = 0x6A00
 
 
 def is_needed(scene: mi.Scene) -> bool:
-    """Whether glass refracts anything but a constant environment. Suns and points contribute
-    nothing through smooth glass, which no path can hit them through.
+    """Whether glass refracts radiance of anything but a constant environment.
+
+    Suns and point-like emitters contribute nothing through smooth glass, through which no path can
+    hit them.
     """
     rough = int(mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DiffuseTransmission)
     scatters = any(flags_of(shape) & rough for shape in scene.shapes())
@@ -44,8 +48,8 @@ def is_needed(scene: mi.Scene) -> bool:
 def refracted_irradiance(
     boundary: SurfaceBoundary, grid: Grid, voxels: mi.UInt32, seed: tuple[int, int]
 ) -> mi.Spectrum:
-    """Estimate the mean irradiance over ``voxels`` that reaches them without collisions from
-    emitters, refracted or reflected on the way.
+    """Estimate the mean over ``voxels`` of the uncollided irradiance that is refracted or reflected
+    on its way from emitters.
     """
     count = dr.width(voxels)
     samples = int(np.clip(PATHS // count, FEWEST, MOST))
@@ -64,7 +68,7 @@ def _mean(
     samples: int,
     seed: tuple[int, int],
 ) -> list[mi.Float]:
-    """Average so many ``samples`` of each voxel."""
+    """Return the mean of ``samples`` paths per voxel, one array per channel."""
     lane, k = Divisor(samples).split(dr.arange(mi.UInt32, dr.width(voxels) * samples))
     voxel = dr.gather(mi.UInt32, voxels, lane)
     words = mi.sample_tea_32(voxel, hashed_seed(seed)[0] + dr.opaque(mi.UInt32, STREAM))

@@ -13,20 +13,23 @@ from mitsuba_irrcache.grids.fields import Field, GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 
-#: Most points along each axis of a voxel over which the medium is averaged.
+#: Maximum number of points along each axis of a voxel over which the medium is averaged.
 FINEST = 4
-#: Quadrature points for collisions along each axis of a voxel or, if it is larger than one of the
-#: data, of parts of it, and their weights: Gauss-Radau points of both halves, exact for products of
-#: fields that are linear in each. Values of the data lie in the middle where grids are the same.
+#: Quadrature points for collisions, and their weights, along each axis of a voxel or, if it is
+#: larger than a voxel of the data, of parts of it: Gauss-Radau points of both halves, exact for
+#: products of fields that are linear in each half. Data values are in the middle if the grids are
+#: the same.
 RADAU = (1 / 6, 3 / 8), (1 / 2, 1 / 4), (5 / 6, 3 / 8)
-#: Values of the extinction along each axis of a voxel that tracks read, about.
+#: Approximate number of extinction values along each axis of a voxel.
 DETAIL = 2
 
 
 def extinction_grid(medium: MediumGrid, grid: Grid) -> Grid:
-    """The grid on which tracks read the extinction. Where ``grid`` lies over the same box as the
-    medium's, it is this one, or, if ``grid`` is much coarser, blocks of its voxels, about `DETAIL`
-    in a voxel along each axis; else it is ``grid``.
+    """Return the grid on which tracks read the extinction.
+
+    If ``grid`` and the medium's grid cover the same box, it is the medium's grid or, if ``grid`` is
+    much coarser, a grid of blocks of its voxels, about `DETAIL` per voxel along each axis.
+    Otherwise it is ``grid``.
     """
     data = medium.sigma_t.grid
     if data is None or not medium.fills(grid) or not medium.fills(data):
@@ -40,8 +43,10 @@ def extinction_grid(medium: MediumGrid, grid: Grid) -> Grid:
 
 
 def resampled(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
-    """Channels of ``field`` at the voxels of ``grid``: its means over voxels that are larger than
-    the field's, or that the boundary of the medium may cut, outside of which the field is 0.
+    """Return the channels of ``field`` at the voxels of ``grid``.
+
+    Values are means over voxels if these are larger than the field's, or if the boundary of the
+    medium may cut them; outside of the boundary the field counts as 0.
     """
     cut = not medium.fills(grid)
     if field.grid is not None and not cut:
@@ -57,8 +62,10 @@ def resampled(medium: MediumGrid, field: Field, grid: Grid) -> list[mi.Float]:
 
 
 def collision_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[mi.Float]:
-    """Channels of the albedo at these ``voxels`` of ``grid``: means over the collisions in constant
-    radiance, weighted by extinction. At the edge of matter both change together.
+    """Return the channels of the albedo at these ``voxels`` of ``grid``, averaged with the
+    extinction as weight: the mean over collisions in uniform radiance.
+
+    The weight matters where albedo and extinction change together, at the edges of objects.
     """
     albedo, extinction = medium.albedo, medium.sigma_t
     if albedo.grid is None:
@@ -73,7 +80,7 @@ def collision_albedo(medium: MediumGrid, grid: Grid, voxels: mi.UInt32) -> list[
 
 
 def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
-    """Means over blocks of so many voxels (x, y, z), which are the voxels of ``grid``."""
+    """Return means over blocks of ``block`` voxels (x, y, z), which are the voxels of ``grid``."""
     sums: list = [0.0] * field.channels
     at = grid.voxel_indices(dr.arange(mi.UInt32, grid.voxel_count))
     for dz, dy, dx in np.ndindex(*block[::-1]):
@@ -88,7 +95,7 @@ def _blocks(field: GridField, grid: Grid, block: np.ndarray) -> list[mi.Float]:
 
 @symbolic
 def _mean(medium, field, grid, index, points: int, cut: bool):
-    """Means over points^3 positions in the voxels ``index``."""
+    """Return means of ``field`` over points^3 positions in the voxels ``index``, per channel."""
     corner, sides = mi.Point3f(*grid.voxel_indices(index)), [Divisor(points)] * 2
     points, count = dr.opaque(mi.Float, points), dr.opaque(mi.UInt32, points**3)
     sums = [dr.zeros(mi.Float, dr.width(index)) for _ in range(field.channels)]
@@ -108,8 +115,8 @@ def _mean(medium, field, grid, index, points: int, cut: bool):
 
 @symbolic
 def _extinction_weighted_albedo(medium, grid, index, parts: int, cut: bool):
-    """Means of the albedo over the voxels ``index``, weighted by extinction, by `RADAU` in so many
-    ``parts`` along each axis.
+    """Return means of the albedo over the voxels ``index``, weighted by extinction, with the
+    quadrature `RADAU` in ``parts`` parts along each axis.
     """
     channels = max(medium.albedo.channels, medium.sigma_t.channels)
     corner, sides = mi.Point3f(*grid.voxel_indices(index)), [Divisor(3 * parts)] * 2

@@ -2,17 +2,17 @@
 
 A batch consists of passes; a pass is a transport sweep of one ordinate set along tracks through all
 voxels (`tracks`). For all orders of scattering (``max_depth`` -1) the first pass of a batch solves
-by source iteration with multigrid and Anderson acceleration (`multigrid`); every other pass then
-sweeps the resulting source along ordinates of its own, so that their mean has little angular noise,
-and improves the source for the passes that follow. For a number of orders the first pass sweeps
-once for each but the last, and the others sweep the source that it leaves. For single scattering
-(``max_depth`` 2) there is one pass.
+by source iteration with multigrid and Anderson acceleration (`multigrid`). Every other pass sweeps
+the resulting source along different ordinates, so that the mean of the passes has little angular
+noise, and improves the source for the passes that follow. For a limited number of orders the first
+pass sweeps once for each order but the last, and the other passes sweep the source of the last
+order. For single scattering (``max_depth`` 2) there is one pass.
 
 Emission of the medium and small or point-like emitters are sampled voxel by voxel
 (`direct_emission`, `direct_light`).
 
-Batches have independent random numbers. The scatter of their results is the standard error of their
-mean, whatever the voxels and orders of scattering of one batch share.
+Batches have independent random numbers, so the standard error of their mean follows from the
+variance of their results, although the voxels and orders of scattering of a batch are correlated.
 """
 
 from __future__ import annotations
@@ -58,39 +58,41 @@ from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Ordinates of a batch, pairs of opposite ones, at least and at most. One even set of 32 has half
-#: the noise of two sets of 16, and one of 64 four fifths of that of two of 32.
+#: Minimum and maximum number of ordinates of a batch (in pairs of opposite ones). One even set of
+#: 32 has half the noise of two sets of 16, and one of 64 has 0.8 times the noise of two of 32.
 BATCH, LARGEST_BATCH = 32, 256
-#: Ordinates of a pass in multiple scattering, where a batch consists of several: the orders before
-#: the last are solved for with one such set.
+#: Number of ordinates of a pass in multiple scattering, where a batch has several passes: all
+#: orders but the last are solved for with one such set.
 DIRECTIONS = 16
-#: Unknowns of a channel (voxels, times moments) beyond which channels are swept one by one:
-#: together they take several times the memory.
+#: Number of unknowns of a channel (voxels times moments) above which channels are swept one by one,
+#: because sweeping them together takes several times the memory.
 MOST_SWEPT_TOGETHER = 1 << 24
-#: Relative change of the irradiance below which further orders of scattering are omitted, as single
-#: precision has it; tested every so many orders.
+#: Relative change of the irradiance below which further orders of scattering are omitted, about the
+#: resolution of single precision; number of orders between two tests of it.
 NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
 
 
 def swept_together(medium: MediumGrid, voxels: int, moments: int) -> bool:
-    """Whether all channels of a cache of so many ``voxels`` and angular ``moments`` (0: the
-    irradiance alone) are swept at once.
+    """Whether all channels of a cache with this number of ``voxels`` and of angular ``moments`` (0:
+    the irradiance alone) are swept at once.
     """
     unknowns = voxels * max(1, moments)
     return medium.sigma_t.channels == 1 and unknowns <= MOST_SWEPT_TOGETHER
 
 
 def batch_of(samples: int, multiple: int) -> int:
-    """The ordinates of a batch of a cache of so many: all of them, or equal parts if there are too
-    many, a multiple of ``multiple``. Each batch solves for all orders anew.
+    """Return the number of ordinates of a batch for a cache of ``samples`` ordinates.
+
+    It is all of them, or an equal part if they exceed `LARGEST_BATCH`, rounded up to a multiple of
+    ``multiple``. Batches should be large, because each one solves for all orders anew.
     """
     batches = -(-samples // LARGEST_BATCH)
     return -(-samples // (batches * multiple)) * multiple
 
 
 class Sweep:
-    """Fills ``cache``, which lies over ``medium``, by discrete ordinates (S_N) along long
-    characteristics, with source iteration, multigrid and Anderson acceleration.
+    """Fills the ``cache`` of ``medium`` by discrete ordinates (S_N) along long characteristics,
+    with source iteration, multigrid and Anderson acceleration.
     """
 
     #: ordinates of a pass in multiple scattering
@@ -105,7 +107,7 @@ class Sweep:
         rr_depth: int = 5,
         pause: Callable[[], None] = lambda: None,
     ) -> None:
-        """``rr_depth`` is that of paths between surfaces; ``pause`` is called after each launch."""
+        """``rr_depth`` applies to paths between surfaces; ``pause`` is called after each launch."""
         self.cache, self.seed = cache, seed
         self._illumination = DistantIllumination(scene, medium.emission is not None)
         if not cache.active_count:
@@ -119,21 +121,22 @@ class Sweep:
         if medium.refracts:
             self._sample_points = medium.boundary.drawn_inside(self._sample_points)
             dr.eval(self._sample_points)
-        #: mean of 1/r^2 over a voxel, over its value at the sample point, in multiple scattering:
-        #: what is scattered near a light is the mean over the voxel
+        #: mean of the inverse-square factor over a voxel, divided by its value at the sample point:
+        #: the source of multiple scattering near an emitter is a mean over the voxel
         self._inverse_square_mean = mi.Float(1)
         if cache.falloff is not None and cache.max_depth != 2:
             self._inverse_square_mean = cache.falloff.spread(cache.active)
             dr.eval(self._inverse_square_mean)
         #: direct lights of the cache by the identity of their irradiance
         self._known_lights = {id(light.irradiance): light for light in cache.direct_lights}
-        #: sampled voxel by voxel in a batch, from each point-like light and from area emitters, and
-        #: from the emission: irradiance, then moments, if they do not follow from the direction
+        #: results of sampling voxel by voxel in a batch: from each point-like emitter and from area
+        #: emitters, and from emission. Each is a list of the irradiance, and its moments unless
+        #: they follow from the direction
         self._direct: list[list[mi.Spectrum]] = []
         self._emission: list[list[mi.Spectrum]] = []
-        #: irradiance of suns that camera rays do not interpolate
+        #: irradiance of suns that are direct lights of the cache
         self._sun_irradiance: list[mi.Spectrum] = []
-        #: irradiance of all channels in units of the first one's
+        #: factors of the channels of a batch's results
         self._colour = np.ones(cache.channels)
         self._boundary: SurfaceBoundary | None = None
         self._emitter_sampling: EmitterSampling | None = None
@@ -146,7 +149,7 @@ class Sweep:
             self._prepare_surroundings(scene, rr_depth)
 
     def _prepare_surroundings(self, scene: mi.Scene, rr_depth: int) -> None:
-        """Prepare what traces rays among surfaces and other media."""
+        """Create the objects that trace rays among surfaces and other media."""
         medium, cache = self._medium, self.cache
         box = occupied_box(cache.grid, cache.active)
         known = [light.emitter for light in cache.direct_lights]
@@ -157,7 +160,7 @@ class Sweep:
         self._boundary = SurfaceBoundary(
             scene, medium, large, rr_depth, cache.directional, self._surfaces
         )
-        # What refracted radiance scatters first counts as a third order.
+        # Crossing glass is a vertex of a path: this source would not fit a limited max_depth.
         isotropic, all_orders = medium.phase.is_isotropic, cache.max_depth < 0
         if medium.refracts and isotropic and all_orders and is_needed(scene):
             self._boundary.carries_refracted = False
@@ -167,22 +170,24 @@ class Sweep:
         )
 
     def _prepare_tracks(self, pause: Callable[[], None]) -> None:
-        """The tracks of each channel of the extinction, and what multiple scattering needs."""
+        """Create the tracks for each channel of the extinction, and resample extinction and albedo
+        for multiple scattering.
+        """
         medium, cache, grid = self._medium, self.cache, self.cache.grid
         if medium.refracts:
-            # Tracks end at the glass: voxels that it cuts are not thinner for that.
+            # Tracks end at the glass, so the extinction of voxels that it cuts must not be reduced.
             medium = medium.replaced(boundary=Boundary("box", medium.boundary.to_world))
         detail = extinction_grid(medium, grid)
         extinction = resampled(medium, medium.sigma_t, detail)
         box = occupied_box(grid, cache.active)
-        # Matter in blocks of the medium's voxels, or in voxels of another orientation, may reach
-        # beyond the active voxels.
+        # The extinction of blocks of the medium's voxels, or of rotated voxels, may extend beyond
+        # the active voxels.
         data = medium.sigma_t.grid
         sparse = data is not None and detail.shape == data.shape and medium.fills(grid)
         rest = *box, detail, cache.active, sparse, pause, self._surfaces
         self._tracks = [Tracks(grid, sigma_t, *rest) for sigma_t in extinction]
         self._levels: dict[tuple[int, ...], MultigridLevel] = {}
-        # The albedo does not matter to single scattering here.
+        # Single scattering does not need the albedo here: lookups multiply by it.
         self._sigma_t = self._albedo = [mi.Float(0)]
         if cache.max_depth != 2 or self._surfaces is not None:
             if detail is not grid:
@@ -190,23 +195,23 @@ class Sweep:
             self._sigma_t = self._at_active(extinction)
             self._albedo = collision_albedo(medium, grid, cache.active)
             if self._surfaces is not None:
-                # Without it, corrections from coarser grids would leave traces of irradiance within
-                # objects, which lookups next to them take for that of their neighbours.
+                # Without this, corrections from coarser grids would leave small irradiance within
+                # objects, and lookups next to them would not replace it by that of neighbours.
                 enclosed = dr.gather(mi.Bool, cache.voxel_classes.enclosed, cache.active)
                 self._albedo = [dr.select(enclosed, 0, albedo) for albedo in self._albedo]
                 dr.eval(self._albedo)
 
     def use(self, scene: mi.Scene | None) -> None:
-        """Trace rays in this ``scene`` from now on, see `Solver.use`."""
+        """Set the scene in which rays are traced, see `Solver.use`."""
         if self.cache.active_count:
             for part in (self._surfaces, self._boundary, self._emitter_sampling):
                 if part is not None:
                     part.scene = scene
 
     def refine(self, samples: int, progress: Progress | None = None) -> None:
-        """Adds ``samples`` ordinates per voxel, a multiple of the cache's batch.
+        """Add ``samples`` ordinates per voxel, a multiple of the cache's batch.
 
-        If ``progress`` raises, batches that are complete stay in the cache.
+        If ``progress`` raises, complete batches remain in the cache.
         """
         cache = self.cache
         if not cache.active_count:
@@ -223,8 +228,8 @@ class Sweep:
     # A batch
 
     def _batch(self, number: int) -> tuple:
-        """Irradiance of both layers in all channels at the active voxels, and the moments if there
-        are any, as `IrradianceCache.add` takes it.
+        """Compute a batch: the irradiance of both layers in all channels at the active voxels, and
+        the moments if any, in the form that `IrradianceCache.add` takes.
         """
         cache, seed = self.cache, (self.seed, number)
         if self._medium.emission is not None:
@@ -235,7 +240,7 @@ class Sweep:
         for channels in self._channel_groups(grey):
             found += self._solve(sets(channels), channels)
         layers: list[list] = [[] for _ in range(len(LAYERS) + cache.moments)]
-        # Channels with one factor in common are one array.
+        # Channels with the same factor share one array.
         factors = {factor: dr.opaque(mi.Float, factor) for factor in map(float, colour)}
         for c in range(cache.channels):
             factor = factors[float(colour[c])]
@@ -247,8 +252,10 @@ class Sweep:
         return (*parts, tuple(chain(*moments))) if moments else tuple(parts)
 
     def _ordinate_sets(self, seed: tuple[int, int]) -> tuple[Callable, bool, np.ndarray]:
-        """The ordinate sets of all passes of a batch, as a function of the channels that are swept
-        together; whether all channels have the same result; and the factors (channels) of it.
+        """Create the ordinate sets of all passes of a batch.
+
+        Returns a function from the channels that are swept together to the sets; whether the
+        results of all channels are equal up to a factor; and these factors (channels).
         """
         cache, rng = self.cache, np.random.default_rng(seed)
         pairs, passes = cache.batch // 2, 1
@@ -277,11 +284,11 @@ class Sweep:
         return sets, grey, np.ones(cache.channels)
 
     def _first_pairs(self, pairs: int) -> int:
-        """Pairs of ordinates of the pass that finds the orders before the last, where other passes
-        have so many ``pairs``; 0 where there are no such orders.
+        """Return the number of pairs of ordinates of the first pass, which computes all orders but
+        the last; 0 if there are no such orders. Other passes have ``pairs``.
 
-        Few orders are found one by one with more ordinates, in about the time of all passes: later
-        passes do not reduce their noise.
+        If there are few orders, the first pass has more ordinates, as many as fit into about the
+        time of the other passes, because these do not reduce its noise.
         """
         orders = self.cache.max_depth - 2
         if orders <= 0:
@@ -289,7 +296,7 @@ class Sweep:
         return max(pairs, self.cache.batch // 2 // orders)
 
     def _channel_groups(self, grey: bool) -> list[tuple[int, ...]]:
-        """The channels that are swept together, of all or of the first one."""
+        """Return groups of channels that are swept together; only the first channel if ``grey``."""
         channels = range(1 if grey else self.cache.channels)
         if swept_together(self._medium, self.cache.grid.voxel_count, self.cache.moments):
             return [tuple(channels)]
@@ -300,8 +307,8 @@ class Sweep:
         sets: list[OrdinateSet] | list[BoundaryOrdinateSet],
         channels: tuple[int, ...],
     ) -> list[tuple]:
-        """For each channel the irradiance at the active voxels: uncollided, and scattered, if
-        wanted; then moments, if there are any.
+        """Return for each channel the irradiance at the active voxels: uncollided, and scattered
+        (None for single scattering), followed by the moments, if any.
         """
         if self.cache.max_depth == 2:
             tracks = self._tracks_of(channels)
@@ -309,7 +316,8 @@ class Sweep:
         level = self._level(channels)
         swept, uncollided = self._uncollided(level.tracks, sets[1:], channels)
         total = self._swept(level, sets, channels)
-        # Both layers with the same ordinates: under a constant environment their sum has no noise.
+        # Both layers use the same ordinates, so that their sum has no noise in a constant
+        # environment.
         scattered = [
             dr.maximum(dr.gather(mi.Float, total, place) - phi, 0)
             for place, phi in zip(self._interleaved_places(channels), swept, strict=True)
@@ -320,7 +328,7 @@ class Sweep:
     # Tracks and levels
 
     def _level(self, channels: tuple[int, ...]) -> MultigridLevel:
-        """The finest level, made when it is first asked for."""
+        """Return the finest level for these channels, created at the first call."""
         if channels not in self._levels:
             sigma_t, albedo = self._sigma_t, self._albedo
             self._levels[channels] = self._new_level(
@@ -331,7 +339,7 @@ class Sweep:
         return self._levels[channels]
 
     def _tracks_of(self, channels: tuple[int, ...]) -> Tracks:
-        """The tracks with the extinction of these channels."""
+        """Return the tracks with the extinction of these channels."""
         return self._tracks[min(channels[0], len(self._tracks) - 1)]
 
     def _new_level(self, sigma_t: mi.Float, albedo: mi.Float, tracks: Tracks) -> MultigridLevel:
@@ -346,8 +354,10 @@ class Sweep:
         sets: list[OrdinateSet] | list[BoundaryOrdinateSet],
         channels: tuple[int, ...],
     ) -> tuple[list[mi.Float], list[mi.Float]]:
-        """Uncollided irradiance in each channel: along tracks, the mean of all passes; and in all,
-        with that of emitters which are sampled voxel by voxel.
+        """Compute the uncollided irradiance in each channel.
+
+        Returns the part along tracks, the mean of all passes; and the total, including emitters
+        that are sampled voxel by voxel.
         """
         (arguments, *suns), share = sets[0].uncollided(sets), dr.opaque(mi.Float, 1 / len(sets))
         interpolated = swept = self._mean_irradiance(tracks, arguments, share, len(channels))
@@ -384,7 +394,7 @@ class Sweep:
     def _mean_irradiance(
         self, tracks: Tracks, arguments: tuple, share: mi.Float, channels: int
     ) -> list[mi.Float]:
-        """``share`` of `Tracks.uncollided` in each channel; channels may be the same array."""
+        """Return `Tracks.uncollided` times ``share`` per channel; channels may share an array."""
         count = self.cache.active_count
         if not len(arguments[0]):
             return [dr.zeros(mi.Float, count)] * channels
@@ -396,7 +406,7 @@ class Sweep:
         return [dr.gather(mi.Float, values, place + start) for start in starts]
 
     def _from_suns(self, channel: int) -> mi.Float | int:
-        """Irradiance of suns that is not interpolated, in units of the batch's colour."""
+        """Return the irradiance of suns among the direct lights over the channel's factor."""
         if not self._colour[channel] > 0:
             channel = int(self._colour.argmax())
         colour = dr.opaque(mi.Float, 1 / float(self._colour[channel]))
@@ -410,8 +420,8 @@ class Sweep:
         sets: list[OrdinateSet] | list[BoundaryOrdinateSet],
         channels: tuple[int, ...],
     ) -> mi.Float:
-        """Irradiance of all orders along tracks at the active voxels, the mean of all passes but
-        the first; channels are interleaved.
+        """Return the irradiance of all orders along tracks at the active voxels, the mean of all
+        passes but the first, with interleaved channels.
         """
         first, *sets = sets
         phi, total = self._irradiance_of_collisions(level, first, channels, len(sets)), mi.Float(0)
@@ -427,8 +437,8 @@ class Sweep:
                 dr.eval(phi)
         if self.cache.max_depth >= 0:
             return total * share
-        # The first passes used a noisier phi than the final one. Without this correction their
-        # noise would count three times as much as that of others.
+        # Earlier passes used a noisier phi than the final one. Without this correction the noise of
+        # the first pass would have three times the weight of the others'.
         change = phi - used * share
         if self._surfaces is None:
             ordinates = merged([each.scattering for each in sets])
@@ -444,8 +454,8 @@ class Sweep:
         channels: tuple[int, ...],
         passes: int,
     ) -> mi.Float:
-        """Mean irradiance of collisions, of all orders but the last, for so many further
-        ``passes``.
+        """Return the mean irradiance of collisions of all orders but the last, computed with the
+        set ``first``. ``passes`` is the number of passes that follow.
         """
         _, phi = first.sweep(level, None)
         phi = self._add_sampled(phi, channels)
@@ -453,13 +463,13 @@ class Sweep:
             return first.solve(level, phi, passes)
         for order in range(self.cache.max_depth - 3):
             before, phi = phi, self._add_sampled(first.sweep(level, phi)[1], channels)
-            # However many orders are asked for: once they are negligible, they need no sweeps.
+            # Omit further orders once they are negligible, whatever max_depth is.
             if order % CHECKED_ORDERS == CHECKED_ORDERS - 1 and _change(before, phi) < NEGLIGIBLE:
                 break
         return phi
 
     def _add_sampled(self, phi: mi.Float, channels: tuple[int, ...]) -> mi.Float:
-        """``phi`` and the irradiance of emitters which are sampled voxel by voxel."""
+        """Return ``phi`` plus the irradiance of emitters that are sampled voxel by voxel."""
         sampled = [sum(self._sampled(c)) for c in channels]
         if self._direct or self._emission:
             phi = phi + interleaved_channels(sampled)
@@ -467,8 +477,8 @@ class Sweep:
         return phi
 
     def _sampled(self, channel: int) -> list[mi.Float]:
-        """Irradiance at the active voxels from emitters which are sampled voxel by voxel, the mean
-        over each voxel.
+        """Return the irradiance from each emitter that is sampled voxel by voxel, as means over the
+        active voxels.
         """
         known = self._known_lights
         direct = [
@@ -480,9 +490,9 @@ class Sweep:
         return direct + [irradiance[channel] for irradiance, *_ in self._emission]
 
     def _with_known_lights(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
-        """Replace and complete ``direct`` by the irradiance that the cache's direct lights know.
+        """Replace and complete ``direct`` by the irradiance of the cache's direct lights.
 
-        ``direct`` is the irradiance of each point-like emitter, followed by that of others.
+        ``direct`` is the irradiance of each point-like emitter, followed by that of other emitters.
         """
         known = {id(d.emitter): [d.irradiance] for d in self.cache.direct_lights}
         lights = self._illumination.point_lights
@@ -492,13 +502,13 @@ class Sweep:
     # Arrays
 
     def _at_active(self, fields: list[mi.Float]) -> list[mi.Float]:
-        """The values at the active voxels."""
+        """Return the values of ``fields`` at the active voxels."""
         found = [dr.gather(mi.Float, field, self.cache.active) for field in fields]
         dr.eval(found)
         return found
 
     def _interleaved_places(self, channels: Sequence[int]) -> list[mi.UInt32]:
-        """Indices of each channel's values in an array with interleaved channels."""
+        """Return the indices of each channel's values in an array with interleaved channels."""
         place = dr.arange(mi.UInt32, self.cache.active_count) * len(channels)
         return [place + c for c in range(len(channels))]
 
@@ -506,7 +516,7 @@ class Sweep:
 def _surfaces_among(
     scene: mi.Scene, cache: IrradianceCache, medium: MediumGrid | None
 ) -> SurfaceVoxels | None:
-    """The voxels near surfaces, None where there are none in the box of the active voxels.
+    """Return the voxels near surfaces; None without surfaces in the box of the active voxels.
 
     ``medium`` is given if its boundary refracts.
     """
@@ -518,7 +528,7 @@ def _surfaces_among(
 
 
 def _change(before: mi.Float, after: mi.Float) -> float:
-    """The mean absolute change, relative to the mean."""
+    """Return the mean absolute change, relative to the mean."""
     change, scale = dr.sum(dr.abs(after - before)), dr.sum(dr.abs(after))
     dr.eval(change, scale)
     return float(change[0]) / max(float(scale[0]), 1e-30)

@@ -1,4 +1,4 @@
-"""Where tracks lie among the voxels: the record of each pair of ordinates."""
+"""Geometry of tracks relative to the voxels: computes the record of each pair of ordinates."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TRANSVERSE
 class TrackLayout:
     """The layout of tracks through a box of the voxels of a grid.
 
-    ``box`` is its first voxel and its size (x, y, z) in the grid of ``extinction``.
-    ``empty_strides`` are the steps of the flat index of the cells of empty space, and
-    ``first_extinction`` tells where the extinction of each axis begins in an array for all of them.
+    ``box`` is the first voxel and the size (x, y, z) of the box in the grid of ``extinction``.
+    ``empty_strides`` are the steps of the flat index of the cells of empty space;
+    ``first_extinction`` is the index of the first extinction value of each axis, if the values for
+    all axes are in one array.
     """
 
     def __init__(
@@ -40,8 +41,8 @@ class TrackLayout:
     def record(
         self, directions: np.ndarray, weights: np.ndarray, offsets: np.ndarray, by_slice: bool
     ) -> tuple[TrackRecord, np.ndarray, np.ndarray]:
-        """The record of pairs of opposite ordinates (see `Tracks.table`), their dominant axes (n),
-        and whether the first one of each pair runs along its axis (n).
+        """Return the record of pairs of opposite ordinates (see `Tracks.table`), their dominant
+        axes (n), and whether the first ordinate of each pair propagates along its axis (n).
         """
         # docs/primer, eq. (4.3)
         extinction = self.extinction
@@ -96,9 +97,11 @@ class TrackLayout:
         steps: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         last: np.ndarray,
     ) -> TransverseFields:
-        """Fields of n pairs with these dominant axes for the transverse axes ``k``: voxels by which
-        tracks move per slice, random shifts, steps of the four flat indices, and the coordinates
-        of the last extinction value.
+        """Return the fields of n pairs for the transverse axes ``k``.
+
+        ``axis`` are the dominant axes, ``slope`` the voxels by which tracks move per slice,
+        ``offset`` the random shifts, ``steps`` those of the four flat indices, and ``last`` the
+        coordinates of the last extinction value.
         """
         size = self.size
         slope = np.rint(slope * FIXED_POINT_ONE).astype(np.int64)
@@ -123,7 +126,9 @@ class TrackLayout:
         )
 
     def _strides(self, axis: np.ndarray, by_slice: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Strides (n, 3) of the swept volume and of the extinction for each dominant axis."""
+        """Return the strides (n, 3) of the swept volume and of the extinction for these dominant
+        axes.
+        """
         layouts = [slicewise(k) for k in range(3)]
         volume = [
             strides_of(self.extinction.grid.resolution, layout if by_slice else STANDARD)
@@ -136,7 +141,7 @@ class TrackLayout:
 
 
 def against_axis_last(incoming: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """Irradiance (n, 2, channels) that enters along each ordinate and its opposite, sorted: along
-    the dominant axis, and against it.
+    """Sort irradiance (n, 2, channels) along each ordinate and its opposite such that the first
+    value is along the dominant axis, and the second against it.
     """
     return np.where(forward[:, None, None], incoming, incoming[:, ::-1])

@@ -1,8 +1,8 @@
 """The record that a kernel reads for each pair of opposite ordinates.
 
-Named fields, packed into two arrays and read from them by this module alone. In a record that is
-packed each field is a NumPy array with a value for each pair; in one that is read, a Dr.Jit array
-with a value for each lane. Another set of ordinates is other data for the same kernels.
+Its named fields are packed into two arrays, and read from them, by this module alone. Before
+packing each field is a NumPy array with a value per pair; after reading it is a Dr.Jit array with a
+value per lane. Different sets of ordinates are different data for the same kernels.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: Positions within a voxel are integers below this (fixed point), so that a track can be followed
-#: back to its entry without rounding.
+#: Positions within a voxel are integers below FIXED_POINT_ONE (fixed point), so that a track can be
+#: traced back to its entry without rounding errors.
 FIXED_POINT_BITS = 24
 FIXED_POINT_ONE = 1 << FIXED_POINT_BITS
 
@@ -34,7 +34,7 @@ class TransverseFields:
     extinction_stride: Integer
     empty_stride: Integer
     voxel_stride: Integer
-    #: what a track moves by from slice to slice [voxels / `FIXED_POINT_ONE`]
+    #: transverse motion of a track per slice [voxels / `FIXED_POINT_ONE`]
     slope: Integer
     #: voxels by which tracks have moved before the first slice, modulo ``size``, and the position
     #: of all tracks within their voxels there
@@ -52,38 +52,36 @@ class TransverseFields:
 
 @dataclass
 class TrackRecord:
-    """Fields for a pair: those of both ``transverse`` axes, and those that follow, for the dominant
-    axis and for the pair as a whole.
-    """
+    """Fields for a pair: of both ``transverse`` axes, the dominant axis, and the whole pair."""
 
     transverse: tuple[TransverseFields, TransverseFields]
-    #: slices that tracks cross, and the one in which those against the axis begin: the last one of
-    #: the box of tracks
+    #: number of slices that tracks cross, and the slice in which tracks against the axis begin (the
+    #: last one of the box)
     slices: Integer
     last_slice: Integer
     stride: Integer
     extinction_stride: Integer
     empty_stride: Integer
     voxel_stride: Integer
-    #: flat indices of the box's first voxel in the swept volume, of what it reads of the
-    #: extinction, and of that voxel in the grid
+    #: flat indices of the first voxel of the box in the swept volume, in the extinction, and in the
+    #: grid
     first_value: Integer
     first_extinction: Integer
     first_voxel: Integer
     #: length of a track between two slices [scene units]
     length: Real
-    #: ordinate weight: the solid angle that each of the pair stands for [sr]
+    #: ordinate weight: the solid angle of each ordinate of the pair [sr]
     weight: Real
     #: extinction of one unit of the quantised values [1 / scene unit]
     quantum: Real
-    #: the ordinate that runs along the dominant axis, world space
+    #: the ordinate along the dominant axis, world space
     direction_x: Real
     direction_y: Real
     direction_z: Real
 
 
 def _paths(kind: str) -> list[tuple[int | None, str]]:
-    """The fields of a kind, in the order of memory: number of the transverse axis and name."""
+    """Return the fields of a kind in memory order, as (transverse axis or None, name)."""
     transverse = [f.name for f in fields(TransverseFields) if f.type == kind]
     own = [f.name for f in fields(TrackRecord) if f.type == kind]
     return [(axis, name) for axis in range(2) for name in transverse] + [(None, n) for n in own]
@@ -105,7 +103,7 @@ class PackedRecords:
         self._reals = mi.Float(packed(REALS).astype(np.float32).ravel())
 
     def read(self, pair: mi.UInt32) -> TrackRecord:
-        """The record of each ``pair``."""
+        """Read the record of each ``pair``."""
         values = {path: self._read_integer(pair, i) for i, path in enumerate(INTEGERS)}
         values |= {path: self._read_real(pair, i) for i, path in enumerate(REALS)}
 
@@ -115,11 +113,11 @@ class PackedRecords:
         return TrackRecord((TransverseFields(**of(0)), TransverseFields(**of(1))), **of(None))
 
     def weight(self, pair: mi.UInt32) -> mi.Float:
-        """The ordinate weight alone."""
+        """Read the ordinate weight alone."""
         return self._read_real(pair, REALS.index((None, "weight")))
 
     def direction(self, pair: mi.UInt32) -> mi.Vector3f:
-        """The ordinate along the dominant axis alone."""
+        """Read the ordinate along the dominant axis alone."""
         first = REALS.index((None, "direction_x"))
         return mi.Vector3f(*(self._read_real(pair, first + k) for k in range(3)))
 

@@ -1,4 +1,4 @@
-"""Tables of ordinates as kernels read them, and the boundary source of the tracks.
+"""Tables of ordinates in the form that kernels read, and the boundary source of the tracks.
 
 The boundary condition of the transport equation prescribes the radiance that enters the box of
 tracks. It is either the same for all tracks of an ordinate (suns, environments), part of the
@@ -22,12 +22,12 @@ TRANSVERSE = np.array([[1, 2], [0, 2], [0, 1]])
 
 
 class TrackGeometry:
-    """Where the tracks of n pairs of opposite ordinates lie.
+    """Geometry of the tracks of n pairs of opposite ordinates.
 
-    ``axis`` (n) is the dominant axis of each, ``forward`` (n) tells whether the first ordinate of
-    the pair runs along it, ``transverse`` (n, 2) are the other axes, and ``sizes`` (n, 3) the
-    voxels of the box along these two and along the dominant axis. ``slopes`` (n, 2) is what tracks
-    move by along the transverse axes from slice to slice, and ``starts`` (n, 2) their position
+    ``axis`` (n) is the dominant axis of each pair, ``forward`` (n) whether its first ordinate
+    propagates along that axis, ``transverse`` (n, 2) are the other axes, and ``sizes`` (n, 3) the
+    numbers of voxels of the box along these two and along the dominant axis. ``slopes`` (n, 2) are
+    the motions of tracks along the transverse axes per slice, and ``starts`` (n, 2) their positions
     within a voxel in the first slice [voxels].
     """
 
@@ -40,7 +40,7 @@ class TrackGeometry:
 
 
 class TrackTable:
-    """Pairs of opposite ordinates as kernels read them: other ordinates compile nothing.
+    """Pairs of opposite ordinates in the form that kernels read; new ordinates compile no kernels.
 
     ``incoming`` (n, 2, channels) is the irradiance that enters along the dominant axis and against
     it; a single channel stands for all.
@@ -50,7 +50,7 @@ class TrackTable:
         self, record: TrackRecord, incoming: np.ndarray, axis: np.ndarray, forward: np.ndarray
     ) -> None:
         self.geometry = TrackGeometry(axis, forward, record)
-        #: replaces ``incoming`` where that is not the same for all tracks of an ordinate
+        #: used instead of ``incoming`` if that differs between the tracks of an ordinate
         self.boundary_source: BoundarySource | None = None
         #: where tracks cross surfaces among the voxels, if there are any
         self.crossings: TrackCrossings | None = None
@@ -62,11 +62,13 @@ class TrackTable:
         self.by_axis = [(k, pairs) for k, pairs in found if pairs]
         self.pair_index = [dr.opaque(mi.UInt32, i) for i in range(len(axis))]
         self.order = [i for _, pairs in self.by_axis for i in pairs]
-        # One more, since kernels that read an array of a single value are different ones.
+        # One more value: arrays of a single value compile other kernels.
         self.ordered = mi.UInt32([*self.order, 0, 1])
 
     def incoming(self, pair: mi.UInt32, way: int, channels: int) -> list[mi.Float]:
-        """Irradiance in each of ``channels`` that enters along the axis (0) or against it (1)."""
+        """Read the irradiance that enters along the axis (``way`` 0) or against it (1), per
+        channel.
+        """
         first = (pair * 2 + way) * self.channels
         values = [dr.gather(mi.Float, self._incoming, first + c) for c in range(self.channels)]
         return values if self.channels == channels else values * channels
@@ -84,15 +86,15 @@ class PairGroup:
         return len(self.rows)
 
     def pair(self, number: mi.UInt32) -> mi.UInt32:
-        """The index in the table of a number in the group."""
+        """Return the index in the table of the pair with a ``number`` in the group."""
         return dr.gather(mi.UInt32, self.table.ordered, self._first + number)
 
     def weight(self, number: mi.UInt32) -> mi.Float:
-        """The ordinate weight of a number in the group."""
+        """Return the ordinate weight of the pair with a ``number`` in the group."""
         return self.table.records.weight(self.pair(number))
 
     def direction(self, number: mi.UInt32) -> mi.Vector3f:
-        """The ordinate that runs along the dominant axis, world space."""
+        """Return the ordinate along the dominant axis (world space) of a ``number``."""
         return self.table.records.direction(self.pair(number))
 
 
@@ -107,41 +109,41 @@ class TrackCrossings:
         records: mi.Float,
         sources: mi.UInt32,
     ) -> None:
-        """``number`` is 1 + the place of each voxel of the grid among those near surfaces, 0 for
-        others; ``first`` (n) the index in ``slots`` of the first of these voxels for each pair.
-        ``slots`` has 1 + the index of the crossing in ``records`` and ``sources``, 0 where there is
-        none.
+        """``number`` holds, for each voxel of the grid, 1 + its index among the voxels near
+        surfaces, 0 for others. ``first`` (n) is the index in ``slots`` of the first of these voxels
+        for each pair. ``slots`` hold 1 + the index of a crossing in ``records`` and ``sources``, 0
+        without a crossing.
         """
         self._number, self._slots = number, slots
         self._records, self._sources = records, sources
-        # One more, since kernels that read an array of a single value are different ones.
+        # One more value: arrays of a single value compile other kernels.
         self._first = mi.UInt32([*first.tolist(), 0, 0])
 
     def first(self, pair: mi.UInt32) -> mi.UInt32:
-        """What `slot` needs for each pair."""
+        """Return the argument ``first`` of `slot` for each pair."""
         return dr.gather(mi.UInt32, self._first, pair)
 
     def slot(self, first: mi.UInt32, voxel: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        """1 + the index of the crossing in a voxel of the grid; 0 without one."""
+        """Return 1 + the index of the crossing in a voxel of the grid; 0 without one."""
         number = dr.gather(mi.UInt32, self._number, voxel, active)
         return dr.gather(mi.UInt32, self._slots, first + number - 1, active & (number > 0))
 
     def record(self, slot: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
-        """The record of the crossing with this `slot`."""
+        """Return the record of the crossing with this `slot`, see `SurfaceCrossings`."""
         return dr.gather(mi.Vector4f, self._records, slot - 1, active)
 
     def source_voxels(self, slot: mi.UInt32, active: mi.Bool) -> mi.Vector2u:
-        """The voxels of the grid whose source applies to the parts of the crossing."""
+        """Return the voxels of the grid whose source applies to the parts before and behind."""
         return dr.gather(mi.Vector2u, self._sources, slot - 1, active)
 
 
 class BoundarySource:
     """Irradiance (radiance times solid angle) that enters the box, track by track.
 
-    A track is identified by the two coordinates at which it passes the first slice, or would if it
-    did not enter the box behind it. These coordinates, scaled and shifted, fall into cells, each
-    with two of the ``values``: along the dominant axis and against it. The values of all
-    ``channels`` follow each other.
+    A track is identified by its two coordinates in the first slice, extrapolated if it enters the
+    box later. These coordinates, scaled and shifted, determine a cell, which has two of the
+    ``values``: along the dominant axis and against it. The values of the ``channels`` are stored
+    one channel after the other.
     """
 
     def __init__(
@@ -152,9 +154,10 @@ class BoundarySource:
         channels: int = 1,
         first_crossing: int | None = None,
     ) -> None:
-        """``transforms`` (n, 5): scale, shifts (2) and slopes (2) of the tracks of each pair;
-        ``cells`` (n, 3): index of the first value, and the number of cells along both axes. Those
-        of crossing 0 among the voxels would be at ``first_crossing`` (None: no values of these).
+        """``transforms`` (n, 5) are scale, shifts (2) and slopes (2) of the tracks of each pair;
+        ``cells`` (n, 3) the index of the first value, and the numbers of cells along both axes.
+        ``first_crossing`` is the index of the values of crossing 0 with surfaces among the voxels
+        (None: no such values); it may be negative, modulo 2^32, in a part of the table.
         """
         self._first_crossing = None
         if first_crossing is not None:
@@ -164,20 +167,22 @@ class BoundarySource:
         self.values, self.channels = values, channels
 
     def read_pair(self, pair: mi.UInt32) -> list:
-        """What `irradiance` needs for each pair."""
+        """Return the argument ``pair`` of `irradiance`."""
         transform = [dr.gather(mi.Float, self._transforms, pair * 5 + i) for i in range(5)]
         return transform + [dr.gather(mi.UInt32, self._cells, pair * 3 + i) for i in range(3)]
 
     def channel_offsets(self) -> list[mi.UInt32]:
-        """Where the values of each channel but the first begin."""
+        """Return the index of the first value of each channel but the first."""
         count = dr.width(self.values) // self.channels
         return [dr.opaque(mi.UInt32, c * count) for c in range(1, self.channels)]
 
     def irradiance(
         self, pair: list, offsets: list, way: int, slice_: mi.Int32, at: tuple, active: mi.Bool
     ) -> list[mi.Float]:
-        """Irradiance that enters along tracks which are in a slice ``at`` these voxels and
-        positions within them (b, c, position_b, position_c).
+        """Return the irradiance that enters along tracks, per channel.
+
+        The tracks are in the slice ``slice_``, ``at`` these voxels and positions within them (b, c,
+        position_b, position_c).
         """
         scale, shift_b, shift_c, slope_b, slope_c, first, nb, nc = pair
         ib, ic, fb, fc = at
@@ -192,7 +197,7 @@ class BoundarySource:
     def from_surface(
         self, slot: mi.UInt32, offsets: list, way: int, active: mi.Bool
     ) -> list[mi.Float]:
-        """Irradiance that leaves a surface among the voxels along the tracks behind it."""
+        """Return the irradiance along tracks that leave a surface among the voxels."""
         if self._first_crossing is None:
             return [mi.Float(0)] * self.channels
         return self._read(self._first_crossing + (slot - 1) * 2 + way, offsets, active)

@@ -10,12 +10,12 @@ through the opposite side, and begins at the exact point of entry, between two s
 Along a track the extinction is interpolated bilinearly in every slice and linearly from slice to
 slice; the source is that of the track's voxel. On a grid that is coarser or finer than the
 medium's, the values across the tracks are still those of the medium, and each half of a slice has
-its own mean. If they were resampled to the grid first and interpolated again, matter would become
-wider and shadows darker: on a CT head at twice its resolution, by 1 % of the irradiance in the air
-and 5 % in the skin.
+its own mean. If they were first resampled to the grid and then interpolated again, objects would
+become wider and shadows darker: on a CT head at twice its resolution, by 1 % of the irradiance in
+the air and 5 % in the skin.
 
-Each launch sweeps an ordinate and its opposite along the same tracks: two independent chains of
-arithmetic, and odd parts of what is integrated over directions cancel.
+Each launch sweeps an ordinate and its opposite along the same tracks: these are two independent
+chains of arithmetic, and odd parts of the integrand over directions cancel.
 
 Long characteristics: Askew, *A characteristics formulation of the neutron transport equation in
 complicated geometries*, AEEW-M 1108, 1972. The kernel is in `kernel`, the extinction as it reads it
@@ -51,25 +51,25 @@ from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
 from mitsuba_irrcache.solvers.discrete_ordinates.track_layout import TrackLayout, against_axis_last
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup, TrackTable
 
-#: Share of second differences that turns means over cross sections of voxels into values at their
-#: centres: a mean over a unit square smooths with variance 1/12 along both axes, and the Taylor
-#: expansion takes back half of it.
+#: Factor of second differences that converts means over cross sections of voxels to values at their
+#: centres: a mean over a unit square smooths with variance 1/12 along both axes, whose effect is
+#: half of that times the second derivative (Taylor expansion).
 SECOND_DIFFERENCE = 1 / 24
-#: Up to so many voxels one launch sweeps all ordinates, each into a copy of the volume, and the
-#: copies are added in a fixed order: atomic sums would differ in their last bits each time.
+#: Number of voxels up to which one launch sweeps all ordinates, each into a copy of the volume. The
+#: copies are added in a fixed order, because atomic sums are not reproducible.
 SMALL_GRID = 40**3
-#: Voxels of all copies together, at most: 64 MB where there is a source.
+#: Maximum number of voxels of all copies together: 64 MB with a source.
 MAX_COPIED_VOXELS = 1 << 22
 
 
 class Tracks:
     """Tracks through the voxels of ``grid`` between ``lower`` and ``upper`` (x, y, z).
 
-    ``sigma_t`` holds the extinction [1/scene unit] at all voxels of ``extinction_grid``, a grid
-    over the same box (None: the same grid). Results are found at the voxels ``active`` (flat
-    indices; None: all). Where these contain all matter, ``sparse`` lets sweeps skip the empty space
-    between them, if that saves time. ``pause`` is called after every launch (see
-    `CacheBuilder.pause`). ``surfaces`` are the voxels near surfaces, if any.
+    ``sigma_t`` is the extinction [1/scene unit] at all voxels of ``extinction_grid``, a grid over
+    the same box (None: the same grid). Results are computed at the voxels ``active`` (flat indices;
+    None: all). ``sparse`` states that the extinction is 0 in all other voxels, so that sweeps may
+    skip empty space. ``pause`` is called after every launch (see `CacheBuilder.pause`).
+    ``surfaces`` are the voxels near surfaces, None without any.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Tracks:
         )
 
     def active_index(self, voxels: mi.UInt32) -> mi.UInt32:
-        """Where these voxels are among the active ones; for others, the number of active voxels."""
+        """Return the indices of voxels among the active ones; ``active_count`` for others."""
         if self.all_active:
             return voxels
         if self._active_index is None:
@@ -134,10 +134,10 @@ class Tracks:
         offsets: np.ndarray,
         by_slice: bool = False,
     ) -> TrackTable:
-        """The table of pairs of opposite ordinates that kernels read.
+        """Create the table of pairs of opposite ordinates that kernels read.
 
         Args:
-            directions: (n, 3), in which radiance travels, world space, unit length.
+            directions: (n, 3), directions of propagation, world space, unit length.
             incoming: (n, 2) or (n, 2, channels), irradiance that enters the box along an ordinate
                 and along its opposite: radiance times solid angle.
             weights: (n), ordinate weights for radiance that voxels emit or scatter [sr].
@@ -155,9 +155,11 @@ class Tracks:
         offsets: np.ndarray,
         boundary_source: Callable | None = None,
     ) -> mi.Float:
-        """Uncollided irradiance at the centres of the active voxels, from radiance that enters
-        along pairs of ordinates: ``incoming``, as in `table`, or, track by track, what
-        ``boundary_source`` makes of the table (`BoundarySource`). Channels follow each other.
+        """Compute the uncollided irradiance at the centres of the active voxels.
+
+        The radiance that enters along pairs of ordinates is ``incoming``, as in `table`, or the
+        `BoundarySource` that ``boundary_source(table)`` returns. The result has the values of one
+        channel after the other.
         """
         table = self.table(directions, incoming, np.zeros(len(incoming)), offsets, by_slice=True)
         table.boundary_source = boundary_source(table) if boundary_source is not None else None
@@ -183,11 +185,11 @@ class Tracks:
     def sweep(self, volume: mi.Float, table: TrackTable) -> None:
         """Sweep radiance that voxels emit or scatter, and that enters from outside.
 
-        ``volume`` holds four values for each voxel: its source S (radiance per optical depth), and
-        three that are added to: its irradiance; the radiance lost in it, the integral of L - S over
-        optical depth and directions; and the integral of 1, W. S plus the mean loss, loss / W, is
-        the mean radiance *of collisions*: scattering it conserves energy exactly, cell by cell.
-        Of several channels, a voxel has those four values of each in turn.
+        ``volume`` has four values per voxel: its source S (radiance per optical depth), and three
+        sums: its irradiance; the radiance lost in it, the integral of L - S over optical depth and
+        directions; and the integral of 1, W. S plus the mean loss, loss / W, is the mean radiance
+        *of collisions*: scattering it conserves energy exactly in every voxel. With several
+        channels, a voxel has these four values for each channel in turn.
         """
         if self.one_launch:
             self._sweep_copies(volume, True, table, table.order)
@@ -202,14 +204,13 @@ class Tracks:
         channels: int = 1,
         collisions: bool = False,
     ) -> Iterator[tuple[int, PairGroup, mi.Float]]:
-        """Sweep groups of pairs, and yield for each its dominant axis and what its ordinates leave
-        in the voxels: volumes one after the other, two for each pair, along the axis and against
-        it.
+        """Sweep groups of pairs; yield the dominant axis, the group, and the results of each.
 
-        With ``source``, which makes such volumes of what voxels emit, these have the four values of
-        `sweep` for each voxel and channel, or the two of ``collisions`` (see `SweptVolume`), which
-        are undefined where no track is; else one, irradiance, laid out by slices. Channels of a
-        voxel are next to each other.
+        The results of a group are consecutive volumes, two per pair, along the axis and against it.
+        ``source(group)`` returns volumes of the radiance that voxels emit or scatter. With a
+        source, results have the four values of `sweep` per voxel and channel, or the two of
+        ``collisions`` (see `SweptVolume`), which are undefined where there is no track; without,
+        they have one value, irradiance, laid out by slices. Channels of a voxel are adjacent.
         """
         values, width = self.grid.voxel_count * channels, (2 if collisions else 4) if source else 1
         most = max(1, MAX_COPIED_VOXELS * 4 // (2 * values * width))
@@ -237,10 +238,10 @@ class Tracks:
                 yield axis, group, copies
 
     def _medium(self, axis: int, has_source: bool) -> SweptMedium:
-        """The extinction for tracks along ``axis``, and empty space.
+        """Return the extinction for tracks along ``axis``, and empty space.
 
-        Without a source, a track finds the row above it in a processor's cache, and rows of corners
-        suffice; sweeps with a source would have replaced it there by their wider volumes.
+        Without a source, the row of values above a track is still in the processor's cache, so that
+        rows are stored only once. With a source, the wider volumes would have evicted it.
         """
         by_rows = not has_source and not self.one_launch
         words = self._extinction.layout.words(has_source, by_rows)
@@ -272,8 +273,9 @@ class Tracks:
     def _sweep_copies(
         self, values: mi.Float, has_source: bool, table: TrackTable, pairs: list[int]
     ) -> None:
-        """The same in one launch, or few, each pair into a copy; the ``pairs``, of any axes, follow
-        each other in the table's order.
+        """Sweep as `_sweep_axis` in one or a few launches, each pair into a copy of the volume.
+
+        The ``pairs``, of any axes, are consecutive in the table's order.
         """
         kind, width = (mi.Vector4f, 4) if has_source else (mi.Float, 1)
         voxels = dr.width(values) // width  # of all channels
@@ -295,7 +297,7 @@ class Tracks:
             self.pause()
 
     def _channels(self, values: mi.Float, has_source: bool) -> int:
-        """How many channels a swept volume has."""
+        """Return the number of channels of a swept volume."""
         return dr.width(values) // (self.grid.voxel_count * (4 if has_source else 1))
 
 
@@ -311,13 +313,13 @@ def values_at_centres(
     begin: mi.UInt32 | int = 0,
     cut: mi.Bool | None = None,
 ) -> mi.Float:
-    """Values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y, z), from
-    ``means`` over the cross sections of all voxels across ``axis``.
+    """Return values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y,
+    z), given ``means`` over the cross sections of all voxels across ``axis``.
 
     Tracks with a random shift sample a voxel's cross section uniformly; second differences along
-    both transverse axes take back the smoothing. Results are never negative. ``means``, laid out by
-    slices from ``begin`` on, have several ``channels``, of which one is taken. Voxels ``cut`` by
-    surfaces, and their neighbours, have no second differences.
+    both transverse axes undo the smoothing. Results are never negative. ``means`` are laid out by
+    slices, starting at ``begin``, with several ``channels``, of which ``channel`` is used. Second
+    differences are omitted in voxels ``cut`` by surfaces, and next to them.
     """
     # docs/primer, eq. (4.5)
     places, strides = grid.voxel_indices(index), strides_of(grid.resolution, slicewise(axis))

@@ -28,12 +28,14 @@ def contributions(
     rr_depth: mi.UInt32,
     excluded: Sequence[mi.EmitterPtr] = (),
 ) -> list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]:
-    """One sample per lane of the incident radiance at ``position``, in the medium ``pointer``:
-    directions towards its origin, and the uncollided and scattered irradiance from there. The sum
-    is an unbiased estimate of the irradiance; moments of the radiance follow from the directions.
+    """Take one sample per lane of the incident radiance at ``position``, in the medium ``pointer``.
+
+    Returns tuples of the direction towards the origin of the radiance, and its uncollided and
+    scattered irradiance. Their sum is an unbiased estimate of the irradiance; moments of the
+    radiance follow from the directions.
 
     ``spread`` are four uniform numbers for the directions. Radiance directly from the emitters
-    ``excluded`` is left out.
+    ``excluded`` is not included.
     """
     vertex, always = dr.zeros(mi.Interaction3f), mi.Bool(True)
     vertex.p = position
@@ -54,8 +56,10 @@ def contributions(
 
 
 def estimate(directional: AngularBasis | None, *args: object) -> list[mi.Spectrum]:
-    """One sample of the irradiance, uncollided and scattered, and of the moments of the radiance if
-    the medium is ``directional``; the others are the arguments of `contributions`.
+    """Take one sample of the irradiance, uncollided and scattered, and of the moments of the
+    radiance if there is an angular basis ``directional``.
+
+    ``args`` are the arguments of `contributions`.
     """
     found = contributions(*args)
     layers = [sum(f[1] for f in found), sum(f[2] for f in found)]

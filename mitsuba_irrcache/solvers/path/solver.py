@@ -35,13 +35,14 @@ from mitsuba_irrcache.solvers.path import estimator as volume_path
 from mitsuba_irrcache.transport.path import Media
 from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 
-#: Paths in one kernel launch: enough to fill any machine, few enough to bound memory (about 100
-#: bytes each).
+#: Number of paths in one kernel launch: enough to occupy any machine, few enough to bound memory
+#: (about 100 bytes per path).
 LANES = 1 << 21
 
-#: Samples of all voxels together by default, without and among surfaces, where each is more work,
-#: and behind glass, where emitters are found by chance: with 2^22 the error of jade under an
-#: environment map was 2.4 %. And samples per voxel, at least and at most.
+#: Default number of samples of all voxels together: without surfaces, among surfaces, where each
+#: sample is more expensive, and behind glass, where paths hit emitters by chance (with 2^22 the
+#: error of jade under an environment map was 2.4 %). Minimum and maximum number of samples per
+#: voxel.
 PATHS, PATHS_AMONG_SURFACES, PATHS_BEHIND_GLASS = 2**24, 2**22, 2**23
 FEWEST_SAMPLES, MOST_SAMPLES = 16, 256
 
@@ -53,8 +54,8 @@ class PathSolver(Solver):
     name = "path"
     #: last, since it supports all scenes
     precedence = 100
-    #: Its noise in smaller voxels would exceed the error of larger ones, and its work grows with
-    #: their number; among surfaces the number of paths does not depend on that of the voxels.
+    #: The noise of smaller voxels would exceed the error of larger ones, and the work grows with
+    #: their number; among surfaces the number of paths does not depend on the number of voxels.
     size_rule = SizeRule(
         target_error=1.0,
         fewest=16,
@@ -232,7 +233,7 @@ class Opening(Preview):
 
 
 class _Estimator:
-    """Estimates of batches, by one kernel for all passes, whose differing parameters are opaque."""
+    """Estimates batches, with one kernel for all passes: parameters that differ are opaque."""
 
     def __init__(self, task: SolverTask) -> None:
         scene, medium, cache = task.scene, task.medium, task.cache
@@ -375,7 +376,7 @@ class _Estimator:
         return uncollided, scattered
 
     def seconds(self, samples: int) -> float:
-        """Predict the time for ``samples`` from one batch at voxels all over the medium."""
+        """Predict the duration [s] of ``samples`` from one batch at voxels all over the medium."""
         count = self.cache.active_count
         voxels = dr.arange(mi.UInt32, min(count, _lanes(self.cache) // 256))
         voxels = voxels * dr.opaque(mi.UInt32, max(1, count // dr.width(voxels)))
