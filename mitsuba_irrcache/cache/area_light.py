@@ -59,6 +59,12 @@ POSITIONS = 64
 #: interpolated.
 MOST_LIGHTS, MOST_VALUES, VALUES = 8, 14 << 24, 14
 
+#: Lines from a position to an emitter whose lengths in the medium divide optical depths: that to
+#: the closest point, those to several points, or none.
+CLOSEST, SEVERAL, NONE = LINES = ("closest", "several", "none")
+#: Coordinates of Gauss-Legendre quadrature over [0, 1] with two points.
+GAUSS_LEGENDRE = (0.5 - 0.28867513, 0.5 + 0.28867513)
+
 
 class AreaLight(DirectLight):
     """The irradiance of an area emitter at the voxels of a grid, and its factors for lookups."""
@@ -87,7 +93,9 @@ class AreaLight(DirectLight):
         self._edges = classes.cut_cells if classes is not None else None
         samples = PEAK_SAMPLES if medium.phase.forward else PHASE_SAMPLES
         self._phase_samples = dr.opaque(mi.UInt32, samples)
-        self._follows_closest_line = True
+        self._lines = CLOSEST
+        #: points that represent the emitter for mean lengths
+        self._places = _places_on(self._shape)
         super().__init__(scene, emitter, medium, grid, voxels, classes)
         self.maximum = 2 * dr.pi * max(float(c[0]) for c in self._radiance)
 
@@ -103,20 +111,23 @@ class AreaLight(DirectLight):
         return self._edges.corrected(self._others, p, passed, mi.Bool(active))
 
     def length(self, p: mi.Point3f) -> mi.Float:
-        """Return the length in the medium of the line to the closest point of the emitter, or 1.
+        """Return the length in the medium of the line to the closest point of the emitter, the mean
+        length of lines to several points, or 1.
 
-        The optical depth divided by that length is smooth next to the emitter and to the face
-        through which its radiance enters. Where lines to different points leave through different
-        faces, the optical depth itself is smoother, and this returns 1. `_extinction` chooses the
-        alternative with the smaller error.
+        The optical depth divided by a length is smooth next to the emitter and to the face through
+        which its radiance enters. Where lines to different points leave through different faces,
+        the mean length or the optical depth itself may be smoother. `_extinction` chooses the
+        alternative with the smallest error.
         """
-        if not self._follows_closest_line:
+        if self._lines == NONE:
             return dr.full(mi.Float, 1, dr.width(p))
-        return self._closest_length(p)
+        if self._lines == CLOSEST:
+            return self._length_to(p, self._solid_angle.closest(p))
+        return sum(self._length_to(p, place) for place in self._places) * (1 / len(self._places))
 
-    def _closest_length(self, p: mi.Point3f) -> mi.Float:
-        """Return the length in the medium of the line to the closest point of the emitter."""
-        offset = self._solid_angle.closest(p) - p
+    def _length_to(self, p: mi.Point3f, place: mi.Point3f) -> mi.Float:
+        """Return the length in the medium of the line to a ``place`` on the emitter."""
+        offset = place - p
         distance = dr.norm(offset)
         direction = dr.select(distance > 0, offset / distance, mi.Vector3f(0, 0, 1))
         return self._length_within(p, direction, distance)
@@ -131,14 +142,14 @@ class AreaLight(DirectLight):
         self, scene: mi.Scene, depth: mi.Float | mi.Color3f, classes: VoxelClasses | None
     ) -> GridField:
         """Create the field as in the base class, with the `length` that has the smaller error."""
-        by_length = self.extinction = super()._extinction(scene, depth, classes)
-        if _is_inside(self._shape, self._medium):
-            return by_length
-        error = self._depth_error(scene)
-        self._follows_closest_line = False
-        by_depth = self.extinction = super()._extinction(scene, depth, classes)
-        self._follows_closest_line = error < self._depth_error(scene)
-        return by_length if self._follows_closest_line else by_depth
+        fields, errors = {}, {}
+        for self._lines in LINES:
+            fields[self._lines] = self.extinction = super()._extinction(scene, depth, classes)
+            if _is_inside(self._shape, self._medium):
+                return self.extinction
+            errors[self._lines] = self._depth_error(scene)
+        self._lines = min(errors, key=errors.get)
+        return fields[self._lines]
 
     def _depth_error(self, scene: mi.Scene) -> float:
         """Estimate the relative error of the irradiance due to interpolated optical depths.
@@ -225,7 +236,7 @@ class AreaLight(DirectLight):
         """
         first, second = (dr.reinterpret_array(mi.UInt32, v) for v in (p.x + p.y, p.z))
         rng = random_stream(mi.sample_tea_32(first, second))
-        length, depth = self._closest_length(p), self.depth(p)
+        length, depth = self._length_to(p, self._solid_angle.closest(p)), self.depth(p)
         depth = depth if isinstance(depth, mi.Float) else channel_mean(depth)
         mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
         return self._mean_residual(basis, p, direction, mean, self._phase_samples, rng, peak_depth)
@@ -420,6 +431,14 @@ def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:
     rng = np.random.default_rng(POSITIONS)
     sample = mi.Point2f(np.float32(rng.random((2, POSITIONS))))
     return bool(dr.any(medium.contains(shape.sample_position(0.0, sample).p)))
+
+
+def _places_on(shape: mi.Shape) -> list[mi.Point3f]:
+    """Return four points of a shape, those of a product rule for a rectangle."""
+    samples = [mi.Point2f(u, v) for u in GAUSS_LEGENDRE for v in GAUSS_LEGENDRE]
+    places = [shape.sample_position(0.0, sample).p for sample in samples]
+    dr.make_opaque(places)
+    return places
 
 
 def _radiance(emitter: mi.Emitter) -> mi.Spectrum:

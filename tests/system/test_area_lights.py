@@ -150,6 +150,45 @@ def test_points_on_emitters_increase_with_the_samples(scenes):
 
 
 @pytest.mark.usefixtures("mono")
+def test_coarse_dense_data_beside_an_emitter():
+    """Where lines to an emitter leave dense data of few voxels through several faces, defaults are
+    within 3 % of fine voxels everywhere; without the mean length of these lines it was 5 %.
+    """
+    density = np.random.default_rng(5).random((4, 4, 4)) ** 8 + 1e-4
+    density[1, 2, 1] = 1
+    look = mi.ScalarTransform4f().look_at([1.5, 2, 1], [0, 0, 0], [0, 1, 0]).scale(0.4)
+    camera = mi.ScalarTransform4f().look_at([2.6, 2.2, 3.6], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}
+    grid = {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid((7.5 * density)[..., None].astype(np.float32)),
+        "to_world": mi.ScalarTransform4f().translate(-1).scale(2),
+    }
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 35, "to_world": camera, "film": film},
+        "cube": {
+            "type": "cube",
+            "bsdf": {"type": "null"},
+            "interior": {"type": "heterogeneous", "sigma_t": grid, "albedo": 0.8},
+        },
+        "lamp": {
+            "type": "rectangle",
+            "to_world": look,
+            "emitter": {"type": "area", "radiance": 10.0},
+        },
+    }
+
+    def image(**settings: int) -> np.ndarray:
+        integrator = {"type": "irrcache", "solver": "sweep", "max_depth": 2} | settings
+        found = np.array(mi.render(mi.load_dict(scene | {"integrator": integrator}), spp=64))
+        return found[..., 0].reshape(12, 2, 12, 2).mean(axis=(1, 3))
+
+    expected = image(resolution=128)
+    assert np.abs(image() - expected).max() < 0.03 * expected.mean()
+
+
+@pytest.mark.usefixtures("mono")
 def test_occluded_emitter(scenes):
     """An object in front of an emitter casts its shadow into the medium."""
     settings = {"solver": "path", "resolution": 24}
