@@ -1,4 +1,4 @@
-"""From derivatives of an objective by the pixels to those by the parameters of the scene."""
+"""Propagate derivatives of an objective with respect to pixels back to the scene's parameters."""
 
 from __future__ import annotations
 
@@ -65,12 +65,14 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
 
 
 class ParameterAdjoint:
-    """Derivatives by the parameters ``keys`` of ``scene`` of objectives of its images, in the types
-    of these parameters: what camera rays depend on straight, view by view, and what the irradiance
-    depends on, for all views at once.
+    """Derivatives of objectives of images with respect to the parameters ``keys`` of ``scene``.
 
-    ``part`` is the scene's only medium, with its cache; ``image`` are its camera rays and the
-    integrator's properties ``step`` and ``emission``; the ordinates depend on ``seed``.
+    They have the types of these parameters, and are the sum of two terms: `view`, at a fixed
+    irradiance, for each view; and `transport`, through the irradiance, once for all views.
+
+    ``part`` is the scene's only medium, with its cache; ``image`` holds the camera rays of the
+    scene and the integrator's properties ``step`` and ``emission``; ``seed`` determines the
+    ordinates.
     """
 
     def __init__(
@@ -92,8 +94,9 @@ class ParameterAdjoint:
         self._emitters = EmitterAdjoint(scene, emitters)
 
     def view(self, film: FilmAdjoint) -> tuple[dict[str, object], list[mi.Float] | None]:
-        """Derivatives of the objective whose derivatives by the pixels ``film`` has, at a given
-        irradiance; and the adjoint fluence that its camera rays leave, None without a cache.
+        """Return the derivatives of the objective of one view at fixed irradiance, and the adjoint
+        fluence that the camera rays deposit per channel, None without a cache. ``film`` holds the
+        derivatives with respect to the pixels.
         """
         if film.largest == 0:
             return {}, None
@@ -101,8 +104,8 @@ class ParameterAdjoint:
         return self._by_parameters(found), fluence
 
     def transport(self, fluence: list[mi.Float]) -> dict[str, object]:
-        """Derivatives of the objective by way of the irradiance, given the sum of the adjoint
-        ``fluence`` of all views.
+        """Return the derivatives of the objective through the irradiance, given the adjoint
+        ``fluence`` summed over all views.
         """
         return self._by_parameters(self._adjoint.transported(fluence))
 
@@ -146,8 +149,9 @@ def _check_emission(part: CachedMedium, of_medium: dict[str, str]) -> None:
 
 
 def by_parameter(value: object, field: Field, grad: mi.Float) -> mi.Float:
-    """The derivative by a parameter's ``value`` from that by the ``field`` made of it: grids have a
-    scale, and in monochromatic variants the luminance of coloured data.
+    """Return the derivative with respect to a parameter's ``value``, given the derivative ``grad``
+    with respect to the ``field`` computed from it: grids have a scale, and monochromatic variants
+    store the luminance of coloured data.
     """
     if field.grid is None:
         return grad * dr.opaque(mi.Float, field.scale)

@@ -1,8 +1,9 @@
-"""Derivatives by the radiance of emitters, on which images depend linearly.
+"""Derivatives with respect to the radiance of emitters, on which images depend linearly.
 
-What enters the medium along each ordinate, and reaches the camera past it, is worth its adjoint
-radiance there. Mitsuba's own emitters carry these derivatives on to their parameters: they are
-evaluated once more, with derivatives, for the same directions.
+The derivative with respect to the radiance that enters the medium along an ordinate, or that
+reaches the camera without scattering, is the adjoint radiance there. Mitsuba propagates it to the
+emitters' parameters: the emitters are evaluated again, with gradients enabled, for the same
+directions.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 
 
 class EmitterAdjoint:
-    """Derivatives by the radiance of the emitters ``wanted`` of ``scene``, which are added to the
-    parameters of these as they are found.
+    """Derivatives with respect to the radiance of the emitters ``wanted`` of ``scene``, accumulated
+    in the gradients of their parameters.
     """
 
     def __init__(self, scene: mi.Scene, wanted: Sequence[mi.Emitter]) -> None:
@@ -35,12 +36,16 @@ class EmitterAdjoint:
         return len(self._wanted)
 
     def add_background(self, ray: mi.Ray3f, adjoint: mi.Spectrum) -> None:
-        """Add what camera rays see of the environment, each worth ``adjoint``."""
+        """Accumulate the derivatives through the environment that camera rays see directly, where
+        ``adjoint`` is the derivative with respect to the radiance along each ray.
+        """
         if self._environment is not None:
             self._add_environment(-ray.d, adjoint)
 
     def add_transport(self, transport: AdjointTransport, found: Derivatives) -> None:
-        """Add what emitters send to the voxels, each of which is worth ``found.direct``."""
+        """Accumulate the derivatives through the irradiance of voxels by emitters, where
+        ``found.direct`` is the derivative with respect to the direct irradiance of each voxel.
+        """
         for light, emitter in enumerate(transport.point_lights):
             if emitter in self._wanted:
                 _add_point(light, transport, found)
@@ -65,7 +70,9 @@ class EmitterAdjoint:
             self._add_environment(towards, mi.Spectrum(adjoint.T.astype(np.float32)))
 
     def _add_environment(self, direction: mi.Vector3f, adjoint: mi.Spectrum) -> None:
-        """Add what travels from the environment along each ``direction``, worth ``adjoint``."""
+        """Accumulate the derivatives through the environment's radiance along each ``direction`` of
+        propagation, where ``adjoint`` is the derivative with respect to that radiance.
+        """
         interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
         interaction.wi = direction
         dr.eval(interaction, adjoint)
@@ -73,7 +80,9 @@ class EmitterAdjoint:
             _pull(self._environment.eval(interaction), adjoint)
 
     def _worth_of_ordinates(self, transport: AdjointTransport, found: Derivatives) -> np.ndarray:
-        """Derivatives (n, 2, channels) by the irradiance that enters along both ways of pairs."""
+        """Return the derivatives (n, 2, channels) with respect to the irradiance that enters along
+        both directions of each of the n pairs of opposite ordinates.
+        """
         worth = np.zeros((len(transport.ordinates.directions), 2, transport.channels))
         for number, part in enumerate(transport.parts):
             for level, channels in transport.levels:
@@ -89,8 +98,8 @@ class EmitterAdjoint:
 def _received(
     level: MultigridLevel, transport: AdjointTransport, part: OrdinatePart, scattered: list[Layers]
 ) -> list[np.ndarray]:
-    """For each channel, integrals (n, 2) over the voxels of the transmittance from where each
-    ordinate of a ``part`` enters, times the importance that is ``scattered`` along it.
+    """Return, for each channel, integrals (n, 2) over voxels of the transmittance from the point
+    where each ordinate of a ``part`` enters, times the importance ``scattered`` along it.
     """
     # docs/primer, eq. (8.10)
     directions, _, unused, offsets = part.ordinates
@@ -119,7 +128,7 @@ def _received(
 
 
 def _solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray) -> np.ndarray:
-    """What the radiance along each ordinate and its opposite is multiplied by."""
+    """Return the solid angles that weight the radiance along each ordinate and its opposite."""
     radiance = environment_radiance(environment, both).reshape(-1, 2, incoming.shape[-1])
     known = radiance > 0
     angle = np.where(known, incoming / np.where(known, radiance, 1), 0)
@@ -150,7 +159,7 @@ def _add_sun(emitter: mi.Emitter, adjoint: np.ndarray) -> None:
 
 
 def _pull(value: mi.Spectrum, adjoint: mi.Spectrum) -> None:
-    """Add to the parameters that ``value`` depends on their derivatives of ``value . adjoint``."""
+    """Accumulate derivatives of ``value . adjoint`` in the parameters that ``value`` depends on."""
     if dr.grad_enabled(value):
-        # Edges are kept: an emitter is evaluated more than once.
+        # Keep the edges of the AD graph: an emitter is evaluated more than once.
         dr.backward_from(dr.sum(dr.dot(value, adjoint)), flags=dr.ADFlag.ClearVertices)

@@ -21,8 +21,8 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 @dataclass(eq=False)
 class CameraPass:
-    """Camera samples of one launch: their rays, and the derivatives of the objective by the
-    radiance along these, the sensor's weight included, and by ``alpha``.
+    """Camera samples of one launch: their rays, and the derivatives of the objective with respect
+    to the radiance along the rays (including the sensor's weight), and with respect to ``alpha``.
     """
 
     sampler: mi.Sampler
@@ -32,8 +32,8 @@ class CameraPass:
 
 
 class FilmAdjoint:
-    """Derivatives ``grad`` (height, width, channels) of an objective by the pixels of an image of
-    ``sensor``, handed on to its camera samples.
+    """Distribute derivatives ``grad`` (height, width, channels) of an objective with respect to the
+    pixels of an image of ``sensor`` to its camera samples.
     """
 
     def __init__(self, sensor: mi.Sensor, grad: mi.TensorXf, seed: int, spp: int) -> None:
@@ -49,7 +49,7 @@ class FilmAdjoint:
 
     @property
     def largest(self) -> float:
-        """The largest derivative by the radiance of a pixel."""
+        """The largest absolute derivative with respect to a channel of a pixel."""
         planes = self.colour + ([self.alpha] if self.alpha is not None else [])
         return max(float(dr.max(dr.abs(plane))[0]) for plane in planes)
 
@@ -74,7 +74,7 @@ class FilmAdjoint:
             yield CameraPass(sampler, mi.Ray3f(ray), radiance, alpha)
 
     def _drawn(self) -> Iterator[tuple]:
-        """Positions on the film, pixels, and rays of the camera samples of each launch."""
+        """Yield positions on the film, pixels, and rays of the camera samples of each launch."""
         sampler, frame = self._sensor.sampler().clone(), self._frame
         sampler.set_sample_count(self._spp)
         sampler.set_samples_per_wavefront(frame.per_pass)
@@ -92,8 +92,9 @@ class FilmAdjoint:
     def _of_samples(
         self, position: mi.Point2f, index: mi.UInt32, norm: mi.Float | None
     ) -> tuple[list[mi.Float], mi.Float | None]:
-        """Derivatives by the values of samples: those by the pixels around them, weighted by the
-        reconstruction filter; ``norm`` holds the sums of weights of the pixels.
+        """Return the derivatives with respect to the channels of camera samples and to their alpha:
+        derivatives with respect to the pixels around them, weighted by the reconstruction filter;
+        ``norm`` holds the sum of the filter's weights in each pixel.
         """
         planes = [*self.colour, *([self.alpha] if self.alpha is not None else [])]
         if norm is None:
@@ -128,7 +129,9 @@ class FilmAdjoint:
 
 
 def _planes(film: mi.Film, grad: mi.TensorXf) -> tuple[list[mi.Float], mi.Float | None]:
-    """Derivatives by red, green and blue, and by alpha, in an array over pixels each."""
+    """Return arrays over the pixels: the derivatives with respect to red, green and blue, also for
+    images of luminance, and with respect to alpha (None without that channel).
+    """
     height, width, depth = grad.shape
     crop = film.crop_size()
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)

@@ -26,13 +26,13 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.machine.extras import require
 
-#: Directions of the cache, if the integrator does not set ``cache_spp``: from these shares of all
-#: steps on. Early steps do not need exact gradients.
+#: Directions of the cache, if the integrator does not set ``cache_spp``, by the fraction of all
+#: steps from which each number is used. Early steps do not need exact gradients.
 DIRECTIONS = ((0.0, 32), (0.6, 64), (0.85, 128))
 #: Directions of the cache for L-BFGS: the same in all steps, since a line search compares values of
 #: one objective.
 LBFGS_DIRECTIONS = 64
-#: Decay rates and least denominator of Adam, and the share of its step size that the last has.
+#: Adam: decay rates of both moments, epsilon, and ratio of the last step size to the first.
 DECAY, EPSILON, LAST_RATE = (0.9, 0.99), 1e-8, 0.1
 #: Optical depth of the scene's diagonal by which the extinction is scaled if the start is thinner.
 DEPTH = 4.0
@@ -51,7 +51,7 @@ METHODS = ("adam", "lbfgs")
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An image (height, width, channel) of linear radiance, and the sensor that took it."""
+    """A reference image (height, width, channel) of linear radiance, and its sensor."""
 
     sensor: mi.Sensor
     image: np.ndarray
@@ -59,21 +59,22 @@ class View:
 
 @dataclass(frozen=True)
 class Settings:
-    """How to fit.
+    """Settings of a fit.
 
     Attributes:
-        steps: of Adam, or iterations of L-BFGS at most.
-        method: "lbfgs", which needs fewer steps, or "adam", which may take some views at a time.
+        steps: number of steps of Adam; for L-BFGS, the largest number of iterations.
+        method: "lbfgs", which needs fewer steps, or "adam", which can use a subset of the ``views``
+            in each step.
         loss: "l2", "l1" or "relative" (squared errors relative to the image).
         rate: first step size of Adam, relative to the scale of a parameter.
-        scale: of extinction and emission; 0: the largest value of the start, at least that of a
-            medium of some optical depth.
+        scale: value by which extinction and emission are normalized; 0: the largest initial value,
+            but at least that of a medium of a certain optical depth.
         smoothness: weight in the loss of the mean squared difference between neighbouring voxels,
             for images of mean square 1 and a scale of 1. Views leave the finest structure of a
             volume undetermined.
-        spp: camera samples of each pixel.
-        views: of each step of Adam, in turn; 0: all.
-        seed: of camera samples and of the choice of views.
+        spp: camera samples per pixel.
+        views: number of views in each step of Adam, which takes all in turn; 0: all views.
+        seed: seed of camera samples and of the order of views.
     """
 
     steps: int = 100
@@ -109,10 +110,11 @@ class Result:
     """The state of a fit after ``step`` steps.
 
     Attributes:
-        values: of the parameters, by their names.
-        history: step, loss of the views of that step, and error of the views held out, relative to
-            their mean (NaN without any, and where it was not computed).
-        moments: first and second moments of Adam, by the names of the parameters.
+        values: values of the parameters, by name.
+        history: for each step, its number, the loss of its views, and the root mean square error of
+            the held-out views relative to their mean (NaN without held-out views, and in steps that
+            do not compute it).
+        moments: first and second moments of Adam, by name of the parameter.
     """
 
     step: int
@@ -132,7 +134,10 @@ class Result:
 
     @classmethod
     def load(cls, path: str | Path, settings: Settings) -> Result:
-        """Read a checkpoint. Raises IrrcacheError if it is none, or one of other ``settings``."""
+        """Return the result read from a checkpoint.
+
+        Raises IrrcacheError if the file is no checkpoint, or was written with other ``settings``.
+        """
         try:
             with np.load(path) as stored:
                 arrays = dict(stored)
@@ -165,13 +170,13 @@ def fit(
     report: Callable[[Result], None] | None = None,
     every: int = 10,
 ) -> Result:
-    """Fit the parameters of ``scene`` that ``names`` stand for (see `key_of`) to ``views``.
+    """Fit the parameters of ``scene`` with the given ``names`` (see `key_of`) to ``views``.
 
-    The parameters start from the values that they have, or from those of ``start``, a result of
-    fewer steps with the same settings; the scene has the last values afterwards. ``report`` is
-    called after each step; the error of the views ``held_out`` is computed ``every`` so many. An
-    exception of ``report`` ends the fit. The same settings give the same bits, also with a
-    ``start``, unless the method is L-BFGS, whose memory starts anew.
+    The fit starts from the scene's current values, or from those of ``start``, a result of fewer
+    steps with the same settings, and leaves the last values in the scene. ``report`` is called
+    after each step; the error of ``held_out`` views is computed every ``every`` steps. An exception
+    raised by ``report`` ends the fit. Equal settings give bit-identical results, also when the fit
+    continues from ``start``, except with L-BFGS, whose history is not part of a result.
 
     Raises IrrcacheError if a parameter or an image does not fit the scene, or has no gradients.
     """
@@ -180,11 +185,11 @@ def fit(
 
 
 def key_of(params: mi.SceneParameters, name: str) -> str:
-    """The key of the parameter that ``name`` stands for: a key itself, or a part of one between
-    dots that is found in a single key of an array, such as ``sigma_t``, ``albedo``, ``emission`` or
-    the id of an emitter.
+    """Return the key in ``params`` that ``name`` abbreviates: the key itself, or a component of it
+    between dots that occurs in only one key of an array, such as ``sigma_t``, ``albedo``,
+    ``emission`` or the id of an emitter.
 
-    Raises IrrcacheError if there is none, or several.
+    Raises IrrcacheError if no key, or more than one, matches.
     """
     arrays = [k for k in params.keys() if k.endswith((".data", ".value")) and name in k.split(".")]
     if name in params.keys():
@@ -275,7 +280,9 @@ class _Fit:
     # Images
 
     def _set(self, values: dict[str, np.ndarray], attached: bool) -> dict[str, object]:
-        """Give the parameters these values; return them."""
+        """Assign ``values`` to the parameters, with gradients enabled if ``attached``; return the
+        parameters by name.
+        """
         for name, key in self._named():
             value = values[name].astype(np.float32)
             # Not from NumPy's memory, which would be borrowed.
@@ -288,7 +295,7 @@ class _Fit:
     def _objective(
         self, values: dict[str, np.ndarray], views: list[tuple], seed: int
     ) -> tuple[float, dict[str, np.ndarray]]:
-        """The loss and its gradient. All images share one cache and one adjoint solve."""
+        """Return the loss and its gradient. All images share one cache and one adjoint solve."""
         leaves, settings = self._set(values, attached=True), self.settings
         function, total = LOSSES[settings.loss], 0.0
         for number, (sensor, target) in enumerate(views):
@@ -305,7 +312,7 @@ class _Fit:
         return loss, gradient
 
     def _held_out_error(self) -> float:
-        """Root mean square error of the views held out, relative to their mean."""
+        """Return the root mean square error of the held-out views, relative to their mean."""
         if not self._held_out:
             return math.nan
         square = mean = 0.0
@@ -358,7 +365,7 @@ class _Fit:
         return first / (1 - a**count) / scale
 
     def _chosen(self, step: int) -> list[tuple]:
-        """The views of a step: all in turn, in an order that changes."""
+        """Return the views of a step: all views in turn, in a random order for each turn."""
         count = self.settings.views
         if not 0 < count < len(self._views):
             return self._views
@@ -426,8 +433,8 @@ class _Fit:
 
 
 def _roughness(values: np.ndarray) -> tuple[float, np.ndarray]:
-    """The mean squared difference between neighbouring voxels (z, y, x, channel), and its gradient;
-    0 if the values are no grid.
+    """Return the mean squared difference between neighbouring voxels (z, y, x, channel), and its
+    gradient; both are 0 if the values are no grid.
     """
     total, gradient = 0.0, np.zeros(values.shape)
     for axis in range(3 if values.ndim == 4 else 0):
@@ -440,7 +447,7 @@ def _roughness(values: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _colours(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """The channels of an image that the target has: without alpha."""
+    """Return the channels of an image that the target has: those without alpha."""
     return image if image.shape[2] == target.shape[2] else image[:, :, : target.shape[2]]
 
 
