@@ -150,7 +150,7 @@ def loaded(scenes, phase: dict, **settings) -> mi.Scene:
 
 @pytest.mark.parametrize(("g", "lamps"), [(0.85, 9), (0.85, 8), (0.5, 9)])
 def test_sharp_shadows_on_surfaces_are_announced(scenes, monkeypatch, g, lamps):
-    """Of more lamps than are treated as narrow, a forward peak counts as unscattered."""
+    """A forward peak counts as unscattered if there are more lamps than are treated as narrow."""
     messages = []
     monkeypatch.setattr(mi, "Log", lambda level, text: messages.append(text))
     cloud = scenes.boundary(scenes.medium(1.0, 0.9) | {"phase": hg(g)})
