@@ -43,8 +43,8 @@ class Phase:
     """A phase function.
 
     ``plugin`` is Mitsuba's phase function (None for `ISOTROPIC`), ``moments`` are the Legendre
-    moments g_0 = 1, g_1, ..., and ``peak`` is the maximum of 4 pi p. ``moments`` and ``peak``
-    exclude the fraction ``forward`` that `delta_m` treats as unscattered.
+    moments g_0 = 1, g_1, ..., without the fraction ``forward`` that `delta_m` treats as
+    unscattered, and ``peak`` is the maximum of 4 pi p / (1 - forward).
     """
 
     # docs/primer, eqs. (1.2), (1.5)
