@@ -8,7 +8,7 @@ harmonics of low order cannot represent. The radiance scattered towards the came
     J = Phi / (4 pi) f,   Phi f = Phi + sum_lm 4 pi g_l Y_lm L_lm + sum_k (4 pi p_k - 1) E_k
 
 where g_l are the Legendre moments of the phase function, p_k is its value for scattering from
-source k towards the camera, and L_lm excludes E_k. (For area emitters, L_lm includes E_k, and p_k
+source k towards the camera, and L_lm excludes E_k. (For nearby lamps, L_lm includes E_k, and p_k
 contains only the degrees above the order of L_lm, blurred by the emitter's extent.) Emitters whose
 irradiance camera rays evaluate in closed form (`cache/direct_light`, `cache/area_light`) contribute
 to neither Phi nor L_lm nor E_k here. Phi is interpolated as in isotropic media. The *factor* f is a

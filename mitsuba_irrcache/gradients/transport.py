@@ -94,7 +94,7 @@ class AdjointTransport:
             self.colour = np.ones(colours)
         self.parts = self.scattering.parts(self.ordinates)
         #: sets of tracks of each sun, the last ordinates
-        self.sun_tracks = illumination.sun_ordinates(pairs) // max(illumination.sun_count, 1)
+        self.sun_tracks = illumination.sun_pairs(pairs) // max(illumination.sun_count, 1)
         self.channels = self.ordinates.incoming.shape[-1] if grey else colours
         solving_pairs = min(pairs, self.scattering.solving_pairs)
         (solving,) = illumination.ordinates(1, solving_pairs, rng)

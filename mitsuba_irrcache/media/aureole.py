@@ -10,10 +10,10 @@ too narrow.
 For small angles the number of events along a path is Poisson distributed with mean D, the optical
 depth of scattering into the peak, and the Legendre moments of successive distributions multiply
 (Goudsmit and Saunderson 1940). With the moments q_l of the peak, the sum over all n >= 1 has the
-moments e^-D(1 - q_l) - e^-D. The TMS correction alone has the moments D q_l, so the phase function
-of the peak is replaced by the one with the moments
+moments exp(-D (1 - q_l)) - exp(-D). The TMS correction alone has the moments D q_l, so the phase
+function of the peak is replaced by the one with the moments
 
-    a_l = [e^-D(1 - q_l) - e^-D] / D.
+    a_l = [exp(-D (1 - q_l)) - exp(-D)] / D.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordin
 from mitsuba_irrcache.solvers.discrete_ordinates.extinction import DENSE
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
 from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import OrdinateSet
-from mitsuba_irrcache.solvers.sweep import DIRECTIONS
+from mitsuba_irrcache.solvers.sweep import DEFAULT_DIRECTIONS
 
 #: Emitters whose radiance enters along tracks.
 EMITTERS = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP, EmitterKind.SUN)
@@ -142,7 +142,7 @@ class MappedMedium:
         the factors of channels.
         """
         all_orders = self._settings.max_depth < 0
-        samples = self._settings.samples or (1 if all_orders else 2) * DIRECTIONS
+        samples = self._settings.samples or (1 if all_orders else 2) * DEFAULT_DIRECTIONS
         pairs = -(-samples // MULTIPLE) * MULTIPLE // 2
         rng = np.random.default_rng((self._settings.seed, 0))
         channels = 1 if mi.is_monochromatic else 3

@@ -34,7 +34,7 @@ def curved(previous, a, b, ratio: mi.Float) -> tuple:
 
 
 def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
-    """Weights of the source albedo Phi / (4 pi) at both ends of a segment, and its transmittance.
+    """Weights of the source alpha * Phi / (4 pi) at both ends of a segment, and its transmittance.
 
     ``quadrature`` is a name in `RULES`, and ``sigma`` the extinction at both ends.
     """

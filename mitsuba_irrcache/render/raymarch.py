@@ -155,7 +155,7 @@ class Projection:
     ) -> tuple:
         """Evaluate the fields at the distance ``t``.
 
-        Returns the extinction; the source albedo Phi / (4 pi), in-scattered radiance per unit of
+        Returns the extinction; the source alpha * Phi / (4 pi), in-scattered radiance per unit of
         optical depth, without the inverse-square factor; the albedo and the relative errors of Phi,
         as far as layers need them; and the ``peak`` at ``t``. ``view`` is the result of
         `angular_terms`.
@@ -346,7 +346,7 @@ class Projection:
 
 @dataclass
 class _FieldSample:
-    """Results of `Projection.fetch` at a point: the extinction, the source albedo, and the values
+    """Results of `Projection.fetch` at a point: the extinction, the source, and the values
     that layers need.
     """
 
@@ -384,7 +384,7 @@ class _MarchState:
 @dataclass
 class _MarchedSegment:
     """A segment up to the distance ``end``: the extinctions at both ends, with a correction for
-    curvature, and the ``weights`` of the source albedos there. ``skip``: behind empty space.
+    curvature, and the ``weights`` of the sources there. ``skip``: behind empty space.
     """
 
     end: mi.Float

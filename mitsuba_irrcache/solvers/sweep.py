@@ -35,7 +35,7 @@ EMITTERS = frozenset(
 #: Default number of directions per voxel: for isolated media, and among surfaces, where camera
 #: paths add noise. It is doubled for single isotropic scattering, where directions are cheaper and
 #: their noise is not blurred by further orders.
-DIRECTIONS, DIRECTIONS_AMONG_SURFACES = 128, 64
+DEFAULT_DIRECTIONS, DIRECTIONS_AMONG_SURFACES = 128, 64
 #: The same for isotropic scattering in a constant environment: errors are at most 1.5 times those
 #: with 128.
 DIRECTIONS_IN_UNIFORM_LIGHT = 64
@@ -46,7 +46,9 @@ DIRECTIONS_OF_SHARP_SCATTERING = 256
 
 @register
 class SweepSolver(Solver):
-    """Solves for all voxels at once, in media that fill a box or sphere."""
+    """Solves for all voxels at once, in media that fill a box or sphere and that no other medium
+    reaches into. Surfaces may reach into media that scatter isotropically and do not emit.
+    """
 
     name = "sweep"
     precedence = 10
@@ -110,7 +112,7 @@ class SweepSolver(Solver):
     def why(cls, medium: MediumGrid) -> str:
         if medium.is_isolated:
             return "all emitters are distant or point-like"
-        return "no surface and no other medium is among the voxels"
+        return "no other medium is among the voxels"
 
     @classmethod
     def default_samples(cls, medium: MediumGrid, max_depth: int, active_count: int) -> int:
@@ -119,14 +121,14 @@ class SweepSolver(Solver):
         if medium.detail is Detail.UNIFORM and medium.phase.is_isotropic:
             return DIRECTIONS_IN_UNIFORM_LIGHT
         once = max_depth == 2 and medium.phase.is_isotropic
-        count = DIRECTIONS if medium.is_isolated else DIRECTIONS_AMONG_SURFACES
+        count = DEFAULT_DIRECTIONS if medium.is_isolated else DIRECTIONS_AMONG_SURFACES
         return 2 * count if once else count
 
     @classmethod
     def batch_size(
         cls, medium: MediumGrid, max_depth: int, samples: int, basis: AngularBasis | None
     ) -> int:
-        multiple = sn_solver.BATCH if basis is None else minimum_batch(basis.order)
+        multiple = sn_solver.SMALLEST_BATCH if basis is None else minimum_batch(basis.order)
         return sn_solver.batch_of(samples, multiple)
 
     @classmethod

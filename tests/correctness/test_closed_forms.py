@@ -209,7 +209,7 @@ def swept(scene, depth: float, layers: int, columns: int, samples: int = 32, wid
     place[:3, 3] = -width / 2, -width / 2, -depth
     grid = Grid((layers, columns, columns), place)
     index, moments = dr.arange(mi.UInt32, grid.voxel_count), None
-    solver, least = sn_solver.Sweep, sn_solver.BATCH
+    solver, least = sn_solver.Sweep, sn_solver.SMALLEST_BATCH
     if not medium.phase.is_isotropic:
         moments = AngularBasis(medium.phase, *sources_of(scene))
         solver, least = AnisotropicSweep, minimum_batch(moments.order)

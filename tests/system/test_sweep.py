@@ -68,7 +68,7 @@ def soft_cloud(scenes, n: int = 12, albedo=0.9, channels: int = 1) -> dict:
 
 def batches(count: int, max_depth: int = -1) -> dict:
     """Return settings with this many batches of the solver, and their ``max_depth``."""
-    return {"max_depth": max_depth, "cache_spp": count * sn_solver.BATCH}
+    return {"max_depth": max_depth, "cache_spp": count * sn_solver.SMALLEST_BATCH}
 
 
 def assert_like(measured, expected, layer: str, tolerance: float) -> None:
@@ -273,7 +273,9 @@ def test_caches_coarser_and_finer_than_the_data(scenes, resolution, tolerance):
     density = np.where(x**2 + y**2 + z**2 < 5.5**2, 8.0, 0.0).astype(np.float32)
     shape = scenes.boundary(scenes.medium(density, 0.8, to_world), to_world)
     settings = {"resolution": resolution, "max_depth": 2}
-    ours = values(filled(scenes, shape, **settings, cache_spp=8 * sn_solver.BATCH).irradiance)
+    ours = values(
+        filled(scenes, shape, **settings, cache_spp=8 * sn_solver.SMALLEST_BATCH).irradiance
+    )
     theirs = values(filled(scenes, shape, "path", **settings, cache_spp=128).irradiance)
     voxel = ((np.arange(resolution) + 0.5) / resolution * 16).astype(int)
     weights = density[np.ix_(voxel, voxel, voxel)][..., None]

@@ -51,7 +51,7 @@ from mitsuba_irrcache.compare.tables import Table, percent, seconds
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.scene_files import load_scene, parse_integrator
 from mitsuba_irrcache.machine.llvm import require_llvm
-from mitsuba_irrcache.solvers.discrete_ordinates.solver import BATCH
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import SMALLEST_BATCH
 
 #: Variant and further parameters of each scene: clouds are grey.
 SCENES = {
@@ -278,7 +278,10 @@ def explore(depth: int, args: argparse.Namespace, point: Callable) -> list[dict]
     them.
     """
     series = [
-        [{"resolution": r, "cache_spp": n * BATCH, "solver": "sweep"} for n in args.batches]
+        [
+            {"resolution": r, "cache_spp": n * SMALLEST_BATCH, "solver": "sweep"}
+            for n in args.batches
+        ]
         for r in args.resolutions
     ]
     series.append([{"resolution": r, "cache_spp": n, "solver": "path"} for r, n in PATH])

@@ -37,7 +37,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.io.scene_files import load_scene
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.pipeline.builder import CacheBuilder, CacheSettings
-from mitsuba_irrcache.solvers.discrete_ordinates.solver import BATCH, LARGEST_BATCH
+from mitsuba_irrcache.solvers.discrete_ordinates.solver import LARGEST_BATCH, SMALLEST_BATCH
 
 VARIANT = "llvm_ad_mono"
 #: Source and voxels along its longest side; 0: as the source has it.
@@ -79,7 +79,10 @@ def run(options: Options) -> None:
     with no_kernels_on_disk():
         counts = row("kernels", kernels, MIDDLE)
     print(sizes_table(sizes).as_text(), images_table(images).as_text(), sep="\n\n")
-    print(f"\nKernels of batches of {BATCH} directions at 128^3, the first with all before it:")
+    print(
+        f"\nKernels of batches of {SMALLEST_BATCH} directions at 128^3, the first with all "
+        "before it:"
+    )
     for number, count in enumerate(counts["passes"], 1):
         print(f"  batch {number}: {count['launches']} launches, {count['compiled']} compilations")
 
@@ -180,10 +183,10 @@ def kernels(scene: Path) -> dict:
     loaded = load_scene(scene, {"max_depth": "2"})
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
-        builder = build(loaded, BATCH)[0]
+        builder = build(loaded, SMALLEST_BATCH)[0]
         passes = [counted(dr.kernel_history())]
         for number in range(2, PASSES + 1):
-            builder.samples = number * BATCH
+            builder.samples = number * SMALLEST_BATCH
             builder.update(loaded)
             passes.append(counted(dr.kernel_history()))
     return {"passes": passes}

@@ -20,12 +20,12 @@ from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 #: Ordinates of a pass for moments up to order 4, and of higher order. They have to integrate
 #: products of two moments: under a sun, half as many have twice the error for g = 0.5, and five
 #: times the error for g = 0.85.
-DIRECTIONS, MORE_DIRECTIONS = 32, 64
+DIRECTIONS_OF_PASS, MORE_DIRECTIONS_OF_PASS = 32, 64
 
 
 def directions_of(order: int) -> int:
     """Return the number of ordinates of a pass for moments up to ``order``."""
-    return DIRECTIONS if order <= 4 else MORE_DIRECTIONS
+    return DIRECTIONS_OF_PASS if order <= 4 else MORE_DIRECTIONS_OF_PASS
 
 
 def minimum_batch(order: int) -> int:
@@ -90,7 +90,7 @@ class AnisotropicSweep(Sweep):
         # not part of the moments; irradiance of point-like emitters; moments of other sources.
         known, unknown = [], []
         for found in (*self._direct, *self._emission):
-            (known if id(found[0]) in self._known_lights else unknown).append(
+            (known if id(found[0]) in self._closed_form_lights else unknown).append(
                 [m[channel] for m in found]
             )
         points = unknown[: len(self._point_directions)]
@@ -132,7 +132,7 @@ class AnisotropicSweep(Sweep):
         count, found = self._moments.count, []
         directions = iter(self._point_directions)
         for irradiance, *more in self._direct:
-            light = self._known_lights.get(id(irradiance))
+            light = self._closed_form_lights.get(id(irradiance))
             if light is not None:
                 value = light.means[channel]
                 higher = (value * mean for mean in light.angular_means()[: count - 1])

@@ -104,8 +104,8 @@ class DistantIllumination:
         """Number of suns."""
         return len(self._suns)
 
-    def sun_ordinates(self, pairs: int) -> int:
-        """Return how many ordinates of a pass, the last ones, belong to suns."""
+    def sun_pairs(self, pairs: int) -> int:
+        """Return how many pairs of ordinates of a pass, the last ones, belong to suns."""
         return len(self._suns) * self._tracks_per_sun(pairs)
 
     def point_irradiance(

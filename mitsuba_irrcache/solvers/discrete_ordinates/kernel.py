@@ -52,10 +52,10 @@ class SweptVolume:
 
     With ``begin_backward`` the two ways of a pair are stored separately: the ordinate against the
     axis writes its values from that voxel on, and values are replaced instead of added to;
-    ``source`` has one value per voxel and way in the same layout; optical depths are not multiplied
-    by solid angles, and the irradiance excludes the source of the voxel itself. With ``collisions``
-    there are two values instead of four: the radiance of collisions without the source of the
-    voxel, and the optical depth.
+    ``source`` has one value per voxel and way in the same layout; W is not multiplied by solid
+    angles, and the irradiance excludes the source of the voxel itself. With ``collisions`` there
+    are two values instead of four: the radiance of collisions without the source of the voxel, and
+    the optical depth.
     """
 
     values: mi.Float
@@ -130,7 +130,8 @@ class _TrackState:
     #: flat indices at which the slice begins: of the volume, of the extinction
     offset: mi.Int32
     extinction_offset: mi.Int32
-    #: slices since entry into the box; 1 unless the track has just entered
+    #: slices from the point of entry into the box to the middle of this slice (0 to 1) if the track
+    #: has entered after the middle of the previous slice; 1 otherwise
     since_entry: mi.Float
     #: radiance in each channel, times the solid angle
     radiance: list[mi.Float]
@@ -604,8 +605,9 @@ class _PairSweep:
     ) -> tuple[list, list]:
         """Propagate radiance through a voxel with a constant source.
 
-        Returns per channel the radiance behind it, and the tally (0, irradiance in its middle,
-        radiance lost, optical depth).
+        Returns per channel the radiance behind it, and the tally (0, irradiance in its middle, V,
+        W). V is the loss of radiance and W the optical depth times solid angle, both over the
+        track's length in a slice.
         """
         # docs/primer, eqs. (4.6), (4.7)
         # The longer a track is in a voxel, the narrower is its tube.

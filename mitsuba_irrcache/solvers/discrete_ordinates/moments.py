@@ -2,9 +2,11 @@
 
 For anisotropic phase functions, the unknowns are not the irradiance alone but all moments of the
 radiance up to the order of the phase function's Legendre expansion. They are stored in one array,
-moment after moment, ordered by degree; channels that are swept together are adjacent. The first
-moment is the irradiance; scattering multiplies a moment of degree l by the phase function's moment
-g_l (see `phase`; Lewis and Miller 1984, chapter 4).
+moment after moment, ordered by degree; channels that are swept together are adjacent. The first one
+is the irradiance Phi = sqrt(4 pi) L_00, the others are the L_lm of eq. (1.5), with Y_lm of the
+direction from which the radiance comes, opposite to that of propagation; scattering multiplies a
+moment of degree l by the phase function's moment g_l (see `phase`; Lewis and Miller 1984, chapter
+4).
 """
 
 from __future__ import annotations

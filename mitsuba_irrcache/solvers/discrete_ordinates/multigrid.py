@@ -1,15 +1,15 @@
 """Multiple scattering: source iteration on a hierarchy of grids (multigrid).
 
 The mean irradiance of collisions phi (the mean over the collisions in a voxel) solves phi = A phi +
-b. The operator A is one transport sweep over a fixed set of ordinates with the source albedo phi /
-(4 pi); b is the uncollided irradiance, averaged over collisions (order 0). Source iteration (phi <-
-A phi + b) adds one order of scattering per sweep; dense media with an albedo near 1 need thousands.
-The slowly converging errors are smooth, and are corrected on coarser grids with the same operator:
-a cycle is a sweep, followed by a correction from the next coarser grid, where one more sweep
-computes the right-hand side (multigrid; for acceleration of discrete-ordinates methods in general
-see Adams and Larsen, *Fast iterative methods for discrete-ordinates particle transport
-calculations*, Progress in Nuclear Energy 40, 2002). Anderson acceleration (`anderson`) combines the
-cycles.
+b. The operator A is one transport sweep over a fixed set of ordinates with the source alpha * phi /
+(4 pi), where alpha is the albedo; b is the uncollided irradiance, averaged over collisions (order
+0). Source iteration (phi <- A phi + b) adds one order of scattering per sweep; dense media with an
+albedo near 1 need thousands. The slowly converging errors are smooth, and are corrected on coarser
+grids with the same operator: a cycle is a sweep, followed by a correction from the next coarser
+grid, where one more sweep computes the right-hand side (multigrid; for acceleration of
+discrete-ordinates methods in general see Adams and Larsen, *Fast iterative methods for
+discrete-ordinates particle transport calculations*, Progress in Nuclear Energy 40, 2002). Anderson
+acceleration (`anderson`) combines the cycles.
 """
 
 from __future__ import annotations
@@ -54,9 +54,11 @@ class MultigridLevel:
     ``sigma_t`` and ``albedo``, like all fields of irradiance, have a value for each active voxel of
     the ``tracks``; the extinction of other voxels is 0. If several channels are swept together,
     albedo and irradiance have adjacent channels. Coarser levels have half as many voxels along the
-    axes along which voxels are shortest, or along all axes (``all_axes``): sweeps reduce errors
-    that vary along an ordinate over optically long distances, and only coarser grids reduce errors
-    between voxels that are optically close.
+    axes along which voxels are shortest, or along all axes (``all_axes``): a sweep reduces errors
+    that differ between voxels that are near, optically. With edges of 4 : 1 and optical depths of 2
+    and 0.5, an error that alternates along the short edges keeps 19 % of its amplitude in a sweep,
+    one that alternates along the long edges 57 %: the coarser grid has to represent the latter, and
+    need not represent the former.
     """
 
     def __init__(
@@ -193,18 +195,18 @@ class MultigridLevel:
             if table.boundary_source is not None:
                 table.boundary_source.update(phi)
         tracks.sweep(volume, table)
-        source, phi, lost, depth = dr.gather(mi.Vector4f, volume, slot)
-        # Radiance of collisions times 4 pi, the integral of 1 over directions.
+        source, irradiance, lost, depth = dr.gather(mi.Vector4f, volume, slot)
+        # S + V / W, the mean radiance of collisions, times 4 pi.
         collided = 4 * dr.pi * (source + lost / dr.select(depth > 0, depth, 1))
         if self._is_cut is not None and tracks.surfaces.medium is not None:
             # Centres of cut voxels may be outside of the medium, where irradiance is not computed.
-            phi = dr.select(self._is_cut & (depth > 0), collided, phi)
-        collided = self.collided_irradiance(depth, collided, phi)
+            irradiance = dr.select(self._is_cut & (depth > 0), collided, irradiance)
+        collided = self.collided_irradiance(depth, collided, irradiance)
         if self._is_cut is not None:
             # Middles of tracks may lie behind the surface: use the mean over parts of tracks.
-            phi = dr.select(self._is_cut, collided, phi)
-        dr.eval(phi, collided)
-        return phi, collided
+            irradiance = dr.select(self._is_cut, collided, irradiance)
+        dr.eval(irradiance, collided)
+        return irradiance, collided
 
     def collisions(self, phi: mi.Float | None, table: TrackTable) -> mi.Float:
         """Return the second result of `sweep`."""
@@ -216,10 +218,10 @@ class MultigridLevel:
         """Return the mean irradiance of collisions, blended from two estimates.
 
         ``collided`` is computed from the loss of radiance along tracks; in voxels that are nearly
-        empty it is replaced by the ``irradiance`` at the centre. ``depth`` is the optical depth of
-        a voxel, integrated over directions. In nearly empty voxels the tracks of suns and of the
-        quadrature pass through different extinction, so that loss over depth is unreliable, while
-        the irradiance is nearly constant.
+        empty it is replaced by the ``irradiance`` at the centre. ``depth`` is the sum W of eq.
+        (4.7): optical depth per unit of length, integrated over directions. In nearly empty voxels
+        the tracks of suns and of the quadrature pass through different extinction, so that loss
+        over depth is unreliable, while the irradiance is nearly constant.
         """
         size = float(self.grid.voxel_size.min()) / (4 * np.pi * THIN)
         found = dr.square(depth * dr.opaque(mi.Float, size))

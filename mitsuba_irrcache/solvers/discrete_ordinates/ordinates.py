@@ -31,8 +31,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackTable
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Number of ordinates of a pass along which radiance enters among surfaces. It varies more between
-#: directions than the radiance scattered between voxels.
+#: Number of ordinates of a pass (opposite ones count as two) along which radiance enters among
+#: surfaces. It varies more between directions than the radiance scattered between voxels.
 BOUNDARY_ORDINATES = 64
 #: The same in boxes of glass, where all tracks of an ordinate hit a face at the same angle, so that
 #: all or none are totally reflected: with 64 ordinates the mean irradiance under an area emitter
@@ -44,7 +44,7 @@ class OrdinateSet:
     """Ordinates for the radiance of distant emitters and of voxels, in some ``channels``."""
 
     def __init__(self, ordinates: Ordinates, channels: Sequence[int], suns: int = 0) -> None:
-        """The last ``suns`` ordinates belong to suns whose irradiance is to be kept separate."""
+        """The last ``suns`` pairs belong to suns, whose irradiance is kept separate."""
         count, incoming = len(ordinates.weights), ordinates.incoming
         self._is_sun = np.arange(count) >= count - suns if suns else None
         own = incoming if incoming.shape[-1] == 1 else incoming[..., list(channels)]
@@ -107,9 +107,10 @@ class BoundaryOrdinateSet:
 
     ``incoming`` is the incoming radiance of all passes; that along the ``ordinates`` of this one
     starts at index ``start``. ``reflected`` is the radiance that leaves the medium and returns to
-    it along the ``scattering`` ordinates while this set solves for all orders (None for sets that
-    do not). ``crossings`` are those of the tracks of ``scattering`` with surfaces among the voxels.
-    ``channels`` are the channels of ``incoming`` and ``reflected`` to use.
+    it along the ``scattering`` ordinates, by paths of its own (in glass by those of ``incoming``);
+    only `solve` uses it (None in all sets but the first, and without further orders). ``crossings``
+    are those of the tracks of ``scattering`` with surfaces among the voxels. ``channels`` are the
+    channels of ``incoming`` and ``reflected`` to use.
     """
 
     def __init__(

@@ -4,9 +4,9 @@ A batch consists of passes; a pass is a transport sweep of one ordinate set alon
 voxels (`tracks`). For all orders of scattering (``max_depth`` -1) the first pass of a batch solves
 by source iteration with multigrid and Anderson acceleration (`multigrid`). Every other pass sweeps
 the resulting source along different ordinates, so that the mean of the passes has little angular
-noise, and improves the source for the passes that follow. For a limited number of orders the first
-pass sweeps once for each order but the last, and the other passes sweep the source of the last
-order. For single scattering (``max_depth`` 2) there is one pass.
+noise, and improves the source for the passes that follow. For ``max_depth`` D >= 3 the first pass
+makes D - 2 sweeps, which give orders 0 to D - 3, the source of the last order; each of the other
+passes sweeps this source once. For single scattering (``max_depth`` 2) there is one pass.
 
 Emission of the medium and small or point-like emitters are sampled voxel by voxel
 (`direct_emission`, `direct_light`).
@@ -58,12 +58,12 @@ from mitsuba_irrcache.solvers.discrete_ordinates.resampling import (
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Minimum and maximum number of ordinates of a batch (in pairs of opposite ones). One even set of
+#: Minimum and maximum number of ordinates of a batch (opposite ones count as two). One even set of
 #: 32 has half the noise of two sets of 16, and one of 64 has 0.8 times the noise of two of 32.
-BATCH, LARGEST_BATCH = 32, 256
-#: Number of ordinates of a pass in multiple scattering, where a batch has several passes: all
-#: orders but the last are solved for with one such set.
-DIRECTIONS = 16
+SMALLEST_BATCH, LARGEST_BATCH = 32, 256
+#: The same for a pass in multiple scattering, where a batch has several passes: all orders but
+#: the last are solved for with one such set.
+DIRECTIONS_OF_PASS = 16
 #: Number of unknowns of a channel (voxels times moments) above which channels are swept one by one,
 #: because sweeping them together takes several times the memory.
 MOST_SWEPT_TOGETHER = 1 << 24
@@ -96,7 +96,7 @@ class Sweep:
     """
 
     #: ordinates of a pass in multiple scattering
-    directions = DIRECTIONS
+    directions = DIRECTIONS_OF_PASS
 
     def __init__(
         self,
@@ -127,8 +127,8 @@ class Sweep:
         if cache.falloff is not None and cache.max_depth != 2:
             self._inverse_square_mean = cache.falloff.spread(cache.active)
             dr.eval(self._inverse_square_mean)
-        #: direct lights of the cache by the identity of their irradiance
-        self._known_lights = {id(light.irradiance): light for light in cache.direct_lights}
+        #: direct lights of the cache, evaluated in closed form, by the identity of their irradiance
+        self._closed_form_lights = {id(light.irradiance): light for light in cache.direct_lights}
         #: results of sampling voxel by voxel in a batch: from each point-like emitter and from area
         #: emitters, and from emission. Each is a list of the irradiance, and its moments unless
         #: they follow from the direction
@@ -244,8 +244,8 @@ class Sweep:
         factors = {factor: dr.opaque(mi.Float, factor) for factor in map(float, colour)}
         for c in range(cache.channels):
             factor = factors[float(colour[c])]
-            for layer, phi in zip(layers, found[min(c, len(found) - 1)], strict=True):
-                layer.append(phi if phi is None else phi * factor)
+            for layer, values in zip(layers, found[min(c, len(found) - 1)], strict=True):
+                layer.append(values if values is None else values * factor)
         dr.eval(layers)
         irradiance, moments = layers[: len(LAYERS)], layers[len(LAYERS) :]
         parts = [tuple(chain(*irradiance)), (None,) * cache.channels]
@@ -268,7 +268,7 @@ class Sweep:
                 passes - bool(first), pairs, cache.channels, rng, first
             )
             self._colour = colour
-            suns = self._illumination.sun_ordinates(pairs) if self._sun_irradiance else 0
+            suns = self._illumination.sun_pairs(pairs) if self._sun_irradiance else 0
 
             def sets(channels: Sequence[int]) -> list[OrdinateSet]:
                 return [OrdinateSet(each, channels, suns) for each in ordinates]
@@ -276,7 +276,7 @@ class Sweep:
             return sets, grey_media and ordinates[0].incoming.shape[-1] == 1, colour
         surroundings = self._boundary, self._illumination, self._tracks[0]
         sets, spectra = boundary_ordinate_sets(*surroundings, passes, pairs, rng, seed)
-        self._direct = self._with_known_lights(self._emitter_sampling.irradiance(seed))
+        self._direct = self._with_closed_form_lights(self._emitter_sampling.irradiance(seed))
         if not self._boundary.carries_refracted:
             arguments = self._boundary, cache.grid, cache.active, seed
             self._direct.append([refracted_irradiance(*arguments)])
@@ -290,10 +290,12 @@ class Sweep:
         If there are few orders, the first pass has more ordinates, as many as fit into about the
         time of the other passes, because these do not reduce its noise.
         """
-        orders = self.cache.max_depth - 2
-        if orders <= 0:
-            return pairs if orders else 0
-        return max(pairs, self.cache.batch // 2 // orders)
+        max_depth = self.cache.max_depth
+        if max_depth < 0:
+            return pairs
+        if max_depth == 2:
+            return 0
+        return max(pairs, self.cache.batch // 2 // (max_depth - 2))
 
     def _channel_groups(self, grey: bool) -> list[tuple[int, ...]]:
         """Return groups of channels that are swept together; only the first channel if ``grey``."""
@@ -312,15 +314,15 @@ class Sweep:
         """
         if self.cache.max_depth == 2:
             tracks = self._tracks_of(channels)
-            return [(phi, None) for phi in self._uncollided(tracks, sets, channels)[1]]
+            return [(found, None) for found in self._uncollided(tracks, sets, channels)[1]]
         level = self._level(channels)
         swept, uncollided = self._uncollided(level.tracks, sets[1:], channels)
         total = self._swept(level, sets, channels)
-        # Both layers use the same ordinates, so that their sum has no noise in a constant
-        # environment.
+        # Both layers use the same ordinates: in their sum the uncollided part along tracks cancels
+        # (but for suns evaluated in closed form), so it has no noise in a constant environment.
         scattered = [
-            dr.maximum(dr.gather(mi.Float, total, place) - phi, 0)
-            for place, phi in zip(self._interleaved_places(channels), swept, strict=True)
+            dr.maximum(dr.gather(mi.Float, total, place) - along_tracks, 0)
+            for place, along_tracks in zip(self._interleaved_places(channels), swept, strict=True)
         ]
         dr.eval(scattered)
         return list(zip(uncollided, scattered, strict=True))
@@ -368,8 +370,8 @@ class Sweep:
             interpolated = swept = self._with_cut_voxels(interpolated, sets, share, channels)
         emitters = *self._direct, *self._emission
         return swept, [
-            phi + sum(irradiance[c] for irradiance, *_ in emitters) + self._from_suns(c)
-            for c, phi in zip(channels, interpolated, strict=True)
+            along_tracks + sum(irradiance[c] for irradiance, *_ in emitters) + self._from_suns(c)
+            for c, along_tracks in zip(channels, interpolated, strict=True)
         ]
 
     def _with_cut_voxels(
@@ -385,8 +387,8 @@ class Sweep:
         is_cut = self._surfaces.is_cut_at(self.cache.active)
         places = self._interleaved_places(channels)
         found = [
-            dr.select(is_cut, dr.gather(mi.Float, collided, place), phi)
-            for place, phi in zip(places, irradiance, strict=True)
+            dr.select(is_cut, dr.gather(mi.Float, collided, place), own)
+            for place, own in zip(places, irradiance, strict=True)
         ]
         dr.eval(found)
         return found
@@ -426,14 +428,14 @@ class Sweep:
         first, *sets = sets
         phi, total = self._irradiance_of_collisions(level, first, channels, len(sets)), mi.Float(0)
         used, share = mi.Float(0), dr.opaque(mi.Float, 1 / len(sets))
-        for known, each in enumerate(sets, 1):
+        for number, each in enumerate(sets, 1):
             irradiance, again = each.sweep(level, phi)
             total, used = total + irradiance, used + phi
             dr.eval(total, used)
             if self.cache.max_depth < 0:
                 # The sweep is another estimate of all orders: the mean of both has less noise.
                 again = each.corrected(level, phi, self._add_sampled(again, channels))
-                phi = dr.lerp(phi, again, dr.opaque(mi.Float, 1 / (known + 1)))
+                phi = dr.lerp(phi, again, dr.opaque(mi.Float, 1 / (number + 1)))
                 dr.eval(phi)
         if self.cache.max_depth >= 0:
             return total * share
@@ -480,7 +482,7 @@ class Sweep:
         """Return the irradiance from each emitter that is sampled voxel by voxel, as means over the
         active voxels.
         """
-        known = self._known_lights
+        known = self._closed_form_lights
         direct = [
             known[id(irradiance)].means[channel]
             if id(irradiance) in known
@@ -489,7 +491,7 @@ class Sweep:
         ]
         return direct + [irradiance[channel] for irradiance, *_ in self._emission]
 
-    def _with_known_lights(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
+    def _with_closed_form_lights(self, direct: list[list[mi.Spectrum]]) -> list[list[mi.Spectrum]]:
         """Replace and complete ``direct`` by the irradiance of the cache's direct lights.
 
         ``direct`` is the irradiance of each point-like emitter, followed by that of other emitters.

@@ -1,11 +1,11 @@
 """Transport sweeps along long characteristics: parallel tracks that all voxels of a grid share.
 
 For one ordinate, tracks lie on the lattice of the voxels of a slice across the ordinate's dominant
-axis, shifted by a random fraction of a voxel, and advance slice by slice. From one slice to the
-next all tracks move by the same number of whole voxels, so in every slice each voxel has exactly
-one track. A voxel and ordinate cost one step, whatever the size of the grid, and no two tracks ever
-write to the same voxel. A track that leaves through a side continues as a new one that enters
-through the opposite side, and begins at the exact point of entry, between two slices.
+axis, shifted by a random fraction of a voxel, and advance slice by slice. All tracks of an ordinate
+pass to the next voxel at the same slices, so in every slice each voxel has exactly one track. A
+voxel and ordinate cost one step, whatever the size of the grid, and no two tracks ever write to the
+same voxel. A track that leaves through a side continues as a new one that enters through the
+opposite side, and begins at the exact point of entry, between two slices.
 
 Along a track the extinction is interpolated bilinearly in every slice and linearly from slice to
 slice; the source is that of the track's voxel. On a grid that is coarser or finer than the
@@ -186,10 +186,11 @@ class Tracks:
         """Sweep radiance that voxels emit or scatter, and that enters from outside.
 
         ``volume`` has four values per voxel: its source S (radiance per optical depth), and three
-        sums: its irradiance; the radiance lost in it, the integral of L - S over optical depth and
-        directions; and the integral of 1, W. S plus the mean loss, loss / W, is the mean radiance
-        *of collisions*: scattering it conserves energy exactly in every voxel. With several
-        channels, a voxel has these four values for each channel in turn.
+        sums, Phi, V and W of eq. (4.7): its irradiance; the loss, the integral of L - S over
+        optical depth and directions; and the integral of 1. V and W are divided by the length of
+        the track in a slice. S + V / W is the mean radiance *of collisions*: scattering it
+        conserves energy exactly in every voxel. With several channels, a voxel has these four
+        values for each channel in turn.
         """
         if self.one_launch:
             self._sweep_copies(volume, True, table, table.order)

@@ -114,7 +114,7 @@ def test_finer_voxels_have_a_limit(monkeypatch):
 )
 def test_size_of_batches(samples, batch):
     """A batch holds all directions, or equal parts of up to 256."""
-    assert sn_solver.batch_of(samples, sn_solver.BATCH) == batch
+    assert sn_solver.batch_of(samples, sn_solver.SMALLEST_BATCH) == batch
 
 
 def soft(count: int, sigma_t: float) -> np.ndarray:
