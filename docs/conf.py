@@ -60,6 +60,7 @@ math_numfig = True
 numfig_secnum_depth = 1
 
 autodoc_typehints = "none"  # docstrings state types and shapes
+autodoc_preserve_defaults = True  # as written, not as printed
 autodoc_member_order = "bysource"
 napoleon_use_rtype = False
 copybutton_prompt_text = "$ "
@@ -75,7 +76,9 @@ if "Source" in urls:
 linkcheck_timeout = 15
 
 #: "eq. (4.7)", or "eqs. (4.6), (4.7) and (5.1)".
-_EQUATIONS = re.compile(r"(?<=eq\. )\(\d\.\d+\)|(?<=eqs\. )(?:\(\d\.\d+\)(?:,| and| to| or)?\s*)+")
+_EQUATIONS = re.compile(
+    r"(?<=eq\.\s)\(\d\.\d+\)|(?<=eqs\.\s)(?:\(\d\.\d+\)(?:,|\s+and|\s+to|\s+or)?\s*)+"
+)
 _LABELS = {
     label
     for page in (HERE / "primer").glob("[0-9]-*.md")

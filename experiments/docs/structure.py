@@ -104,7 +104,7 @@ def summary(docstring: str) -> str:
     Markdown.
     """
     paragraph = " ".join(docstring.split("\n\n")[0].split())
-    first = re.split(r"(?<=[^.])\.(?: |$)", paragraph)[0]
+    first = re.split(r"(?<=[^.])(?<!\beq)(?<!\beqs)\.(?: |$)", paragraph)[0]
     return re.sub(r"`+([^`]+)`+", r"`\1`", first)
 
 

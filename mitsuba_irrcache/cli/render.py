@@ -43,7 +43,8 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
         "--mode",
         default="llvm_ad_rgb",
         choices=SUPPORTED,
-        help="variant (default: %(default)s)",
+        metavar="VARIANT",
+        help=f"{', '.join(SUPPORTED)} (default: %(default)s)",
     )
     parser.add_argument(
         "-D", "--define", action="append", default=[], metavar="KEY=VALUE",
