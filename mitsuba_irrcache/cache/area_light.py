@@ -35,7 +35,7 @@ from mitsuba_irrcache.lights.solid_angle import SolidAngle
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.voxel_classes import VoxelClasses
 from mitsuba_irrcache.transport.path import Media, visibility
-from mitsuba_irrcache.transport.tracking import medium_transmittance
+from mitsuba_irrcache.transport.tracking import GAUSS_POINTS, medium_transmittance
 
 #: Number of points on an emitter: in total over all voxels, and minimum and maximum per voxel.
 SAMPLES, FEWEST_SAMPLES, MOST_SAMPLES = 1 << 24, 32, 512
@@ -62,8 +62,6 @@ MOST_LIGHTS, MOST_VALUES, VALUES = 8, 14 << 24, 14
 #: Lines from a position to an emitter whose lengths in the medium divide optical depths: that to
 #: the closest point, those to several points, or none.
 CLOSEST, SEVERAL, NONE = LINES = ("closest", "several", "none")
-#: Coordinates of Gauss-Legendre quadrature over [0, 1] with two points.
-GAUSS_LEGENDRE = (0.5 - 0.28867513, 0.5 + 0.28867513)
 
 
 class AreaLight(DirectLight):
@@ -142,11 +140,11 @@ class AreaLight(DirectLight):
         self, scene: mi.Scene, depth: mi.Float | mi.Color3f, classes: VoxelClasses | None
     ) -> GridField:
         """Create the field as in the base class, with the `length` that has the smaller error."""
+        if _is_inside(self._shape, self._medium):
+            return super()._extinction(scene, depth, classes)
         fields, errors = {}, {}
         for self._lines in LINES:
             fields[self._lines] = self.extinction = super()._extinction(scene, depth, classes)
-            if _is_inside(self._shape, self._medium):
-                return self.extinction
             errors[self._lines] = self._depth_error(scene)
         self._lines = min(errors, key=errors.get)
         return fields[self._lines]
@@ -435,7 +433,7 @@ def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:
 
 def _places_on(shape: mi.Shape) -> list[mi.Point3f]:
     """Return four points of a shape, those of a product rule for a rectangle."""
-    samples = [mi.Point2f(u, v) for u in GAUSS_LEGENDRE for v in GAUSS_LEGENDRE]
+    samples = [mi.Point2f(u, v) for u in GAUSS_POINTS for v in GAUSS_POINTS]
     places = [shape.sample_position(0.0, sample).p for sample in samples]
     dr.make_opaque(places)
     return places
