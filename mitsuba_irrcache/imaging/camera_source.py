@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
@@ -9,12 +11,15 @@ from mitsuba_irrcache.core.cancellation import StopCondition, Stopped
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.imaging.options import Options
 from mitsuba_irrcache.imaging.stock import StockIntegrators
-from mitsuba_irrcache.out_of_core.rendering import MappedMedium
 from mitsuba_irrcache.pipeline.builder import Progress
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import CameraRays, ClosedFormCameraRays, TracedCameraRays
 from mitsuba_irrcache.render.tolerance import Certificate
 from mitsuba_irrcache.scene.consistency import check_sensor
+
+# few volumes stay in files: these modules are imported on use
+if TYPE_CHECKING:
+    from mitsuba_irrcache.out_of_core.rendering import MappedMedium
 
 
 class CameraRaySource:
@@ -33,6 +38,8 @@ class CameraRaySource:
         self._step = options.rays.step  # replaced by the step that the search finds
         self._mapped: MappedMedium | None = None
         if options.volume is not None:
+            from mitsuba_irrcache.out_of_core.rendering import MappedMedium
+
             whole = not (self._search or options.rays.layered or options.emission is not None)
             self._mapped = MappedMedium(options.settings, options.volume, whole)
         #: estimated error of the last image with a ``tolerance``

@@ -14,7 +14,9 @@ from mitsuba_irrcache.errors import IrrcacheError
 
 #: Where Linux keeps its control groups, and those of this process.
 CONTROL_GROUPS, PROCESS_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-#: Stands for no limit, in bytes.
+#: Where Linux states the memory of the machine.
+MACHINE_MEMORY = Path("/proc/meminfo")
+#: Value that represents no limit [bytes].
 UNLIMITED = 2**63
 #: Arrays of at least this many bytes are returned to the system when freed: glibc's initial
 #: threshold.
@@ -26,23 +28,36 @@ _M_MMAP_THRESHOLD = -3
 
 
 def available_memory() -> int:
-    """Bytes that can be allocated without swapping, within the limit of a container, if any."""
-    # Imported here because importing the package takes longer with it.
-    import psutil
-
-    return max(0, min(psutil.virtual_memory().available, _left_in_container()))
+    """Return the bytes that can be allocated without swapping, within the limit of a container."""
+    return max(0, min(_of_machine("MemAvailable", "available"), _left_in_container()))
 
 
 def total_memory() -> int:
-    """Bytes of memory of the machine, or of the container if it is limited."""
+    """Return the bytes of memory of the machine, or of the container if it is limited."""
+    limits = (_bytes(folder / limit) for folder, limit, *_ in _control_groups())
+    return min(_of_machine("MemTotal", "total"), *limits, UNLIMITED)
+
+
+def _of_machine(entry: str, attribute: str) -> int:
+    """Return a number of bytes: an ``entry`` of `MACHINE_MEMORY`, else an ``attribute`` of psutil.
+
+    On Linux psutil reads the same file, but takes 10 ms to import.
+    """
+    with suppress(OSError, ValueError, IndexError):
+        for line in MACHINE_MEMORY.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name == entry:
+                return int(value.split()[0]) << 10
     import psutil
 
-    limits = (_bytes(folder / limit) for folder, limit, *_ in _control_groups())
-    return min(psutil.virtual_memory().total, *limits, UNLIMITED)
+    return getattr(psutil.virtual_memory(), attribute)
 
 
 def _left_in_container() -> int:
-    """Bytes that the control groups of this process permit to allocate, `UNLIMITED` if any."""
+    """Return the bytes that the control groups of this process still permit to allocate.
+
+    `UNLIMITED` if no group has a limit.
+    """
     left = UNLIMITED
     for folder, limit, usage, cache in _control_groups():
         allowed = _bytes(folder / limit)

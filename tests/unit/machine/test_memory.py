@@ -80,6 +80,17 @@ def test_memory_without_limits_is_that_of_the_machine(groups):
     assert memory.available_memory() == pytest.approx(free, rel=0.2)
 
 
+@pytest.mark.parametrize("text", [None, "", "MemTotal:\nMemAvailable: many kB\n"])
+def test_memory_of_other_systems_is_that_of_psutil(groups, monkeypatch, tmp_path, text):
+    file = tmp_path / "meminfo"
+    if text is not None:
+        file.write_text(text)
+    monkeypatch.setattr(memory, "MACHINE_MEMORY", file)
+    assert memory.total_memory() == psutil.virtual_memory().total
+    free = psutil.virtual_memory().available
+    assert memory.available_memory() == pytest.approx(free, rel=0.2)
+
+
 def test_memory_is_limited_by_the_container(groups):
     root, listed = groups
     listed.write_text("0::/on/the/host\n")  # not the path inside of the container
