@@ -294,7 +294,7 @@ def functions_of(checkout: Path) -> list[tuple[int, int, str]]:
             arguments = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
             count = len(arguments) - bool(arguments and arguments[0].arg in ("self", "cls"))
             lines = node.end_lineno - node.lineno + 1
-            found.append((lines, count, f"{module.replace('.', '/')}.py::{name}"))
+            found.append((lines, count, f"`{name}` in {module.replace('.', '/')}"))
     return sorted(found, key=lambda item: (-item[0], item[2]))
 
 
@@ -322,7 +322,7 @@ def functions_table(checkouts: dict[str, Path]) -> Table:
             "parameters",
         ])  # fmt: skip
     rows = [
-        [str(number), *(cell for lines, _, name in row for cell in (f"`{name}`", str(lines)))]
+        [str(number), *(cell for lines, _, name in row for cell in (name, str(lines)))]
         for number, row in enumerate(zip(*columns, strict=True), 1)
     ]
     for row in zip(*counts, strict=True):

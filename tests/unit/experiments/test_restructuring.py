@@ -58,8 +58,8 @@ def test_modules_that_import_each_other_share_a_level():
 
 def test_functions_have_lines_and_parameters(checkout):
     assert restructuring.functions_of(checkout) == [
-        (2, 2, "high/a.py::C.g"),
-        (2, 0, "low/below.py::f"),
+        (2, 2, "`C.g` in high/a"),
+        (2, 0, "`f` in low/below"),
     ]
 
 
