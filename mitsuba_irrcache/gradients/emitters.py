@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.gradients.resampling import volume_of
-from mitsuba_irrcache.gradients.scattering import Layers, OrdinatePart
+from mitsuba_irrcache.gradients.scattering import Components, OrdinatePart
 from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.lights.environments import environment_radiance
@@ -54,19 +54,19 @@ class EmitterAdjoint:
         ]
         if self._environment is None and not any(sun in self._wanted for sun in suns):
             return
-        worth = self._worth_of_ordinates(transport, found)
+        derivatives = self._derivatives_by_ordinates(transport, found)
         directions, incoming, *_ = transport.ordinates
         tracks = transport.sun_tracks
         end = len(directions) - len(suns) * tracks
         for number, sun in enumerate(suns):
             if sun in self._wanted:
-                rows = worth[end + number * tracks : end + (number + 1) * tracks, 0]
+                rows = derivatives[end + number * tracks : end + (number + 1) * tracks, 0]
                 _add_sun(sun, rows.mean(axis=0))
         if self._environment is not None:
             both = np.stack([directions[:end], -directions[:end]], axis=1).reshape(-1, 3)
             angle = _solid_angles(self._environment, both, incoming[:end])
             towards = mi.Vector3f(both.T.astype(np.float32))
-            adjoint = (worth[:end] * angle).reshape(len(both), -1)
+            adjoint = (derivatives[:end] * angle).reshape(len(both), -1)
             self._add_environment(towards, mi.Spectrum(adjoint.T.astype(np.float32)))
 
     def _add_environment(self, direction: mi.Vector3f, adjoint: mi.Spectrum) -> None:
@@ -79,24 +79,31 @@ class EmitterAdjoint:
         with dr.resume_grad():
             _pull(self._environment.eval(interaction), adjoint)
 
-    def _worth_of_ordinates(self, transport: AdjointTransport, found: Derivatives) -> np.ndarray:
+    def _derivatives_by_ordinates(
+        self, transport: AdjointTransport, found: Derivatives
+    ) -> np.ndarray:
         """Return the derivatives (n, 2, channels) with respect to the irradiance that enters along
         both directions of each of the n pairs of opposite ordinates.
         """
-        worth = np.zeros((len(transport.ordinates.directions), 2, transport.channels))
+        result = np.zeros((len(transport.ordinates.directions), 2, transport.channels))
         for number, part in enumerate(transport.parts):
             for level, channels in transport.levels:
                 scattered = [found.direct[c][number] for c in channels]
                 for c, values in zip(
-                    channels, _received(level, transport, part, scattered), strict=True
+                    channels,
+                    _transmitted_importance(level, transport, part, scattered),
+                    strict=True,
                 ):
-                    own = worth[part.rows, :, c]
-                    worth[part.rows, :, c] = np.where(part.mask, values, own)
-        return worth
+                    own = result[part.rows, :, c]
+                    result[part.rows, :, c] = np.where(part.mask, values, own)
+        return result
 
 
-def _received(
-    level: MultigridLevel, transport: AdjointTransport, part: OrdinatePart, scattered: list[Layers]
+def _transmitted_importance(
+    level: MultigridLevel,
+    transport: AdjointTransport,
+    part: OrdinatePart,
+    scattered: list[Components],
 ) -> list[np.ndarray]:
     """Return, for each channel, integrals (n, 2) over voxels of the transmittance from the point
     where each ordinate of a ``part`` enters, times the importance ``scattered`` along it.
@@ -114,37 +121,38 @@ def _received(
         table, lambda group: scattering.along(level, none, group)
     ):
         place = dr.arange(mi.UInt32, 2 * len(group) * voxels)
-        light = dr.gather(mi.Float, copies, place * 4 + 1)
-        for layers, result in zip(scattered, found, strict=True):
+        transmittance = dr.gather(mi.Float, copies, place * 4 + 1)
+        for components, result in zip(scattered, found, strict=True):
             # The importance travels against the radiance.
             opposite = place + (1 - 2 * (place // voxels % 2)) * voxels
-            worth = dr.gather(mi.Float, scattering.along(level, layers, group), opposite)
-            sums = dr.block_sum(light * worth, voxels)
-            ways = np.array(sums, dtype=np.float64).reshape(-1, 2)
+            importance = dr.gather(mi.Float, scattering.along(level, components, group), opposite)
+            sums = dr.block_sum(transmittance * importance, voxels)
+            both = np.array(sums, dtype=np.float64).reshape(-1, 2)
             rows = np.array(group.rows)
-            # A table holds the way along the dominant axis first.
-            result[rows] = np.where(forward[rows, None], ways, ways[:, ::-1])
+            # A table holds the direction along the dominant axis first.
+            result[rows] = np.where(forward[rows, None], both, both[:, ::-1])
     return [result * volume_of(transport.grid) for result in found]
 
 
 def _solid_angles(environment: mi.Emitter, both: np.ndarray, incoming: np.ndarray) -> np.ndarray:
     """Return the solid angles that weight the radiance along each ordinate and its opposite."""
     radiance = environment_radiance(environment, both).reshape(-1, 2, incoming.shape[-1])
-    known = radiance > 0
-    angle = np.where(known, incoming / np.where(known, radiance, 1), 0)
+    is_lit = radiance > 0
+    angle = np.where(is_lit, incoming / np.where(is_lit, radiance, 1), 0)
     most = angle.max(axis=-1, keepdims=True)
-    return np.where(known, angle, most)
+    return np.where(is_lit, angle, most)
 
 
 def _add_point(light: int, transport: AdjointTransport, found: Derivatives) -> None:
+    """Accumulate the derivatives through the irradiance of a point-like light."""
     emitter, irradiance = transport.point_lights[light], transport.from_points[light]
     at = dr.zeros(mi.Interaction3f, transport.grid.voxel_count)
     at.p = transport.positions
     _, unattenuated = emitter.sample_direction(at, mi.Point2f(0.5))
-    lit = unattenuated > 0
-    passed = dr.select(lit, irradiance / dr.select(lit, unattenuated, 1), 0)
+    is_lit = unattenuated > 0
+    transmittance = dr.select(is_lit, irradiance / dr.select(is_lit, unattenuated, 1), 0)
     share = dr.opaque(mi.Float, volume_of(transport.grid))
-    adjoint = passed * transport.worth_of_point(light, found) * share
+    adjoint = transmittance * transport.derivative_by_point(light, found) * share
     dr.eval(at, adjoint)
     with dr.resume_grad():
         _, value = emitter.sample_direction(at, mi.Point2f(0.5))
@@ -152,10 +160,11 @@ def _add_point(light: int, transport: AdjointTransport, found: Derivatives) -> N
 
 
 def _add_sun(emitter: mi.Emitter, adjoint: np.ndarray) -> None:
-    worth = mi.Spectrum([dr.opaque(mi.Float, float(v)) for v in adjoint])
+    """Accumulate the derivatives through the irradiance of a sun, given by channel."""
+    weights = mi.Spectrum([dr.opaque(mi.Float, float(v)) for v in adjoint])
     with dr.resume_grad():
         _, value = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1), mi.Point2f(0.5))
-        _pull(value, worth)
+        _pull(value, weights)
 
 
 def _pull(value: mi.Spectrum, adjoint: mi.Spectrum) -> None:

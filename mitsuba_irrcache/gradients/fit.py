@@ -392,7 +392,7 @@ class _Fit:
         ends = np.cumsum([0, *(value.size for value in result.values.values())])
         scale = np.concatenate([np.full(v.size, self._scales[n]) for n, v in result.values.items()])
 
-        def apart(x: np.ndarray) -> dict[str, np.ndarray]:
+        def by_name(x: np.ndarray) -> dict[str, np.ndarray]:
             parts = (x[a:b] for a, b in pairwise(ends))
             return {
                 name: self._within_bounds(name, part.reshape(shape)).astype(np.float32)
@@ -402,14 +402,14 @@ class _Fit:
         first: list[float] = []
 
         def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-            loss, gradient = self._objective(apart(x * scale), self._views, settings.seed)
+            loss, gradient = self._objective(by_name(x * scale), self._views, settings.seed)
             _check_finite(loss, gradient, result.step)
             first.append(loss or 1.0)
             flat = np.concatenate([g.ravel() for g in gradient.values()]) * scale
             return loss / first[0], flat / first[0]  # tolerances are for values around 1
 
         def iterated(intermediate_result) -> None:
-            result.values = apart(intermediate_result.x * scale)
+            result.values = by_name(intermediate_result.x * scale)
             self._step_done(float(intermediate_result.fun) * first[0])
 
         left = settings.steps - result.step

@@ -1,4 +1,4 @@
-"""The fluence of a cache in single precision at all voxels, also where there is no matter."""
+"""The fluence of a cache in single precision at all voxels, including voxels without extinction."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mitsuba_irrcache.cache.direct_light import DirectLight, DirectLightAlongRay
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.spectrum import interleaved
 from mitsuba_irrcache.gradients.replay import InScattering
-from mitsuba_irrcache.gradients.scattering import Layers
+from mitsuba_irrcache.gradients.scattering import Components
 from mitsuba_irrcache.gradients.transport import AdjointTransport
 from mitsuba_irrcache.grids.root_field import RootField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
@@ -25,11 +25,12 @@ class FluenceFields:
     """Fields of the fluence for lookups along camera rays, and the fluence of collisions.
 
     Attributes:
-        irradiance: divided by `falloff`, without that of `direct_lights`.
-        falloff: factor of emitters nearby; None without any.
-        direct_lights: emitters whose irradiance camera rays evaluate themselves.
-        angular: scattering into camera rays; None where it is isotropic.
-        collided: layers of the fluence of collisions in each channel of ``transport``.
+        irradiance: the irradiance without that of `direct_lights`, divided by `falloff`.
+        falloff: inverse-square factor of emitters nearby; None if there are none.
+        direct_lights: emitters whose irradiance is evaluated along camera rays.
+        angular: anisotropic scattering into camera rays; None if scattering is isotropic.
+        collided: for each channel of ``transport``, the components of the fluence weighted by
+            collisions, one value per voxel.
     """
 
     def __init__(
@@ -46,33 +47,35 @@ class FluenceFields:
             DirectLight(scene, light.emitter, medium, grid, voxels) for light in cache.direct_lights
         ]
         channels, colour = transport.channels, transport.colour
-        # The brightest of all channels that differ by a factor.
+        # Of channels that differ by a constant factor, the brightest one represents all.
         own = range(channels) if channels == cache.channels else [int(colour.argmax())]
-        known = [self._known(c) for c in own]
+        cached = [self._cached(c) for c in own]
         swept, self.collided = transport.irradiance(
-            [self._with_narrow_sources(c, k, lights) for c, k in zip(own, known, strict=True)]
+            [self._with_narrow_sources(c, k, lights) for c, k in zip(own, cached, strict=True)]
         )
         has_value = dr.zeros(mi.Bool, grid.voxel_count)
         if cache.active_count and cache.samples:
             dr.scatter(has_value, mi.Bool(True), cache.active)
-        swept = [self._as_in_cache(layers) for layers in swept]
+        swept = [self._as_in_cache(components) for components in swept]
         total = [
             [dr.select(has_value, a, b) for a, b in zip(*pair, strict=True)]
-            for pair in zip(known, swept, strict=True)
+            for pair in zip(cached, swept, strict=True)
         ]
-        brightest = max((float(dr.max(dr.abs(layers[0]))[0]) for layers in total), default=0.0)
+        brightest = max(
+            (float(dr.max(dr.abs(components[0]))[0]) for components in total), default=0.0
+        )
         for light in lights:
-            for c, layers in zip(own, total, strict=True):
-                layers[0] = dr.maximum(layers[0] - self._scaled(light.irradiance[c], c), 0)
+            for c, components in zip(own, total, strict=True):
+                components[0] = dr.maximum(components[0] - self._scaled(light.irradiance[c], c), 0)
         self.angular, basis = None, None
         if cache.directional is not None:
             moments = [values for each in zip(*total, strict=True) for values in each][channels:]
-            irradiance = [layers[0] for layers in total]
+            irradiance = [components[0] for components in total]
             field = AngularField(cache.directional, grid, irradiance, moments)
             self.angular = InScattering(field, transport.scattering.basis)
             basis = AngularBasis(medium.phase, [])
         falloff = InverseSquareFactor.of(scene, grid, [light.emitter for light in lights])
-        roots = [dr.sqrt(dr.maximum(layers[0], 0)) for layers in total]
+        roots = [dr.sqrt(dr.maximum(components[0], 0)) for components in total]
         if falloff is not None:
             smooth = dr.rsqrt(falloff.of_voxels(voxels))
             roots = [r * smooth for r in roots]
@@ -87,47 +90,53 @@ class FluenceFields:
         self.direct_lights = [DirectLightAlongRays(light, basis) for light in lights]
 
     def scattered_by(self, phase: Phase) -> FluenceFields:
-        """The same fluence with another phase function for scattering into camera rays."""
-        fields, known = copy(self), self._cache.directional
-        basis = AngularBasis(phase, known.sources, order=known.order)
+        """Return these fields with another ``phase`` function for scattering into camera rays."""
+        fields, own = copy(self), self._cache.directional
+        basis = AngularBasis(phase, own.sources, order=own.order)
         fields.angular = self.angular.in_basis(basis)
-        basis = AngularBasis(phase, [], order=known.order)
+        basis = AngularBasis(phase, [], order=own.order)
         fields.direct_lights = [DirectLightAlongRays(light, basis) for light in self._lights]
         return fields
 
-    def _known(self, channel: int) -> Layers:
-        """The layers of a channel of the cache at all voxels: the irradiance, moments, and the
-        irradiance of its narrow sources; 0 where it has none.
+    def _cached(self, channel: int) -> Components:
+        """Return the values of a channel of the cache at all voxels, 0 at inactive ones.
+
+        These are the irradiance, its moments, and the irradiance of each narrow source of the
+        cache.
         """
         cache = self._cache
         place = dr.arange(mi.UInt32, cache.grid.voxel_count) * cache.channels + channel
         irradiance = dr.gather(mi.Float, cache.irradiance.array, place)
-        layers = [irradiance]
+        components = [irradiance]
         if cache.directional is not None:
             for values in cache.moment_means()[channel :: cache.channels]:
                 spread = dr.zeros(mi.Float, cache.grid.voxel_count)
                 if cache.active_count:
                     dr.scatter(spread, values, cache.active)
-                layers.append(spread)
-            dr.eval(layers)
-        return [self._scaled(values, channel) for values in layers]
+                components.append(spread)
+            dr.eval(components)
+        return [self._scaled(values, channel) for values in components]
 
     def _scaled(self, values: mi.Float, channel: int) -> mi.Float:
-        """``values`` of a channel in units of its colour."""
+        """Return ``values`` of a channel divided by the factor of its colour."""
         return values * dr.opaque(mi.Float, 1 / float(self._transport.colour[channel]))
 
     def _with_narrow_sources(
-        self, channel: int, layers: Layers, lights: list[DirectLight]
-    ) -> Layers:
-        """Moments of all radiance, from ``layers`` of `_known` and direct ``lights``."""
+        self, channel: int, components: Components, lights: list[DirectLight]
+    ) -> Components:
+        """Return the moments of all radiance.
+
+        ``components`` are those that `_cached` returns, which lack the higher moments of narrow
+        sources and of direct ``lights``.
+        """
         scattering, p = self._transport.scattering, self._transport.positions
-        result = layers[: scattering.count]
+        result = components[: scattering.count]
         if self._cache.directional is None:
             return result
         narrow = [
             (irradiance, source.seen_from(p)[0])
             for source, irradiance in zip(
-                self._cache.directional.sources, layers[scattering.count :], strict=True
+                self._cache.directional.sources, components[scattering.count :], strict=True
             )
         ]
         narrow += [
@@ -138,13 +147,13 @@ class FluenceFields:
             result[1:] = [a + b for a, b in zip(result[1:], higher, strict=True)]
         return result
 
-    def _as_in_cache(self, layers: Layers) -> Layers:
-        """``layers`` with the irradiance of those narrow sources only that the cache has, too."""
+    def _as_in_cache(self, components: Components) -> Components:
+        """Return ``components`` without narrow sources that the cache does not distinguish."""
         if self._cache.directional is None:
-            return layers
+            return components
         scattering = self._transport.scattering
-        sources = list(zip(scattering.basis.sources, layers[scattering.count :], strict=True))
-        result = layers[: scattering.count]
+        sources = list(zip(scattering.basis.sources, components[scattering.count :], strict=True))
+        result = components[: scattering.count]
         for own in self._cache.directional.sources:
             number = next(i for i, (source, _) in enumerate(sources) if source.is_same(own))
             result.append(sources.pop(number)[1])

@@ -1,5 +1,7 @@
-"""The transpose of delta-M scaling: from derivatives by the medium without the forward peak of its
-phase function (`media/delta_m`) to those by the medium of the scene.
+"""The transpose of delta-M scaling (`media/delta_m`).
+
+It converts derivatives with respect to the scaled medium, whose phase function has no forward peak,
+to derivatives with respect to the medium of the scene.
 """
 
 from __future__ import annotations
@@ -22,9 +24,16 @@ def with_forward_peak(
     wanted: dict[str, int],
     change: float = 0.0,
 ) -> dict[str, mi.Float]:
-    """Derivatives by the extinction and albedo of ``medium.original``, of those that are
-    ``wanted``, in so many channels, from those by ``medium`` in ``channels``; and that by the mean
-    cosine of the phase function, by which the share of the peak has the derivative ``change``.
+    """Return derivatives with respect to ``medium.original``, by role, as flat arrays.
+
+    Args:
+        medium: the scaled medium.
+        found: derivatives with respect to the extinction and albedo of ``medium``, by role, at the
+            voxels of their data; and, at fixed extinction and albedo, the mean cosine.
+        channels: number of channels of ``found``.
+        wanted: number of channels of each derivative to return, by role: `SIGMA_T`, `ALBEDO`,
+            `MEAN_COSINE`; other roles are returned as they are.
+        change: derivative of the share of the forward peak with respect to the mean cosine.
     """
     # docs/primer, eq. (8.14)
     share, field = medium.phase.forward, medium.sigma_t
@@ -63,14 +72,14 @@ def with_forward_peak(
 
 
 def _positions(grid: Grid | None) -> mi.Point3f:
-    """The voxel centres; any position without a grid."""
+    """Return the voxel centres of a grid, or an arbitrary position if there is none."""
     if grid is None:
         return mi.Point3f(0)
     return grid.centers(dr.arange(mi.UInt32, grid.voxel_count))
 
 
 def _channels(values: mi.Float, count: int) -> list[mi.Float]:
-    """So many interleaved channels, each as an array."""
+    """Return the ``count`` channels of an array with interleaved channels."""
     index = dr.arange(mi.UInt32, dr.width(values) // count) * count
     return [dr.gather(mi.Float, values, index + c) for c in range(count)]
 
@@ -80,8 +89,9 @@ def _total(values: mi.Float) -> float:
 
 
 def _at_data(field: Field, p: mi.Point3f, values: list[mi.Float], channels: int) -> mi.Float:
-    """Derivatives by the data of ``field`` in so many channels, from those by its ``values`` at
-    positions.
+    """Return derivatives with respect to the data of ``field``, with this number of channels.
+
+    ``values`` are the derivatives with respect to its lookups at positions ``p``.
     """
     values = [sum(values)] if channels == 1 else values
     if field.grid is None:

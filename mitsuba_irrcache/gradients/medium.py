@@ -1,4 +1,4 @@
-"""Derivatives of an objective by the fields of a medium, from those by the pixels."""
+"""Derivatives of an objective with respect to the fields of a medium."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from mitsuba_irrcache.gradients.parameters import (
     MEAN_COSINE,
     SIGMA_T,
 )
-from mitsuba_irrcache.gradients.phase_function import PhasesBeside
-from mitsuba_irrcache.gradients.points import add_ways
-from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats
+from mitsuba_irrcache.gradients.phase_function import NeighbouringPhases
+from mitsuba_irrcache.gradients.points import add_paths_to_light
+from mitsuba_irrcache.gradients.replay import CameraReplay, CameraSplats, RaySegments
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature, volume_of
 from mitsuba_irrcache.gradients.scattering import split
 from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums
-from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
+from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives, TransportSettings
 from mitsuba_irrcache.grids.fields import Field
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.machine.memory import require_memory
@@ -32,39 +32,45 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 
-#: Pairs of ordinates for the default directions of the cache, with others in proportion; those for
-#: phase functions with a forward peak, whose moments are of higher order; those under environments
-#: that vary, whose spots they have to find; and the fewest.
+#: Numbers of pairs of ordinates where the cache has its default number of directions: usually; for
+#: phase functions with a forward peak, which have moments of higher order; and under environments
+#: that vary, whose bright spots the ordinates have to sample. With other numbers of directions
+#: they are in proportion, but not below the last one.
 PAIRS, SHARP_PAIRS, MOST_PAIRS, FEWEST_PAIRS = 24, 64, 128, 8
+#: Kinds of environments that vary.
 UNEVEN = (EmitterKind.ENVIRONMENT_MAP,)
-#: How much larger than estimated sums of magnitudes may be, in `FixedPointSums`.
+#: Factor by which sums of magnitudes may exceed their estimates, in `FixedPointSums`.
 MARGIN = 256.0
-#: Bytes for camera samples and copies of tracks; numbers for each voxel, for each of its channels,
-#: and for each further moment of these.
+#: Memory for camera samples and copies of tracks [bytes]; and numbers that are stored for each
+#: voxel, for each of its channels, and for each higher moment of each channel.
 MEMORY, NUMBERS = 3 << 27, (40, 25, 12)
-#: Optical depth of a voxel below which its collisions do not matter.
+#: Optical depth of a voxel below which its collisions are neglected.
 EMPTY = 1e-6
 
 
 def original_of(medium: MediumGrid) -> MediumGrid:
-    """The medium of the scene, which is not scaled by delta-M."""
+    """Return the medium of the scene, before delta-M scaling."""
     return medium.original or medium
 
 
 def field_of(medium: MediumGrid, role: str) -> Field:
-    """The field of ``medium`` that a role names."""
+    """Return the field of ``medium`` with a role: `SIGMA_T`, `ALBEDO` or `EMISSION`."""
     if role == EMISSION:
         return medium.emission.field
     return medium.sigma_t if role == SIGMA_T else medium.albedo
 
 
 class MediumAdjoint:
-    """Derivatives by the medium of ``part`` in ``scene``; ``image`` are the camera rays and the
-    integrator's property ``step``.
+    """Derivatives of an objective with respect to the medium of ``part`` in ``scene``.
 
-    ``wanted`` maps what is wanted, `SIGMA_T`, `ALBEDO`, `EMISSION` or `MEAN_COSINE`, to its
-    channels; the derivatives by ``emitters`` are added to their parameters. The ordinates depend on
-    ``seed``.
+    Args:
+        scene: the scene.
+        part: its only medium, with the cache.
+        image: the camera rays, and the integrator's property ``step``.
+        wanted: number of channels of each derivative to compute, by role: `SIGMA_T`, `ALBEDO`,
+            `EMISSION` or `MEAN_COSINE`.
+        emitters: receives the derivatives with respect to the radiance of emitters.
+        seed: determines the ordinates.
     """
 
     def __init__(
@@ -80,17 +86,17 @@ class MediumAdjoint:
         self._camera_rays, step = image
         self._medium, self._emitters = part.medium, emitters
         self._transport: AdjointTransport | None = None
-        #: channels of the sums at the data of each field of the medium
+        #: number of channels of the sums for each role, see `_sums_for`
         self._sums = self._sums_for(wanted)
         self._fluence: FluenceFields | None = None
-        #: phase functions beside that of the medium, see `PhasesBeside`
-        self._phases: PhasesBeside | None = None
+        #: for derivatives with respect to the mean cosine
+        self._phases: NeighbouringPhases | None = None
         colour = None
         if part.cache is not None:
             self.grid = part.cache.grid
             self._check_memory()
             self._transport = self._new_transport(seed)
-            self._phases = self._transport.beside
+            self._phases = self._transport.neighbours
             self._fluence = FluenceFields(scene, self._medium, part.cache, self._transport)
             self._quadrature = VoxelQuadrature(self._medium, self.grid)
             self._extinction = list(self._quadrature.extinction())
@@ -99,18 +105,20 @@ class MediumAdjoint:
                 factors = [dr.opaque(mi.Float, float(c)) for c in self._transport.colour]
                 colour = mi.Spectrum(factors)
         _warn_of_aureole(part)
-        beside = None
+        neighbours = None
         if self._phases is not None:
             marches = [
                 CameraReplay(self._medium, self._fluence.scattered_by(phase), colour, step)
                 for phase in (self._phases.below, self._phases.above)
             ]
-            beside = (*marches, self._phases.step)
-        self._march = CameraReplay(self._medium, self._fluence, colour, step, beside)
+            neighbours = (*marches, self._phases.step)
+        self._march = CameraReplay(self._medium, self._fluence, colour, step, neighbours)
 
     def _sums_for(self, wanted: dict[str, int]) -> dict[str, int]:
-        """Channels of what is summed for the ``wanted`` derivatives: the extinction and albedo
-        after delta-M scaling depend on the albedo before it, both.
+        """Return the number of channels of the derivatives to sum, by role.
+
+        With delta-M scaling, the ``wanted`` derivative with respect to the albedo follows from
+        those with respect to both the scaled extinction and the scaled albedo.
         """
         if self._medium.original is None or wanted.keys() <= {EMISSION}:
             return dict(wanted)
@@ -125,16 +133,18 @@ class MediumAdjoint:
             self._scene,
             self._medium,
             self.grid,
-            (settings.seed, seed),
-            self._pairs,
-            settings.max_depth == 2,
             self._sums,
-            is_grey and not self._emitters and EMISSION not in wanted,
+            TransportSettings(
+                (settings.seed, seed),
+                self._pairs,
+                single=settings.max_depth == 2,
+                grey=is_grey and not self._emitters and EMISSION not in wanted,
+            ),
         )
 
     @property
     def _pairs(self) -> int:
-        """Pairs of ordinates, in proportion to the directions of the cache."""
+        """Return the number of pairs of ordinates, in proportion to the directions of the cache."""
         part, environment = self._part, self._scene.environment()
         uneven = environment is not None and kind_of(environment) in UNEVEN
         usual = part.solver.default_samples(
@@ -145,7 +155,7 @@ class MediumAdjoint:
         return max(FEWEST_PAIRS, round((MOST_PAIRS if uneven else pairs) * share))
 
     def _check_memory(self) -> None:
-        """Refuse an adjoint solve that cannot be held."""
+        """Raise IrrcacheError if the adjoint solve needs more memory than is free."""
         channels, moments = 1 if mi.is_monochromatic else 3, values_per_voxel(self._part.cache) - 1
         counts = 1, channels, channels * moments
         needed = MEMORY + 4 * self.grid.voxel_count * sum(
@@ -157,26 +167,30 @@ class MediumAdjoint:
     # The camera
 
     def replayed(self, film: FilmAdjoint) -> tuple[dict[str, mi.Float], list[mi.Float] | None]:
-        """Derivatives by what is wanted, at the data's voxels, of what the camera rays of ``film``
-        depend on straight; and the adjoint fluence that they leave in the voxels.
+        """Return the derivatives at a fixed fluence, and the adjoint fluence of the camera rays.
+
+        ``film`` provides the camera rays. The derivatives are flat arrays at the voxels of the
+        data, by role. The adjoint fluence is one array per channel, see `_adjoint_fluence`; None
+        without a cache.
         """
         splats = None
         for each in film.passes():
-            span, behind, weights, hit, offset = self._rays(each, film.medium)
-            march = each.ray, span, each.radiance
-            ahead, passed = self._march.radiance(*march, offset, hit)
-            straight = passed
+            segments, behind, weights = self._rays(each, film.medium)
+            ahead, transmittance = self._march.radiance(segments)
+            original = transmittance  # that of the medium before delta-M scaling
             if self._is_scaled:
                 projection = self._camera_rays.projection
-                straight = projection.unscattered(passed, each.ray, *span, hit)
-            ahead, unscattered = ahead + passed * behind[0], straight * behind[1]
-            seen = (passed * weights[0] + straight * weights[1]) * each.radiance
-            dr.eval(ahead, seen, unscattered)
+                original = projection.unscattered(
+                    transmittance, each.ray, segments.near, segments.far, segments.active
+                )
+            ahead, unscattered = ahead + transmittance * behind[0], original * behind[1]
+            visible = (transmittance * weights[0] + original * weights[1]) * each.radiance
+            dr.eval(ahead, visible, unscattered)
             if self._scene.environment() is not None:
-                self._emitters.add_background(each.ray, seen)
+                self._emitters.add_background(each.ray, visible)
             if splats is None:
                 splats = self._camera_splats(dr.abs(ahead) + dr.abs(unscattered), film)
-            self._march.replay(*march, ahead, offset, hit, splats, unscattered)
+            self._march.replay(segments, ahead, unscattered, splats)
             dr.eval()
         found = self._at_data({role: getattr(splats, role).values() for role in self._sums})
         if splats.unscattered is not None:
@@ -187,12 +201,13 @@ class MediumAdjoint:
 
     @property
     def _is_scaled(self) -> bool:
-        """Whether a forward peak of the phase function counts as unscattered (see `delta_m`)."""
+        """Return whether the medium is scaled by delta-M, and scatters."""
         return self._medium.original is not None and self._fluence is not None
 
     def _at_data(self, found: dict[str, mi.Float]) -> dict[str, mi.Float]:
-        """Derivatives by what is wanted of the scene's medium, from those of the medium that is
-        rendered.
+        """Convert derivatives with respect to the rendered medium to those of the scene's medium.
+
+        These differ by delta-M scaling.
         """
         if self._medium.original is None or self._sums.keys() <= {EMISSION}:
             return found
@@ -200,10 +215,14 @@ class MediumAdjoint:
         return with_forward_peak(self._medium, found, self._sums[SIGMA_T], self._wanted, change)
 
     def _rays(self, each: CameraPass, medium: mi.Medium | None) -> tuple:
-        """For camera rays the distances between which they are in the medium; the weighted radiance
-        behind it that its transmittance attenuates, and that which the transmittance of the medium
-        with its forward peak attenuates; the weights of an environment in these; whether rays hit
-        the medium, and the first step. ``medium`` is around the sensor.
+        """Return what the march of camera rays starts from.
+
+        ``medium`` is the one around the sensor. The results are
+
+        - the rays within the medium;
+        - two weighted radiances behind it: one that is attenuated by the transmittance of the
+          medium as it is rendered, and one that is attenuated by that before delta-M scaling;
+        - the weights of an environment in both of these.
         """
         ray, camera_rays = each.ray, self._camera_rays
         visible, background, *weights = camera_rays.background(self._scene, ray, mi.Bool(True))
@@ -214,12 +233,15 @@ class MediumAdjoint:
             behind[self._is_scaled] -= each.alpha / dr.size_v(mi.Spectrum)
         hit, near, far = camera_rays.span(ray, medium)
         offset = 1 - each.sampler.next_1d()
-        span = mi.Float(near), mi.Float(far)
-        dr.eval(ray, span, behind, weights, hit, offset, each.radiance)
-        return span, behind, weights, hit, offset
+        segments = RaySegments(ray, mi.Float(near), mi.Float(far), each.radiance, offset, hit)
+        dr.eval(segments, behind, weights)
+        return segments, behind, weights
 
     def _camera_splats(self, ahead: mi.Spectrum, film: FilmAdjoint) -> CameraSplats:
-        """Empty sums for the derivatives that are wanted."""
+        """Return sums, 0 at first, for the derivatives that are wanted.
+
+        ``ahead`` is the largest weighted radiance of the rays, which bounds the sums.
+        """
         lengths = np.linalg.norm(self._medium.frame[:3, :3], axis=0)
         diagonal, rays = float(np.linalg.norm(lengths)), film.samples * MARGIN
         largest = film.largest * film.pixels * MARGIN
@@ -229,8 +251,8 @@ class MediumAdjoint:
         mean = irradiance.maximum * peak / (4 * np.pi) if irradiance is not None else 0.0
         collisions = unscattered = None
         if self._transport is not None:
-            layers = self._transport.channels * self._transport.scattering.camera_count
-            collisions = VoxelSums(self.grid, layers, largest * peak)
+            components = self._transport.channels * self._transport.scattering.camera_count
+            collisions = VoxelSums(self.grid, components, largest * peak)
         if self._is_scaled and SIGMA_T in self._wanted:
             original, bound = self._medium.original.sigma_t, brightest * diagonal
             unscattered = splat_of(original, self._wanted[SIGMA_T], bound)
@@ -244,7 +266,7 @@ class MediumAdjoint:
         )
 
     def _splat(self, role: str, bound: float) -> GridSplat | ConstantSplat | None:
-        """Empty sums of the derivative by a field of the medium; None if it is not wanted."""
+        """Return sums for derivatives with respect to a field; None if they are not wanted."""
         if role not in self._sums:
             return None
         return splat_of(field_of(self._medium, role), self._sums[role], bound)
@@ -252,8 +274,9 @@ class MediumAdjoint:
     # Transport
 
     def _adjoint_fluence(self, sums: VoxelSums) -> list[mi.Float]:
-        """The adjoint fluence of camera rays for collisions in the voxels, by channel: its layers
-        one after the other.
+        """Return the adjoint fluence of camera rays for collisions in the voxels.
+
+        It is one array for each channel, whose components follow each other.
         """
         # docs/primer, eq. (8.4)
         least = dr.opaque(mi.Float, EMPTY / float(self.grid.voxel_size.min()))
@@ -267,11 +290,13 @@ class MediumAdjoint:
             for c, mean in zip(range(self._transport.channels), self._extinction, strict=False)
         ]
         dr.eval(found)
-        return [concatenated(layers) for layers in found]
+        return [concatenated(components) for components in found]
 
     def transported(self, fluence: list[mi.Float]) -> dict[str, mi.Float]:
-        """Derivatives by what is wanted, at the data's voxels, of the radiance that reaches the
-        voxels, given the adjoint ``fluence`` of camera rays.
+        """Return the derivatives through the fluence, given its adjoint of all camera rays.
+
+        ``fluence`` is the sum of the arrays that `replayed` returns. The derivatives are flat
+        arrays at the voxels of the data, by role.
         """
         transport = self._transport
         count = transport.scattering.camera_count
@@ -295,32 +320,37 @@ class MediumAdjoint:
             result[MEAN_COSINE] = mi.Float(total * volume_of(self.grid))
         if SIGMA_T in self._sums:
             for light in range(len(transport.point_lights)):
-                result[SIGMA_T] = result[SIGMA_T] + self._along_ways(light, found)
+                result[SIGMA_T] = result[SIGMA_T] + self._along_paths_to_light(light, found)
         return self._at_data(result)
 
-    def _along_ways(self, light: int, found: Derivatives) -> mi.Float:
-        """The derivative by the extinction between a point-like light and the voxels."""
+    def _along_paths_to_light(self, light: int, found: Derivatives) -> mi.Float:
+        """Return derivatives through the extinction between a point-like light and the voxels."""
         grid, transport = self.grid, self._transport
         share = dr.opaque(mi.Float, -volume_of(grid))
-        worth = transport.worth_of_point(light, found)
+        worth = transport.derivative_by_point(light, found)
         removed = transport.from_points[light] * worth * share
         dr.eval(removed)
         diagonal = float(np.linalg.norm(grid.side_lengths))
         bound = float(dr.max(dr.max(dr.abs(removed)))[0]) * grid.voxel_count * diagonal * 3
         splat, emitter = self._splat(SIGMA_T, bound * MARGIN), transport.point_lights[light]
-        add_ways(self._medium, emitter, transport.positions, removed, self._march.step, splat)
+        add_paths_to_light(
+            self._medium, emitter, transport.positions, removed, self._march.step, splat
+        )
         return splat.values()
 
 
 def splat_of(field: Field, channels: int, bound: float) -> GridSplat | ConstantSplat:
-    """Empty sums of the derivative by a ``field``."""
+    """Return sums, 0 at first, for derivatives with respect to the data of a ``field``.
+
+    ``bound`` is an upper bound of the sum of their magnitudes.
+    """
     if field.grid is None:
         return ConstantSplat(channels, bound)
     return GridSplat(field.grid, channels, bound)
 
 
 def values_per_voxel(cache: IrradianceCache) -> int:
-    """Layers of the adjoint fluence that camera rays leave in the voxels of a ``cache``."""
+    """Return the number of components of the adjoint fluence of camera rays per voxel."""
     basis = cache.directional
     if basis is None:
         return 1
@@ -328,12 +358,12 @@ def values_per_voxel(cache: IrradianceCache) -> int:
 
 
 def _largest(channels: list[mi.Float]) -> float:
-    """The largest magnitude; 0 without any channels."""
+    """Return the largest magnitude in all channels; 0 if there are none."""
     return max((float(dr.max(dr.abs(values))[0]) for values in channels), default=0.0)
 
 
 def _warn_of_aureole(part: CachedMedium) -> None:
-    """Log a warning if derivatives neglect several scattering events into a forward peak."""
+    """Log a warning if derivatives neglect multiple scattering into a forward peak."""
     cache = part.cache
     if part.medium.original is None or cache is None or cache.directional is None:
         return

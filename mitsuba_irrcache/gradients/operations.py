@@ -1,9 +1,9 @@
-"""Images as operations of Dr.Jit's graph, such that several of them share one adjoint solve.
+"""Images as operations of Dr.Jit's AD graph, so that several of them share one adjoint solve.
 
 The irradiance is a variable of the graph: it depends on the parameters, and images depend on it and
-on the parameters straight. The derivatives of an objective by the irradiance are the adjoint
-fluence of camera rays, which Dr.Jit adds up over all images. It visits the irradiance once, after
-all images, and only then the adjoint equation is solved.
+directly on the parameters. The derivatives of an objective with respect to the irradiance are the
+adjoint fluence of camera rays, which Dr.Jit accumulates over all images. In reverse mode it visits
+the irradiance once, after all images, and only then is the adjoint equation solved.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mitsuba_irrcache.gradients.parameters import enabled
 
 
 class DifferentiableIntegrator(Protocol):
-    """What these operations need of the integrator."""
+    """The interface of the integrator that these operations use."""
 
     caches: dict[str, IrradianceCache | None]
 
@@ -37,20 +37,22 @@ class DifferentiableIntegrator(Protocol):
         """The method of Mitsuba's integrators."""
 
     def exclusively(self) -> AbstractContextManager:
-        """A context in which no other thread changes the cache."""
+        """Return a context in which no other thread changes the cache."""
 
     def adjoint(
         self, scene: mi.Scene, params: mi.SceneParameters, keys: list[str], seed: int
     ) -> ParameterAdjoint:
-        """The derivatives of images of ``scene`` by the parameters ``keys``."""
+        """Return the derivatives of images of ``scene`` with respect to the parameters ``keys``."""
 
     def revision(self, scene: mi.Scene) -> int:
-        """The number of the present state of the cache, which is brought up to date."""
+        """Update the cache for ``scene``, and return the number of its state."""
 
 
 class SceneState:
-    """A state of ``scene`` and of ``params``, which carry gradients, and the adjoint that images of
-    this state share. With ``alone`` there is one image, which solves at once.
+    """A state of ``scene`` and of its parameters, and the adjoint that images of this state share.
+
+    ``params`` are the parameters, of which some carry gradients. ``alone`` states that there is
+    only one image, whose derivatives are solved for immediately.
     """
 
     def __init__(
@@ -63,7 +65,7 @@ class SceneState:
         self.integrator, self.scene, self.params = integrator, scene, params
         self._identity, self._revision = _variables(params), integrator.revision(scene)
         cache = next(iter(integrator.caches.values()), None)
-        #: values of the irradiance in each channel
+        #: number of values of the irradiance in each channel
         self.voxels = 1
         if cache is not None:
             self.voxels = cache.grid.voxel_count * values_per_voxel(cache)
@@ -72,7 +74,7 @@ class SceneState:
         self._is_solved = alone
 
     def is_state_of(self, scene: mi.Scene, params: mi.SceneParameters) -> bool:
-        """Whether another image of these may share the adjoint solve."""
+        """Return whether another image of ``scene`` and ``params`` may share the adjoint solve."""
         if self._is_solved or self._adjoint is not None:
             return False
         if self.scene is not scene or self.params is not params:
@@ -86,9 +88,10 @@ class SceneState:
     def add_image(
         self, grad: mi.TensorXf, sensor: mi.Sensor, seed: int, spp: int
     ) -> mi.Spectrum | None:
-        """Add to the parameters their derivatives at a given irradiance, from those by the pixels,
-        ``grad``. Return those by the irradiance while its adjoint solve is still to come; otherwise
-        solve.
+        """Accumulate the derivatives of one image in the parameters, at a fixed irradiance.
+
+        ``grad`` holds the derivatives with respect to the pixels. Returns those with respect to the
+        irradiance, if the adjoint equation is solved later; otherwise solves it and returns None.
         """
         with dr.suspend_grad(), self.integrator.exclusively():
             shared = not self._is_solved and self._is_current
@@ -110,7 +113,10 @@ class SceneState:
         return mi.Spectrum(*fluence)
 
     def solve(self, fluence: mi.Spectrum) -> None:
-        """Add to the parameters their derivatives by way of the irradiance, from those by it."""
+        """Accumulate the derivatives through the irradiance in the parameters.
+
+        ``fluence`` holds the derivatives with respect to the irradiance.
+        """
         adjoint, self._adjoint, self._is_solved = self._adjoint, None, True
         if adjoint is None:
             return  # no image depends on the irradiance
@@ -119,7 +125,7 @@ class SceneState:
         self._accumulate(found)
 
     def refuse_forward(self) -> None:
-        """Raise the error of the integrator for derivatives in forward mode."""
+        """Raise the integrator's error that forward mode is not supported."""
         self.integrator.render_forward(self.scene, self.params)
 
     def _accumulate(self, found: dict[str, object]) -> None:
@@ -129,7 +135,7 @@ class SceneState:
 
 
 class Irradiance(dr.CustomOp):
-    """The irradiance of a `SceneState`; its value does not matter."""
+    """The irradiance of a `SceneState` in the AD graph; its values are not used."""
 
     def eval(self, state: SceneState, parameters: dict) -> mi.Spectrum:
         self._state = state
@@ -143,7 +149,7 @@ class Irradiance(dr.CustomOp):
 
 
 class SharedIrradiance:
-    """The variable of the irradiance of a state of the scene, for all images of it."""
+    """The variable of the irradiance that all images of one state of the scene share."""
 
     def __init__(self, state: SceneState) -> None:
         self.state = state
@@ -151,8 +157,9 @@ class SharedIrradiance:
 
 
 class Image(dr.CustomOp):
-    """An image that depends on the ``irradiance`` and on parameters; ``seed`` and ``spp`` are those
-    of the image and of its gradients.
+    """An image in the AD graph, which depends on the ``irradiance`` and on parameters.
+
+    ``seed`` and ``spp`` are pairs: of the image, and of its gradients.
     """
 
     def eval(
@@ -174,7 +181,7 @@ class Image(dr.CustomOp):
 
     def backward(self) -> None:
         found = self._shared.state.add_image(self.grad_out(), self._sensor, self._seed, self._spp)
-        # Dr.Jit visits only what has a gradient, and forgets that it was asked for.
+        # Dr.Jit visits the irradiance only if it has a gradient.
         self.set_grad_in("irradiance", mi.Spectrum(0) if found is None else found)
 
 
@@ -187,16 +194,18 @@ def image(
     seed: tuple[int, int],
     spp: tuple[int, int],
 ) -> tuple[mi.TensorXf, SharedIrradiance]:
-    """An `Image` of which ``params`` receive gradients, and the irradiance that it shares with
-    others: the ``shared`` one if that is of the same state of the scene.
+    """Render an `Image` through which ``params`` receive gradients.
+
+    Returns it and the irradiance that it shares with other images: ``shared`` if that belongs to
+    the same state of the scene, otherwise a new one.
     """
     with integrator.exclusively():
         if shared is None or not shared.state.is_state_of(scene, params):
             shared = SharedIrradiance(SceneState(integrator, scene, params))
-    rest = dict(params), sensor, seed, spp
-    return dr.custom(Image, shared, shared.variable, *rest), shared
+    arguments = dict(params), sensor, seed, spp
+    return dr.custom(Image, shared, shared.variable, *arguments), shared
 
 
 def _variables(params: mi.SceneParameters) -> dict[str, list[int]]:
-    """The variables of Dr.Jit's graph of all parameters that carry gradients."""
+    """Return the indices in the AD graph of all parameters that carry gradients, by key."""
     return {key: graph_variables(params[key]) for key in enabled(params)}

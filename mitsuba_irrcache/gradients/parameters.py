@@ -1,4 +1,4 @@
-"""Which parameters of a scene gradients are computed for, and the refusal of all others."""
+"""The parameters of a scene with respect to which gradients are computed; others are refused."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import mitsuba as mi
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.media.bake import children
 
-#: What a parameter can be of a medium.
+#: Roles of a parameter in a medium.
 SIGMA_T, ALBEDO, EMISSION, MEAN_COSINE = "sigma_t", "albedo", "emission", "g"
 #: Textures of emitters on which their radiance depends linearly.
 RADIANCE = ("radiance", "irradiance", "intensity")
 
 
 def enabled(params: Mapping) -> list[str]:
-    """Keys of the parameters that carry gradients.
+    """Return the keys of the parameters that carry gradients.
 
-    Raises IrrcacheError where an integrator around this one has hidden them.
+    Raises IrrcacheError if an enclosing integrator does not pass the parameters on.
     """
     if not hasattr(params, "keys"):
         raise IrrcacheError(
@@ -42,9 +42,11 @@ def roles_of(
     scene: mi.Scene,
     emission: object = None,
 ) -> dict[str, str | mi.Emitter]:
-    """What each of the parameters ``keys`` is: `SIGMA_T` or `ALBEDO` of ``medium``, the
-    `MEAN_COSINE` of its phase function ``hg``, its `EMISSION` if it belongs to that volume of the
-    integrator, or the emitter whose radiance it is.
+    """Return the role of each of the parameters ``keys``, by key.
+
+    A role is `SIGMA_T` or `ALBEDO` of ``medium``, the `MEAN_COSINE` of its phase function ``hg``,
+    its `EMISSION` if the parameter belongs to the integrator's volume ``emission``, or the emitter
+    whose radiance the parameter is.
 
     Raises IrrcacheError for any other parameter.
     """
@@ -84,7 +86,7 @@ def _first_key_of(params: mi.SceneParameters, node: mi.Object, keys: list[str]) 
 
 
 def refuse(key: str, reason: str) -> None:
-    """Raise the error for a parameter without gradients."""
+    """Raise IrrcacheError for a parameter with respect to which no gradient is computed."""
     raise IrrcacheError(
         f'irrcache computes no gradient of the parameter "{key}": {reason}. It has gradients of '
         "sigma_t and albedo of a medium and of the radiance of emitters and emission; detach this "
@@ -93,7 +95,7 @@ def refuse(key: str, reason: str) -> None:
 
 
 def refuse_all(keys: list[str], reason: str, remedy: str) -> None:
-    """Raise the error for a scene or setting in which no gradients are computed."""
+    """Raise IrrcacheError for a scene or setting in which no gradients are computed."""
     names = ", ".join(f'"{key}"' for key in keys[:3]) + (", ..." if len(keys) > 3 else "")
     raise IrrcacheError(
         f"irrcache computes no gradient of {names} here: {reason}. {remedy}, or use the integrator "
@@ -102,12 +104,12 @@ def refuse_all(keys: list[str], reason: str, remedy: str) -> None:
 
 
 def channels_of(value: object) -> int:
-    """How many channels a constant has."""
+    """Return the number of channels of a constant parameter."""
     return len(value) if dr.depth_v(value) > 1 else 1
 
 
 def shaped_like(value: object, grad: mi.Float) -> object:
-    """A gradient, given as a flat array, in the type of the parameter's ``value``."""
+    """Convert a gradient from a flat array to the type and shape of the parameter's ``value``."""
     kind = type(value)
     if dr.is_tensor_v(value):
         return kind(grad, value.shape)

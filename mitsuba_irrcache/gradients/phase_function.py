@@ -1,7 +1,7 @@
-"""Derivatives by the mean cosine g of the phase function ``hg``.
+"""Derivatives with respect to the mean cosine g of the phase function ``hg``.
 
-Images depend on it by the phase function alone, whose derivative is a difference between two others
-beside it. Where a forward peak is truncated, its share, and with it extinction and albedo, change.
+The derivative of the phase function with respect to g is approximated by a central difference. If
+a forward peak is truncated, its share depends on g, and so do the scaled extinction and albedo.
 """
 
 from __future__ import annotations
@@ -11,19 +11,20 @@ import numpy as np
 
 from mitsuba_irrcache.media.phase import Phase
 
-#: Half the difference of the mean cosines; and the largest mean cosine.
+#: Half the difference between the mean cosines, and their largest absolute value.
 STEP, LARGEST = 0.005, 0.99
 
 
-class PhasesBeside:
-    """Phase functions with a slightly smaller and larger mean cosine than ``phase`` has, with as
-    many moments.
+class NeighbouringPhases:
+    """Two phase functions ``hg`` whose mean cosines are slightly below and above that of ``phase``.
+
+    They have the same number of moments as ``phase``.
 
     Attributes:
         below, above: these phase functions.
         step: difference between their mean cosines.
-        moments: derivatives of the moments of the phase function.
-        forward: derivative of the share of a truncated forward peak.
+        moments: derivatives of the moments with respect to the mean cosine.
+        forward: derivative of the share of a truncated forward peak with respect to it.
     """
 
     # docs/primer, eq. (8.15)
@@ -38,11 +39,11 @@ class PhasesBeside:
 
 
 def _with_mean_cosine(phase: Phase, g: float) -> Phase:
-    """The phase function ``hg`` with another mean cosine, with the order of ``phase``."""
+    """Return the phase function ``hg`` with mean cosine ``g`` and the order of ``phase``."""
     plugin = mi.load_dict({"type": "hg", "g": g})
     moments = g ** np.arange(len(phase.moments), dtype=np.float64)
     if not phase.forward:
         return Phase(plugin, moments, 2 * phase.peak)
-    share, known = moments[phase.order + 1], np.arange(len(moments)) <= phase.order
-    truncated = np.where(known, (moments - share) / (1 - share), 0)
+    share, is_kept = moments[phase.order + 1], np.arange(len(moments)) <= phase.order
+    truncated = np.where(is_kept, (moments - share) / (1 - share), 0)
     return Phase(plugin, truncated, 2 * phase.peak, float(share), moments)

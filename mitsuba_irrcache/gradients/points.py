@@ -1,4 +1,4 @@
-"""Point-like lights: what the medium on the way from a light removes of its irradiance."""
+"""Derivatives through the extinction between point-like lights and the voxels they illuminate."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import mitsuba as mi
 
 from mitsuba_irrcache.core.fast_math import minimum
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, of_channels
+from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, summed_to_channels
 from mitsuba_irrcache.media.medium import MediumGrid
 
 
 @symbolic
-def add_ways(
+def add_paths_to_light(
     medium: MediumGrid,
     emitter: mi.Emitter,
     position: mi.Point3f,
@@ -20,8 +20,15 @@ def add_ways(
     step: mi.Float,
     splat: GridSplat | ConstantSplat,
 ):
-    """Add to ``splat`` the derivative by the extinction on the way from each ``position`` to the
-    light of an ``emitter``, where a unit of optical depth is worth ``removed``.
+    """Add derivatives with respect to the extinction between positions and a point-like light.
+
+    Args:
+        medium: the medium that the lines to the light cross.
+        emitter: the light.
+        position: ends of the lines, in world space.
+        removed: derivative of the objective with respect to the optical depth of each line.
+        step: step along the lines, in scene units.
+        splat: sums to which the derivatives are added.
     """
     # docs/primer, eq. (8.9)
     at = dr.zeros(mi.Interaction3f, dr.width(position))
@@ -31,9 +38,9 @@ def add_ways(
     hit, near, far = medium.intersect(ray)
     t, far = dr.maximum(near, 0), dr.minimum(far, record.dist)
     active = hit & (t < far) & (dr.max(dr.abs(removed)) > 0)
-    while dr.hint(active, label="way to a light"):
+    while dr.hint(active, label="line to a light"):
         end = minimum(t + step, far)
         change = removed * (end - t)
-        splat.add(ray(0.5 * (t + end)), of_channels(change, splat.channels), active)
+        splat.add(ray(0.5 * (t + end)), summed_to_channels(change, splat.channels), active)
         t = end
         active &= t < far

@@ -1,15 +1,15 @@
-"""Replay of camera rays: what an image depends on along them, and the adjoint fluence that they
-leave in the medium.
+"""Derivatives of camera rays by path replay, and the adjoint fluence of the rays in the medium.
 
 A ray's radiance is L = sum_k T_k (1 - e^-tau_k) q_k + T B, with the source q = albedo Phi / (4 pi)
-in the middle of each step, and the radiance B behind the medium. It is marched twice: once for L,
-and again with the radiance that is still ahead, which is L minus what was gathered (Vicini et al.
-2021 replay paths for the same reason).
+in the middle of each step, and the radiance B behind the medium. Each ray is marched twice: first
+to compute L, then to compute derivatives, which depend on the radiance ahead of each step: L minus
+the contributions of the previous steps. Like path replay backpropagation (Vicini, Speierer and
+Jakob 2021), this needs no memory per step.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -18,22 +18,51 @@ from mitsuba_irrcache.cache.angular import AngularBasis, AngularField
 from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
 from mitsuba_irrcache.core.fast_math import absorptance, minimum
 from mitsuba_irrcache.core.jit import symbolic
-from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, VoxelSums, of_channels
+from mitsuba_irrcache.gradients.splatting import (
+    ConstantSplat,
+    GridSplat,
+    VoxelSums,
+    summed_to_channels,
+)
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor
 from mitsuba_irrcache.media.medium import MediumGrid
 
-#: Transmittance below which nothing ahead matters.
+#: Transmittance below which the march of a ray ends.
 OPAQUE = 1e-6
 
 
-class CameraSplats:
-    """Where the replay adds derivatives: by extinction, albedo and emission at positions, and the
-    adjoint fluence of collisions in voxels, layer by layer of each channel. ``unscattered`` is that
-    by the extinction before delta-M scaling, which attenuates narrow sources behind the medium;
-    ``g`` that by the mean cosine of the phase function. None where a derivative is not wanted.
+class RaySegments(NamedTuple):
+    """Camera rays within the medium.
 
-    It is no dataclass, whose fields would be state of the recorded loop.
+    Attributes:
+        ray: the rays.
+        near, far: the distances at which they enter and leave the medium.
+        adjoint: derivative of the objective with respect to the radiance of each ray.
+        offset: length of the first step, in steps, in (0, 1].
+        active: the rays that hit the medium.
+    """
+
+    ray: mi.Ray3f
+    near: mi.Float
+    far: mi.Float
+    adjoint: mi.Spectrum
+    offset: mi.Float
+    active: mi.Bool
+
+
+class CameraSplats:
+    """Sums to which the replay adds derivatives; None for those that are not wanted.
+
+    Not a dataclass, because Dr.Jit would make its fields state variables of the recorded loop.
+
+    Attributes:
+        sigma_t, albedo, emission: with respect to these fields.
+        collisions: the adjoint fluence of collisions in voxels, all components of each channel in
+            turn.
+        unscattered: with respect to the extinction before delta-M scaling, which attenuates narrow
+            sources behind the medium.
+        g: with respect to the mean cosine of the phase function.
     """
 
     def __init__(
@@ -50,30 +79,34 @@ class CameraSplats:
 
 
 class InScattering:
-    """Anisotropic scattering into camera rays: ``field`` is the factor of the irradiance, and
-    ``basis`` has all narrow sources.
+    """Anisotropic scattering into camera rays.
+
+    ``field`` evaluates the factor by which scattering into a direction differs from isotropic
+    scattering; ``basis`` has all narrow sources of the scene.
     """
 
     def __init__(self, field: AngularField, basis: AngularBasis) -> None:
         self._field, self._basis = field, basis
 
     def in_basis(self, basis: AngularBasis) -> InScattering:
-        """The same with another phase function of the field."""
+        """Return the scattering by another phase function, that of ``basis``."""
         return InScattering(self._field.in_basis(basis), self._basis)
 
     def view(self, direction: mi.Vector3f) -> tuple:
-        """What depends on the ``direction`` of rays alone."""
+        """Evaluate what depends on the ``direction`` of rays only; an argument of other methods."""
         moments = list(dr.sh_eval(-direction, self._basis.order))[1:]
         return direction, self._field.directional.basis(direction), moments
 
     def factor(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> mi.Float | mi.Color3f:
-        """`AngularField.factor`."""
+        """Return the factor of the irradiance at ``p``, see `AngularField.factor`."""
         direction, basis, _ = view
         return self._field.factor(p, direction, basis, active)
 
     def importance(self, p: mi.Point3f, view: tuple, active: mi.Bool) -> list[mi.Float]:
-        """Layers of the importance of a ray: moments of its direction, and what the irradiance of
-        each narrow source is weighted by.
+        """Return the components of the importance of rays at ``p``.
+
+        These are the spherical harmonics of their direction, followed by the weight with which the
+        irradiance of each narrow source is scattered into it.
         """
         # docs/primer, eq. (8.12)
         direction, _, moments = view
@@ -91,12 +124,15 @@ class FluenceAlongRays(Protocol):
 
 
 class CameraReplay:
-    """The march of camera rays through ``medium``, whose ``fluence`` is None where nothing is
-    scattered.
+    """The march of camera rays through a medium.
 
-    All channels of the fluence are one, times the factors ``colour``, unless that is None. ``step``
-    is the integrator's property. ``beside`` are marches with phase functions beside that of the
-    medium, and the difference between their mean cosines; None where none is known.
+    Args:
+        medium: the medium.
+        fluence: its fluence; None if nothing is scattered.
+        colour: factors of the channels, if the fluence has one channel for all; else None.
+        step: the integrator's property.
+        neighbours: marches with phase functions of slightly smaller and larger mean cosine, and the
+            difference between these; None if no derivative with respect to it is wanted.
     """
 
     def __init__(
@@ -105,12 +141,12 @@ class CameraReplay:
         fluence: FluenceAlongRays | None,
         colour: mi.Spectrum | None,
         step: float,
-        beside: tuple[CameraReplay, CameraReplay, float] | None = None,
+        neighbours: tuple[CameraReplay, CameraReplay, float] | None = None,
     ) -> None:
-        self.medium, self.colour, self._beside = medium, colour, None
-        if beside is not None:
-            *marches, difference = beside
-            self._beside = marches, dr.opaque(mi.Float, 1 / difference)
+        self.medium, self.colour, self._neighbours = medium, colour, None
+        if neighbours is not None:
+            *marches, difference = neighbours
+            self._neighbours = marches, dr.opaque(mi.Float, 1 / difference)
         self.irradiance = self._falloff = self._angular = None
         self._direct_lights: list[DirectLightAlongRays] = []
         if fluence is not None:
@@ -129,11 +165,11 @@ class CameraReplay:
         return mi.Spectrum(self.medium.albedo.at_world(p, active))
 
     def view(self, direction: mi.Vector3f) -> tuple:
-        """What `mean_radiance` needs of the ``direction`` of rays."""
+        """Evaluate what `mean_radiance` needs of the ``direction`` of rays."""
         return () if self._angular is None else self._angular.view(direction)
 
     def mean_radiance(self, p: mi.Point3f, active: mi.Bool, view: tuple = ()) -> mi.Spectrum:
-        """Phi / (4 pi), with the phase function for scattering into rays."""
+        """Return Phi / (4 pi), times the factor of anisotropic scattering into the rays."""
         if self.irradiance is None:
             return mi.Spectrum(0)
         phi = mi.Spectrum(self.irradiance.at_world(p, active))
@@ -149,15 +185,15 @@ class CameraReplay:
             phi = phi + light.at(p, active, direction, with_peak=True)
         return phi * dr.inv_four_pi
 
-    def views_beside(self, direction: mi.Vector3f) -> list[tuple]:
-        """Results of `view` of the marches beside this one."""
-        return [] if self._beside is None else [m.view(direction) for m in self._beside[0]]
+    def neighbour_views(self, direction: mi.Vector3f) -> list[tuple]:
+        """Return `view` of both neighbours."""
+        return [] if self._neighbours is None else [m.view(direction) for m in self._neighbours[0]]
 
     def by_mean_cosine(self, p: mi.Point3f, active: mi.Bool, views: list[tuple]) -> mi.Spectrum:
-        """The derivative of `mean_radiance` by the mean cosine of the phase function."""
-        if self._beside is None:
+        """Return the derivative of `mean_radiance` with respect to the mean cosine."""
+        if self._neighbours is None:
             return mi.Spectrum(0)
-        marches, factor = self._beside
+        marches, factor = self._neighbours
         below, above = (
             march.mean_radiance(p, active, view) for march, view in zip(marches, views, strict=True)
         )
@@ -166,27 +202,20 @@ class CameraReplay:
     def collisions(
         self, collided: mi.Spectrum, p: mi.Point3f, active: mi.Bool, view: tuple
     ) -> list[mi.Float]:
-        """Layers of the importance that collides, channel by channel."""
+        """Return the components of the importance that collides, channel after channel."""
         values = list(collided) if self.colour is None else [dr.sum(collided * self.colour)]
         if self._angular is None:
             return values
-        layers = self._angular.importance(p, view, active)
-        return [value * layer for value in values for layer in layers]
+        components = self._angular.importance(p, view, active)
+        return [value * layer for value in values for layer in components]
 
     @symbolic
-    def radiance(
-        self,
-        ray: mi.Ray3f,
-        span: tuple[mi.Float, mi.Float],
-        adjoint: mi.Spectrum,
-        offset: mi.Float,
-        active: mi.Bool,
-    ):
-        """The radiance that the medium scatters into rays, times ``adjoint``; and the
-        transmittance. ``span`` are the distances at which rays enter and leave, ``offset`` in
-        (0, 1] is the first step in steps.
+    def radiance(self, segments: RaySegments):
+        """Return the radiance that the medium scatters into rays, and its transmittance.
+
+        The radiance is multiplied by the derivative of the objective with respect to it.
         """
-        near, far = span
+        ray, near, far, adjoint, offset, active = segments
         view = self.view(ray.d)
         k, t, total = mi.Float(0), mi.Float(near), mi.Spectrum(0)
         transmittance, active = mi.Spectrum(1), mi.Bool(active) & (near < far)
@@ -205,26 +234,29 @@ class CameraReplay:
     @symbolic
     def replay(
         self,
-        ray: mi.Ray3f,
-        span: tuple[mi.Float, mi.Float],
-        adjoint: mi.Spectrum,
+        segments: RaySegments,
         ahead: mi.Spectrum,
-        offset: mi.Float,
-        active: mi.Bool,
-        splats: CameraSplats,
         unscattered: mi.Spectrum,
+        splats: CameraSplats,
     ):
-        """March again, and add to ``splats``. ``adjoint`` is the derivative of the objective by
-        the rays' radiance; ``ahead`` is the result of `radiance` and what reaches the ray from
-        behind the medium, all times ``adjoint``. ``unscattered`` is what is attenuated by the
-        extinction before delta-M scaling instead. The other arguments are those of `radiance`.
+        """March the rays again, and add derivatives to ``splats``.
+
+        Args:
+            segments: the rays.
+            ahead: their radiance, times their ``adjoint``: the result of `radiance`, and the
+                attenuated radiance behind the medium.
+            unscattered: radiance behind the medium, times ``adjoint``, that is attenuated by the
+                extinction before delta-M scaling and is no part of ``ahead``.
+            splats: the sums to which derivatives are added.
         """
         # docs/primer, eqs. (8.2), (8.3)
-        near, far = span
+        ray, near, far, adjoint, offset, active = segments
         k, t, ahead = mi.Float(0), mi.Float(near), mi.Spectrum(ahead)
         passed, active = mi.Spectrum(adjoint), mi.Bool(active) & (near < far)
         transmittance, view = mi.Spectrum(1), self.view(ray.d)
-        beside = self.views_beside(ray.d) if dr.hint(splats.g is not None, mode="scalar") else []
+        neighbours = (
+            self.neighbour_views(ray.d) if dr.hint(splats.g is not None, mode="scalar") else []
+        )
         while dr.hint(active, label="camera rays"):
             end = minimum(dr.fma(k + offset, self.step, near), far)
             p, length = ray(0.5 * (t + end)), end - t
@@ -235,23 +267,23 @@ class CameraReplay:
             following = passed * (1 - absorbed)
             if dr.hint(splats.sigma_t is not None, mode="scalar"):
                 change = length * (following * albedo * mean - ahead)
-                splats.sigma_t.add(p, of_channels(change, splats.sigma_t.channels), active)
+                splats.sigma_t.add(p, summed_to_channels(change, splats.sigma_t.channels), active)
             if dr.hint(splats.albedo is not None, mode="scalar"):
                 change = passed * absorbed * mean
-                splats.albedo.add(p, of_channels(change, splats.albedo.channels), active)
+                splats.albedo.add(p, summed_to_channels(change, splats.albedo.channels), active)
             if dr.hint(splats.emission is not None, mode="scalar"):
                 thin = tau < 1e-4
                 share = dr.select(thin, 1 - 0.5 * tau, absorbed / dr.select(thin, 1, tau))
-                change = of_channels(passed * share * length, splats.emission.channels)
+                change = summed_to_channels(passed * share * length, splats.emission.channels)
                 splats.emission.add(p, change, active & self.medium.emission.covers(p))
             if dr.hint(splats.collisions is not None, mode="scalar"):
                 values = self.collisions(passed * absorbed, p, active, view)
                 splats.collisions.add(p, values, active)
             if dr.hint(splats.g is not None, mode="scalar"):
-                change = passed * absorbed * albedo * self.by_mean_cosine(p, active, beside)
-                splats.g.add(p, of_channels(change, 1), active)
+                change = passed * absorbed * albedo * self.by_mean_cosine(p, active, neighbours)
+                splats.g.add(p, summed_to_channels(change, 1), active)
             if dr.hint(splats.unscattered is not None, mode="scalar"):
-                change = of_channels(-length * unscattered, splats.unscattered.channels)
+                change = summed_to_channels(-length * unscattered, splats.unscattered.channels)
                 splats.unscattered.add(p, change, active)
             passed = following
             transmittance *= 1 - absorbed

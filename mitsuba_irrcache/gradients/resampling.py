@@ -1,4 +1,4 @@
-"""The transpose of resampling the medium's data to the voxels of the cache."""
+"""The transpose of resampling a medium's data to the voxels of the cache."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.core.jit import Divisor, symbolic, unravelled
-from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, of_channels
+from mitsuba_irrcache.gradients.splatting import ConstantSplat, GridSplat, summed_to_channels
 from mitsuba_irrcache.gradients.transport import Derivatives
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.medium import MediumGrid
 
-#: Points along each axis of a voxel that the boundary may cut, at least.
+#: Smallest number of points along each axis of voxels that the boundary may cut.
 CUT_POINTS = 4
-#: Points along each axis of a voxel by which its extinction is integrated, at least.
+#: Smallest number of points along each axis with which the extinction of a voxel is integrated.
 COLLISION_POINTS = 4
 
 
 class VoxelQuadrature:
-    """Points in the voxels of ``grid`` at which the data of ``medium`` are read: as dense as the
-    data along each axis, and at their voxel centres where both grids are the same.
+    """Quadrature points in each voxel of ``grid`` at which the data of ``medium`` are evaluated.
+
+    Along each axis there are two points for each voxel of the finest data.
     """
 
     def __init__(self, medium: MediumGrid, grid: Grid) -> None:
@@ -42,15 +43,22 @@ class VoxelQuadrature:
         mean_albedo: list,
         emission: GridSplat | ConstantSplat | None = None,
     ):
-        """Add the derivatives ``found`` at voxels to those by the data. ``mean_albedo`` is the
-        albedo of the voxels: matter of another albedo scatters more, or less.
+        """Add the derivatives ``found`` with respect to voxels to those with respect to the data.
+
+        Args:
+            sigma_t: sums of the derivatives with respect to the extinction; None if not wanted.
+            albedo: sums of those with respect to the albedo.
+            found: derivatives with respect to the means over the voxels.
+            mean_albedo: the albedo of the voxels, by channel. Where the albedo of the data differs
+                from it, extinction that is added also changes the albedo of the voxel.
+            emission: sums of those with respect to the emission.
         """
         # docs/primer, eqs. (8.8), (8.11)
         grid, medium = self.grid, self.medium
         voxel = dr.arange(mi.UInt32, grid.voxel_count)
         corner, sides = mi.Point3f(*grid.voxel_indices(voxel)), [Divisor(self.points)] * 2
         count, points = dr.opaque(mi.UInt32, self.points**3), dr.opaque(mi.Float, self.points)
-        # A channel that stands for all is their sum.
+        # A single channel that represents all holds the sum of their derivatives.
         several = dr.size_v(mi.Spectrum) // len(found.collided)
         share = dr.opaque(mi.Float, volume_of(grid) / self.points**3 / several)
         by_sigma_t = mi.Spectrum(*(found.sigma_t or [0.0])) * share
@@ -66,18 +74,18 @@ class VoxelQuadrature:
             if dr.hint(sigma_t is not None, mode="scalar"):
                 own = mi.Spectrum(medium.albedo.at_world(p, inside))
                 change = by_sigma_t + (own - mean) * by_collided
-                sigma_t.add(p, of_channels(change, sigma_t.channels), inside)
+                sigma_t.add(p, summed_to_channels(change, sigma_t.channels), inside)
             if dr.hint(albedo is not None, mode="scalar"):
                 change = mi.Spectrum(medium.sigma_t.at_world(p, inside)) * by_collided
-                albedo.add(p, of_channels(change, albedo.channels), inside)
+                albedo.add(p, summed_to_channels(change, albedo.channels), inside)
             if dr.hint(emission is not None, mode="scalar"):
                 there = inside & medium.emission.covers(p)
-                emission.add(p, of_channels(by_emission, emission.channels), there)
+                emission.add(p, summed_to_channels(by_emission, emission.channels), there)
             k += 1
 
     @symbolic
     def extinction(self):
-        """Means of the extinction over the voxels, for each channel of the radiance."""
+        """Return the mean of the extinction over each voxel, for each channel of the radiance."""
         grid, medium = self.grid, self.medium
         voxel = dr.arange(mi.UInt32, grid.voxel_count)
         number = max(self.points, COLLISION_POINTS)
@@ -93,5 +101,5 @@ class VoxelQuadrature:
 
 
 def volume_of(grid: Grid) -> float:
-    """The volume of a voxel."""
+    """Return the volume of a voxel in world space."""
     return abs(float(np.linalg.det(grid.to_world[:3, :3]))) / grid.voxel_count

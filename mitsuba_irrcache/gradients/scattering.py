@@ -1,10 +1,10 @@
-"""Angular representation of fluence and adjoint fluence: *layers* of one value for each voxel.
+"""Angular representation of fluence and adjoint fluence by *components* with one value per voxel.
 
-Where scattering is isotropic there is one layer. Otherwise the layers are spherical-harmonic
-moments by the direction from which radiance, or the importance of camera rays, arrives. Camera rays
-scatter the irradiance of narrow sources by the exact phase function, which moments do not
-represent. So the radiance has *parts* whose importance differs: part 0, and one for each narrow
-source.
+Where scattering is isotropic there is one component, the fluence. Otherwise the components are the
+spherical-harmonic moments of the radiance, or of the importance of camera rays, over the direction
+from which it arrives. Camera rays scatter the irradiance of narrow sources by the exact phase
+function, which the moments do not represent. So the radiance is divided into *parts* whose
+importance differs: part 0, and one part for each narrow source.
 """
 
 from __future__ import annotations
@@ -27,35 +27,38 @@ from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
-#: Values of a channel at all voxels (mi.Float), layer by layer.
-Layers = list
+#: The components of one channel: a list of arrays (mi.Float) of one value per voxel.
+Components = list
 
 
 class OrdinatePart:
-    """The ordinates along which radiance of a part enters or is scattered.
+    """The n pairs of ordinates along which radiance of one part enters or is scattered.
 
-    ``rows`` (n) are their numbers in the whole set; ``mask`` (n, 2) tells along which of both ways
-    of each pair what enters belongs to the part.
+    ``rows`` (n) are their indices in the whole set; ``mask`` (n, 2) states for both directions of
+    each pair whether the radiance that enters along it belongs to the part.
     """
 
     def __init__(self, ordinates: Ordinates, rows: np.ndarray, mask: np.ndarray) -> None:
         self.ordinates, self.rows, self.mask = ordinates, rows, mask
 
-    def of_channels(self, channels: Sequence[int]) -> Ordinates:
-        """The ordinates, with what enters along them in these channels."""
-        return of_channels(self.ordinates, channels)
+    def with_channels(self, channels: Sequence[int]) -> Ordinates:
+        """Return the ordinates with the incoming radiance of these channels only."""
+        return with_channels(self.ordinates, channels)
 
 
-def split(values: mi.Float, count: int) -> Layers:
-    """So many layers that follow each other in an array."""
+def split(values: mi.Float, count: int) -> Components:
+    """Return ``count`` components that are stored one after the other in an array."""
     voxels = dr.width(values) // count
     place = dr.arange(mi.UInt32, voxels)
     starts = [dr.opaque(mi.UInt32, layer * voxels) for layer in range(count)]
     return [dr.gather(mi.Float, values, place + start) for start in starts]
 
 
-def of_channels(ordinates: Ordinates, channels: Sequence[int]) -> Ordinates:
-    """``ordinates`` with what enters along them in these channels; one may stand for all."""
+def with_channels(ordinates: Ordinates, channels: Sequence[int]) -> Ordinates:
+    """Return ``ordinates`` with the incoming radiance of these channels only.
+
+    Incoming radiance of a single channel is the same in all channels.
+    """
     incoming = ordinates.incoming
     if incoming.shape[-1] > 1:
         incoming = incoming[..., list(channels)]
@@ -63,13 +66,13 @@ def of_channels(ordinates: Ordinates, channels: Sequence[int]) -> Ordinates:
 
 
 class IsotropicScattering:
-    """Scattering into all directions alike: order 0 of `AnisotropicScattering`."""
+    """Isotropic scattering: order 0 of `AnisotropicScattering`."""
 
-    #: layers of the fluence, and of the adjoint fluence of camera rays
+    #: numbers of components of the fluence, and of the adjoint fluence of camera rays
     count = camera_count = 1
-    #: whether channels of the same extinction are swept at once
+    #: whether channels of the same extinction are swept together
     joins_channels = True
-    #: pairs of ordinates along which the adjoint equation is solved
+    #: number of pairs of ordinates with which the adjoint equation is solved
     solving_pairs = 16
 
     # Levels and their arrays
@@ -77,15 +80,15 @@ class IsotropicScattering:
     def new_level(
         self, sigma_t: mi.Float, albedo: list[mi.Float], tracks: Tracks
     ) -> MultigridLevel:
-        """The transport equation of channels with this ``albedo``."""
+        """Return the transport equation of channels with this ``albedo`` (one array each)."""
         return MultigridLevel(sigma_t, interleaved_channels(albedo), tracks)
 
-    def joined(self, channels: list[Layers]) -> mi.Float:
-        """Layers of channels as an array of the level's sweeps."""
-        return interleaved_channels([layers[0] for layers in channels])
+    def joined(self, channels: list[Components]) -> mi.Float:
+        """Return the components of channels as one array, as sweeps of the level take it."""
+        return interleaved_channels([components[0] for components in channels])
 
-    def apart(self, values: mi.Float, channels: int) -> list[Layers]:
-        """Inverse of `joined`."""
+    def separated(self, values: mi.Float, channels: int) -> list[Components]:
+        """Return the components of each channel of an array; the inverse of `joined`."""
         if channels == 1:
             return [[values]]
         place = dr.arange(mi.UInt32, dr.width(values) // channels) * channels
@@ -96,42 +99,51 @@ class IsotropicScattering:
     # Parts of the radiance
 
     def parts(self, ordinates: Ordinates) -> list[OrdinatePart]:
-        """The parts of what enters along ``ordinates``."""
+        """Divide the radiance that enters along ``ordinates`` into its parts."""
         count = len(ordinates.directions)
         return [OrdinatePart(ordinates, np.arange(count), np.ones((count, 2), bool))]
 
     def point_parts(self, lights: int) -> list[int]:
-        """The number of the part of each of so many point-like lights."""
+        """Return the index of the part of each of ``lights`` point-like lights."""
         return [0] * lights
 
-    def from_direction(self, irradiance: mi.Float, towards: mi.Vector3f) -> Layers:
-        """Layers of an irradiance that comes from the direction ``towards``."""
+    def from_direction(self, irradiance: mi.Float, towards: mi.Vector3f) -> Components:
+        """Return the components of an ``irradiance`` that arrives from ``towards``, a direction."""
         return [irradiance]
 
-    def of_parts(self, camera: Layers, travelled: Layers) -> list[Layers]:
-        """The adjoint fluence for each part of the radiance: that of ``camera`` rays, and that
-        which has ``travelled`` between voxels.
+    def of_parts(self, camera: Components, travelled: Components) -> list[Components]:
+        """Return the adjoint fluence for each part of the radiance.
+
+        It is the sum of that of ``camera`` rays and that which has ``travelled`` between voxels.
         """
         return [[travelled[0] + camera[0]]]
 
     # Scattering
 
-    def scattered(self, layers: Layers, scale: mi.Float) -> Layers:
-        """Layers of what a fluence scatters; ``scale`` is the scattering coefficient over 4 pi."""
-        return [scale * layers[0]]
+    def scattered(self, components: Components, scale: mi.Float) -> Components:
+        """Return the components of the radiance that a fluence scatters.
 
-    def product(self, fluence: Layers, adjoint: Layers) -> mi.Float:
-        """The integral over all directions of what is scattered, for a scattering coefficient of
-        1, times the importance that travels against it.
+        ``scale`` is the scattering coefficient divided by 4 pi.
+        """
+        return [scale * components[0]]
+
+    def product(self, fluence: Components, adjoint: Components) -> mi.Float:
+        """Return the integral over directions of scattered radiance times opposite importance.
+
+        The radiance is scattered with a scattering coefficient of 1; the importance is that which
+        propagates against it.
         """
         return fluence[0] * adjoint[0] * dr.inv_four_pi
 
-    def into(self, scattered: Layers, direction: mi.Vector3f) -> mi.Float:
-        """Radiance that is scattered into a ``direction``."""
+    def into(self, scattered: Components, direction: mi.Vector3f) -> mi.Float:
+        """Return the radiance that is scattered into a ``direction``."""
         return scattered[0]
 
-    def along(self, level: MultigridLevel, scattered: Layers, group: PairGroup) -> mi.Float:
-        """Radiance that is scattered along both ways of all pairs of a group, pair by pair."""
+    def along(self, level: MultigridLevel, scattered: Components, group: PairGroup) -> mi.Float:
+        """Return the radiance that is scattered along both directions of each pair of a group.
+
+        The array holds one value per voxel for each direction, pair by pair.
+        """
         voxels = level.grid.voxel_count
         index = dr.arange(mi.UInt32, 2 * len(group) * voxels) % dr.opaque(mi.UInt32, voxels)
         result = dr.gather(mi.Float, scattered[0], index)
@@ -140,8 +152,9 @@ class IsotropicScattering:
 
 
 class AnisotropicScattering(IsotropicScattering):
-    """Scattering of moments of the radiance up to the order of ``basis``, whose sources are all
-    narrow sources of the scene.
+    """Anisotropic scattering of the moments of the radiance, up to the order of ``basis``.
+
+    The sources of the basis are all narrow sources of the scene.
     """
 
     joins_channels = False
@@ -159,11 +172,11 @@ class AnisotropicScattering(IsotropicScattering):
     ) -> MultigridLevel:
         return AnisotropicMultigridLevel(sigma_t, *albedo, tracks, moments=self._moments)
 
-    def joined(self, channels: list[Layers]) -> mi.Float:
-        (layers,) = channels
-        return concatenated(layers[: self.count])
+    def joined(self, channels: list[Components]) -> mi.Float:
+        (components,) = channels
+        return concatenated(components[: self.count])
 
-    def apart(self, values: mi.Float, channels: int) -> list[Layers]:
+    def separated(self, values: mi.Float, channels: int) -> list[Components]:
         found = split(values, self.count)
         dr.eval(found)
         return [found]
@@ -185,25 +198,29 @@ class AnisotropicScattering(IsotropicScattering):
     def point_parts(self, lights: int) -> list[int]:
         return [n for n, source in enumerate(self.basis.sources, 1) if not source.far]
 
-    def from_direction(self, irradiance: mi.Float, towards: mi.Vector3f) -> Layers:
+    def from_direction(self, irradiance: mi.Float, towards: mi.Vector3f) -> Components:
         return [irradiance * y for y in self._moments.basis(towards)]
 
-    def of_parts(self, camera: Layers, travelled: Layers) -> list[Layers]:
+    def of_parts(self, camera: Components, travelled: Components) -> list[Components]:
         smooth = [a + b for a, b in zip(travelled, camera, strict=False)]
-        # A narrow source is scattered towards the camera exactly, and further by moments.
+        # Radiance of a narrow source is scattered into camera rays by the exact phase function, and
+        # between voxels by the moments.
         exact = [[travelled[0] + own, *travelled[1:]] for own in camera[self.count :]]
         return [smooth, *exact]
 
-    def scattered(self, layers: Layers, scale: mi.Float) -> Layers:
-        return [scale * g * layer for g, layer in zip(self._factors, layers, strict=True)]
+    def scattered(self, components: Components, scale: mi.Float) -> Components:
+        return [scale * g * layer for g, layer in zip(self._factors, components, strict=True)]
 
     def product(
-        self, fluence: Layers, adjoint: Layers, moments: np.ndarray | None = None
+        self, fluence: Components, adjoint: Components, moments: np.ndarray | None = None
     ) -> mi.Float:
-        """As for isotropic scattering; by another phase function if its ``moments`` are given."""
+        """Compute the integral as `IsotropicScattering.product`.
+
+        ``moments`` are those of another phase function, if not that of the medium is meant.
+        """
         # docs/primer, eq. (8.13)
         moments = self.basis.phase.moments if moments is None else moments
-        # What travels against a direction has moments of the opposite sign if they are odd.
+        # The importance propagates in the opposite direction, where odd moments change their sign.
         factors = [
             dr.opaque(mi.Float, (-1) ** n * float(moments[n]) / (1 if n else 4 * np.pi))
             for n in self._moments.degrees
@@ -211,17 +228,17 @@ class AnisotropicScattering(IsotropicScattering):
         triples = zip(factors, fluence, adjoint, strict=True)
         return sum(factor * a * b for factor, a, b in triples)
 
-    def into(self, scattered: Layers, direction: mi.Vector3f) -> mi.Float:
+    def into(self, scattered: Components, direction: mi.Vector3f) -> mi.Float:
         first, *higher = scattered
         _, *basis = self._moments.basis(-direction)
         return first * dr.inv_four_pi + sum(s * y for s, y in zip(higher, basis, strict=True))
 
-    def along(self, level: MultigridLevel, scattered: Layers, group: PairGroup) -> mi.Float:
+    def along(self, level: MultigridLevel, scattered: Components, group: PairGroup) -> mi.Float:
         return level.source_along(concatenated(scattered), group)
 
 
 def scattering_of(scene: mi.Scene, medium: MediumGrid) -> IsotropicScattering:
-    """The representation that the phase function of ``medium`` needs."""
+    """Return the angular representation that the phase function of ``medium`` requires."""
     if medium.phase.is_isotropic:
         return IsotropicScattering()
     sources, _ = sources_of(scene)

@@ -1,8 +1,7 @@
-"""Transposes of interpolation: contributions at positions are added to the voxels that a lookup
-there reads.
+"""Transposes of interpolation: values at positions are added to the voxels that a lookup reads.
 
-Many contributions fall on each voxel, in an order that differs from run to run. They are added in
-64-bit fixed point, where the order does not matter: the same seed gives the same bits.
+Many values are added to each voxel, in an order that differs between runs. They are added in 64-bit
+fixed point, where the result does not depend on the order: equal seeds give equal bits.
 """
 
 from __future__ import annotations
@@ -17,14 +16,15 @@ import numpy as np
 from mitsuba_irrcache.core.fast_math import clipped
 from mitsuba_irrcache.grids.grid import Grid
 
-#: Bits of the largest sum of magnitudes.
+#: Number of bits of the largest sum of magnitudes.
 BITS = 60
-#: Sums of a constant field: contributions to a single address would wait for each other.
+#: Number of sums among which the derivatives with respect to a constant are distributed, because
+#: atomic additions to a single address would be serialised.
 SLOTS = 1 << 12
 
 
 class FixedPointSums:
-    """``size`` sums of scattered numbers, the same bits whatever the order of additions.
+    """An array of ``size`` sums whose bits do not depend on the order of additions.
 
     ``bound`` is an upper bound of the sum of the magnitudes of all contributions.
     """
@@ -43,7 +43,7 @@ class FixedPointSums:
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, mi.Int64(scaled), index, active)
 
     def values(self) -> mi.Float:
-        """The sums."""
+        """Return the sums."""
         double = dr.float64_array_t(mi.Float)
         result = mi.Float(double(self.sums) * dr.opaque(double, 2.0**-self._exponent))
         dr.eval(result)
@@ -69,7 +69,7 @@ class GridSplat:
 
 
 class VoxelSums:
-    """Integrals over the voxels of ``grid`` of ``channels`` values."""
+    """Integrals over each voxel of ``grid`` of ``channels`` values at positions."""
 
     def __init__(self, grid: Grid, channels: int, bound: float) -> None:
         self.grid, self.channels = grid, channels
@@ -86,7 +86,7 @@ class VoxelSums:
             self._sums.add(index + c, value, active)
 
     def values(self) -> list[mi.Float]:
-        """The integrals of each channel."""
+        """Return the integrals over the voxels, one array for each channel."""
         sums = self._sums.values()
         place = dr.arange(mi.UInt32, self.grid.voxel_count) * self.channels
         found = [dr.gather(mi.Float, sums, place + c) for c in range(self.channels)]
@@ -95,7 +95,7 @@ class VoxelSums:
 
 
 class ConstantSplat:
-    """The transpose of the lookup of a constant of ``channels`` values."""
+    """The transpose of the lookup of a constant field of ``channels`` values."""
 
     def __init__(self, channels: int, bound: float) -> None:
         self.channels = channels
@@ -113,8 +113,9 @@ class ConstantSplat:
         return mi.Float(sums.sum(axis=0).tolist())
 
 
-def of_channels(values: mi.Spectrum, channels: int) -> list[mi.Float]:
-    """The derivative by each channel of a field from that by each channel of the radiance: grey
-    fields take part in all.
+def summed_to_channels(values: mi.Spectrum, channels: int) -> list[mi.Float]:
+    """Convert derivatives by channel of the radiance to derivatives by channel of a field.
+
+    A grey field affects all channels, so that its derivative is their sum.
     """
     return [dr.sum(values)] if channels == 1 else list(values)

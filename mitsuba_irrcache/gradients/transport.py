@@ -1,16 +1,16 @@
-"""Adjoint transport: how the objective depends on the medium between emitters and the points at
-which camera rays read the irradiance.
+"""Adjoint transport: derivatives through the irradiance that camera rays read.
 
-Transport is its own adjoint under reversal of directions. So the adjoint fluence Phi*, which the
-objective's derivative by the irradiance leaves in the medium, solves the equation of all orders of
-scattering with the adjoint fluence of the camera rays as its source, and the solver of the
-irradiance solves it. Extinction is then worth, along each ordinate, what it removes and scatters of
-the radiance L, times the adjoint radiance W that arrives against it.
+Radiative transfer is its own adjoint under reversal of directions. So the adjoint fluence Phi*
+obeys the same equation as the fluence, with the adjoint fluence of camera rays (the derivative of
+the objective with respect to the irradiance) as its source, and the same solver solves it. The
+derivative with respect to the extinction is the integral over directions of the radiance that it
+adds by scattering and removes, S - L, times the adjoint radiance W of the opposite direction.
 """
 
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -18,12 +18,8 @@ import numpy as np
 
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.gradients.parameters import EMISSION, MEAN_COSINE, SIGMA_T
-from mitsuba_irrcache.gradients.phase_function import PhasesBeside
-from mitsuba_irrcache.gradients.scattering import (
-    Layers,
-    of_channels,
-    scattering_of,
-)
+from mitsuba_irrcache.gradients.phase_function import NeighbouringPhases
+from mitsuba_irrcache.gradients.scattering import Components, scattering_of, with_channels
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.falloff import InverseSquareFactor, VoxelSamplePoints
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -40,19 +36,24 @@ from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks
 
 
 class Derivatives:
-    """Derivatives of the objective by the means over the voxels of a grid, per volume, for each
-    channel of the radiance: by the extinction, for collisions of the voxel's albedo;
-    ``collided``, by the scattering coefficient, Phi Phi* / (4 pi); and ``emitted``, by emission
-    that is scattered. ``direct`` is, for each channel and part of the radiance, the scattered
-    importance of what enters from emitters (see `scattering`); ``g``, by the mean cosine of the
-    phase function.
+    """Derivatives of the objective with respect to means over the voxels, per volume.
+
+    Each attribute is a list over the channels of the radiance.
+
+    Attributes:
+        sigma_t: with respect to the extinction, at the albedo of the voxel.
+        collided: with respect to the scattering coefficient, Phi Phi* / (4 pi).
+        direct: for each part of the radiance (see `scattering`), the components of the derivative
+            with respect to the radiance that arrives from emitters.
+        emitted: with respect to the emission, through scattering.
+        g: with respect to the mean cosine of the phase function.
     """
 
     def __init__(
         self,
         sigma_t: list,
         collided: list,
-        direct: list[list[Layers]],
+        direct: list[list[Components]],
         emitted: list,
         g: Sequence = (),
     ) -> None:
@@ -60,13 +61,33 @@ class Derivatives:
         self.direct, self.emitted, self.g = direct, emitted, g
 
 
+@dataclass(frozen=True)
+class TransportSettings:
+    """How the transport equation and its adjoint are discretised.
+
+    Attributes:
+        seed: determines the ordinates.
+        pairs: number of pairs of opposite ordinates.
+        single: whether radiance is scattered once only.
+        grey: whether the medium and the derivatives have a single channel. If all emitters are of
+            one colour, too, a single channel is computed for all.
+    """
+
+    seed: tuple[int, int]
+    pairs: int
+    single: bool
+    grey: bool = False
+
+
 class AdjointTransport:
     """The transport equation in all voxels of ``grid``, and its adjoint.
 
-    ``pairs`` of opposite ordinates are used. With ``single``, radiance is scattered once only.
-    ``wanted`` are the derivatives to be found: `SIGMA_T`, `EMISSION` and `MEAN_COSINE` may be among
-    them. If the medium and what is wanted are ``grey``, and all emitters have one colour, a single
-    channel stands for all: ``colour`` holds the factors of the radiance of each.
+    ``wanted`` are the roles of the derivatives to be computed; those of `SIGMA_T`, `EMISSION` and
+    `MEAN_COSINE` are computed only on request.
+
+    Attributes:
+        channels: number of channels that are computed.
+        colour: factor of the radiance of each channel, if one is computed for all; otherwise 1.
     """
 
     def __init__(
@@ -74,28 +95,25 @@ class AdjointTransport:
         scene: mi.Scene,
         medium: MediumGrid,
         grid: Grid,
-        seed: tuple[int, int],
-        pairs: int,
-        single: bool,
         wanted: Container[str],
-        grey: bool = False,
+        settings: TransportSettings,
     ) -> None:
-        self.grid, self._medium, self.single, self._wanted = grid, medium, single, wanted
+        self.grid, self._medium, self.single, self._wanted = grid, medium, settings.single, wanted
         self.scattering = scattering_of(scene, medium)
-        #: phase functions beside that of the medium, if derivatives by its mean cosine are wanted
-        self.beside = PhasesBeside(medium.phase) if MEAN_COSINE in wanted else None
+        #: for derivatives with respect to the mean cosine, if they are wanted
+        self.neighbours = NeighbouringPhases(medium.phase) if MEAN_COSINE in wanted else None
         colours = 1 if mi.is_monochromatic else 3
-        rng = np.random.default_rng((*seed, 0x67726164))
+        pairs, rng = settings.pairs, np.random.default_rng((*settings.seed, 0x67726164))
         illumination = DistantIllumination(scene)
-        if grey:
+        if settings.grey:
             (self.ordinates,), self.colour = illumination.factored_ordinates(1, pairs, colours, rng)
         else:
             (self.ordinates,) = illumination.ordinates(1, pairs, rng)
             self.colour = np.ones(colours)
         self.parts = self.scattering.parts(self.ordinates)
-        #: sets of tracks of each sun, the last ordinates
+        #: number of ordinates of each sun; those of suns are the last ones
         self.sun_tracks = illumination.sun_pairs(pairs) // max(illumination.sun_count, 1)
-        self.channels = self.ordinates.incoming.shape[-1] if grey else colours
+        self.channels = self.ordinates.incoming.shape[-1] if settings.grey else colours
         solving_pairs = min(pairs, self.scattering.solving_pairs)
         (solving,) = illumination.ordinates(1, solving_pairs, rng)
         self._solving = solving.scattering().without_incoming()
@@ -103,13 +121,13 @@ class AdjointTransport:
         self.positions = VoxelSamplePoints(scene, grid).of(voxels)
         self.point_lights = illumination.point_lights
         self._point_parts = self.scattering.point_parts(len(self.point_lights))
-        #: irradiance from each point-like light at the voxel centres, and means over the voxels
+        #: irradiance of each point-like light at the voxel centres; below, means over the voxels
         self.at_centres = illumination.point_irradiance(medium, self.positions)
         falloff = InverseSquareFactor.of(scene, grid) if self.at_centres else None
         mean = falloff.spread(voxels) if falloff is not None else mi.Float(1)
         self.from_points = [irradiance * mean for irradiance in self.at_centres]
         dr.eval(self.at_centres, self.from_points)
-        #: levels of channels that are swept together, with the numbers of these channels
+        #: the equation of channels that are swept together, and the indices of these channels
         self.levels = self._new_levels(medium, grid, voxels)
 
     def _new_levels(
@@ -120,10 +138,10 @@ class AdjointTransport:
         mean = resampled(medium, medium.sigma_t, grid) if detail is not grid else extinction
         plain = resampled(medium, medium.albedo, grid)
         albedo = collision_albedo(medium, grid, voxels)
-        # Where there is no matter yet, some that is added has the albedo of the data.
+        # In empty voxels there are no collisions to average over; the albedo is that of the data.
         none = [s <= 0 for s in mean]
         albedo = [
-            dr.select(none[min(c, len(none) - 1)], _of(plain, c), _of(albedo, c))
+            dr.select(none[min(c, len(none) - 1)], _channel(plain, c), _channel(albedo, c))
             for c in range(self.channels)
         ]
         dr.eval(albedo)
@@ -135,66 +153,70 @@ class AdjointTransport:
         groups = [together] if joined else [(c,) for c in together]
         levels = []
         for own in groups:
-            albedos, own_tracks = [albedo[c] for c in own], _of(tracks, own[0])
-            level = self.scattering.new_level(_of(mean, own[0]), albedos, own_tracks)
+            albedos, own_tracks = [albedo[c] for c in own], _channel(tracks, own[0])
+            level = self.scattering.new_level(_channel(mean, own[0]), albedos, own_tracks)
             levels.append((level, own))
         return levels
 
     # The irradiance
 
-    def irradiance(self, known: list[Layers]) -> tuple[list[Layers], list[Layers]]:
-        """Fluence at all voxels, and that of collisions, in each channel; ``known`` is that of the
-        cache, 0 where it has none.
+    def irradiance(self, cached: list[Components]) -> tuple[list[Components], list[Components]]:
+        """Return the fluence at the voxel centres, and that of collisions, for each channel.
 
-        Behind the layers of the former are the irradiance of each narrow source, whose moments they
-        exclude (see `cache/angular`).
+        ``cached`` is the fluence of the cache, 0 at inactive voxels. The higher moments of the
+        fluence at the centres exclude narrow sources (see `cache/angular`), whose irradiances
+        follow.
         """
         centres, collided = [], []
         for level, own in self.levels:
-            phi = None if self.single else self.scattering.joined([known[c] for c in own])
-            table = level.tracks.table(*of_channels(self.ordinates, own))
-            found, swept = (self.scattering.apart(v, len(own)) for v in level.sweep(phi, table))
-            for c, layers, own_collided in zip(own, found, swept, strict=True):
-                centres.append(self._with_narrow_sources(level, c, layers))
+            phi = None if self.single else self.scattering.joined([cached[c] for c in own])
+            table = level.tracks.table(*with_channels(self.ordinates, own))
+            found, swept = (self.scattering.separated(v, len(own)) for v in level.sweep(phi, table))
+            for c, components, own_collided in zip(own, found, swept, strict=True):
+                centres.append(self._with_narrow_sources(level, c, components))
                 collided.append(self._with_points(c, own_collided))
             dr.eval(centres, collided)
         return centres, collided
 
-    def _with_narrow_sources(self, level: MultigridLevel, channel: int, layers: Layers) -> Layers:
-        """Swept ``layers`` with the irradiance of point-like lights, without the higher moments of
-        narrow sources, followed by the irradiance of each of these.
+    def _with_narrow_sources(
+        self, level: MultigridLevel, channel: int, components: Components
+    ) -> Components:
+        """Return ``components`` of a sweep as `irradiance` returns them.
+
+        The irradiance of point-like lights is added, the higher moments of narrow sources are
+        subtracted, and the irradiance of each of these is appended.
         """
-        irradiance, *higher = layers
+        irradiance, *higher = components
         irradiance = irradiance + sum((e[channel] for e in self.at_centres), mi.Float(0))
         narrow, points = [], iter(self.at_centres)
         for number, part in enumerate(self.parts[1:], 1):
             if number in self._point_parts:
                 narrow.append(next(points)[channel])
                 continue
-            table = level.tracks.table(*part.of_channels([channel]))
-            ((own, *moments),) = self.scattering.apart(level.sweep(None, table)[0], 1)
+            table = level.tracks.table(*part.with_channels([channel]))
+            ((own, *moments),) = self.scattering.separated(level.sweep(None, table)[0], 1)
             higher = [a - b for a, b in zip(higher, moments, strict=True)]
             narrow.append(own)
         return [irradiance, *higher, *narrow]
 
-    def _with_points(self, channel: int, layers: Layers) -> Layers:
-        """``layers`` of collisions with those of point-like lights."""
+    def _with_points(self, channel: int, components: Components) -> Components:
+        """Add the radiance of point-like lights to the ``components`` of collisions."""
         from_lights = [
             self.scattering.from_direction(irradiance[channel], self.towards_point(light))
             for light, irradiance in enumerate(self.from_points)
         ]
         if not from_lights:
-            return layers
-        return [a + sum(own) for a, *own in zip(layers, *from_lights, strict=True)]
+            return components
+        return [a + sum(own) for a, *own in zip(components, *from_lights, strict=True)]
 
     def towards_point(self, light: int) -> mi.Vector3f:
-        """The direction from the voxels to the point-like light of this number."""
+        """Return the direction from each voxel to a point-like light, given its index."""
         at = dr.zeros(mi.Interaction3f, self.grid.voxel_count)
         at.p = self.positions
         return self.point_lights[light].sample_direction(at, mi.Point2f(0.5))[0].d
 
-    def worth_of_point(self, light: int, found: Derivatives) -> mi.Spectrum:
-        """The derivative by the irradiance of the point-like light of this number."""
+    def derivative_by_point(self, light: int, found: Derivatives) -> mi.Spectrum:
+        """Return the derivatives with respect to the irradiance of a point-like light, by voxel."""
         direction, part = self.towards_point(light), self._point_parts[light]
         return mi.Spectrum(
             *(self.scattering.into(direct[part], direction) for direct in found.direct)
@@ -202,10 +224,13 @@ class AdjointTransport:
 
     # The adjoint
 
-    def adjoint(self, camera: list[Layers]) -> tuple[list, list, list]:
-        """The adjoint fluence of collisions in each channel: for each part of the radiance, with
-        that of the ``camera`` rays; that which has travelled between voxels; and its mean over
-        directions at the voxel centres, also without matter.
+    def adjoint(self, camera: list[Components]) -> tuple[list, list, list]:
+        """Solve the adjoint equation, given the adjoint fluence of ``camera`` rays by channel.
+
+        Returns three lists over the channels: the adjoint fluence of collisions for each part of
+        the radiance; the share of it that has travelled between voxels; and its mean over
+        directions at the voxel centres, including empty voxels. The last list is empty if radiance
+        is scattered once and the derivative with respect to the emission is not wanted.
         """
         # docs/primer, eq. (8.5)
         scattering = self.scattering
@@ -223,26 +248,30 @@ class AdjointTransport:
                 dr.eval(phi)
                 irradiance, phi = level.sweep(phi, table)
                 centres += self._irradiances(irradiance, own)
-                found = scattering.apart(phi, len(own))
+                found = scattering.separated(phi, len(own))
             travelled += found
             totals += [
-                scattering.of_parts(camera[c], layers) for c, layers in zip(own, found, strict=True)
+                scattering.of_parts(camera[c], components)
+                for c, components in zip(own, found, strict=True)
             ]
         dr.eval(totals, travelled, centres)
         return totals, travelled, centres
 
     def _irradiances(self, values: mi.Float, channels: Sequence[int]) -> list[mi.Float]:
-        return [layers[0] for layers in self.scattering.apart(values, len(channels))]
+        return [components[0] for components in self.scattering.separated(values, len(channels))]
 
-    def _zeros(self, count: int) -> Layers:
+    def _zeros(self, count: int) -> Components:
         return [dr.zeros(mi.Float, self.grid.voxel_count) for _ in range(count)]
 
     def derivatives(
-        self, phi: list[Layers], camera: list[Layers], extinction: list[mi.Float]
+        self, phi: list[Components], camera: list[Components], extinction: list[mi.Float]
     ) -> Derivatives:
-        """Derivatives by the medium, from the fluence ``phi`` of collisions and the adjoint fluence
-        of the ``camera`` rays; ``extinction`` is its mean over the voxels. Those by the extinction
-        are left out if they are not wanted.
+        """Return the derivatives with respect to the medium; those not wanted are empty lists.
+
+        Args:
+            phi: the fluence of collisions, by channel.
+            camera: the adjoint fluence of camera rays, by channel.
+            extinction: means over the voxels, by channel.
         """
         # docs/primer, eq. (8.6)
         scattering = self.scattering
@@ -253,22 +282,27 @@ class AdjointTransport:
                 scale = self.albedo[c] * dr.inv_four_pi
                 if SIGMA_T in self._wanted:
                     source = None if self.single else scattering.scattered(phi[c], scale)
-                    adjoint = [scattering.scattered(layers, scale) for layers in totals[c]]
+                    adjoint = [scattering.scattered(components, scale) for components in totals[c]]
                     sigma_t.append(self._products(level, c, source, adjoint))
                 collided.append(scattering.product(phi[c], travelled[c]))
-                if self.beside is not None:
-                    change = scattering.product(phi[c], travelled[c], self.beside.moments)
+                if self.neighbours is not None:
+                    change = scattering.product(phi[c], travelled[c], self.neighbours.moments)
                     by_g.append(extinction[c] * self.albedo[c] * change)
                 scale = extinction[c] * scale
-                direct.append([scattering.scattered(layers, scale) for layers in totals[c]])
+                direct.append([scattering.scattered(components, scale) for components in totals[c]])
         dr.eval(sigma_t, collided, direct, by_g)
         return Derivatives(sigma_t, collided, direct, emitted, by_g)
 
     def _products(
-        self, level: MultigridLevel, channel: int, source: Layers | None, adjoint: list[Layers]
+        self,
+        level: MultigridLevel,
+        channel: int,
+        source: Components | None,
+        adjoint: list[Components],
     ) -> mi.Float:
-        """The sum over all ordinates of (S - L) W: ``source`` is S, None for 0, and ``adjoint``
-        that of W for each part of L.
+        """Return the sum over all ordinates of (S - L) W, one value per voxel.
+
+        ``source`` is S, None for 0; ``adjoint`` is the source of W for each part of L.
         """
         none = self._zeros(self.scattering.count)
         source = none if source is None else source
@@ -278,7 +312,7 @@ class AdjointTransport:
             if len(part.rows):
                 scattered = none if number else source
                 total = self._add_products(
-                    total, level, part.of_channels([channel]), scattered, own
+                    total, level, part.with_channels([channel]), scattered, own
                 )
         return total
 
@@ -287,14 +321,14 @@ class AdjointTransport:
         total: mi.Float,
         level: MultigridLevel,
         ordinates: Ordinates,
-        source: Layers,
-        adjoint: Layers,
+        source: Components,
+        adjoint: Components,
     ) -> mi.Float:
-        """``total`` and the products of a part."""
+        """Add the products of one part of the radiance to ``total``, and return the sum."""
         scattering, tracks = self.scattering, level.tracks
         directions, incoming, weights, offsets = ordinates
         forward = tracks.table(directions, incoming, weights, offsets)
-        # Ordinates of emitters alone have no weight, but what enters along them meets W, too.
+        # Ordinates of suns have no weight in sums over directions, but contribute to the products.
         backward = tracks.table(directions, 0 * incoming, np.ones_like(weights), offsets)
         dr.eval(source, adjoint)
         swept = list(adjoint)
@@ -316,8 +350,8 @@ class AdjointTransport:
         return total
 
 
-def _of(channels: list, number: int):
-    """A channel; grey fields have the same in all."""
+def _channel(channels: list, number: int):
+    """Return the values of a channel; a grey field has the same values in all channels."""
     return channels[min(number, len(channels) - 1)]
 
 
@@ -325,11 +359,18 @@ def _of(channels: list, number: int):
 def _pair_products(
     grid: Grid, group: PairGroup, radiance: mi.Float, importance: mi.Float, adjoint: mi.Float
 ):
-    """Sums over the ordinates of a group of the means over voxels of (S - L) W; ``adjoint`` is the
-    source S* of the importance, laid out as both, ordinate by ordinate, or the same along all.
+    """Return the sums over the ordinates of a group of means over each voxel of (S - L) W.
 
-    Within a voxel both decay towards their sources S and S*, L forwards and W backwards: with
-    L - S and W - S* in its middle, the mean is -(L - S) [S* sinh(tau/2) / (tau/2) + W - S*].
+    Within a voxel L and W decay exponentially towards their sources S and S*, in opposite
+    directions. With L - S and W - S* at the middle of the voxel, the mean of the product is
+    -(L - S) [S* sinh(tau/2) / (tau/2) + W - S*].
+
+    Args:
+        grid: the grid.
+        group: the pairs of ordinates.
+        radiance: result of `Tracks.sweep_separately`, which holds L - S.
+        importance: the same with W - S*.
+        adjoint: S*, one value per voxel for each direction, or the same for all directions.
     """
     # docs/primer, eq. (8.7)
     voxels = dr.opaque(mi.UInt32, grid.voxel_count)
@@ -341,13 +382,13 @@ def _pair_products(
         number = k // 2
         place, opposite = k * voxels + voxel, (k + 1 - 2 * (k - number * 2)) * voxels + voxel
         area = dr.max(dr.abs(grid.coordinates.vector(group.direction(number))))
-        _, light, _, depth = dr.gather(mi.Vector4f, radiance, place)
+        _, excess, _, depth = dr.gather(mi.Vector4f, radiance, place)
         _, weight, _, _ = dr.gather(mi.Vector4f, importance, opposite)
         if dr.hint(each, mode="scalar"):
             own = dr.gather(mi.Float, adjoint, opposite)
         half = 0.5 * depth / area
         series = 1 + half * half * (1 / 6)
         mean = dr.select(half < 0.1, series, dr.sinh(half) / half)
-        total -= light * dr.fma(own, mean, weight)
+        total -= excess * dr.fma(own, mean, weight)
         k += 1
     return total

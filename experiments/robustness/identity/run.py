@@ -1,8 +1,9 @@
-"""Render small scenes of all kinds, and compare the images bit by bit with those of another run.
+"""Render small scenes of all kinds, and compare the results bit by bit with those of another run.
 
     python -m experiments.robustness.identity.run FOLDER [--against OTHER_FOLDER] [--only PART]
 
-Writes FOLDER/<scene>-<solver>.npy, one image for each solver that supports the scene. With
+Writes FOLDER/<scene>-<solver>.npy, one image for each solver that supports the scene, and
+FOLDER/gradient-<case>-<parameter>.npy, derivatives of images of `experiments.gradients.cases`. With
 ``--against``, every image is compared with the one of the same name in OTHER_FOLDER; the script
 prints the differences, and exits with 1 if there are any. To be run before and after a change that
 must not affect results, for instance a refactoring, on the same machine with the same versions of
@@ -13,13 +14,17 @@ from __future__ import annotations
 
 import argparse
 import gc
+import re
 import sys
 from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
+from experiments.gradients.cases import CASES
+from experiments.gradients.differences import gradients, pixel_weights
 from experiments.performance.kinds import scenes as kinds
 from experiments.support.options import begin
 from mitsuba_irrcache.errors import IrrcacheError
@@ -145,6 +150,25 @@ SCENES: dict[str, tuple[Callable[[], dict], dict]] = {
 }  # fmt: skip
 
 
+#: Cases of which gradients are computed.
+GRADIENTS = (
+    "sky",
+    "sun, single",
+    "point in the medium",
+    "spot",
+    "envmap with a bright spot",
+    "coloured extinction",
+    "empty voxels",
+    "hg 0.6, coloured albedo",
+    "hg 0.6, emission",
+    "hg 0.6, radiance of sky and sun",
+    "hg 0.3, intensity of a point",
+    "hg 0.65, spot",
+    "hg 0.65, coloured albedo",
+    "hg 0.85, empty voxels",
+)
+
+
 def images(only: str) -> Iterator[tuple[str, np.ndarray]]:
     """Yield name and image of each scene with ``only`` in its name, for each solver."""
     for name, (build, properties) in SCENES.items():
@@ -157,6 +181,19 @@ def images(only: str) -> Iterator[tuple[str, np.ndarray]]:
                 yield title, rendered(build(), SMALL | {"solver": solver} | properties)
             except IrrcacheError as error:
                 print(f"{title}: not supported ({str(error)[:70]}...)", flush=True)
+
+
+def derivatives(only: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield name and gradient of each case and parameter with ``only`` in its name."""
+    for name in GRADIENTS:
+        title = f"gradient-{re.sub('[^a-z0-9.]+', '_', name)}"
+        if only not in title:
+            continue
+        gc.collect()
+        scene = CASES[name].load()
+        found = gradients(scene, CASES[name].parameters, pixel_weights(scene))
+        for parameter, values in found.items():
+            yield f"{title}-{parameter}", values
 
 
 def rendered(objects: dict, properties: dict) -> np.ndarray:
@@ -196,7 +233,7 @@ def main() -> int:
     begin()
     args.folder.mkdir(parents=True, exist_ok=True)
     names, changed = set(), 0
-    for name, image in images(args.only):
+    for name, image in chain(images(args.only), derivatives(args.only)):
         names.add(name)
         np.save(args.folder / f"{name}.npy", image)
         found = args.against and difference(image, args.against / f"{name}.npy")

@@ -13,7 +13,7 @@ from experiments.gradients.cases import Case
 from mitsuba_irrcache.gradients.forward_peak import with_forward_peak
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature
 from mitsuba_irrcache.gradients.splatting import GridSplat
-from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives
+from mitsuba_irrcache.gradients.transport import AdjointTransport, Derivatives, TransportSettings
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.media.delta_m import without_forward_peak
@@ -28,13 +28,15 @@ def medium_of(case: Case):
     return scene, medium
 
 
+SETTINGS = TransportSettings((0, 1), pairs=64, single=False)
+
+
 def test_a_sweep_is_its_own_transpose():
     """Weighted by the scattering coefficient, for smooth fields."""
     case = Case(data=20, cache=20)
     scene, medium = medium_of(case)
-    transport = AdjointTransport(
-        scene, medium, Grid.near_cubic(medium.frame, 20), (0, 1), 64, False, ()
-    )
+    grid = Grid.near_cubic(medium.frame, 20)
+    transport = AdjointTransport(scene, medium, grid, (), SETTINGS)
     ((level, own),) = transport.levels
     table = level.tracks.table(*transport.ordinates.scattering().without_incoming())
     z, y, x = np.mgrid[:20, :20, :20] / 20
@@ -51,7 +53,7 @@ def test_a_sweep_of_moments_is_its_own_transpose(mono):
     case = Case(data=20, cache=20, g=0.4)
     scene, medium = medium_of(case)
     grid = Grid.near_cubic(medium.frame, 20)
-    transport = AdjointTransport(scene, medium, grid, (0, 1), 64, False, ())
+    transport = AdjointTransport(scene, medium, grid, (), SETTINGS)
     ((level, _),), scattering = transport.levels, transport.scattering
     table = level.tracks.table(*transport.ordinates.scattering().without_incoming())
     z, y, x = np.mgrid[:20, :20, :20] / 20
@@ -63,8 +65,8 @@ def test_a_sweep_of_moments_is_its_own_transpose(mono):
         ]
         pair.append([mi.Float(wave.ravel().tolist()) for wave in waves])
     swept = [
-        scattering.apart(level.sweep(scattering.joined([layers]), table)[1], 1)[0]
-        for layers in pair
+        scattering.separated(level.sweep(scattering.joined([components]), table)[1], 1)[0]
+        for components in pair
     ]
     weight = level.sigma_t * transport.albedo[0]
     sums = [float(dr.sum(weight * scattering.product(pair[i], swept[1 - i]))[0]) for i in (0, 1)]
