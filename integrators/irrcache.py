@@ -355,11 +355,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         self._stock.cancel()
 
     def should_stop(self) -> bool:
-        """Whether rendering was cancelled or has reached its ``timeout``."""
+        """Return whether rendering was cancelled or has reached its ``timeout``."""
         return self._stopping.is_due
 
     def aov_names(self) -> list[str]:
-        """Names of the channels in addition to colour and alpha, in the film's order."""
+        """Return the names of the channels in addition to colour and alpha, in the film's order."""
         return self._image.aov_names()
 
     def sample(
@@ -370,7 +370,7 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-        """Radiance along ``ray``, for wrappers such as ``aov``.
+        """Return the radiance along ``ray``, for wrappers such as ``aov``.
 
         The mask is a random rounding of alpha.
         """
@@ -526,13 +526,13 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
         return ParameterAdjoint(scene, params, keys, part, image, seed)
 
     def to_string(self) -> str:
-        """All properties with their current values, as a record of how an image was computed."""
+        """Return all properties with their values, to record how an image was computed."""
         aovs = ", ".join(f"{name}:{kind}" for name, kind in self._options.aovs.items())
         values = self._properties.values | {"cache_spp": self.cache_spp, "aovs": aovs}
         return f"IrradianceCachingIntegrator[\n{properties.described(values)}\n]"
 
     def _repr_html_(self) -> str:
-        """Properties, and slices of every cache, for notebooks."""
+        """Return the properties and slices of every cache as HTML, for notebooks."""
         caches = "".join(
             f"<h4>{html.escape(name)}</h4>{cache._repr_html_()}"
             for name, cache in self.caches.items()

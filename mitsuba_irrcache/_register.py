@@ -38,8 +38,9 @@ def _variant_changed(old: str | None, new: str) -> None:
 
 
 def _wrapped(render: Callable) -> Callable:
-    """Wrap ``mi.render`` so that its exceptions state the original cause, and images that receive
-    gradients share what they can.
+    """Wrap ``mi.render`` so that its exceptions state the original cause.
+
+    Images through which derivatives are propagated share one adjoint solve (`_shared`).
 
     ``mi.render`` calls integrators through ``dr.custom``, which replaces the message of any
     exception by "error while performing a custom differentiable operation (see above)".
@@ -59,8 +60,10 @@ def _wrapped(render: Callable) -> Callable:
 
 
 def _shared(arguments: dict) -> Callable | None:
-    """Return a function that renders with ``render_shared`` of our integrator; None if these
-    ``arguments`` of ``mi.render`` are not for it, or no parameter carries gradients.
+    """Return a function that renders by ``render_shared`` of our integrator.
+
+    None if these ``arguments`` of ``mi.render`` are for another integrator, or if no parameter
+    carries gradients.
     """
     params = arguments.get("params")
     if not isinstance(params, mi.SceneParameters):

@@ -113,7 +113,7 @@ class AngularBasis:
     def hits_source(
         self, origin: mi.Point3f, direction: mi.Vector3f, far: mi.Bool, near: mi.Bool
     ) -> mi.Bool:
-        """Whether rays hit a narrow source.
+        """Return whether rays hit a narrow source.
 
         ``far`` is the mask of rays that leave the scene, ``near`` of those that hit an emitter.
         """
@@ -155,7 +155,7 @@ class AngularBasis:
         return 1 + self._smooth(dr.dot(direction, towards))
 
     def has_residual(self, with_peak: bool = True) -> bool:
-        """Whether moments up to `order` do not represent the phase function completely."""
+        """Return whether moments up to `order` do not represent the phase function completely."""
         if self.phase.forward:
             return with_peak
         return self.phase.tail(self.order) > NEGLIGIBLE_TERM

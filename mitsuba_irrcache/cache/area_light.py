@@ -425,7 +425,7 @@ def _with_harmonics(
 
 
 def _is_inside(shape: mi.Shape, medium: MediumGrid) -> bool:
-    """Whether any of `POSITIONS` points of a shape lies in the medium."""
+    """Return whether any of `POSITIONS` points of a shape lies in the medium."""
     rng = np.random.default_rng(POSITIONS)
     sample = mi.Point2f(np.float32(rng.random((2, POSITIONS))))
     return bool(dr.any(medium.contains(shape.sample_position(0.0, sample).p)))

@@ -26,7 +26,7 @@ from mitsuba_irrcache.machine.llvm import require_llvm
 
 #: The integrator in place of a path tracer; only this solver has gradients.
 INTEGRATOR = "irrcache{solver=sweep}"
-#: Seconds between checkpoints, at least.
+#: Shortest time between checkpoints [s].
 CHECKPOINT_SECONDS = 30.0
 CHECKPOINT = "fit.npz"
 IMAGES = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
@@ -143,12 +143,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _Report:
-    """Prints the progress, and writes a checkpoint now and then."""
+    """Print the progress, and write a checkpoint every `CHECKPOINT_SECONDS` at most."""
 
     def __init__(self, checkpoint: Path, settings: Settings) -> None:
         self._checkpoint, self._settings = checkpoint, settings
         self._begun = self._saved = perf_counter()
-        #: the last state
+        #: the state after the last step
         self.result: Result | None = None
 
     def __call__(self, result: Result) -> None:
@@ -166,7 +166,7 @@ class _Report:
 
 
 def _image_files(given: list[str]) -> list[Path]:
-    """The image files; those of a folder by their names."""
+    """Return the image files; those of a folder are sorted by name."""
     paths = [Path(name) for name in given]
     if len(paths) == 1 and paths[0].is_dir():
         folder = paths[0]
@@ -180,7 +180,7 @@ def _image_files(given: list[str]) -> list[Path]:
 
 
 def _pixels(file: Path) -> np.ndarray:
-    """Linear radiance (height, width, 3), or 1 channel in a monochromatic variant."""
+    """Return linear radiance (height, width, 3), or 1 channel in a monochromatic variant."""
     form = mi.Bitmap.PixelFormat.Y if mi.is_monochromatic else mi.Bitmap.PixelFormat.RGB
     try:
         bitmap = mi.Bitmap(str(file)).convert(form, mi.Struct.Type.Float32, srgb_gamma=False)

@@ -55,8 +55,10 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
 def chosen_integrator(
     scene: Path, parameters: dict[str, str], integrator: str | None
 ) -> str | None:
-    """Return ``integrator``, or what replaces that of a scene if None is given: ``irrcache`` in
-    place of a path tracer, None for others.
+    """Return the integrator to render with; None for the scene's own.
+
+    It is ``integrator`` if that is given, otherwise ``irrcache`` for scenes with one of the
+    integrators `REPLACED`.
     """
     if integrator is None and integrator_of(scene, parameters) in REPLACED:
         return "irrcache"
@@ -141,16 +143,16 @@ def run(args: argparse.Namespace) -> int:
 def _with_tolerance(
     integrator: str | None, source: Path, parameters: dict[str, str], args: argparse.Namespace
 ) -> str:
-    """Return the specification of the integrator with the tolerance."""
+    """Return the specification of the integrator with the property ``tolerance``."""
     if args.budget or args.error:
         raise IrrcacheError(
-            "--tolerance has a target of its own; leave --budget and --error away, or use the "
-            "property timeout for a limit of the time."
+            "--tolerance is itself a target; leave --budget and --error away, or limit the time by "
+            "the property timeout."
         )
     if integrator is None and integrator_of(source, parameters) == "irrcache":
         raise IrrcacheError(
-            f'the scene "{source}" has properties of irrcache of its own; state tolerance there, '
-            "or add -i irrcache to replace them."
+            f'the scene "{source}" sets the properties of irrcache itself; set tolerance there, or '
+            "add -i irrcache to replace them."
         )
     name, properties = parse_integrator(integrator or integrator_of(source, parameters))
     if name != "irrcache":
@@ -309,8 +311,8 @@ def described(
 ) -> dict[str, object]:
     """Describe how an image of the file ``source`` was made, for the header of the EXR.
 
-    ``spp`` 0 are the scene's; ``samples`` are those per voxel of the cache that the image shows,
-    0 those of the cache now.
+    ``spp`` is the number of samples per pixel, or 0 for that of the scene; ``samples`` is that per
+    voxel of the cache that the image shows, or 0 for the present one.
     """
     found = {
         "version": __version__,

@@ -188,7 +188,7 @@ def _reference(
         "spp": args.reference_spp,
         "seconds": seconds,
     }
-    found = run_job("reference", job | wanted, result, log, report=_now_and_then("reference"))
+    found = run_job("reference", job | wanted, result, log, report=_progress_printer("reference"))
     reference = Reference.load(Path(found["path"]))
     print(f"reference: {2 * reference.spp} samples per pixel, {found['path']}", flush=True)
     return reference
@@ -305,8 +305,8 @@ def make_folders(folder: Path) -> None:
         (folder / name).mkdir()
 
 
-def _now_and_then(name: str) -> Callable[[str], None]:
-    """Print lines of progress, at most one every few seconds."""
+def _progress_printer(name: str) -> Callable[[str], None]:
+    """Return a function that prints lines of progress, at most one every five seconds."""
     printed = time.monotonic()
 
     def report(line: str) -> None:

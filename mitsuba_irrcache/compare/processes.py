@@ -56,7 +56,7 @@ def run_job(
     if not text:
         log.unlink()
     if status:
-        raise WorkerError(said or _last_words(status, text))
+        raise WorkerError(said or _failure(status, text))
     return json.loads(result.read_text())
 
 
@@ -77,7 +77,8 @@ def _run(job: Path, log: Path, environment: dict, report: Callable[[str], None])
     return process.returncode
 
 
-def _last_words(status: int, log: str) -> str:
+def _failure(status: int, log: str) -> str:
+    """Return why a process failed: its exit status, and the last line of its log."""
     lines = log.splitlines()
     last = f": {lines[-1]}" if lines else ""
     if status < 0:

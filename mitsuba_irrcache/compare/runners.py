@@ -164,7 +164,7 @@ def effort_is_free(subject: Subject) -> bool:
 
 
 def run(subject: Subject, scene: mi.Scene, budgets: list[float]) -> Frames:
-    """Return the runner for the integrator of ``scene``.
+    """Return the runner that suits the integrator of ``scene``.
 
     The integrator must have rendered an image already, so that its kernels are compiled.
     """

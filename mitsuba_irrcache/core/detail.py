@@ -1,4 +1,4 @@
-"""How much the light that reaches a medium varies."""
+"""How much the radiance incident on a medium varies."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from enum import Enum
 
 
 class Detail(Enum):
-    """How much the radiance that reaches a medium from outside varies with direction and position.
+    """How much the radiance incident on a medium varies with direction and position.
 
-    It decides how large the voxels of a cache may be, and how many directions are needed.
+    The default voxel size of a cache and the default number of directions depend on it.
     """
 
-    #: the same from all directions, or none
+    #: the same radiance from all directions, or none
     UNIFORM = "uniform"
-    #: from environments without bright regions
+    #: radiance of environments without bright regions
     SMOOTH = "smooth"
-    #: all other emitters, which cast shadows with edges
+    #: radiance of all other emitters, whose shadows have sharp edges
     SHARP = "sharp"

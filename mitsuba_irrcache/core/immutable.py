@@ -9,8 +9,8 @@ from typing import Any
 class Immutable:
     """Base of classes whose instances do not change after construction.
 
-    Not a frozen dataclass: Dr.Jit takes the fields of dataclasses that a symbolic loop reads for
-    state variables of the loop, copies them, and fails to assign the frozen ones.
+    Not a frozen dataclass: Dr.Jit treats the fields of dataclasses that a symbolic loop reads as
+    state variables of the loop, which it copies; it cannot assign them if they are frozen.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -22,13 +22,13 @@ class Immutable:
         @wraps(initialise)
         def construct(self: Immutable, *args: Any, **kwargs: Any) -> None:
             initialise(self, *args, **kwargs)
-            if type(self) is cls:  # else the constructor of a derived class goes on
+            if type(self) is cls:  # otherwise the constructor of a derived class has not finished
                 self.__dict__["_is_complete"] = True
 
         cls.__init__ = construct
 
     def attributes(self) -> dict[str, Any]:
-        """Return the attributes that the constructor was given, by name; not the private ones."""
+        """Return all attributes by name, except private ones."""
         return {name: value for name, value in vars(self).items() if not name.startswith("_")}
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -78,8 +78,9 @@ def unravelled(index: mi.UInt32, sides: Sequence[Divisor]) -> tuple[mi.UInt32, .
 
 
 def concatenated(parts: Sequence[dr.ArrayBase]) -> dr.ArrayBase:
-    """Concatenate arrays of one type by kernels that do not depend on their widths, as those of
-    ``dr.concat`` do.
+    """Concatenate arrays of one type.
+
+    Unlike those of ``dr.concat``, the kernels do not depend on the widths of the arrays.
     """
     if len(parts) == 1:
         return parts[0]
@@ -93,8 +94,9 @@ def concatenated(parts: Sequence[dr.ArrayBase]) -> dr.ArrayBase:
 
 
 def graph_variables(value: object) -> list[int]:
-    """Numbers of the variables of Dr.Jit's derivative graph that an array, or the matrix of a
-    transform, consists of, also while derivatives are suspended.
+    """Return the indices of the variables in Dr.Jit's AD graph of which a value consists.
+
+    The value is an array or a transform. Derivatives may be suspended.
     """
     if not dr.is_array_v(value):
         # Points accept any attribute name as a swizzle.
@@ -102,6 +104,6 @@ def graph_variables(value: object) -> list[int]:
     if dr.is_tensor_v(value):
         return graph_variables(value.array)
     if dr.depth_v(value) > 1:
-        return [number for part in value for number in graph_variables(part)]
-    number = getattr(value, "index_ad", 0)
-    return [number] if number else []
+        return [index for part in value for index in graph_variables(part)]
+    index = getattr(value, "index_ad", 0)
+    return [index] if index else []

@@ -35,7 +35,10 @@ GOLDEN_ANGLE = 2.399963229728653
 
 
 def hashed_seed(seed: tuple[int, int]) -> tuple[mi.UInt32, mi.UInt32]:
-    """Two random words of a pair of integers; other integers do not compile another kernel."""
+    """Return two random words that depend on a pair of integers.
+
+    Kernels do not depend on the integers.
+    """
     first, second = (dr.opaque(mi.UInt32, s) for s in seed)
     return mi.sample_tea_32(first, second)
 
@@ -43,8 +46,10 @@ def hashed_seed(seed: tuple[int, int]) -> tuple[mi.UInt32, mi.UInt32]:
 def random_stream(
     words: tuple[mi.UInt32, mi.UInt32], sequence: mi.UInt32 | int | None = None
 ) -> mi.PCG32:
-    """The generator of two random words in each lane: they are its state and the number of its
-    sequence; or, if the ``sequence`` is given, both of them its state.
+    """Return a generator that is initialised by two random words, in each lane.
+
+    Without a ``sequence`` number, the words are its state and its sequence number; otherwise both
+    form its state.
     """
     first, second = words
     if sequence is None:
@@ -66,7 +71,7 @@ def kronecker_steps(dimension: int) -> tuple[float, ...]:
 def kronecker(
     index: mi.UInt32, dimension: int, shift: Sequence[mi.Float] | None = None
 ) -> list[mi.Float]:
-    """Coordinates of point ``index`` of the sequence in [0, 1)^dimension, after a ``shift``."""
+    """Return the coordinates in [0, 1) of point ``index`` of the sequence, shifted modulo 1."""
     values = [mi.Float(index) * step for step in kronecker_steps(dimension)]
     if shift is not None:
         values = [value + s for value, s in zip(values, shift, strict=True)]
@@ -74,8 +79,10 @@ def kronecker(
 
 
 def kronecker_words(index: mi.UInt32, shift: Sequence[mi.UInt32]) -> list[mi.UInt32]:
-    """Coordinates of point ``index`` of the sequence, in as many dimensions as there are shifts,
-    times 2^32: exact for any index, where single precision is not.
+    """Return the coordinates of point ``index`` of the sequence, times 2^32.
+
+    There is one coordinate for each ``shift``, which is added modulo 2^32. Unlike single precision,
+    integers are exact for any index.
     """
     steps = kronecker_steps(len(shift))
     return [
@@ -84,17 +91,17 @@ def kronecker_words(index: mi.UInt32, shift: Sequence[mi.UInt32]) -> list[mi.UIn
 
 
 def unit_floats(words: Sequence[mi.UInt32]) -> list[mi.Float]:
-    """Numbers in [0, 1) from the upper 24 bits of each word."""
+    """Convert the upper 24 bits of each word to a number in [0, 1)."""
     return [mi.Float(word >> 8) * 2.0**-24 for word in words]
 
 
 def golden_words(index: mi.UInt32, shift: int = 0) -> mi.UInt32:
-    """Multiples of one over the golden ratio modulo 1, times 2^32; ``shift`` likewise."""
+    """Return ``index`` over the golden ratio, modulo 1, times 2^32, plus ``shift``."""
     return index * mi.UInt32(int(GOLDEN_STEP * 2**32)) + mi.UInt32(shift)
 
 
 def kronecker_points(index: np.ndarray, dimension: int) -> np.ndarray:
-    """Points (dimension, n) of the sequence for an array of indices (n), float64."""
+    """Return the points (dimension, n) of the sequence with these indices (n), float64."""
     return np.array([index * step % 1 for step in kronecker_steps(dimension)])
 
 
@@ -102,14 +109,15 @@ def kronecker_points(index: np.ndarray, dimension: int) -> np.ndarray:
 
 
 def lattice_points(count: int, step: float) -> np.ndarray:
-    """A rank-1 lattice (2, count) in the unit square: ((i + 1/2) / count, i step mod 1)."""
+    """Return a rank-1 lattice (2, count) in the unit square: ((i + 1/2) / count, i step mod 1)."""
     index = np.arange(count)
     return np.stack([(index + 0.5) / count, index * step % 1])
 
 
 def fibonacci_hemisphere(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (count, 3) of a Fibonacci spiral on the upper hemisphere, and their azimuths (in
-    turns).
+    """Return the points (count, 3) of a Fibonacci spiral on the upper unit hemisphere.
+
+    The second result is their azimuths (count), in turns.
     """
     index = np.arange(count)
     z, turn = 1 - (index + 0.5) / count, index / GENERALISED_GOLDEN_RATIOS[1] % 1
@@ -118,8 +126,9 @@ def fibonacci_hemisphere(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fibonacci_direction(index: mi.UInt32, count: int, azimuth: float = 0.0) -> mi.Vector3f:
-    """Direction ``index`` of a Fibonacci spiral of ``count`` directions on the sphere, which begins
-    at an ``azimuth`` [radians].
+    """Return point ``index`` of a Fibonacci spiral of ``count`` points on the unit sphere.
+
+    ``azimuth`` is that of point 0 [radians].
     """
     z = (mi.Float(index) + 0.5) * (2 / count) - 1
     radius = dr.sqrt(1 - z * z)

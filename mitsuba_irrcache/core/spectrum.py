@@ -29,7 +29,10 @@ def scatter_channels(flat: mi.Float, channels: list[mi.Float], items: mi.UInt32)
 
 
 def channel_mean(values: mi.Color3f) -> mi.Float:
-    """Mean over the channels; kernels with ``dr.mean`` would depend on the number of lanes."""
+    """Return the mean over the channels.
+
+    Unlike those of ``dr.mean``, the kernels do not depend on the number of lanes.
+    """
     return dr.sum(values) * (1 / len(values))
 
 

@@ -9,22 +9,23 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import TextIO
 
-#: Seconds between updates, and after which a stage is named in a log, which is no terminal.
+#: Interval between updates [s]; duration after which a stage is named on a stream other than a
+#: terminal [s].
 _INTERVAL, _LONG = 0.5, 1.0
 _CLEAR = "\r\x1b[K"
 
 
 class StageDisplay:
-    """Shows the current stage from its begin, with the time it has taken and the share done.
+    """Display the current stage of a command, the time it has taken, and the share that is done.
 
-    A thread updates the line, since compiling and rendering do not return for seconds. On a stream
-    that is no terminal, stages that take longer than a second are named once.
+    A thread updates the line, because compiling and rendering block for seconds. On a stream other
+    than a terminal, stages that take longer than a second are named once.
     """
 
     def __init__(self, stream: TextIO | None = None, is_updated: bool = True) -> None:
         """Write to ``stream``, by default the standard error.
 
-        Where stages have progress bars of their own, the line is not ``is_updated``.
+        ``is_updated`` is False if stages have progress bars of their own.
         """
         self._is_updated = is_updated
         self._stream = sys.stderr if stream is None else stream

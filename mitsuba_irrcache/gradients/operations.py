@@ -31,10 +31,10 @@ class DifferentiableIntegrator(Protocol):
     def render(
         self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, develop: bool, evaluate: bool
     ) -> mi.TensorXf:
-        """The method of Mitsuba's integrators."""
+        """Render an image, as Mitsuba's integrators do."""
 
     def render_forward(self, scene: mi.Scene, params: mi.SceneParameters) -> mi.TensorXf:
-        """The method of Mitsuba's integrators."""
+        """Propagate derivatives in forward mode, as Mitsuba's integrators do."""
 
     def exclusively(self) -> AbstractContextManager:
         """Return a context in which no other thread changes the cache."""

@@ -46,13 +46,13 @@ class Boundary:
         return self.to_world @ unit
 
     def contains(self, position: np.ndarray) -> bool:
-        """Whether a world position (3,) lies inside or on the boundary."""
+        """Return whether a world position (3,) lies inside or on the boundary."""
         local = np.linalg.inv(self.to_world) @ np.append(position, 1.0)
         order = np.inf if self.kind == "box" else 2
         return bool(np.linalg.norm(local[:3], order) <= 1.0)
 
     def surrounds(self, p: mi.Point3f) -> mi.Bool:
-        """Whether world positions lie inside or on the boundary."""
+        """Return whether world positions lie inside or on the boundary."""
         local = self._to_local.point(p)
         if self.kind == "box":
             return dr.max(dr.abs(local)) <= 1

@@ -57,7 +57,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _meant(message: str, path: Path) -> str:
-    """Return a suggestion for the unknown plugin, property or parameter of an error message."""
+    """Return a suggestion for the unknown plugin, property or parameter in an error message."""
     plugin = re.search(r'Plugin "(\w+)" not found', message)
     if plugin is not None:
         return suggestion(plugin[1], _plugin_names())
@@ -216,7 +216,7 @@ def parse_parameters(definitions: list[str]) -> dict[str, str]:
 
 
 def describe_integrator(name: str, properties: dict[str, object]) -> str:
-    """The inverse of `parse_integrator`."""
+    """Format a plugin's name and properties as `parse_integrator` reads them."""
     return f"{name}{{{','.join(f'{key}={_quoted(value)}' for key, value in properties.items())}}}"
 
 
@@ -282,7 +282,7 @@ class _search_path:  # noqa: N801 (a context manager)
 
 
 def has_cache(scene: mi.Scene) -> bool:
-    """Whether the scene's integrator builds a cache before rendering."""
+    """Return whether the scene's integrator builds a cache before rendering."""
     method = getattr(scene.integrator(), "prepare", None)
     # Mitsuba's differentiable integrators have an unrelated method of this name.
     return callable(method) and "scene" in inspect.signature(method).parameters

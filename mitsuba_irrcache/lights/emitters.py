@@ -84,17 +84,19 @@ def kind_of(emitter: mi.Emitter) -> EmitterKind:
 
 
 def emits_in_one_direction(emitter: mi.Emitter) -> bool:
-    """Whether its radiance has the same single direction everywhere, whatever its kind."""
+    """Return whether its radiance has the same single direction everywhere, whatever its kind."""
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
 
 
 def are_distant(emitters: mi.EmitterPtr) -> mi.Bool:
-    """Whether emitters are at an infinite distance: environments and suns."""
+    """Return whether emitters are at an infinite distance: environments and suns."""
     return mi.has_flag(emitters.flags(), mi.EmitterFlags.Infinite)
 
 
 def varies_in_space(emitter: mi.Emitter) -> bool:
-    """Whether the radiance of a surface, or the irradiance of a beam, depends on the position."""
+    """Return whether the radiance of a surface, or the irradiance of a beam, depends on the
+    position.
+    """
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 

@@ -34,8 +34,8 @@ def detail_of(emitters: Iterable[mi.Emitter]) -> Detail:
 
 
 def is_smooth(environment: mi.Emitter) -> bool:
-    """Whether the maximum radiance of an environment is at most `SMOOTH_CONTRAST` times its mean,
-    in every channel.
+    """Return whether the maximum radiance of an environment is at most `SMOOTH_CONTRAST` times its
+    mean, in every channel.
     """
     upper, _ = fibonacci_hemisphere(EVEN // 2)
     even = environment_radiance(environment, np.concatenate([upper, -upper]))

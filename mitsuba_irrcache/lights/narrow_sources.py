@@ -97,7 +97,7 @@ class Source:
         return dr.maximum(total - along_view * inverse, 0) * inverse
 
     def is_same(self, other: Source) -> bool:
-        """Whether ``other`` is at the same position, or in the same direction."""
+        """Return whether ``other`` is at the same position, or in the same direction."""
         return self.far == other.far and np.array_equal(self._direction, other._direction)
 
     @property
@@ -106,7 +106,10 @@ class Source:
         return self.far and self._cosine < np.cos(MIN_ANGULAR_RADIUS) - 1e-6
 
     def covers(self, directions: np.ndarray) -> np.ndarray:
-        """Whether ``directions`` (..., 3) point to this source; False unless it is ``far``."""
+        """Return whether ``directions`` (..., 3) point to this source.
+
+        False for all unless it is ``far``.
+        """
         return (directions @ self._direction >= self._cosine) & self.far
 
 
@@ -190,7 +193,7 @@ def spots_of(environment: mi.Emitter) -> tuple[list[Source], np.ndarray]:
 
 
 def is_bright(density: np.ndarray) -> np.ndarray:
-    """Whether an environment that is sampled with this ``density`` [1/sr] is bright there."""
+    """Return whether an environment is bright where it is sampled with ``density`` [1/sr]."""
     return density > BRIGHT / (4 * np.pi)
 
 

@@ -27,7 +27,7 @@ from mitsuba_irrcache.machine.memory import available_memory, total_memory
 from mitsuba_irrcache.machine.variants import SUPPORTED, require_variant
 
 DEFAULT_VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
-DEVELOPMENT = ("test", "docs")  # extras that users have no need for
+DEVELOPMENT = ("test", "docs")  # extras for developers only
 
 _EXTENSIONS = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512vl", "asimd", "sve")
 _OPTIX_FILES = (
@@ -109,7 +109,7 @@ def examine(variants: list[str]) -> dict[str, Any]:
 
 
 def examine_system() -> dict[str, Any]:
-    """Python, operating system, processor, cores and memory (bytes)."""
+    """Return versions of Python and the operating system, processor, cores and memory [bytes]."""
     return {
         "python": f"{platform.python_version()} ({sys.executable})",
         "platform": platform.platform(),
@@ -122,7 +122,7 @@ def examine_system() -> dict[str, Any]:
 
 
 def examine_packages() -> list[dict[str, Any]]:
-    """Every package that users need or may want, its version and whether it is sufficient."""
+    """Return name, version and state of all required and optional packages."""
     return [
         {
             "name": requirement.name,
@@ -138,7 +138,7 @@ def examine_packages() -> list[dict[str, Any]]:
 
 
 def examine_llvm() -> dict[str, Any]:
-    """The LLVM selected by the environment variable, the one loaded by Dr.Jit, and others found."""
+    """Return the LLVM that the environment variable names, the loaded one, and all others found."""
     chosen = os.environ.get(runtime.LLVM_VARIABLE, "")
     loaded = runtime.loaded_llvm()
     problem = runtime.inspect_llvm(chosen).problem if chosen else ""
@@ -161,7 +161,7 @@ def examine_llvm() -> dict[str, Any]:
 
 
 def examine_cuda() -> dict[str, Any]:
-    """Whether Dr.Jit can use a GPU, the driver's CUDA version, and OptiX."""
+    """Return whether Dr.Jit can use a GPU, the driver's CUDA version, and OptiX."""
     import drjit as dr
 
     available = bool(dr.has_backend(dr.JitBackend.CUDA))
@@ -173,7 +173,7 @@ def examine_cuda() -> dict[str, Any]:
 
 
 def examine_kernel_cache() -> dict[str, Any]:
-    """Folder of Dr.Jit's cache of compiled kernels, its size in bytes, whether it is writable."""
+    """Return the folder of compiled kernels, its size [bytes], and whether it is writable."""
     folder = _kernel_cache_folder()
     exists = folder.is_dir()
     writable = os.access(folder if exists else folder.parent, os.W_OK)
@@ -240,7 +240,7 @@ def _probe(variant: str, environment: dict[str, str]) -> str:
 
 
 def _remedies(packages: list[dict], trials: dict[str, dict], ok: bool) -> list[str]:
-    """What to do, one line each; empty if everything required works."""
+    """Return remedies, one line each; empty if everything required works."""
     remedies = []
     wrong = [
         package
@@ -274,21 +274,21 @@ def _processor() -> str:
 
 
 def _vector_extensions() -> list[str]:
-    """Vector extensions of the processor as named by Linux; empty on other systems."""
+    """Return the processor's vector extensions as Linux names them; empty on other systems."""
     flags = re.search(r"^(?:flags|Features)\s*: (.*)", _read("/proc/cpuinfo"), re.MULTILINE)
     present = flags[1].split() if flags else []
     return [extension for extension in _EXTENSIONS if extension in present]
 
 
 def available_cores() -> int:
-    """Number of cores available to this process."""
+    """Return the number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def _optix_library() -> str | None:
-    """Path of the OptiX library: the one selected by the user, else the driver's (Linux only)."""
+    """Return the path of the OptiX library that the user selected, or of the driver's (Linux)."""
     named = os.environ.get("DRJIT_LIBOPTIX_PATH")
     found = [path for pattern in _OPTIX_FILES for path in glob.glob(pattern)]
     return named or (found[0] if found else None)

@@ -68,12 +68,12 @@ class LLVMLibrary:
 
 
 def minimum_llvm() -> int:
-    """Lowest major version of LLVM that Dr.Jit supports on this processor."""
+    """Return the lowest major version of LLVM that Dr.Jit supports on this processor."""
     return 17 if platform.machine().lower() in ("x86_64", "amd64") else 15
 
 
 def version_problem(version: tuple[int, ...]) -> str:
-    """Why an LLVM of this version cannot be used here, or ``""``."""
+    """Return why an LLVM of this version cannot be used here, or ``""``."""
     if version[0] >= minimum_llvm():
         return ""
     return f"too old: Dr.Jit refuses it or aborts with it; {minimum_llvm()} or newer is needed"
@@ -128,12 +128,12 @@ def prepare_llvm() -> None:
 
 
 def usable_llvm() -> LLVMLibrary | None:
-    """The first entry of `find_llvm` without a problem, or None."""
+    """Return the first entry of `find_llvm` without a problem, or None."""
     return next((library for library in find_llvm() if not library.problem), None)
 
 
 def loaded_llvm() -> tuple[int, ...]:
-    """Version of the LLVM that Dr.Jit has loaded into this process; empty if there is none."""
+    """Return the version of the LLVM that Dr.Jit has loaded; empty if it has loaded none."""
     import drjit as dr
 
     if not dr.has_backend(dr.JitBackend.LLVM):
@@ -167,7 +167,7 @@ def llvm_remedy() -> str:
 
 
 def _llvm_patterns() -> list[str]:
-    """Glob patterns of the LLVM library on this system."""
+    """Return glob patterns of the LLVM library on this system."""
     conda = os.environ.get("CONDA_PREFIX")
     prefixes = [glob.escape(prefix) for prefix in (conda, sys.base_prefix) if prefix]
     if platform.system() == "Windows":
@@ -194,7 +194,7 @@ def _folders_in(variable: str) -> list[str]:
 
 
 def _file_problem(path: Path) -> str:
-    """Why a file cannot be a shared library of this system, or ``""``."""
+    """Return why a file cannot be a shared library of this system, or ``""``."""
     if not path.exists():
         return "there is no such file"
     if not path.is_file():
@@ -217,7 +217,7 @@ def _judge(path: Path, version: tuple[int, ...]) -> LLVMLibrary:
 
 
 def _version_from_name(path: Path) -> tuple[int, ...]:
-    """Version contained in the name, folder or neighbouring files of a library, or ``()``."""
+    """Return the version in the name, folder or neighbouring files of a library, or ``()``."""
     real = path.resolve()
     match = _LIBRARY_NAME.match(real.name)
     stated = match and (match["start"] or match["end"])
@@ -237,7 +237,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 
 def _version_by_loading(path: Path) -> tuple[int, ...]:
-    """Version reported by the library itself, loaded in a subprocess, or ``()``."""
+    """Return the version reported by the library itself, loaded in a subprocess, or ``()``."""
     try:
         probe = subprocess.run(
             [sys.executable, "-I", "-c", _PROBE, str(path)],
@@ -262,7 +262,7 @@ def _explain_llvm(version: tuple[int, ...]) -> str:
 
 
 def _install_remedy() -> str:
-    """How to install LLVM on this system, with and without administrator rights."""
+    """Return how to install LLVM on this system, with and without administrator rights."""
     if platform.system() == "Darwin":
         return "`brew install llvm`; or, " + _conda_remedy("libllvm19", "libLLVM*.dylib in lib")
     if platform.system() == "Windows":

@@ -95,7 +95,7 @@ def _control_groups() -> Iterator[tuple[Path, str, str, str]]:
 
 
 def _bytes(file: Path) -> int:
-    """Return the number in a file of a control group; `UNLIMITED` if it is none."""
+    """Return the number in a file of a control group; `UNLIMITED` if it holds no number."""
     try:
         return min(int(file.read_text()), UNLIMITED)
     except (OSError, ValueError):  # "max"

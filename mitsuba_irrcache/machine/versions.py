@@ -46,7 +46,7 @@ def requirements(extra: str = "") -> list[Requirement]:
 
 
 def extras() -> list[str]:
-    """Names of this package's extras in the order of declaration."""
+    """Return the names of this package's extras in the order of declaration."""
     try:
         return list(metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or [])
     except metadata.PackageNotFoundError:
@@ -69,7 +69,7 @@ def installed_version(name: str) -> str | None:
 
 
 def is_satisfied(requirement: Requirement) -> bool:
-    """Whether the installed package fulfils a requirement."""
+    """Return whether the installed package fulfils a requirement."""
     version = installed_version(requirement.name)
     return version is not None and requirement.specifier.contains(
         Version(version), prereleases=True
@@ -96,12 +96,15 @@ def check_versions() -> None:
 
 @lru_cache(maxsize=1)
 def require_versions() -> None:
-    """As `check_versions`, which reads files for 10 ms: once in a process, if it succeeds."""
+    """Call `check_versions`, which takes 10 ms, unless it succeeded in this process before."""
     check_versions()
 
 
 def _is_wanted(requirement: Requirement, extra: str) -> bool:
-    """Whether a requirement applies on this system and, if given, only because of ``extra``."""
+    """Return whether a requirement applies on this system.
+
+    If ``extra`` is given, only requirements of that extra count.
+    """
     if requirement.marker is None:
         return not extra
     without = requirement.marker.evaluate({"extra": ""})

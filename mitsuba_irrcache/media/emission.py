@@ -41,7 +41,9 @@ class Emission:
         return dr.select(inside, self.field.at_world(p, active & inside), 0)
 
     def covers(self, p: mi.Point3f) -> mi.Bool:
-        """Whether world positions are in the emissive grid; always true for constant emission."""
+        """Return whether world positions are in the emissive grid; always true for constant
+        emission.
+        """
         if self.grid is None:
             return mi.Bool(True)
         u = self.grid.coordinates.point(p)
@@ -112,6 +114,6 @@ def _box(to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _overlap(grid: Grid, frame: np.ndarray) -> bool:
-    """Whether the world bounding boxes overlap."""
+    """Return whether the world bounding boxes overlap."""
     (a, b), (c, d) = _box(grid.to_world), _box(frame)
     return bool((np.maximum(a, c) < np.minimum(b, d)).all())

@@ -188,17 +188,19 @@ class MediumGrid(Immutable):
         return dr.inf if self.homogeneous else float(self.sigma_t.grid.voxel_size.min())
 
     def contains(self, p: mi.Point3f) -> mi.Bool:
-        """Whether world positions lie in the medium."""
+        """Return whether world positions lie in the medium."""
         inside = self.boundary.surrounds(p)
         return inside if self.bbox is None else inside & self._clip.contains(p)
 
     def fills(self, grid: Grid) -> bool:
-        """Whether the medium fills the whole box covered by ``grid``."""
+        """Return whether the medium fills the whole box covered by ``grid``."""
         same = np.abs(self.boundary.frame - grid.to_world).max() <= 1e-6 * grid.side_lengths.max()
         return self.boundary.kind == "box" and self.bbox is None and bool(same)
 
     def intersect(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-        """Whether the line of a ray intersects the medium, and its distances of entry and exit."""
+        """Return whether the line of a ray intersects the medium, and its distances of entry and
+        exit.
+        """
         hit, near, far = self.boundary.intersect(ray)
         if self.bbox is not None:
             # Mitsuba's box accepts the rays of the first variant only that was used in the process.

@@ -63,7 +63,7 @@ class Phase:
         self.all_moments = moments if all_moments is None else all_moments
 
     def tail(self, order: int) -> float:
-        """Largest magnitude of the moments beyond ``order``."""
+        """Return the largest magnitude of the moments beyond ``order``."""
         return float(np.abs(self.moments[order + 1 :]).max())
 
     @property

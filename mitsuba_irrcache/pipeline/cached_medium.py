@@ -465,7 +465,7 @@ class CachedMedium:
             )
 
     def _is_ahead(self, file: str) -> bool:
-        """Whether another process has written at least as many samples of the same scene.
+        """Return whether another process has written at least as many samples of the same scene.
 
         Raises CacheFileError if the file now belongs to another scene.
         """
@@ -491,7 +491,9 @@ def _angular_basis(
 
 
 def _is_within(medium: MediumGrid, emitter: mi.Emitter) -> bool:
-    """Whether an emitter lies in the boundary of a medium, by the centre of its shape if any."""
+    """Return whether an emitter lies in the boundary of a medium, by the centre of its shape if
+    any.
+    """
     shape = emitter.get_shape()
     if shape is None:
         return medium.boundary.contains(position_of(emitter))

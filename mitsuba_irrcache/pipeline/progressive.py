@@ -242,7 +242,7 @@ class _Run:
         return self.builder.done
 
     def _is_fulfilled_by(self, samples: int) -> bool:
-        """Whether a cache with ``samples`` per voxel meets the targets."""
+        """Return whether a cache with ``samples`` per voxel meets the targets."""
         wanted = self.targets.standard_error
         exact = wanted > 0 and self.error <= wanted
         return exact or samples >= self.goal or self.builder.is_dark

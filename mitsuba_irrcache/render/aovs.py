@@ -61,7 +61,7 @@ class Layers:
 
     @classmethod
     def of(cls, channels: list[mi.Float]) -> Layers:
-        """Inverse of `channels`."""
+        """Return the inverse of `channels`."""
         n = dr.size_v(mi.Spectrum)
         spectra = [mi.Spectrum(*channels[i * n : (i + 1) * n]) for i in range(4)]
         depth, *probes, bias = channels[4 * n :]
@@ -69,7 +69,7 @@ class Layers:
 
     @classmethod
     def background_only(cls, radiance: mi.Spectrum) -> Layers:
-        """Components of rays that do not intersect a medium."""
+        """Return the components of rays that do not intersect a medium."""
         dark, zero = dr.zeros(mi.Spectrum, dr.width(radiance)), dr.zeros(mi.Float)
         return cls(dark, dark, radiance, dr.full(mi.Spectrum, 1), zero, [], zero)
 

@@ -404,7 +404,7 @@ class TracedCameraRays:
         return *found, unscattered
 
     def _is_cached(self, pointer: mi.MediumPtr) -> mi.Bool:
-        """Whether the radiance in a medium is cached."""
+        """Return whether the radiance in a medium is cached."""
         known = mi.Bool(False)
         for projection in self.projections:
             known |= pointer == projection.medium.pointer

@@ -54,7 +54,8 @@ class ClearanceAlongRay:
         self.strides = dr.select(forward, strides, -strides)
 
     def exit(self, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Float]:
-        """Whether the position at ``t`` is empty, and the distance up to which it remains empty.
+        """Return whether the position at ``t`` is empty, and the distance up to which it remains
+        empty.
 
         The distance is at least ``t``.
         """

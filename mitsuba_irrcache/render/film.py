@@ -229,7 +229,7 @@ class SampledFilm:
         return total / dr.maximum(2 * count, 1)
 
     def corner(self, pixel: mi.UInt32) -> mi.Point2f:
-        """Position on the film of the upper left corner of a pixel."""
+        """Return the position on the film of the upper left corner of a pixel."""
         place = mi.Point2f(pixel_of(pixel, self.width) - self.border)
         return place + mi.Vector2f(self.film.crop_offset())
 
@@ -287,7 +287,7 @@ class PixelPositions:
         self._sequence, self._count = AntitheticPairs(count), Divisor(count)
 
     def next(self, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Point2f:
-        """Position in [0, 1)^2 of a ``sample`` of this pass."""
+        """Return the position in [0, 1)^2 of a ``sample`` of this pass."""
         if not self.independent:
             return self.sampler.next_2d()
         part, number = self._count.split(self.first + sample)
@@ -296,7 +296,7 @@ class PixelPositions:
         return mi.Point2f(unit_floats([dr.select(is_paired, word, 1 << 31) for word in words]))
 
     def emitter_sample(self, pixel: mi.UInt32, sample: mi.UInt32) -> EmitterSample:
-        """Position on emitters for a ``sample`` of this pass."""
+        """Return the position on emitters for a ``sample`` of this pass."""
         if not self.independent:
             return EmitterSample(self.sampler.next_2d())
         part, number = self._count.split(self.first + sample)
@@ -491,7 +491,7 @@ class PixelCells:
         self._area = dr.opaque(mi.Float, 1 / count)
 
     def position(self, cell: mi.UInt32, within: mi.Point2f) -> mi.Point2f:
-        """Position in the pixel, in [0, 1)^2, of a point ``within`` a cell."""
+        """Return the position in the pixel, in [0, 1)^2, of a point ``within`` a cell."""
         is_longer = cell < self._longer_end
         begin = dr.select(is_longer, 0, self._longer_end)
         columns = [each.split(cell - begin)[1] for each in self._columns]

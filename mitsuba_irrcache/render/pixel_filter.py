@@ -58,12 +58,14 @@ class FurtherSamples:
         self.count, self.weight = count, dr.opaque(mi.Float, 1 / further)
 
     def sums(self) -> list[mi.Float]:
-        """Sums of the values of each half, with the weight of the samples that are replaced."""
+        """Return the sums of the values of each half, with the weight of the samples that are
+        replaced.
+        """
         return [dr.block_sum(value, self.count) * self.weight for value in self.values]
 
 
 def _packed(numbers: list[mi.Float], index: mi.UInt32) -> list[mi.Float]:
-    """Arrays as packets of four, at places ``index``."""
+    """Return arrays as packets of four, at places ``index``."""
     numbers = numbers + [mi.Float(0)] * (-len(numbers) % 4)
     packets = []
     for start in range(0, len(numbers), 4):
@@ -189,7 +191,7 @@ def _columns(samples: Samples, reach: int) -> list[list[mi.Float]]:
 
 
 def _without(halves: mi.UInt32, per_half: int, position: mi.Point2f) -> mi.Point2f:
-    """Positions of samples, those of some ``halves`` out of reach of all filters."""
+    """Return the positions of samples, those of some ``halves`` out of reach of all filters."""
     x = position.x + dr.zeros(mi.Float, dr.width(position))
     dr.eval(x)
     half, sample = Divisor(per_half).split(dr.arange(mi.UInt32, dr.width(halves) * per_half))
@@ -200,7 +202,7 @@ def _without(halves: mi.UInt32, per_half: int, position: mi.Point2f) -> mi.Point
 
 
 def _further_gathered(film: mi.Film, border: int, further: FurtherSamples) -> list[mi.Float]:
-    """The sums of `reconstructed` over ``further`` samples."""
+    """Return the sums of `reconstructed` over ``further`` samples."""
     reach = int(film.rfilter().border_size())
     parts = _around(film, border, reach, further)
     width, height = (int(n) for n in film.crop_size())
@@ -216,8 +218,8 @@ def _further_gathered(film: mi.Film, border: int, further: FurtherSamples) -> li
 
 @symbolic
 def _around(film: mi.Film, border: int, reach: int, further: FurtherSamples) -> list[mi.Float]:
-    """Sums of values and weights of each half's ``further`` samples at the (2 ``reach`` + 1)^2
-    pixels around, row by row.
+    """Return the sums of values and weights of each half's ``further`` samples at the (2 ``reach``
+    + 1)^2 pixels around, row by row.
     """
     filter_, side = film.rfilter(), 2 * reach + 1
     radius, count = filter_.radius(), dr.opaque(mi.UInt32, further.count)
@@ -245,7 +247,7 @@ def _around(film: mi.Film, border: int, reach: int, further: FurtherSamples) -> 
 
 @symbolic
 def _collected(parts: list, numbers, pixel, reach: int, frame: tuple[int, int]) -> list[mi.Float]:
-    """Sums at each ``pixel`` of the ``parts`` of all pixels around it, two for each."""
+    """Return the sums at each ``pixel`` of the ``parts`` of all pixels around it, two for each."""
     side = 2 * reach + 1
     count = dr.opaque(mi.UInt32, side * side)
     columns, rows = (dr.opaque(mi.Int32, n) for n in frame)

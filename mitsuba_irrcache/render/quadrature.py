@@ -34,7 +34,8 @@ def curved(previous, a, b, ratio: mi.Float) -> tuple:
 
 
 def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
-    """Weights of the source alpha * Phi / (4 pi) at both ends of a segment, and its transmittance.
+    """Return the weights of the source alpha * Phi / (4 pi) at both ends of a segment, and its
+    transmittance.
 
     ``quadrature`` is a name in `RULES`, and ``sigma`` the extinction at both ends.
     """
@@ -42,7 +43,8 @@ def segment(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
 
 
 def emission_weights(quadrature: str, sigma: tuple, length: mi.Float) -> tuple:
-    """Weights of the emission at both ends: int_0^1 (1 - u | u) e^-tau(u) du times ``length``.
+    """Return the weights of the emission at both ends: int_0^1 (1 - u | u) e^-tau(u) du times
+    ``length``.
 
     ``quadrature`` is a name in `RULES`, and ``sigma`` the extinction at both ends.
     """
@@ -92,7 +94,7 @@ def _exponential(sigma_a, sigma_b, length: mi.Float) -> tuple:
 
 
 def exponential_weights(tau_a, tau_b, transmittance) -> tuple:
-    """Weights of the sources at both ends: int_0^1 (1 - u | u) sigma(u) e^-tau(u) du.
+    """Return the weights of the sources at both ends: int_0^1 (1 - u | u) sigma(u) e^-tau(u) du.
 
     ``tau_a``, ``tau_b`` are the extinctions at the ends times the segment's length; sigma(u) is
     linear between them and tau(u) = tau_a u + (tau_b - tau_a) u^2 / 2. Integration by parts gives

@@ -59,7 +59,7 @@ class MarchedPart:
         self.state = state
 
     def holds(self, fields: AlongRay, t: mi.Float) -> mi.Bool:
-        """Whether the fields are known at a distance along rays."""
+        """Return whether the fields are known at a distance along rays."""
         raise NotImplementedError
 
 
@@ -314,7 +314,7 @@ class Projection:
         return 4 * dr.size_v(mi.Spectrum) + 1 + errors if self.layered else 0
 
     def zero_sums(self) -> list:
-        """Initial sums for `Layers`: colour, depth, errors."""
+        """Return the initial sums for `Layers`: colour, depth, errors."""
         if not self.layered:
             return []
         errors = self.uncertainty.count if self.uncertainty is not None else 0
@@ -420,7 +420,7 @@ class _RayMarch:
         self._lattice = near, far, offset, step, dr.rcp(step), limit
 
     def begin(self, active: mi.Bool, with_peak: bool) -> _MarchState:
-        """The state before the first segment.
+        """Return the state before the first segment.
 
         Points of the lattice are numbered from 1; number 0 is the beginning, reached by a first
         step of length 0 that only evaluates the fields there.
@@ -448,7 +448,7 @@ class _RayMarch:
         )
 
     def goes_on(self, state: _MarchState, part: MarchedPart | None) -> mi.Bool:
-        """Whether there is a further segment, in the ``part`` of the medium if there is one."""
+        """Return whether there is a further segment; with ``part``, within that part."""
         if part is None:
             return mi.Bool(state.active)
         return state.active & part.holds(self._fields, self._next_point(state)[-1])
@@ -534,7 +534,7 @@ class _RayMarch:
     def _curved(
         self, state: _MarchState, before: tuple, there: _FieldSample, length: mi.Float
     ) -> tuple[tuple, tuple]:
-        """Extinctions and sources at both ends, corrected for their curvature where the
+        """Return the extinctions and sources at both ends, corrected for their curvature where the
         quadrature rule is of third order.
         """
         here, ratio = state.here, length / state.previous_length
@@ -617,7 +617,9 @@ def _simplified(field: Field) -> Field:
 
 
 def _varies(field: GridField) -> bool:
-    """Whether some of 4096 scattered voxels differ, which is faster than testing all of them."""
+    """Return whether some of 4096 scattered voxels differ, which is faster than testing all of
+    them.
+    """
     voxels, channels = field.grid.voxel_count, field.channels
     count = min(voxels, 4096)
     place = dr.arange(mi.UInt32, count) * dr.opaque(mi.UInt32, voxels // count * channels)

@@ -56,7 +56,7 @@ def first_opaque(
 
 @symbolic
 def unobstructed(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool):
-    """Whether no surface but null ones lies on ``ray`` up to its end."""
+    """Return whether no surface but null ones lies on ``ray`` up to its end."""
     ray, clear, active = mi.Ray3f(ray), mi.Bool(active), mi.Bool(active)
     crossings = mi.UInt32(0)
     while dr.hint(active, label="visible nodes"):

@@ -112,7 +112,7 @@ def _detail(scene: mi.Scene, emission: Emission | None, max_depth: int) -> Detai
 
 
 def _has_surfaces(scene: mi.Scene) -> bool:
-    """Whether any shape is more than the boundary of a medium."""
+    """Return whether any shape is more than the boundary of a medium."""
     return any(
         shape.bsdf() is not None and not is_null(int(shape.bsdf().flags()))
         for shape in scene.shapes()
@@ -174,7 +174,9 @@ def _baked(
 
 
 def _is_visible(scene: mi.Scene, medium: mi.Medium) -> bool:
-    """Whether a camera ray can reach a medium without crossing a surface other than a null one."""
+    """Return whether a camera ray can reach a medium without crossing a surface other than a null
+    one.
+    """
     return any(is_null(flags_of(s)) for s in _around(scene, medium)) or any(
         sensor.get_medium() == medium for sensor in scene.sensors()
     )
@@ -347,13 +349,13 @@ def _check_shape(scene: mi.Scene, shape: mi.Shape) -> None:
 
 
 def _has_media(scene: mi.Scene, instance: mi.Shape) -> bool:
-    """Whether rays through an instance enter a medium there."""
+    """Return whether rays through an instance enter a medium there."""
     return bool(dr.any(_meets_media(scene, mi.ShapePtr(instance), rays_through(instance))))
 
 
 @symbolic
 def _meets_media(scene: mi.Scene, instance: mi.ShapePtr, ray: mi.Ray3f):
-    """Whether a medium begins or ends at an instance along rays."""
+    """Return whether a medium begins or ends at an instance along rays."""
     ray, inside = mi.Ray3f(ray), mi.Bool(False)
     crossings, active = mi.UInt32(0), mi.Bool(True)
     while dr.hint(active, label="crossings"):

@@ -117,7 +117,7 @@ def check_sensor(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
 
 def _nothing_is_outside(shapes: list[mi.Shape]) -> mi.Bool:
-    """Whether there is certainly no medium outside of all shapes.
+    """Return whether there is certainly no medium outside of all shapes.
 
     An exterior medium that is not the interior of any shape may be there.
     """
@@ -337,7 +337,7 @@ class _Names:
         self._media = {_number(mi.MediumPtr(m)): m for m in media if m is not None}
 
     def is_only_shape_of_its_medium(self, number: int) -> bool:
-        """Whether no other shape has the interior medium of this one."""
+        """Return whether no other shape has the interior medium of this one."""
         interior = self.shapes[number].interior_medium()
         others = (s for n, s in self.shapes.items() if n != number)
         return all(interior not in (s.interior_medium(), s.exterior_medium()) for s in others)

@@ -169,7 +169,7 @@ class CutCells:
 
 
 def _is_ahead(plane: mi.Vector4f, s: mi.Point3f) -> mi.Bool:
-    """Whether voxel coordinates lie on the side of the ``plane`` to which its normal points."""
+    """Return whether voxel coordinates lie on the side to which the normal of ``plane`` points."""
     return dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), s) + plane.w > 0
 
 

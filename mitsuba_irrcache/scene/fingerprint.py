@@ -82,7 +82,7 @@ class Snapshot:
         return sorted({*names, *(node.class_name() for node in self._objects ^ other._objects)})
 
     def shares_objects_with(self, other: Snapshot) -> bool:
-        """Whether both belong to the same scene, or to scenes that share objects."""
+        """Return whether both belong to the same scene, or to scenes that share objects."""
         return not self._objects.isdisjoint(other._objects)
 
 
@@ -93,7 +93,7 @@ def _value(entry: tuple) -> Any:
 
 
 def _is_transform(value: Any) -> bool:
-    """Whether a value is a transform. Points accept any attribute name as a swizzle."""
+    """Return whether a value is a transform. Points accept any attribute name as a swizzle."""
     return not dr.is_array_v(value) and hasattr(value, "matrix")
 
 

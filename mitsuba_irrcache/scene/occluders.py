@@ -45,7 +45,7 @@ def obstacle(scene: mi.Scene, grid: Grid, lower: np.ndarray, upper: np.ndarray) 
 
 
 def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
-    """Whether the bounds of a shape overlap the box."""
+    """Return whether the bounds of a shape overlap the box."""
     box = shape.bbox()
     ends = np.array([box.min, box.max], dtype=np.float64)
     if not np.isfinite(ends).all():
@@ -54,8 +54,8 @@ def _may_meet(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray)
 
 
 def boxes_meet(grid: Grid, lower: np.ndarray, upper: np.ndarray, corners: np.ndarray) -> bool:
-    """Whether a box with these world ``corners`` (8, 3) may overlap the box of the voxels between
-    ``lower`` and ``upper``: whether their extents along the axes of world and grid overlap.
+    """Return whether a box with these world ``corners`` (8, 3) may overlap the box of the voxels
+    between ``lower`` and ``upper``: whether their extents along the axes of world and grid overlap.
     """
     own = np.where(_PICK, upper, lower)
     slack = SLACK * grid.voxel_size.min()
@@ -80,7 +80,7 @@ def _mapped(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _is_partly_within(shape: mi.Shape, grid: Grid, lower: np.ndarray, upper: np.ndarray) -> bool:
-    """Whether a vertex of a mesh, or another shape as a whole, is in the box."""
+    """Return whether a vertex of a mesh, or another shape as a whole, is in the box."""
     vertices = mi.traverse(shape).get("vertex_positions")
     if vertices is not None:
         u = grid.coordinates.point(dr.unravel(mi.Point3f, mi.Float(vertices)))

@@ -158,7 +158,7 @@ def _medium_at(
 
 @symbolic
 def _meets_back(scene: mi.Scene, p: mi.Point3f, direction: mi.Vector3f, is_medium: mi.Bool):
-    """Whether rays hit the first surface that is not null from behind.
+    """Return whether rays hit the first surface that is not null from behind.
 
     Transmissive surfaces do not count if ``p`` is in the medium.
     """

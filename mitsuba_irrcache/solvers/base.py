@@ -140,7 +140,8 @@ class Solver(ABC):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        """Whether the uncollided layer includes exactly ``light.irradiance`` for each direct light.
+        """Return whether the uncollided layer includes exactly ``light.irradiance`` for each direct
+        light.
 
         Lookups subtract it, and camera rays evaluate it in closed form. Otherwise the cache gets no
         direct lights.

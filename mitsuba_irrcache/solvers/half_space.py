@@ -84,13 +84,13 @@ def series_error(medium: MediumGrid) -> float:
 
 
 def is_seen_from_outside(scene: mi.Scene, medium: MediumGrid) -> bool:
-    """Whether all sensors and point-like emitters of the scene are outside of ``medium``."""
+    """Return whether all sensors and point-like emitters of the scene are outside of ``medium``."""
     inside = [medium.boundary.contains(position_of(e)) for e in point_lights(scene)]
     return not any(inside) and all(s.get_medium() is None for s in scene.sensors())
 
 
 def supports_emitters(scene: mi.Scene) -> bool:
-    """Whether all emitters of the scene are of the kinds ``EMITTERS``."""
+    """Return whether all emitters of the scene are of the kinds ``EMITTERS``."""
     return all(kind_of(emitter) in EMITTERS for emitter in scene.emitters())
 
 

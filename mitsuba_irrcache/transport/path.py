@@ -119,12 +119,14 @@ class Media(Immutable):
 
 
 def is_null(flags: mi.UInt32) -> mi.Bool:
-    """Whether a BSDF with these flags is an ideal null interface."""
+    """Return whether a BSDF with these flags is an ideal null interface."""
     return (flags & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
 
 
 def transmits(flags: mi.UInt32) -> mi.Bool:
-    """Whether a BSDF with these flags lets radiance through, refracted, scattered or straight."""
+    """Return whether a BSDF with these flags lets radiance through, refracted, scattered or
+    straight.
+    """
     return (flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)) != 0
 
 
@@ -134,18 +136,21 @@ def flags_of(shape: mi.Shape) -> int:
 
 
 def refracts(shape: mi.Shape) -> bool:
-    """Whether radiance passes a shape, and is deflected or partly reflected by it."""
+    """Return whether radiance passes a shape, and is deflected or partly reflected by it."""
     flags = flags_of(shape)
     return bool(transmits(flags)) and not is_null(flags)
 
 
 def is_surface(shape: mi.Shape) -> bool:
-    """Whether a shape is more than a medium boundary: a scatterer, an emitter or a sensor."""
+    """Return whether a shape is more than a medium boundary.
+
+    It is if it scatters, emits or is a sensor.
+    """
     return not is_null(flags_of(shape)) or shape.is_emitter() or shape.is_sensor()
 
 
 def is_solid(si: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether hit surfaces are more than the boundary of a medium: they scatter or emit."""
+    """Return whether hit surfaces are more than the boundary of a medium: they scatter or emit."""
     return ~is_null(si.bsdf().flags()) | (si.shape.emitter() != None)  # noqa: E711
 
 

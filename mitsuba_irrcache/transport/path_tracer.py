@@ -114,7 +114,7 @@ class _Segment:
     surface: mi.Bool
 
     def vertex(self, ray: mi.Ray3f) -> mi.Interaction3f:
-        """The vertex at the end of the segment along ``ray``."""
+        """Return the vertex at the end of the segment along ``ray``."""
         vertex = dr.zeros(mi.Interaction3f)
         vertex.p = dr.select(self.collided, ray(self.t), self.si.p)
         vertex.n = dr.select(self.collided, 0, self.si.n)

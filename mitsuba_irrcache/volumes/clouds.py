@@ -107,7 +107,7 @@ def _water_unit(
     options: ReadOptions,
     variables: CloudVariables,
 ) -> float | np.ndarray:
-    """Return what makes kg/m^3 of the values of the liquid water."""
+    """Return the factor that converts the liquid water content to kg/m^3."""
     unit = str(dataset[name].attrs.get("units", ""))
     factor = mass_density(unit)
     if factor is not None:

@@ -83,11 +83,11 @@ def _choose_series(folder: Path, series: str | None) -> str:
 
 
 def _check_left_out(folder: Path, classes: dict[Path, str | None]) -> None:
-    """Refuse damaged slices, which GDCM leaves out: at an end of the series they would not be
-    missed.
+    """Raise IrrcacheError for damaged slices.
 
-    A file in no series is one if it is named like a slice, and is no DICOM file of another class,
-    such as a report.
+    GDCM leaves them out, which `_check_gaps` does not notice at the ends of a series. A file that
+    belongs to no series is a damaged slice if its name is like that of a slice, unless it is a
+    DICOM file of another class, such as a report.
     """
     uids = SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     used = {Path(file).name for uid in uids for file in _series_files(folder, uid)}
@@ -103,7 +103,7 @@ def _check_left_out(folder: Path, classes: dict[Path, str | None]) -> None:
 
 
 def _pattern(name: str) -> str:
-    """Return the name of a file with all numbers alike."""
+    """Return the name of a file with all numbers replaced by 0."""
     return re.sub(r"\d+", "0", name)
 
 

@@ -31,7 +31,7 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
             in other files.
     """
     if not h5py.is_hdf5(path):
-        raise IrrcacheError(f"{path} is no HDF5 file, or its begin is damaged; export it again")
+        raise IrrcacheError(f"{path} is no HDF5 file, or its header is damaged; export it again")
     with h5py.File(path, "r") as file:
         found: dict[str, h5py.Dataset] = {}
 

@@ -47,7 +47,7 @@ _AXIS_OF_NAME = {
 }
 #: Relative deviation from even steps up to which coordinates count as even.
 _EVEN = 1e-2
-#: Limit of the number of even levels, relative to the uneven ones that they replace.
+#: Largest ratio of the number of even levels to that of the uneven levels that they replace.
 _MOST_LEVELS = 4
 
 
@@ -61,7 +61,7 @@ class _Axis:
 
     @property
     def spacing(self) -> float:
-        """Return the spacing of an even grid: of these positions, or nearly their least step."""
+        """Return the spacing of the even grid that represents these positions."""
         steps = np.diff(self.positions)
         if self.is_even:
             return float(np.mean(steps))

@@ -51,9 +51,9 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
 
 
 def _are_slices(series: Sequence[tifffile.TiffPageSeries]) -> bool:
-    """Return whether a file has several series, each of one slice like the others.
+    """Return whether a file has several series, which are slices of equal shape and type.
 
-    So writers leave it that compress page after page.
+    Some writers that compress each page by itself produce such files.
     """
     kinds = {(part.shape, part.dtype, part.axes) for part in series}
     return len(series) > 1 and len(kinds) == 1 and series[0].axes in ("YX", "YXS")

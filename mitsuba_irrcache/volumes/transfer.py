@@ -14,8 +14,8 @@ The JSON format, with every key::
       "colour": [[-300, [0.9, 0.7, 0.6]], ...]   points [value, [r, g, b]] in 0..1
     }
 
-Points are sorted by value, linear in between and constant outside. An opacity is the share of
-light that is lost over ``length``: ``sigma_t = -ln(1 - opacity) / length``. The colour *is* the
+Points are sorted by value, linear in between and constant outside. An opacity is the share of the
+radiance that is lost over ``length``: ``sigma_t = -ln(1 - opacity) / length``. The colour *is* the
 albedo. With ``"value_range": "percentile"`` the data have no unit (as in MR): point values 0 and 1
 stand for the two ``percentiles`` of all voxels of the imported volume.
 """

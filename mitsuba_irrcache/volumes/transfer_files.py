@@ -59,7 +59,7 @@ def load(name: str | os.PathLike) -> TransferFunction:
 
 
 def _is_list(path: Path) -> bool:
-    """Whether the file is JSON whose outermost value is a list, as VPT writes."""
+    """Return whether the file is JSON whose outermost value is a list, as VPT writes."""
     with path.open("rb") as stream:
         return stream.read(256).lstrip()[:1] == b"["
 

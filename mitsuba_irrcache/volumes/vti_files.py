@@ -128,7 +128,7 @@ class _Decoder:
     def _data(self, stream: bytes, position: int, is_raw: bool, expected: int) -> bytes:
         """Return the decoded bytes of an array that begins at ``position``.
 
-        Of a compressed array that unpacks to more than ``expected`` bytes, no more are unpacked.
+        At most ``expected`` bytes of a compressed array are decompressed.
         """
         size = self._header.itemsize
 

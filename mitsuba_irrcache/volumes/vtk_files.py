@@ -88,7 +88,7 @@ def read(path: Path, options: ReadOptions) -> VolumeData:
 
 
 class _Parser:
-    """Reads a file from its begin to its end, since arrays have no table of contents."""
+    """Read a file from beginning to end, since it has no table of contents."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

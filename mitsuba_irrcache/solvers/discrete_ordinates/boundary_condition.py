@@ -391,7 +391,7 @@ def _coarse_voxels(fine: Grid, coarse: Grid, voxel: mi.UInt32) -> mi.UInt32:
 
 
 def _any_positive(spectra: list[list]) -> bool:
-    """Whether any value of any spectrum is positive."""
+    """Return whether any value of any spectrum is positive."""
     largest = [dr.max(channel) for spectrum in spectra for channel in spectrum]
     dr.eval(largest)
     return any(each[0] > 0 for each in largest)

@@ -83,11 +83,11 @@ class SurfaceVoxels:
         dr.eval(self.number)
 
     def is_cut_at(self, voxel: mi.UInt32) -> mi.Bool:
-        """Whether surfaces cut these voxels of the grid."""
+        """Return whether surfaces cut these voxels of the grid."""
         return dr.gather(mi.Bool, self.is_cut, voxel)
 
     def is_beyond(self, voxel: mi.UInt32, active: mi.Bool = True) -> mi.Bool:
-        """Whether these are voxels of a medium whose centres are outside of its boundary."""
+        """Return whether these are voxels of a medium whose centres are outside of its boundary."""
         if self.medium is None:
             return mi.Bool(False)
         return dr.gather(mi.Bool, self._beyond, voxel, active)

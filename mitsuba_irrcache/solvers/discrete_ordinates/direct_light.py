@@ -35,7 +35,7 @@ SAMPLES, MOST_SAMPLES = 4, 16
 
 
 def is_area_emitter(emitter: mi.Emitter) -> bool:
-    """Whether it is an area emitter that emits in all directions."""
+    """Return whether it is an area emitter that emits in all directions."""
     return kind_of(emitter) is EmitterKind.AREA
 
 

@@ -44,7 +44,7 @@ class ExtinctionLayout:
         self.quantum, self._is_dense = quantum, is_dense
 
     def is_read_by_voxel(self, has_source: bool) -> bool:
-        """Whether sweeps read one value for each voxel of the grid."""
+        """Return whether sweeps read one value for each voxel of the grid."""
         return self.values_grid.shape == self.grid.shape and not (has_source and self._is_dense)
 
     def sides(self, axis: int) -> np.ndarray:

@@ -30,7 +30,7 @@ STREAM = 0x6A00
 
 
 def is_needed(scene: mi.Scene) -> bool:
-    """Whether glass refracts radiance of anything but a constant environment.
+    """Return whether glass refracts radiance of anything but a constant environment.
 
     Suns and point-like emitters contribute nothing through smooth glass, through which no path can
     hit them.

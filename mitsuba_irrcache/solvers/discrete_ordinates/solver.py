@@ -73,8 +73,8 @@ NEGLIGIBLE, CHECKED_ORDERS = 1e-7, 8
 
 
 def swept_together(medium: MediumGrid, voxels: int, moments: int) -> bool:
-    """Whether all channels of a cache with this number of ``voxels`` and of angular ``moments`` (0:
-    the irradiance alone) are swept at once.
+    """Return whether all channels of a cache with this number of ``voxels`` and of angular
+    ``moments`` (0: the irradiance alone) are swept at once.
     """
     unknowns = voxels * max(1, moments)
     return medium.sigma_t.channels == 1 and unknowns <= MOST_SWEPT_TOGETHER
@@ -537,7 +537,7 @@ def _change(before: mi.Float, after: mi.Float) -> float:
 
 
 def is_grey(spectra: Sequence[mi.Spectrum]) -> bool:
-    """Whether all channels of each spectrum are the same."""
+    """Return whether all channels of each spectrum are the same."""
     same = [dr.all(c == spectrum[0]) for spectrum in spectra for c in list(spectrum)[1:]]
     dr.eval(same)
     return all(s[0] for s in same)

@@ -351,7 +351,7 @@ def values_at_centres(
 def _any_cut(
     grid: Grid, cut: mi.Bool, places: tuple, k: int, ends: tuple, active: mi.Bool
 ) -> mi.Bool:
-    """Whether surfaces cut one of the three voxels of a second difference along axis ``k``."""
+    """Return whether surfaces cut any voxel of the second difference along axis ``k``."""
     at_first, at_last = ends
     centre = mi.Int32(places[k]) + dr.select(at_first, 1, 0) - dr.select(at_last, 1, 0)
     result = mi.Bool(False)

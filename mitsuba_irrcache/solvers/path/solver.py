@@ -109,7 +109,9 @@ class PathSolver(Solver):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        """Whether straight lines within the boundary of ``medium`` stay in it up to a surface."""
+        """Return whether straight lines within the boundary of ``medium`` stay in it up to a
+        surface.
+        """
         if medium.is_isolated or not dr.width(active):
             return medium.is_isolated
         if not medium.has_exact_boundary or medium.others or medium.refracts:
