@@ -174,13 +174,14 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
 
      * - work_folder
        - |string|
-       - Folder for working files: 10 bytes per voxel of ``sigma_t_file``, 18 for all orders; three
-         channels: 26 and 50; 4 more for ``albedo_file``. (Default: that of ``sigma_t_file``)
+       - Folder for working files: 10 bytes per voxel of ``sigma_t_file``, 22 for all orders; three
+         channels: 26 and 62. (Default: that of ``sigma_t_file``)
 
      * - irradiance_file
        - |string|
        - File ``.npy`` to which the irradiance in the voxels of ``sigma_t_file`` is written: float32
-         (z, y, x, channel). (Default: none)
+         (z, y, x, channel). If it is there and was computed from the same inputs, it is read
+         instead; ``irrcache farm cache`` computes it on many workers. (Default: none)
 
      * - timeout
        - |float|

@@ -17,8 +17,7 @@ EDGE = 32
 
 
 class BrickFile:
-    """Values (z, y, x, channel) of one type in a file without a name, 0 at first. The file vanishes
-    when it is closed, or with this object.
+    """Values (z, y, x, channel) of one type in a file, 0 at first; a file that is there is opened.
 
     Slabs across any axis are read and written in whole bricks, each of which is contiguous; slabs
     across x of an array with x fastest would touch every page of the file.
@@ -35,10 +34,11 @@ class BrickFile:
                 "irrcache: sigma_t_file needs Linux or macOS: working files of this system cannot "
                 "be read at a position; use a volume that fits into memory."
             )
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         self.close = weakref.finalize(self, os.close, self._file)
-        os.unlink(path)
         size = int(np.prod(self._counts, dtype=object)) * self._bytes
+        if os.fstat(self._file).st_size == size:
+            return
         try:
             os.ftruncate(self._file, size)
             if hasattr(os, "posix_fallocate"):
@@ -50,6 +50,16 @@ class BrickFile:
                 f'irrcache: cannot create a working file of {size / 2**30:.1f} GiB at "{path}": '
                 f"{error.strerror}; set work_folder to a folder on another disk."
             ) from None
+
+    @classmethod
+    def without_name(
+        cls, path: Path, shape: tuple[int, int, int], dtype: np.dtype, channels: int = 1
+    ) -> BrickFile:
+        """Create a file that vanishes when it is closed, or with the returned object."""
+        try:
+            return cls(path, shape, dtype, channels)
+        finally:
+            path.unlink(missing_ok=True)
 
     def read(self, lower: Sequence[int], upper: Sequence[int]) -> np.ndarray:
         """Return the box between these voxels (z, y, x): (z, y, x), with channels if several."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,12 +17,13 @@ from mitsuba_irrcache.grids.fields import ConstantField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.lights.emitters import EmitterKind, kind_of
 from mitsuba_irrcache.machine.memory import available_memory
+from mitsuba_irrcache.machine.versions import DISTRIBUTION, installed_version
 from mitsuba_irrcache.media.medium import MediumGrid, axis_aligned
-from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
+from mitsuba_irrcache.out_of_core.brick_file import BrickFile
+from mitsuba_irrcache.out_of_core.irradiance_file import IrradianceFile, recorded, write
 from mitsuba_irrcache.out_of_core.scattering import ScatteredIrradiance, add
 from mitsuba_irrcache.out_of_core.slab_march import MappedIrradiance, SlabProjection
 from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
-from mitsuba_irrcache.out_of_core.slabs import even_slabs
 from mitsuba_irrcache.out_of_core.survey import MappedField
 from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
 from mitsuba_irrcache.out_of_core.volume_settings import VolumeSettings, check_settings, work_folder
@@ -28,7 +31,7 @@ from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.description import SceneDescription
-from mitsuba_irrcache.scene.fingerprint import Snapshot
+from mitsuba_irrcache.scene.fingerprint import Snapshot, digests
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.extinction import DENSE
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
@@ -44,6 +47,8 @@ SHARE, BASE = 0.5, 700 << 20
 MULTIPLE = 32
 
 Progress = Callable[[str, int, int], None]
+#: creates the sweeps of an extinction, given the digest of all inputs of the irradiance
+BeginSweep = Callable[[MappedField, str], SlabSweep]
 
 
 class MappedMedium:
@@ -57,7 +62,7 @@ class MappedMedium:
         self._states: list | None = None
         self._folder: tempfile.TemporaryDirectory | None = None
         self._medium: MediumGrid | None = None
-        self._irradiance: tuple[BrickFile, np.ndarray] | None = None
+        self._irradiance: tuple[BrickFile | IrradianceFile, np.ndarray] | None = None
         self._rays: ClosedFormCameraRays | None = None
 
     def camera_rays(
@@ -71,14 +76,13 @@ class MappedMedium:
         """Create the camera rays for ``scene``; the irradiance is computed if it is not known yet,
         or if the scene or a file has changed.
         """
-        check_settings(self._settings, self._files, self._whole)
         snapshot = Snapshot(scene, None, self._snapshot)
         paths = [path for path in (self._files.sigma_t, self._files.albedo) if path]
         states = [VolumeFile(path).state for path in paths]
         changed = states != self._states or snapshot.changes(self._snapshot)
         if self._rays is None or changed:
             self._rays = None
-            self._compute(scene, progress)
+            self.compute(scene, self._on_this_machine, progress)
             field = MappedIrradiance(*self._irradiance, self._medium.sigma_t.grid)
             arguments = self._medium, field, quadrature, step, self._memory
             projection = SlabProjection(*arguments)
@@ -91,12 +95,16 @@ class MappedMedium:
         wanted = self._files.max_memory or int(SHARE * available_memory())
         return max(wanted - BASE, 64 << 20)
 
-    def _compute(self, scene: mi.Scene, progress: Progress | None) -> None:
-        """Find the irradiance of a scene."""
+    def compute(self, scene: mi.Scene, begin: BeginSweep, progress: Progress | None) -> None:
+        """Find the irradiance of a scene, by the sweeps that ``begin`` creates; an
+        ``irradiance_file`` that was computed from the same inputs is read instead.
+        """
+        check_settings(self._settings, self._files, self._whole)
         description = compile_scene(scene, max_depth=self._settings.max_depth)
         medium, files = _only_medium(scene, description), self._files
         sigma_t_file = VolumeFile(files.sigma_t)
         grid = Grid(sigma_t_file.shape, _placement(medium))
+        inputs = self._inputs(scene, description, medium, grid)
         sigma_t = MappedField(
             sigma_t_file, grid, _scale(medium), f'sigma_t of medium "{medium.name}"'
         )
@@ -104,9 +112,15 @@ class MappedMedium:
         if files.albedo:
             changes["albedo"] = _albedo(VolumeFile(files.albedo), grid, medium.name)
         self._medium = medium.replaced(**changes)
+        if self._irradiance is not None:
+            self._irradiance[0].close()
+        known = recorded(Path(files.irradiance), inputs) if files.irradiance else None
+        if known is not None:
+            self._irradiance = known, np.ones(1 if mi.is_monochromatic else 3)
+            mi.Log(mi.LogLevel.Info, f'irrcache: the irradiance is read from "{files.irradiance}"')
+            return
         _log_start(grid, sigma_t)
-        self._folder = work_folder(files)
-        sweep = SlabSweep(sigma_t, Path(self._folder.name), self._memory)
+        sweep = begin(sigma_t, inputs)
         if sweep.is_dense:
             mi.Log(
                 mi.LogLevel.Warn,
@@ -119,8 +133,6 @@ class MappedMedium:
             if progress is not None:
                 progress("cache", done, total)
 
-        if self._irradiance is not None:
-            self._irradiance[0].close()
         shown = range(ordinates.incoming.shape[-1])
         (arguments,) = OrdinateSet.uncollided([OrdinateSet(ordinates, shown)])
         found = sweep.uncollided(*arguments, report)
@@ -135,7 +147,28 @@ class MappedMedium:
         sweep.close()
         self._irradiance = found, colour
         if files.irradiance:
-            _write_irradiance(files.irradiance, found, colour)
+            write(Path(files.irradiance), found, colour, inputs)
+
+    def _on_this_machine(self, sigma_t: MappedField, _: str) -> SlabSweep:
+        self._folder = work_folder(self._files)
+        return SlabSweep(sigma_t, Path(self._folder.name), self._memory)
+
+    def _inputs(
+        self, scene: mi.Scene, description: SceneDescription, medium: MediumGrid, grid: Grid
+    ) -> str:
+        """The SHA-256 of all that the irradiance depends on; volume files count as unchanged while
+        their sizes and times are.
+        """
+        settings = self._settings
+        paths = [path for path in (self._files.sigma_t, self._files.albedo) if path]
+        parts = [
+            [[part[1:3] for part in VolumeFile(path).state] for path in paths],
+            [grid.shape, grid.to_world.tolist(), _scale(medium)],
+            [settings.max_depth, settings.samples, settings.seed],
+            digests(scene, description.media, medium),
+            installed_version(DISTRIBUTION),
+        ]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def _ordinates(self, scene: mi.Scene) -> tuple[Ordinates, np.ndarray]:
         """The ordinates, for single scattering those of the first batch of a cache in memory, and
@@ -226,28 +259,6 @@ def _albedo(file: VolumeFile, grid: Grid, name: str) -> MappedField:
             "creates energy. Clip it to [0, 1]."
         )
     return field
-
-
-def _write_irradiance(name: str, irradiance: BrickFile, colour: np.ndarray) -> None:
-    """Write the irradiance, float32 (z, y, x, channel), slab by slab."""
-    path = Path(name)
-    partial = path.with_name(f".{path.name}.tmp")
-    shape, (slices, ny, nx) = (*irradiance.shape, len(colour)), irradiance.shape
-    try:
-        for first, last in even_slabs(slices, EDGE):
-            # Opened anew each time, as pages of a mapped file count as memory of the process.
-            mode = "r+" if first else "w+"
-            mapped = np.lib.format.open_memmap(partial, mode, np.float32, shape)
-            values = irradiance.read((first, 0, 0), (last, ny, nx))
-            values = values.reshape(last - first, ny, nx, -1)
-            mapped[first:last] = values * colour.astype(np.float32)
-            del mapped
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise IrrcacheError(
-            f'irrcache: irradiance_file "{path}" cannot be written: {error.strerror}.'
-        ) from None
 
 
 def _log_start(grid: Grid, sigma_t: MappedField) -> None:

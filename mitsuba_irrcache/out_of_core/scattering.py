@@ -9,7 +9,7 @@ repeated while it changes much.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import drjit as dr
@@ -87,7 +87,6 @@ class ScatteredIrradiance:
         self._channels = uncollided.channels
         self._grid: Grid = medium.sigma_t.grid
         self._initial: GridField | None = None
-        self._albedo: BrickFile | None = None
 
     def solve(
         self, scene: mi.Scene, description: SceneDescription, settings: CacheSettings
@@ -107,16 +106,12 @@ class ScatteredIrradiance:
 
     def find(self, progress: Progress) -> BrickFile:
         """Return the file of the scattered irradiance, after one or more passes."""
-        if isinstance(self._medium.albedo, MappedField):
-            self._albedo = self._sweep.stored("albedo", self._medium.albedo)
         before: BrickFile | None = None
         for number in range(MOST_PASSES):
-
-            def source(lower: list[int], upper: list[int], before=before) -> np.ndarray:
-                return self._source(lower, upper, before)
-
+            source = self._source(f"source-{number}", before)
             name = f"scattered-{number}"
-            after = self._sweep.scattered(name, self._ordinates, source, self._channels, progress)
+            after = self._sweep.scattered(name, self._ordinates, source, progress)
+            source.close()
             change = self._change(before, after)
             if before is not None:
                 before.close()
@@ -134,22 +129,33 @@ class ScatteredIrradiance:
                 f"irrcache: the last of {MOST_PASSES} passes over the whole volume still changed "
                 f"the irradiance by {change:.1%}",
             )
-        if self._albedo is not None:
-            self._albedo.close()
         return before
 
-    def _source(self, lower: list[int], upper: list[int], before: BrickFile | None) -> np.ndarray:
-        """The scattered radiance per optical depth in a box."""
-        shape = [b - a for a, b in zip(lower, upper, strict=True)]
-        scattered = self._scattered(lower, upper, before)
-        irradiance = self._uncollided.read(lower, upper).reshape(scattered.shape) + scattered
-        if self._albedo is not None:
-            albedo = self._albedo.read(lower, upper)[..., None]
-        elif isinstance(self._medium.albedo, ConstantField):
-            albedo = np.array(self._medium.albedo.value, np.float32).ravel()
-        else:
-            albedo = self._evaluated(self._medium.albedo, lower, upper)
-        return (irradiance * albedo * np.float32(1 / (4 * np.pi))).reshape(*shape, self._channels)
+    def _source(self, name: str, before: BrickFile | None) -> BrickFile:
+        """The scattered radiance per optical depth, in a working file."""
+        file = self._sweep.file(name, channels=self._channels)
+        for lower, upper in self._boxes():
+            scattered = self._scattered(lower, upper, before)
+            irradiance = self._uncollided.read(lower, upper).reshape(scattered.shape) + scattered
+            albedo = self._albedo(lower, upper)
+            file.write(lower, irradiance * albedo * np.float32(1 / (4 * np.pi)))
+        return file
+
+    def _boxes(self) -> Iterator[tuple[list[int], list[int]]]:
+        """Yield runs of slices in whole bricks: lower and upper end (z, y, x)."""
+        slices, ny, nx = self._grid.shape
+        for first, last in even_slabs(slices, EDGE):
+            yield [first, 0, 0], [last, ny, nx]
+
+    def _albedo(self, lower: list[int], upper: list[int]) -> np.ndarray:
+        """The albedo in some whole slices, or the same for all voxels."""
+        albedo = self._medium.albedo
+        if isinstance(albedo, MappedField):
+            values = albedo.file.read(lower[0], upper[0]) * np.float32(albedo.factor)
+            return values[..., None]
+        if isinstance(albedo, ConstantField):
+            return np.array(albedo.value, np.float32).ravel()
+        return self._evaluated(albedo, lower, upper)
 
     def _scattered(self, lower: list[int], upper: list[int], known: BrickFile | None) -> np.ndarray:
         if known is None:
@@ -172,9 +178,7 @@ class ScatteredIrradiance:
         extinction.
         """
         change = total = 0.0
-        slices, ny, nx = self._grid.shape
-        for first, last in even_slabs(slices, EDGE):
-            box = [first, 0, 0], [last, ny, nx]
+        for box in self._boxes():
             new = self._scattered(*box, after)
             weight = self._sweep.extinction(*box)[..., None].astype(np.float32)
             difference = new - self._scattered(*box, before)

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile, RecordFile
+from mitsuba_irrcache.out_of_core.brick_file import BrickFile, RecordFile
 from mitsuba_irrcache.out_of_core.slab_tracks import (
     SlabTracks,
     by_slices,
@@ -50,9 +50,9 @@ MOST_SLICES = 128
 SHARE_CARRIED = 0.4
 
 Progress = Callable[[int, int], None]
-#: returns the radiance that the voxels of a box emit or scatter, per optical depth: (z, y, x,
-#: channel), given its lower and upper end (z, y, x)
-Source = Callable[[list[int], list[int]], np.ndarray]
+#: directions (n, 3), weights (n) and offsets (n, 2) of pairs of ordinates, as `Tracks.table` takes
+#: them
+PairsOfOrdinates = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class SlabSweep:
@@ -64,13 +64,13 @@ class SlabSweep:
         self.grid, self._folder, self._memory = sigma_t.grid, folder, memory
         #: whether sweeps with a source would distinguish the halves of voxels in memory
         top, self.is_dense = largest_extinction(self.grid, sigma_t.largest)
-        self._levels = BrickFile(folder / "extinction", self.grid.shape, np.uint16)
-        slice_voxels = self.grid.voxel_count // self.grid.shape[0]
-        for first, last in even_slabs(self.grid.shape[0], _thickness(memory, slice_voxels * 24)):
-            levels = quantised(sigma_t.values(first, last), top, first * slice_voxels)
-            values = np.array(levels).astype(np.uint16)
-            self._levels.write((first, 0, 0), values.reshape(last - first, *self.grid.shape[1:]))
+        self._levels = self.file("extinction", np.uint16)
+        write_levels(self._levels, sigma_t, top, memory)
         self._tracks = SlabTracks(self.grid, top / LEVELS)
+
+    def file(self, name: str, dtype: np.dtype = np.float32, channels: int = 1) -> BrickFile:
+        """Create a working file for values of all voxels."""
+        return BrickFile.without_name(self._folder / name, self.grid.shape, dtype, channels)
 
     def uncollided(
         self,
@@ -88,144 +88,188 @@ class SlabSweep:
     def scattered(
         self,
         name: str,
-        ordinates: tuple[np.ndarray, np.ndarray, np.ndarray],
-        source: Source,
-        channels: int,
+        ordinates: PairsOfOrdinates,
+        source: BrickFile,
         progress: Progress = lambda done, total: None,
     ) -> BrickFile:
-        """Irradiance of what voxels emit or scatter, in a file called ``name``, along ordinates:
-        directions (n, 3), weights (n) and offsets (n, 2), as `Tracks.table` takes them.
+        """Irradiance of what voxels emit or scatter, in a file called ``name``; ``source`` is this
+        radiance per optical depth.
         """
-        incoming = np.zeros((len(ordinates[0]), 2, channels))
+        incoming = np.zeros((len(ordinates[0]), 2, source.channels))
         return self._irradiance(name, ordinates, incoming, source, progress)
 
     def _irradiance(
         self,
         name: str,
-        all_ordinates: tuple[np.ndarray, np.ndarray, np.ndarray],
+        ordinates: PairsOfOrdinates,
         incoming: np.ndarray,
-        source: Source | None,
+        source: BrickFile | None,
         progress: Progress,
     ) -> BrickFile:
-        directions, weights, offsets = all_ordinates
-        total = BrickFile(self._folder / name, self.grid.shape, np.float32, incoming.shape[2])
-        axes = self._tracks.dominant_axes(all_ordinates)
+        total = self.file(name, channels=incoming.shape[2])
         done = 0
-        for axis in range(3):
-            rows = np.flatnonzero(axes == axis)
-            if not len(rows):
-                continue
-            ordinates = directions[rows], weights[rows], offsets[rows]
-            sweep = _AxisSweep(self._tracks, self._levels, axis, ordinates, incoming[rows], source)
+        for sweep in AxisSweep.of_all(self._tracks, self._levels, ordinates, incoming, source):
             groups = sweep.groups(self._memory)
             slabs = sweep.slabs(self._memory, max(len(group) for group in groups))
             records = RecordFile(self._folder / "sums")
             for group in groups:
-                is_last = group is groups[-1]
+                carried: Carried = {}
                 for step, _ in enumerate(slabs):
-                    sweep.cross(slabs, step, group, records, total if is_last else None)
-                    done += len(group) / (len(slabs) * len(directions))
+                    numbers = sweep.numbers(slabs, step)
+                    parts = [records.read(number) for number in numbers]
+                    sums = sweep.cross(slabs, step, group, carried, parts)
+                    is_complete = group is groups[-1] and sweep.is_second_visit(slabs, step)
+                    for number, own in zip(numbers, sums, strict=True):
+                        if is_complete:
+                            box = sweep.box(slabs[number])
+                            before = total.read(*box)
+                            found = sweep.irradiance(own, box).reshape(before.shape)
+                            total.write(box[0], before + found)
+                        else:
+                            records.write(number, np.ascontiguousarray(own))
+                    done += len(group) / (len(slabs) * len(incoming))
                     progress(int(done * 1000), 1000)
-                sweep.finish()
         return total
 
     def extinction(self, lower: list[int], upper: list[int]) -> np.ndarray:
         """The extinction in a box (z, y, x), in units of its quantum."""
         return self._levels.read(lower, upper)
 
-    def stored(self, name: str, field: MappedField) -> BrickFile:
-        """Copy a field to a working file, boxes of which are read."""
-        file = BrickFile(self._folder / name, self.grid.shape, np.float32)
-        for first, last in even_slabs(self.grid.shape[0], EDGE):
-            file.write((first, 0, 0), field.file.read(first, last) * np.float32(field.factor))
-        return file
-
     def close(self) -> None:
         """Closes the working file of the extinction."""
         self._levels.close()
 
 
-class _AxisSweep:
-    """Sweeps along all ordinates of one dominant ``axis``."""
+def write_levels(file: BrickFile, sigma_t: MappedField, top: float, memory: int) -> None:
+    """Write the quantised extinction, up to ``top``, of all voxels."""
+    slices, *sides = sigma_t.grid.shape
+    slice_voxels = int(np.prod(sides))
+    for first, last in even_slabs(slices, _thickness(memory, slice_voxels * 24)):
+        levels = quantised(sigma_t.values(first, last), top, first * slice_voxels)
+        values = np.array(levels).astype(np.uint16)
+        file.write((first, 0, 0), values.reshape(last - first, *sides))
+
+
+#: What the tracks of each pair carry, by its number: for either way the radiance in each channel
+#: and the extinction passed last.
+Carried = dict[int, tuple[list, list]]
+
+
+class AxisSweep:
+    """Sweeps along all ordinates of one dominant ``axis`` through the quantised extinction
+    ``levels``.
+    """
 
     def __init__(
         self,
         tracks: SlabTracks,
         levels: BrickFile,
         axis: int,
-        ordinates: tuple[np.ndarray, np.ndarray, np.ndarray],
+        ordinates: PairsOfOrdinates,
         incoming: np.ndarray,
-        source: Source | None,
+        source: BrickFile | None,
     ) -> None:
-        self._tracks, self._levels, self._axis = tracks, levels, axis
+        self._tracks, self._levels, self.axis = tracks, levels, axis
         self._ordinates, self._incoming, self._source = ordinates, incoming, source
         self._channels = incoming.shape[2]
         self._track_count = int(np.prod(np.delete(tracks.grid.resolution, axis)))
         self._track_index = dr.arange(mi.UInt32, self._track_count)
         dr.eval(self._track_index)
-        #: what the tracks of each pair carry
-        self._carried: dict[int, tuple[list[mi.Float], list[mi.Float]]] = {}
+
+    @classmethod
+    def of_all(
+        cls,
+        tracks: SlabTracks,
+        levels: BrickFile,
+        ordinates: PairsOfOrdinates,
+        incoming: np.ndarray,
+        source: BrickFile | None,
+    ) -> list[AxisSweep]:
+        """Return the sweeps along these ordinates, one for each dominant axis that has some."""
+        axes = tracks.dominant_axes(ordinates)
+        rows = {axis: np.flatnonzero(axes == axis) for axis in range(3)}
+        return [
+            cls(tracks, levels, axis, tuple(a[own] for a in ordinates), incoming[own], source)
+            for axis, own in rows.items()
+            if len(own)
+        ]
+
+    @property
+    def pair_count(self) -> int:
+        """Number of pairs of ordinates."""
+        return len(self._incoming)
 
     def groups(self, memory: int) -> list[list[int]]:
         """The pairs, in as many groups as needed for what the tracks of one to fit into memory."""
-        count = len(self._incoming)
         each = 2 * self._track_count * (self._channels + 1) * 4
         most = max(1, int(SHARE_CARRIED * memory / each))
-        return [list(range(first, last)) for first, last in even_slabs(count, most)]
+        return [list(range(first, last)) for first, last in even_slabs(self.pair_count, most)]
 
-    def slabs(self, memory: int, pairs: int) -> list[Slab]:
-        """Slabs of as many slices as fit beside what the tracks of so many ``pairs`` carry."""
+    def slabs(self, memory: int, pairs: int, fewest: int = 1) -> list[Slab]:
+        """Slabs of as many slices as fit beside what the tracks of so many ``pairs`` carry, about
+        ``fewest`` at least.
+        """
         carried = (pairs + 1) * 2 * self._track_count * (self._channels + 1) * 4
         of_channel = BYTES_OF_CHANNEL if self._source is None else BYTES_OF_SOURCE
         each = 2 * self._track_count * (BYTES + of_channel * self._channels)
         most = MOST_VALUES // (2 * self._track_count * self._channels)
-        thickness = max(1, min(_thickness(memory - carried, each), most))
-        return symmetric_slabs(int(self._tracks.grid.resolution[self._axis]), thickness)
+        slices = int(self._tracks.grid.resolution[self.axis])
+        most = min(most, -(-slices // fewest))
+        return symmetric_slabs(slices, max(1, min(_thickness(memory - carried, each), most)))
+
+    @staticmethod
+    def numbers(slabs: list[Slab], step: int) -> list[int]:
+        """The slabs that are crossed in a ``step``: along the axis, and, if it is another one,
+        against it.
+        """
+        last = len(slabs) - 1 - step
+        return [step] if step == last else [step, last]
+
+    @staticmethod
+    def is_second_visit(slabs: list[Slab], step: int) -> bool:
+        """Whether the slabs of a ``step`` have been crossed both ways after it."""
+        return step >= len(slabs) // 2
 
     def cross(
         self,
         slabs: list[Slab],
         step: int,
-        group: list[int],
-        records: RecordFile,
-        total: BrickFile | None,
-    ) -> None:
-        """Cross one slab each way; what has been crossed both ways is added to the ``total``, if
-        that is given.
+        pairs: list[int],
+        carried: Carried,
+        parts: list[np.ndarray | None],
+    ) -> list[np.ndarray]:
+        """Cross one slab each way with these ``pairs``; return the sums of each slab, to which is
+        added what was ``carried`` there.
+
+        ``parts`` are the sums before, None for 0. What the tracks carry is replaced.
         """
-        numbers = [step, len(slabs) - 1 - step]
-        numbers = numbers[:1] if numbers[0] == numbers[1] else numbers
+        numbers = self.numbers(slabs, step)
         pair = slabs[numbers[0]], slabs[numbers[-1]]
-        boxes = [self._box(slabs[number]) for number in numbers]
-        medium = swept_medium([self._levels.read(*box) for box in boxes], self._axis)
-        values = self._sums([records.read(number) for number in numbers], boxes)
-        table = self._tracks.slab_table(self._ordinates, self._incoming, self._axis, pair)
+        boxes = [self.box(slabs[number]) for number in numbers]
+        medium = swept_medium([self._levels.read(*box) for box in boxes], self.axis)
+        values = self._values(parts, boxes)
+        table = self._tracks.slab_table(self._ordinates, self._incoming, self.axis, pair)
         source = None if self._source is None else values
         volume = SweptVolume(values, source, dr.opaque(mi.UInt32, 0), self._channels)
-        for i in group:
-            carried = CarriedRadiance(self._carried.get(i))
-            sweep_tracks(medium, volume, table, table.pair_index[i], self._track_index, carried)
-            dr.eval(values, carried.after)
-            self._carried[i] = carried.after
-        del medium, carried
-        is_second = step >= len(slabs) // 2
-        self._keep(values, boxes, numbers, records, total if is_second else None)
+        for i in pairs:
+            state = CarriedRadiance(carried.get(i))
+            sweep_tracks(medium, volume, table, table.pair_index[i], self._track_index, state)
+            dr.eval(values, state.after)
+            carried[i] = state.after
+        del medium, state
+        return self._sums(values, boxes)
 
-    def finish(self) -> None:
-        """Forget what the tracks of the last group carry."""
-        self._carried.clear()
-
-    def _box(self, slab: Slab) -> tuple[list[int], list[int]]:
+    def box(self, slab: Slab) -> tuple[list[int], list[int]]:
         """Lower and upper end (z, y, x) of a slab."""
         lower, upper = [0, 0, 0], list(self._tracks.grid.shape)
-        lower[2 - self._axis], upper[2 - self._axis] = slab
+        lower[2 - self.axis], upper[2 - self.axis] = slab
         return lower, upper
 
-    def _sums(self, parts: list[np.ndarray | None], boxes: list) -> mi.Float:
+    def _values(self, parts: list[np.ndarray | None], boxes: list) -> mi.Float:
         """The sums of one or two slabs as they were left, or 0, by slices; with the source, the
         four values of `Tracks.sweep`.
         """
-        shapes = [by_slices(np.empty(_shape(box), bool), self._axis).shape for box in boxes]
+        shapes = [by_slices(np.empty(_shape(box), bool), self.axis).shape for box in boxes]
         if self._source is None and all(part is None for part in parts):
             voxels = sum(int(np.prod(shape)) for shape in shapes)
             return dr.opaque(mi.Float, 0, voxels * self._channels)
@@ -234,47 +278,40 @@ class _AxisSweep:
             np.zeros(shape, np.float32) if part is None else part.reshape(shape)
             for part, shape in zip(parts, shapes, strict=True)
         ]
-        place = slice_place(self._axis)
+        place = slice_place(self.axis)
         joined = parts[0] if len(parts) == 1 else np.concatenate(parts, place)
         if self._source is not None:
             sums, joined = joined, np.zeros((*joined.shape, 4), np.float32)
-            sources = [by_slices(self._source(*box), self._axis) for box in boxes]
-            joined[..., 0] = np.concatenate(sources, place)
+            sources = [by_slices(self._source.read(*box), self.axis) for box in boxes]
+            joined[..., 0] = np.concatenate(sources, place).reshape(sums.shape)
             joined[..., 1] = sums
         return mi.Float(joined.ravel())
 
-    def _keep(
-        self,
-        values: mi.Float,
-        boxes: list,
-        numbers: list[int],
-        records: RecordFile,
-        total: BrickFile | None,
-    ) -> None:
-        """Store the sums of the slabs, or add what they mean to the ``total``."""
-        place, first = slice_place(self._axis), 0
-        shape = list(by_slices(np.empty(_shape(boxes[0]), bool), self._axis).shape)
+    def _sums(self, values: mi.Float, boxes: list) -> list[np.ndarray]:
+        """The sums of each slab, by slices."""
+        place, first = slice_place(self.axis), 0
+        shape = list(by_slices(np.empty(_shape(boxes[0]), bool), self.axis).shape)
         thickness = shape[place]
         shape[place] *= len(boxes)
         if self._source is not None:
             values = dr.gather(
                 mi.Float, values, 4 * dr.arange(mi.UInt32, dr.width(values) // 4) + 1
             )
-        sums = np.array(values).reshape(*shape, self._channels)
-        for box, number in zip(boxes, numbers, strict=True):
+        sums, found = np.array(values).reshape(*shape, self._channels), []
+        for _ in boxes:
             within: list = [slice(None)] * sums.ndim
             within[place] = slice(first, first + thickness)
-            own = sums[tuple(within)]
+            found.append(sums[tuple(within)])
             first += thickness
-            if total is None:
-                records.write(number, np.ascontiguousarray(own))
-            else:
-                if self._source is None:
-                    found = self._at_centres(mi.Float(own.ravel()), _shape(box))
-                else:
-                    found = from_slices(own, self._axis)
-                before = total.read(*box)
-                total.write(box[0], before + found.reshape(before.shape))
+        return found
+
+    def irradiance(self, sums: np.ndarray, box: tuple) -> np.ndarray:
+        """The irradiance that the sums of a slab mean, in its ``box``: (z, y, x, channel)."""
+        if self._source is None:
+            found = self._at_centres(mi.Float(sums.ravel()), _shape(box))
+        else:
+            found = from_slices(sums, self.axis)
+        return found.reshape(*_shape(box), self._channels)
 
     def _at_centres(self, means: mi.Float, shape: tuple[int, int, int]) -> np.ndarray:
         """The values of a slab at the centres of its voxels (z, y, x, channel)."""
@@ -283,7 +320,7 @@ class _AxisSweep:
         box = np.zeros(3, int), grid.resolution
         found = []
         for c in range(channels):
-            value = values_at_centres(means, grid, *box, self._axis, index, c, channels)
+            value = values_at_centres(means, grid, *box, self.axis, index, c, channels)
             found.append(np.array(value))
         return found[0] if channels == 1 else np.stack(found, axis=1)
 

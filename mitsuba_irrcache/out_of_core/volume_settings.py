@@ -80,7 +80,7 @@ def work_folder(files: VolumeSettings) -> tempfile.TemporaryDirectory:
     except OSError as error:
         raise IrrcacheError(
             f'irrcache: cannot create working files in "{parent}" ({error.strerror}); set '
-            "work_folder to a folder with 10 to 54 bytes of free space per voxel."
+            "work_folder to a folder with 10 to 62 bytes of free space per voxel."
         ) from None
 
 

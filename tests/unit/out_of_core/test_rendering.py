@@ -73,6 +73,28 @@ def test_the_irradiance_is_written_to_a_file(density, tmp_path):
     np.testing.assert_allclose(np.load(file), expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("sky", [[0.5, 0.5, 0.5], [0.2, 0.5, 0.9]])
+def test_an_irradiance_file_of_the_same_inputs_is_read(density, tmp_path, monkeypatch, sky):
+    file = tmp_path / "irradiance.npy"
+
+    def rendered(scale: float = 2.0) -> np.ndarray:
+        emitter = {"type": "constant", "radiance": {"type": "rgb", "value": sky}}
+        files = {"irradiance_file": str(file)}
+        interior = medium(scale, 0.9, PLACE)
+        return image(scene_of(tmp_path, interior, files=files, emitter=emitter), spp=2)
+
+    computed, written = rendered(), file.stat()
+    np.testing.assert_array_equal(rendered(), computed)
+    assert file.stat().st_mtime_ns == written.st_mtime_ns
+    # Another medium, a volume that was written again, and a file that somebody has written to.
+    assert np.abs(rendered(3.0) - computed).max() > 0.01
+    np.testing.assert_array_equal(rendered(), computed)
+    np.save(file, np.load(file) * 2)
+    np.testing.assert_array_equal(rendered(), computed)
+    np.save(tmp_path / "density.npy", density[::-1])
+    assert np.abs(rendered() - computed).max() > 0.01
+
+
 def test_all_orders_of_a_white_furnace_are_white(density, tmp_path, monkeypatch):
     monkeypatch.setattr(scattering, "COARSE", 24)
     file = tmp_path / "irradiance.npy"
