@@ -305,6 +305,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
             "cache_spp", samples, 0, "0 (chosen) or a number"
         )
 
+    @property
+    def emission(self) -> tuple[object, float]:
+        """The volumetric emission (None: media do not emit), and the factor of it."""
+        return self._options.emission, self._options.emission_scale
+
     def traverse(self, callback: mi.TraversalCallback) -> None:
         super().traverse(callback)
         if isinstance(self._options.emission, mi.Object):

@@ -15,8 +15,9 @@ import mitsuba as mi
 from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.io.scene_xml import scene_element
 
-#: Properties common to all volumetric path integrators, with the same meaning in irrcache.
-SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+#: Properties that an integrator inherits from one that it replaces, if it has them: those common to
+#: all volumetric path integrators, and the emission of media, which belongs to the scene.
+SHARED_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters", "emission", "emission_scale")
 
 
 #: A list item: text without commas, except inside quotes.

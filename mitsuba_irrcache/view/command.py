@@ -7,6 +7,8 @@ import gc
 import signal
 import threading
 import webbrowser
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,11 +26,16 @@ from mitsuba_irrcache.volumes import importer
 from mitsuba_irrcache.volumes.options import MissingItemError
 
 if TYPE_CHECKING:
+    from mitsuba_irrcache.view.appearance import Appearance
+    from mitsuba_irrcache.view.document import Document
     from mitsuba_irrcache.view.server import Server
     from mitsuba_irrcache.view.session import Session
     from mitsuba_irrcache.view.time_panel import TimeSteps
+    from mitsuba_irrcache.volumes.colours import Colours
     from mitsuba_irrcache.volumes.data import VolumeData
 
+#: Volumes with more voxels than this are preceded by an image of a part of their voxels.
+MANY_VOXELS = 96**3
 #: A number of a time step that no file has.
 MOST_STEPS = 1 << 30
 
@@ -108,8 +115,8 @@ def _fill(server: Server, args: argparse.Namespace, name: str) -> Session:
     mi.set_variant(args.mode)
     mi.set_log_level(mi.LogLevel.Info if args.verbose else mi.LogLevel.Warn)
     free_at_once()
-    document, appearance = _document(args)
-    server.say("computing the first illumination ...")
+    document, appearance = _document(args, server)
+    server.say("computing the illumination ...")
     session = Session(document)
     gc.freeze()  # collections then scan the objects created below only
     session.start()
@@ -124,8 +131,9 @@ def _time_steps(args: argparse.Namespace) -> TimeSteps | None:
     if args.frame is None:
         return None
 
-    def read(frame: int) -> VolumeData:
-        return importer.read(argparse.Namespace(**vars(args) | {"frame": frame}))[0]
+    def read(frame: int) -> tuple[VolumeData, Colours | None]:
+        volume, _, colours = importer.read(argparse.Namespace(**vars(args) | {"frame": frame}))
+        return volume, colours
 
     try:
         read(MOST_STEPS)
@@ -134,8 +142,11 @@ def _time_steps(args: argparse.Namespace) -> TimeSteps | None:
     return None
 
 
-def _document(args: argparse.Namespace) -> tuple:
-    """Return the scene as a document and, if it is made from a volume, the volume's appearance."""
+def _document(args: argparse.Namespace, server: Server) -> tuple[Document, Appearance | None]:
+    """Return the scene as a document and, if it is made from a volume, the volume's appearance.
+
+    A coarse image of a volume is displayed as soon as there are values to show.
+    """
     from mitsuba_irrcache.view.appearance import Appearance
     from mitsuba_irrcache.view.document import Document
 
@@ -149,12 +160,34 @@ def _document(args: argparse.Namespace) -> tuple:
         if integrator is None and integrator_of(path, parameters) in REPLACED:
             integrator = "irrcache"
         return Document.load(path, parameters, integrator), None
-    volume, mapping = importer.read(args)
-    appearance = Appearance(volume, mapping, args.preset or "")
-    settings = importer.scene_settings(args, "irrcache")
-    if appearance.is_editable:  # CT, MR and the like: before a dark background
-        settings = replace(settings, hide_emitters=True)
-    return appearance.document(settings, parameters, args.integrator), appearance
+
+    def document(appearance: Appearance) -> Document:
+        settings = importer.scene_settings(args, "irrcache")
+        if appearance.is_editable or appearance.is_emissive:  # CT, MR, flames: on a dark background
+            settings = replace(settings, hide_emitters=True)
+        return appearance.document(settings, parameters, args.integrator)
+
+    small = importer.read_small(args)
+    if small is not None:
+        _preview(server, document, Appearance(*small))
+    volume, mapping, colours = importer.read(args)
+    appearance = Appearance(volume, mapping, args.preset or "", colours)
+    if small is None and appearance.volume.values.size > MANY_VOXELS:
+        _preview(server, document, appearance.coarse())
+    return document(appearance), appearance
+
+
+def _preview(
+    server: Server, document: Callable[[Appearance], Document], appearance: Appearance
+) -> None:
+    """Display an image of a volume of few voxels, if any of them is visible."""
+    from mitsuba_irrcache.view.session import Session
+
+    with suppress(IrrcacheError):  # thin objects may lie between the voxels that were chosen
+        session = Session(document(appearance))
+        session.start()
+        server.send_preview(session)
+        session.stop()
 
 
 def _wait() -> None:

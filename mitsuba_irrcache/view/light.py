@@ -22,6 +22,8 @@ from mitsuba_irrcache.scene.medium_probe import medium_at
 MANY_VOXELS, COARSE = 48**3, 32
 #: Directions per batch of `sweep`; larger batches would delay the first image.
 DIRECTIONS = 32
+#: The same in emissive media, whose voxels trace rays in each direction, without interruption.
+EMISSIVE_DIRECTIONS = 8
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,10 @@ class Light:
         pause: Callable[[], None] | None = None,
     ) -> None:
         self.scene, self.settings, self.seeing = scene, settings, seeing
-        self._builder = CacheBuilder(replace(settings, samples=DIRECTIONS, with_error=False))
+        emission, factor = scene.integrator().emission
+        samples = DIRECTIONS if emission is None else EMISSIVE_DIRECTIONS
+        settings = replace(settings, samples=samples, with_error=False)
+        self._builder = CacheBuilder(settings, emission, factor)
         self._builder.pause.action = pause
         self._builder.early = True
         self._coarse: CachedMedium | None = None
@@ -113,6 +118,11 @@ class Light:
     def is_dark(self) -> bool:
         """Return whether the caches are zero and need no refinement."""
         return bool(self.parts) and self._builder.is_dark
+
+    @property
+    def is_emissive(self) -> bool:
+        """Return whether the media emit, which ``volpath`` does not render."""
+        return any(part.medium.emission is not None for part in self.parts)
 
     def prepare(self) -> None:
         """Find the media of the scene.

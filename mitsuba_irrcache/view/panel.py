@@ -68,10 +68,9 @@ class LightPanel:
 
     def show(self, status: Status) -> None:
         """Display the progress of the cache refinement; called in the session's thread."""
-        error = "" if math.isnan(status.error) else f"error {status.error:.2%}, "
+        error = "" if math.isnan(status.error) else f"error {100 * status.error:.2g} %, "
         state = "improving" if status.improving else "done"
-        samples = f"{status.samples} samples, {status.seconds:.1f} s"
-        self._status.content = f"{state}: {error}{samples}"
+        self._status.content = f"{state}: {error}{status.samples} samples"
         target = self._session.target_error
         above = status.improving and status.error > target
         shown = f"error of the illumination {100 * status.error:.2g} %, target {100 * target:.2g} %"

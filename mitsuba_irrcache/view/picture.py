@@ -24,6 +24,8 @@ MARKED, MARK, FLOOR = "image, errors marked", (1.0, 0.0, 0.8), 0.02
 KINDS = ("image", MARKED, "colour", "illumination", "error bar", "transmittance", "depth")
 #: Scale factor with which the standard error is displayed.
 ERROR_SCALE = 10.0
+#: Exposures in stops that can be chosen.
+EXPOSURES = (-8.0, 8.0)
 #: Tone curves; all are followed by the sRGB transfer function.
 TONES: dict[str, Callable] = {
     "sRGB": lambda c: c,
@@ -209,6 +211,14 @@ class Samples:
         allowed = dr.opaque(mi.Float, look.target) * dr.maximum(radiance, FLOOR * dr.max(radiance))
         share = dr.clip(0.5 * error / dr.maximum(allowed, 1e-12) - 0.5, 0, 0.7)
         return dr.lerp(shown, mi.Color3f(*MARK) * dr.maximum(radiance, 0.2), share)
+
+
+def exposure_of(image: np.ndarray) -> float:
+    """Return the exposure in stops with which the brightest pixels of an ``image`` (height, width,
+    channel) are just not clipped, but for one in a hundred; 0 for a black one.
+    """
+    bright = float(np.quantile(image.max(axis=-1), 0.99))
+    return float(np.clip(np.round(-np.log2(bright), 1), *EXPOSURES)) if bright > 0 else 0.0
 
 
 def displayed(image: np.ndarray, look: Look, behind: np.ndarray) -> np.ndarray:

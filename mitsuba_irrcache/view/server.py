@@ -33,8 +33,6 @@ LOG = logging.getLogger(__name__)
 
 #: Time in which windows receive a last message.
 FAREWELL_SECONDS = 0.5
-#: (width, height) of the image that is displayed until the page has started.
-PREVIEW = (480, 240)
 
 
 class Server:
@@ -94,14 +92,10 @@ class Server:
         if self.channel.has_windows:
             time.sleep(FAREWELL_SECONDS)
 
-    def _send_preview(self, session: Session) -> None:
-        """Send an image that the page displays until viser's client has started and asks for one.
-
-        It is wider than most windows; they crop it.
-        """
-        picture = session.call(lambda: session.preview(PREVIEW))
+    def send_preview(self, session: Session) -> None:
+        """Send an image that the page displays until viser's client asks for one."""
         encoded = io.BytesIO()
-        Image.fromarray(picture).save(encoded, "JPEG", quality=90)
+        Image.fromarray(session.first_look).save(encoded, "JPEG", quality=90)
         self.channel.send("preview", encoded.getvalue())
 
     def show(
@@ -112,7 +106,7 @@ class Server:
     ) -> None:
         """Display a started ``session`` in all windows, also in those that are open already."""
         self.session = session
-        self._send_preview(session)
+        self.send_preview(session)
         self.say("loading the controls ...")
         self._set_first_camera(session)
         self._placeholder.remove()

@@ -24,7 +24,7 @@ from mitsuba_irrcache.errors import IrrcacheError, original_message
 from mitsuba_irrcache.view.camera import Camera, Placement, cameras_of
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.light import Light, Seen, Status
-from mitsuba_irrcache.view.picture import Look, Samples
+from mitsuba_irrcache.view.picture import Look, Samples, exposure_of
 from mitsuba_irrcache.view.window import REST_SECONDS, Picture, View, Window
 
 LOG = logging.getLogger(__name__)
@@ -35,6 +35,9 @@ GROWTH = 1.25
 TARGET_ERROR = 0.005
 #: Seconds between two checks for moved cameras while the solver runs.
 CHECK_SECONDS = 0.02
+#: (width, height) of an image that is displayed until windows have cameras of their own. It is
+#: wider than most windows; they crop it.
+FIRST_LOOK = (480, 240)
 
 
 class Superseded(Exception):  # noqa: N818 (not an error: the user caused it)
@@ -52,6 +55,10 @@ class Session:
         #: the scene's sensors by name, and its mapping to browser coordinates; set by `start`
         self.cameras: dict[str, Camera] = {}
         self.placement = Placement(np.zeros(3), 1.0)
+        #: coarse image of the first camera, uint8 (height, width, 3); set by `start`
+        self.first_look: np.ndarray | None = None
+        #: in stops, with which windows begin; set by `start`
+        self.exposure = 0.0
         self.status = Status()
         #: log of the thread: (activity, start time, end time), the newest last
         self.history: deque[tuple[str, float, float]] = deque(maxlen=20000)
@@ -153,15 +160,14 @@ class Session:
         """Return the displayed caches; for the session's thread only."""
         return self._shown
 
-    def preview(self, size: tuple[int, int]) -> np.ndarray:
-        """Return an image by the first camera with one sample per pixel, uint8 (height, width, 3).
-
-        For the session's thread only.
-        """
-        camera, look = next(iter(self.cameras.values())), Look()
-        samples = Samples(self._shown.seen(look.layered, look.with_error), camera, size)
+    def _look_first(self) -> None:
+        """Render an image by the first camera with one sample per pixel, and choose an exposure."""
+        camera = next(iter(self.cameras.values()))
+        samples = Samples(self._shown.seen(layered=False, with_error=False), camera, FIRST_LOOK)
         samples.add(1)
-        return samples.picture(look, self.extent(camera))
+        if self._shown.is_emissive:  # of any radiance, in contrast to what usual emitters light
+            self.exposure = exposure_of(samples.image())
+        self.first_look = samples.picture(Look(exposure=self.exposure), self.extent(camera))
 
     def complete(self, seen: Seen, view: View) -> Samples | None:
         """Return all samples of ``view`` if a window has them; for the session's thread only."""
@@ -213,6 +219,7 @@ class Session:
         self.placement = Placement.around(self._shown.parts[0].medium.frame)
         self.cameras = cameras_of(scene, self.placement)
         self.document.orient(next(iter(self.cameras.values())).up)
+        self._look_first()
 
     def _light_of(self, scene: mi.Scene) -> Light:
         document = self.document

@@ -11,6 +11,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.view.editing import Editing
 from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.volumes.colours import Colours
 from mitsuba_irrcache.volumes.data import VolumeData
 
 
@@ -20,7 +21,7 @@ class TimeSteps:
 
     count: int
     first: int
-    read: Callable[[int], VolumeData]
+    read: Callable[[int], tuple[VolumeData, Colours | None]]
 
 
 class TimePanel:
@@ -42,7 +43,7 @@ class TimePanel:
     def _show(self, step: int) -> None:
         if not isinstance(step, int) or not 0 <= step < self._steps.count:
             raise IrrcacheError(f"there is no time step {step!r}.")
-        volume = self._steps.read(step)
+        volume, colours = self._steps.read(step)
         if volume.values.shape != self._appearance.volume.values.shape:
             raise IrrcacheError(f"time step {step} has another size: {volume.size}.")
-        self._appearance.change(self._session.edit, volume=volume)
+        self._appearance.change(self._session.edit, volume=volume, colours=colours)

@@ -22,7 +22,7 @@ from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.comparison import Compared, described
 from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.export_panel import ExportPanel
-from mitsuba_irrcache.view.picture import KINDS, MARKED, TONES, Look
+from mitsuba_irrcache.view.picture import EXPOSURES, KINDS, MARKED, TONES, Look
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 
@@ -53,13 +53,13 @@ class Visitor:
         self._gone = False
         self._noted = 0.0
         self._view: View | None = None
-        self._look = Look()
+        self._look = Look(exposure=session.exposure)
         self.window = session.open(self._show)
         self._add_controls(client.gui)
         client.camera.on_update(self._camera_moved)
-        if self._aspect < 1:
-            self._go_to(self._sensor.value)  # the first camera was placed for wide windows
-        self._look_again()
+        # Windows that were open before the scene was loaded have viser's camera, and the first
+        # camera was placed for wide windows.
+        self._go_to(self._sensor.value)
 
     def close(self) -> None:
         """Release the window after the browser has disconnected."""
@@ -80,7 +80,7 @@ class Visitor:
                 "camera", cameras, initial_value=cameras[0], visible=len(cameras) > 1
             )
             self._kind = gui.add_dropdown("show", KINDS)
-            self._exposure = gui.add_slider("exposure, EV", -8.0, 8.0, 0.1, 0.0)
+            self._exposure = gui.add_slider("exposure, EV", *EXPOSURES, 0.1, self.session.exposure)
             self._compare = gui.add_dropdown(
                 "volpath", COMPARISONS,
                 hint="compare with volpath, which is refined while no camera moves: swipe with the "
@@ -89,10 +89,8 @@ class Visitor:
             self._reset = gui.add_button("reset camera", color="gray")
             gui.add_html(f'<irrcache-window key="{self._key}"></irrcache-window>')
         with gui.add_folder("Camera and tone", order=5, expand_by_default=False):
-            fov = math.degrees(self.client.camera.fov)
-            self._fov = gui.add_slider(
-                "field of view, °", NARROWEST, WIDEST, 0.5, min(max(round(fov, 1), 1.0), 150.0)
-            )
+            fov = self.session.cameras[cameras[0]].fov
+            self._fov = gui.add_slider("field of view, °", NARROWEST, WIDEST, 0.5, fov)
             self._tone = gui.add_dropdown("tone mapping", tuple(TONES))
             self._filter = gui.add_checkbox(
                 "filter", False, hint="of the illumination; weaker as the caches converge"
@@ -115,6 +113,8 @@ class Visitor:
             raise IrrcacheError(f"{kind!r}, {tone!r}, exposure {exposure!r}: nothing to be shown.")
         if self._compare.value not in COMPARISONS:
             raise IrrcacheError(f"{self._compare.value!r} is no comparison.")
+        if self._compare.value != "off" and self.session.light.is_emissive:
+            raise IrrcacheError("volpath does not render the emission of media.")
         colour = tuple(_linear(c) for c in self._background.value)
         self._look = Look(kind, float(exposure), tone, bool(self._filter.value), colour)
         self._look_again()

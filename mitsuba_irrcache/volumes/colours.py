@@ -10,6 +10,7 @@ import numpy as np
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.options import MissingItemError
+from mitsuba_irrcache.volumes.transfer import DensityMapping, TransferFunction
 
 #: What the colours of a file may be, by the option ``--colour``.
 USES = ("albedo", "emission", "extinction")
@@ -29,6 +30,27 @@ class ColourVolume:
 
     density: VolumeData
     rgb: tuple[VolumeData, VolumeData, VolumeData]
+
+
+@dataclass(frozen=True)
+class Colours:
+    """Linear colours of a volume: ``values`` (z, y, x, 3), and their ``use``, one of `USES`.
+
+    The values of extinctions are multiplied by the factor of a density.
+    """
+
+    use: str
+    values: np.ndarray
+
+    def apply(
+        self, mapping: TransferFunction | DensityMapping, sigma_t: np.ndarray, albedo: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Return extinction, albedo and emission, given those of the ``mapping`` of a density."""
+        if self.use == "extinction":
+            return mapping.apply(self.values)[0], albedo, None
+        if self.use == "albedo":
+            return sigma_t, self.values, None
+        return sigma_t, albedo, self.values
 
 
 def read_colours(source: str, use: str, read: Callable[[int], VolumeData]) -> ColourVolume:

@@ -15,7 +15,7 @@ from mitsuba_irrcache.core.argument_types import argument, finite, finite_number
 from mitsuba_irrcache.core.stage_display import StageDisplay
 from mitsuba_irrcache.errors import IrrcacheError, suggestion
 from mitsuba_irrcache.volumes import processing, transfer_files
-from mitsuba_irrcache.volumes.colours import USES, ColourVolume, linear, read_colours
+from mitsuba_irrcache.volumes.colours import USES, Colours, ColourVolume, linear, read_colours
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.detached import OPTION
 from mitsuba_irrcache.volumes.formats import format_of, suffixes
@@ -35,6 +35,8 @@ CLOUD_ASYMMETRY = 0.85
 #: Radiance of the sky and irradiance of the sun in scenes of clouds, in arbitrary units.
 CLOUD_SKY, CLOUD_SUN = 0.1, 4.0
 _PHANTOMS = ("thorax", "cloud")
+#: Voxels of phantoms for a first look.
+SMALL = "64,40,55"
 # Air is -1000 HU; data in Hounsfield units without air are rare.
 _AIR_LIKE = -200
 
@@ -188,22 +190,52 @@ def _write(
     return 0
 
 
-def read(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | DensityMapping]:
+def read(
+    args: argparse.Namespace,
+) -> tuple[VolumeData, TransferFunction | DensityMapping, Colours | None]:
     """Read the volume given by ``args`` at the requested resolution, and its appearance."""
     if args.colour is not None:
-        raise IrrcacheError(
-            f"{args.input[0]}: --colour is for irrcache import; import the file, and view the scene"
-        )
+        return _read_in_colour(args)
     volume, mapping = _volume(args)
+    return _resampled(volume, args), mapping, None
+
+
+def _read_in_colour(
+    args: argparse.Namespace,
+) -> tuple[VolumeData, TransferFunction | DensityMapping, Colours]:
+    _check_appearance(args)
+    mapping = _mapping(args)
+    _check_colour(args, mapping)
+    channels = read_colours(args.input[0], args.colour, lambda number: _read(args, number))
+    density = _resampled(_process(channels.density, args), args)
+    if args.colour == "extinction":
+        parts = [_resampled(_process(channel, args), args).values for channel in channels.rgb]
+        rgb = np.stack(parts, axis=-1).astype(np.float32)
+    else:
+        rgb = _resampled_rgb(channels, density.size, args)
+    if args.colour == "albedo":
+        rgb = np.minimum(rgb, 1.0)
+    return density, mapping, Colours(args.colour, rgb)
+
+
+def read_small(
+    args: argparse.Namespace,
+) -> tuple[VolumeData, TransferFunction | DensityMapping] | None:
+    """Make a volume like that of `read` in few voxels; None where a file has to be read."""
+    name = args.input[0].removeprefix("phantom:").partition(":")[0]
+    if not _is_phantom(args) or name not in _PHANTOMS or args.crop is not None:
+        return None
+    return _volume(argparse.Namespace(**vars(args) | {"input": [f"phantom:{name}:{SMALL}"]}))
+
+
+def _resampled(volume: VolumeData, args: argparse.Namespace) -> VolumeData:
+    """Return a volume at the requested resolution."""
     size = _target_size(volume, args)
-    return volume if size == volume.size else processing.resample(volume, size), mapping
+    return volume if size == volume.size else processing.resample(volume, size)
 
 
 def _volume(args: argparse.Namespace) -> tuple[VolumeData, TransferFunction | DensityMapping]:
-    if not has_appearance(args):
-        raise IrrcacheError(
-            f"{args.input[0]}: give --preset, --transfer-function, --density or --cloud."
-        )
+    _check_appearance(args)
     mapping = _mapping(args)
     volume = _process(_read(args), args)
     _warn_about_unit(volume, mapping)
@@ -223,6 +255,13 @@ def scene_settings(args: argparse.Namespace, integrator: str = "volpath") -> Sce
     )
     # A cloud that absorbs nothing is invisible before a uniform environment: add a sun.
     return replace(settings, radiance=CLOUD_SKY, sun=CLOUD_SUN) if args.cloud else settings
+
+
+def _check_appearance(args: argparse.Namespace) -> None:
+    if not has_appearance(args):
+        raise IrrcacheError(
+            f"{args.input[0]}: give --preset, --transfer-function, --density or --cloud."
+        )
 
 
 def has_appearance(args: argparse.Namespace) -> bool:
@@ -362,7 +401,7 @@ def _mapping(args: argparse.Namespace) -> TransferFunction | DensityMapping:
 
 def _read(args: argparse.Namespace, channel: int | None = None) -> VolumeData:
     source = args.input[0]
-    if source.partition(":")[0] == "phantom" and len(args.input) == 1:
+    if _is_phantom(args):
         return _phantom(source)
     raw = None
     if args.raw_shape is not None:
@@ -383,6 +422,10 @@ def _read(args: argparse.Namespace, channel: int | None = None) -> VolumeData:
         ),
         cloud=_cloud(args),
     )
+
+
+def _is_phantom(args: argparse.Namespace) -> bool:
+    return args.input[0].partition(":")[0] == "phantom" and len(args.input) == 1
 
 
 def _cloud(args: argparse.Namespace) -> CloudVariables | None:

@@ -78,14 +78,14 @@ def viewer(arguments: Sequence[str], log: Path) -> Iterator[str]:
 class Window:
     """A browser window that displays the viewer."""
 
-    def __init__(self, page: Page, address: str) -> None:
+    def __init__(self, page: Page, address: str, script: str = "") -> None:
         self.page = page
         page.set_default_timeout(1000 * PATIENCE)
         #: console messages: (kind, text)
         self.console: list[tuple[str, str]] = []
         page.on("console", lambda message: self.console.append((message.type, message.text)))
         page.on("pageerror", lambda error: self.console.append(("error", str(error))))
-        page.add_init_script(_HOOKS)
+        page.add_init_script(_HOOKS + script)
         self.opened = time.time()
         page.goto(f"{address}{'&' if '?' in address else '?'}fixedDpr=1")
 
@@ -234,7 +234,7 @@ class Browser:
         self._browser.close()
         self._playwright.stop()
 
-    def open(self, address: str, size: tuple[int, int] = (512, 512)) -> Window:
-        """Open a new window of this (width, height)."""
+    def open(self, address: str, size: tuple[int, int] = (512, 512), script: str = "") -> Window:
+        """Open a new window of this (width, height), with a ``script`` that runs in its page."""
         page = self._browser.new_page(viewport={"width": size[0], "height": size[1]})
-        return Window(page, address)
+        return Window(page, address, script)

@@ -114,11 +114,11 @@
     if (former) URL.revokeObjectURL(former);
   }
 
-  /** Show an image until the first one for this window arrives. */
+  /** Show an image until the first one for this window arrives; windows that open later have none. */
   function preview(bytes) {
-    const image = find("preview"), done = !bytes || !bytes.length || !find("note").hidden;
-    image.hidden = done;
-    if (done) return;
+    const image = find("preview");
+    if (!bytes.length || !find("note").hidden) return;
+    image.hidden = false;
     image.src = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
     image.onload = image.onerror = () => URL.revokeObjectURL(image.src);
   }
@@ -148,7 +148,10 @@
     irrcache.receive("axes", (value) => { labels = value; if (rows) axes(rows, labels); });
     irrcache.receive("wait", (text) => { waiting = text; message(); });
     irrcache.receive("connection", (text) => { lost = text; message(); });
-    irrcache.receive("note", (text) => { set("note", text); preview(null); });
+    irrcache.receive("note", (text) => {
+      set("note", text);
+      if (text.endsWith("per pixel")) find("preview").hidden = true; // an image, no message
+    });
     irrcache.receive("preview", preview);
     irrcache.receive("hint", (text) => set("hint", text));
     irrcache.receive("comparison", compare);

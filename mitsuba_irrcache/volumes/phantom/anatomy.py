@@ -7,10 +7,10 @@ plane, z = 0 lies in the second lumbar vertebra and z = 330 in the neck.
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from mitsuba_irrcache.volumes.phantom.canvas import Tissue
 from mitsuba_irrcache.volumes.phantom.distance import Trunk
+from mitsuba_irrcache.volumes.phantom.splines import monotone
 
 LOWER = (-190.0, -120.0, 0.0)
 UPPER = (190.0, 120.0, 330.0)
@@ -89,7 +89,7 @@ SPINE = np.array(
 
 def spine_y(z: np.ndarray | float) -> np.ndarray:
     """Return the y of the centre of the vertebral column at height ``z``, mm."""
-    return PchipInterpolator(SPINE[:, 0], SPINE[:, 1])(np.clip(z, SPINE[0, 0], SPINE[-1, 0]))
+    return monotone(SPINE[:, 0], SPINE[:, 1])(np.clip(z, SPINE[0, 0], SPINE[-1, 0]))
 
 
 def spine_axis(z: float) -> np.ndarray:

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator
+
+from mitsuba_irrcache.volumes.phantom.splines import Curve, monotone, smooth
 
 Bounds = tuple[np.ndarray, np.ndarray]
 
@@ -105,7 +106,7 @@ def smooth_curve(points: Sequence[Sequence[float]], count: int, reach: float = 1
     points = np.asarray(points, dtype=np.float64)
     chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
     position = np.concatenate([[0.0], np.cumsum(chords)])
-    return CubicSpline(position, points)(np.linspace(0, reach * position[-1], count))
+    return smooth(position, points)(np.linspace(0, reach * position[-1], count))
 
 
 @dataclass(frozen=True)
@@ -173,11 +174,11 @@ class Trunk:
 
     profile: np.ndarray
     exponent: float = 2.5
-    _curves: PchipInterpolator = field(init=False, repr=False)
+    _curves: Curve = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         rows = np.asarray(self.profile, dtype=np.float64)
-        object.__setattr__(self, "_curves", PchipInterpolator(rows[:, 0], rows[:, 1:]))
+        object.__setattr__(self, "_curves", monotone(rows[:, 0], rows[:, 1:]))
 
     def inset(self, thickness: float) -> Trunk:
         """Return the trunk within this one, ``thickness`` mm below its sides."""
@@ -230,4 +231,4 @@ class Trunk:
     def _slope(self, z: np.ndarray) -> np.ndarray:
         low, high = np.asarray(self.profile)[[0, -1], 0]
         within = ((z >= low) & (z <= high))[..., None]
-        return np.where(within, self._curves(np.clip(z, low, high), 1), 0).astype(np.float32)
+        return np.where(within, self._curves.slope(np.clip(z, low, high)), 0).astype(np.float32)

@@ -11,9 +11,11 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.appearance import WHOLE, Appearance, cropped
 from mitsuba_irrcache.view.comparison import _finest, false_colours, rounded
 from mitsuba_irrcache.view.crop_panel import checked_box
+from mitsuba_irrcache.volumes.colours import Colours
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.options import MissingItemError, picked
-from mitsuba_irrcache.volumes.transfer import load_preset
+from mitsuba_irrcache.volumes.scene import ALBEDO_FILE, EMISSION_FILE, SIGMA_T_FILE
+from mitsuba_irrcache.volumes.transfer import DensityMapping, load_preset
 
 
 def test_crop_boxes_keep_whole_voxels():
@@ -37,6 +39,47 @@ def test_empty_boxes_are_refused():
     appearance.box = ((0.0, 0.5), (0.0, 1.0), (0.0, 1.0))
     with pytest.raises(IrrcacheError, match="crop box"):
         appearance.grids(appearance.mapping)
+
+
+@pytest.mark.parametrize("use", ["albedo", "emission", "extinction"])
+def test_colours_of_a_file_are_those_of_the_medium(use):
+    """The crop box cuts what is coloured, too."""
+    rng = np.random.default_rng(0)
+    density = rng.uniform(0.1, 1, (4, 5, 6)).astype(np.float32)
+    rgb = rng.uniform(0.1, 1, (4, 5, 6, 3)).astype(np.float32)
+    mapping = DensityMapping(2.0, (0.5, 0.6, 0.7))
+    appearance = Appearance(VolumeData(density), mapping, colours=Colours(use, rgb))
+    grids = appearance.grids(mapping)
+    sigma_t = 2 * rgb if use == "extinction" else 2 * density
+    albedo = rgb if use == "albedo" else np.broadcast_to(np.float32(mapping.albedo), rgb.shape)
+    np.testing.assert_allclose(grids[SIGMA_T_FILE], sigma_t)
+    np.testing.assert_allclose(grids[ALBEDO_FILE], albedo)
+    assert (EMISSION_FILE in grids) == (use == "emission")
+    appearance.box = ((0.0, 0.5), (0.0, 1.0), (0.0, 1.0))
+    for name in {SIGMA_T_FILE, EMISSION_FILE} & set(grids):
+        cut = appearance.grids(mapping)[name]
+        np.testing.assert_array_equal(cut[:, :, :3], grids[name][:, :, :3])
+        assert not cut[:, :, 3:].any()
+
+
+def test_coarse_volumes_lie_where_the_whole_ones_do():
+    """Voxels of a coarse volume are voxels of the whole one, at their places."""
+    z, y, x = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (200, 60, 130)), indexing="ij")
+    volume = VolumeData(
+        1 + z * 1e-3, spacing=(1, 2, 3), origin=(5, 6, 7), direction=np.eye(3)[[1, 0, 2]]
+    )
+    colours = Colours("albedo", np.stack([x, y, z], axis=-1))
+    coarse = Appearance(volume, DensityMapping(), colours=colours).coarse()
+    assert max(coarse.volume.size) < 80
+    assert coarse.colours.values.shape == (*coarse.volume.values.shape, 3)
+    for index in np.ndindex(2, 2, 2):
+        place = coarse.volume.index_to_world @ [*index, 1]
+        found = coarse.colours.values[index[::-1]]
+        np.testing.assert_allclose(volume.index_to_world @ [*found, 1], place)
+    low, high = (coarse.volume.to_world @ [*corner, 1] for corner in ((0,) * 3, (1,) * 3))
+    step = 2 * np.max(coarse.volume.spacing)
+    np.testing.assert_allclose(low, volume.to_world @ [0, 0, 0, 1], atol=step)
+    np.testing.assert_allclose(high, volume.to_world @ [1, 1, 1, 1], atol=step)
 
 
 def test_missing_time_steps_tell_how_many_there_are():

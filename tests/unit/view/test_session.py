@@ -18,12 +18,17 @@ from mitsuba_irrcache.io.images import read_image
 from mitsuba_irrcache.view import picture
 from mitsuba_irrcache.view import session as sessions
 from mitsuba_irrcache.view import window as windows
+from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.keep import keep
 from mitsuba_irrcache.view.picture import KINDS, Look, Samples
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
+from mitsuba_irrcache.volumes.colours import Colours
+from mitsuba_irrcache.volumes.data import VolumeData
+from mitsuba_irrcache.volumes.scene import SceneSettings
+from mitsuba_irrcache.volumes.transfer import DensityMapping
 from tests.support.viewer_session import PATIENCE, SCENE, SIZE, Screen, drag, front, turned
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -268,3 +273,35 @@ def test_unsupported_scenes_raise_errors(path, tmp_path):
     with pytest.raises(IrrcacheError, match="no medium"):
         session.start()
     session.stop()
+
+
+def test_emission_is_displayed(tmp_path):
+    """Media emit in the viewer, too, and its exposure is that of what they emit."""
+    values = np.zeros((8, 8, 8), np.float32)
+    values[2:6, 2:6, 2:6] = 0.1
+    red = np.zeros((8, 8, 8, 3), np.float32)
+    red[2:6, 2:6, 2:6, 0] = 50
+    volume, mapping = VolumeData(values), DensityMapping()
+    appearance = Appearance(volume, mapping, colours=Colours("emission", red))
+    settings = SceneSettings(integrator="irrcache", radiance=0, hide_emitters=True)
+    session = Session(appearance.document(settings))
+    session.start()
+    try:
+        assert session.exposure == pytest.approx(-np.log2(4 * 50), abs=1)
+        centre = session.first_look[120, 240]
+        assert centre[0] > 200 and not centre[1:].any() and not session.first_look[0, 0].any()
+        assert session.light.is_emissive
+        screen = Screen()
+        window = session.open(screen.show)
+        session.look(window, View(front(session), SIZE, Look(exposure=session.exposure)))
+        shown = screen.wait(lambda p: not p.moving).pixels[SIZE[1] // 2, SIZE[0] // 2]
+        assert shown[0] > 200 and not shown[1:].any()
+    finally:
+        session.stop()
+
+
+def test_exposures_suit_bright_and_dark_images():
+    image = np.ones((10, 10, 3)) * 8
+    assert picture.exposure_of(image) == -3
+    assert picture.exposure_of(0 * image) == 0
+    assert picture.exposure_of(1e9 * image) == picture.EXPOSURES[0]

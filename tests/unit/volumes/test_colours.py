@@ -14,6 +14,8 @@ import pytest
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.images import write_pixels
 from mitsuba_irrcache.io.mitsuba_vol import read_vol, write_vol
+from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.view.appearance import Appearance
 from mitsuba_irrcache.volumes import importer
 from tests.support.volume_files import VTK_FILES
 
@@ -235,3 +237,35 @@ def test_incomplete_pictures_are_refused(tmp_path, change, message):
         imported(folder, "--density", "--channel", 0)
     with pytest.raises(IrrcacheError, match=r"s8\.png is one slice; give a folder"):
         imported(folder / "s8.png", "--density", output="../out")
+
+
+@pytest.mark.parametrize("use", ["albedo", "emission", "extinction"])
+def test_what_the_viewer_reads_is_what_is_imported(tmp_path, use):
+    """Extinction, albedo and emission, with steps of processing."""
+    channels = 3 if use == "extinction" else 4
+    source = saved(tmp_path, colours(channels))
+    options = ["--colour", use, "--density", "2", "--flip", "x", "--crop", "1:9,:,:"]
+    folder = imported(source, *options)
+    parser = argparse.ArgumentParser()
+    importer.add_input(parser)
+    importer.add_options(parser)
+    volume, mapping, found = importer.read(parser.parse_args([str(source), *options]))
+    grids = Appearance(volume, mapping, colours=found).grids(mapping)
+    assert (folder / "emission.vol").exists() == ("emission.vol" in grids)
+    for name, values in grids.items():
+        read = read_vol(folder / name)[0]
+        values = values.reshape(*values.shape[:3], -1)
+        expected = np.broadcast_to(read, values.shape)  # grey albedo has one channel
+        np.testing.assert_allclose(values, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_another_integrator_inherits_the_emission(tmp_path):
+    """It belongs to the scene; volpath has none."""
+    folder = imported(saved(tmp_path, colours()), "--colour", "emission", "--density", 0.01)
+    parameters = {"width": "8", "height": "8", "spp": "4", "radiance": "0"}
+    images = [
+        np.array(mi.render(load_scene(folder / "scene.xml", parameters, name), seed=1)).mean()
+        for name in (None, "irrcache{step=0.9}", "irrcache{emission_scale=3}", "volpath")
+    ]
+    assert images[0] > 0.1
+    np.testing.assert_allclose(images[1:], [images[0], 3 * images[0], 0], rtol=0.02)
