@@ -36,6 +36,7 @@ from mitsuba_irrcache.render.tolerance import Certificate
 if TYPE_CHECKING:  # most programs compute no gradients: their modules are imported on use
     from mitsuba_irrcache.gradients.backward import ParameterAdjoint
     from mitsuba_irrcache.gradients.operations import SharedIrradiance
+    from mitsuba_irrcache.out_of_core.rendering import MappedMedium
 
 
 class IrradianceCachingIntegrator(mi.SamplingIntegrator):
@@ -341,6 +342,11 @@ class IrradianceCachingIntegrator(mi.SamplingIntegrator):
     def depends_on_view(self) -> bool:
         """Whether a ``tolerance`` chooses the caches anew for every view."""
         return self._source.depends_on_view
+
+    @property
+    def mapped_medium(self) -> MappedMedium | None:
+        """The medium whose extinction is in ``sigma_t_file``, if that is set."""
+        return self._source.mapped
 
     def cached_media(self, scene: mi.Scene) -> list[CachedMedium]:
         """Return the visible media of ``scene``, each with its cache as far as it is filled."""

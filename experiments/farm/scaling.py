@@ -35,6 +35,7 @@ from mitsuba_irrcache.farm.cache import CacheRun
 from mitsuba_irrcache.farm.cluster import ClusterOptions, add_cluster_options, connected
 from mitsuba_irrcache.farm.jobs import Environment, scene_arguments
 from mitsuba_irrcache.farm.results import Outcome
+from mitsuba_irrcache.io.scene_files import load_scene
 
 JOBS = 16
 #: Settings of each solver: jobs of 64 batches, and of one batch.
@@ -85,7 +86,8 @@ def _parts(settings: dict) -> tuple[float, float, int]:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         arguments = scene_arguments(SCENE, {}, specification)
-        run = CacheRun(arguments, environment, folder / "light.cache", False)
+        scene = load_scene(SCENE, {}, specification)
+        run = CacheRun(arguments, scene, environment, folder / "light.cache", False)
         for job in run.begin():
             made = folder / job.name
             made.mkdir()

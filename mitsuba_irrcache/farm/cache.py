@@ -6,11 +6,12 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import mitsuba as mi
+
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.jobs import Environment, Job
 from mitsuba_irrcache.farm.results import Checkpoints, OrderedParts, Outcome, Results
-from mitsuba_irrcache.io.scene_files import load_scene
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.pipeline.stream_parts import missing_parts
 
@@ -23,14 +24,18 @@ class CacheRun:
     the order in which they arrive.
     """
 
-    def __init__(self, scene: dict, environment: Environment, file: Path, resume: bool) -> None:
-        """``scene`` is a result of `scene_arguments`. Raises IrrcacheError where no cache can be
-        made, or if there are files, unless this is to ``resume``.
+    def __init__(
+        self, scene: dict, loaded: mi.Scene, environment: Environment, file: Path, resume: bool
+    ) -> None:
+        """``scene`` is a result of `scene_arguments` for the ``loaded`` one.
+
+        Raises IrrcacheError where no cache can be made, or if there are files, unless this is to
+        ``resume``.
         """
         self._arguments, self._environment = scene, environment
         self._results = Results(file.with_name(f"{file.name}.parts"))
-        self._scene = load_scene(scene["scene"], scene["parameters"], scene["integrator"])
-        integrator = self._scene.integrator()
+        self._scene = loaded
+        integrator = loaded.integrator()
         if not hasattr(integrator, "cached_media"):
             raise IrrcacheError(f'"{scene["scene"]}" is rendered without a cache; add -i irrcache.')
         media = enumerate(integrator.cached_media(self._scene))

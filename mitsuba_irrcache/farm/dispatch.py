@@ -71,6 +71,7 @@ class Dispatch:
         self._answered: queue.Queue[str] = queue.Queue()
         self._counts: dict[str, Counter] = {"error": Counter(), "killed": Counter()}
         self._durations: list[float] = []
+        self._failures = 0
         self._workers: list[str] = []
         self._looked, self._refilled = 0.0, time.monotonic()
         self._seen = self._reminded = time.monotonic()
@@ -177,7 +178,7 @@ class Dispatch:
 
     def _repeat_slow(self) -> None:
         """Give jobs that take unusually long to workers that have nothing else to do."""
-        if self._waiting or not self._durations:
+        if self._next_ready() is not None or not self._durations:
             return
         jobs_by_worker = self._client.processing()
         idle = [address for address in self._fit if not jobs_by_worker.get(address)]
@@ -195,11 +196,15 @@ class Dispatch:
         if self._client.status != "running" or (self.unfit and not self._fit):
             return
         room = JOBS_PER_WORKER * max(len(self._fit), 1) - len(self._attempts)
-        while self._waiting and room > 0:
-            job = self._waiting.popleft()
-            if job.name in self._open:
-                self._submit(job)
-                room -= 1
+        while room > 0 and (job := self._next_ready()) is not None:
+            self._waiting.remove(job)
+            self._submit(job)
+            room -= 1
+
+    def _next_ready(self) -> Job | None:
+        """The first job that waits for no other."""
+        ready = (job for job in self._waiting if not any(n in self._open for n in job.after))
+        return next(ready, None)
 
     def _submit(self, job: Job, workers: list[str] | None = None) -> None:
         """Submit a job, for some ``workers`` only if they are given, or if others are unfit."""
@@ -282,9 +287,22 @@ class Dispatch:
             "whether there is enough memory",
         )
 
-    def _fail(self, job: Job, message: str) -> None:
+    def _give_up(self, job: Job, message: str) -> None:
+        """Leave out a job, and all that need it."""
         self.failed[job.name] = message
         self._open.pop(job.name, None)
+        lost = [job.name]
+        while lost:
+            name = lost.pop()
+            for other in [other for other in self._waiting if name in other.after]:
+                self._waiting.remove(other)
+                self._open.pop(other.name, None)
+                self.failed[other.name] = f"it needs {name}, which failed"
+                lost.append(other.name)
+
+    def _fail(self, job: Job, message: str) -> None:
         print(f"{job.name} failed: {message}", flush=True)
-        if len(self.failed) >= FAILURES and not self._durations:
+        self._give_up(job, message)
+        self._failures += 1
+        if self._failures >= FAILURES and not self._durations:
             raise IrrcacheError(f"the first {FAILURES} jobs failed; {job.name}: {message}")

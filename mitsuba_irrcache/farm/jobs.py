@@ -11,10 +11,15 @@ from pathlib import Path
 import mitsuba as mi
 
 from mitsuba_irrcache.compare.scene_files import scene_digest
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.machine.versions import DISTRIBUTION, installed_version
 
 #: Packages that have to be of the same version on all machines.
 SOFTWARE = (DISTRIBUTION, "mitsuba", "drjit")
+
+
+class UnfitWorkerError(IrrcacheError):
+    """This worker cannot run a job, while others may."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +54,14 @@ class Job:
         kind: one of `work.KINDS`.
         arguments: JSON-serialisable.
         environment: that of the run.
+        after: names of jobs that have to be finished before this one starts.
     """
 
     name: str
     kind: str
     arguments: dict
     environment: Environment
+    after: tuple[str, ...] = ()
 
     @cached_property
     def digest(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
 from mitsuba_irrcache.farm.references import ReferenceRun
 from mitsuba_irrcache.farm.results import Outcome, Results
 from mitsuba_irrcache.farm.studies import SceneStudy, arguments_by_scene
+from mitsuba_irrcache.farm.volume import FarmSweep
 from mitsuba_irrcache.io.scene_files import (
     check_scene_file,
     load_scene,
@@ -29,6 +31,9 @@ from mitsuba_irrcache.io.scene_files import (
     parse_parameters,
 )
 from mitsuba_irrcache.machine.llvm import require_llvm
+from mitsuba_irrcache.machine.memory import total_memory
+from mitsuba_irrcache.out_of_core.rendering import memory_beside_python
+from mitsuba_irrcache.out_of_core.survey import MappedField
 
 Store = Callable[[Job, Outcome], None]
 
@@ -39,8 +44,11 @@ def run_cache(args: argparse.Namespace) -> int:
     scene, parameters, integrator = _scene(args)
     _check_parent(args.output)
     integrator = chosen_integrator(scene, parameters, integrator)
+    loaded = load_scene(scene, parameters, integrator)
+    if getattr(loaded.integrator(), "mapped_medium", None) is not None:
+        return _fill_volume(args, options, environment, loaded)
     arguments = scene_arguments(scene, parameters, integrator)
-    cache = CacheRun(arguments, environment, args.output, args.resume)
+    cache = CacheRun(arguments, loaded, environment, args.output, args.resume)
     try:
         status = _dispatch(options, cache.begin(), cache.store)
     finally:
@@ -48,6 +56,31 @@ def run_cache(args: argparse.Namespace) -> int:
     if complete:
         print(f"wrote {', '.join(cache.files)}")
     return status
+
+
+def _fill_volume(
+    args: argparse.Namespace, options: ClusterOptions, environment: Environment, scene: mi.Scene
+) -> int:
+    """Fill the irradiance of a medium whose extinction is in a file."""
+    file, parts = args.output, args.output.with_name(f"{args.output.name}.parts")
+    present = [path for path in (file, parts) if path.exists()]
+    if present and not args.resume:
+        raise IrrcacheError(
+            f'"{present[0]}" exists already; add --resume to continue it, or name another file.'
+        )
+    medium = scene.integrator().mapped_medium
+    medium.use_file(file)
+    sharing = 1 if options.scheduler else options.workers
+    memory = memory_beside_python(medium.max_memory or total_memory() // (2 * sharing))
+    with terminated_like_interrupted(), connected(options) as connection:
+
+        def begin(sigma_t: MappedField, inputs: str) -> FarmSweep:
+            return FarmSweep(sigma_t, parts, memory, connection, environment, inputs)
+
+        medium.compute(scene, begin, None)
+    shutil.rmtree(parts, ignore_errors=True)
+    print(f"wrote {file}")
+    return 0
 
 
 def run_frames(args: argparse.Namespace) -> int:

@@ -20,8 +20,9 @@ from mitsuba_irrcache.cli.render import described
 from mitsuba_irrcache.compare.command import measure_integrator
 from mitsuba_irrcache.compare.reference import render_halves
 from mitsuba_irrcache.compare.scene_files import scene_digest
-from mitsuba_irrcache.errors import IrrcacheError, original_message
-from mitsuba_irrcache.farm.jobs import Environment, difference, software
+from mitsuba_irrcache.errors import original_message
+from mitsuba_irrcache.farm import volume_jobs
+from mitsuba_irrcache.farm.jobs import Environment, UnfitWorkerError, difference, software
 from mitsuba_irrcache.farm.results import Outcome
 from mitsuba_irrcache.io.images import write_image
 from mitsuba_irrcache.io.scene_files import load_scene
@@ -32,10 +33,6 @@ from mitsuba_irrcache.pipeline.stream_parts import StreamParts
 #: Held by the thread that works: a worker with several threads runs one job at a time, since Dr.Jit
 #: uses all cores.
 _WORKING = threading.Lock()
-
-
-class UnfitWorkerError(IrrcacheError):
-    """This worker cannot run a job, while others may."""
 
 
 class _Kept:
@@ -116,7 +113,8 @@ def cache_part(arguments: dict, folder: Path) -> None:
 def frame(arguments: dict, folder: Path) -> None:
     """Render an image; the caches of the last frame are used again where they fit."""
     scene = _loaded(arguments["scene"])
-    if not getattr(scene.integrator(), "depends_on_view", True):
+    integrator = scene.integrator()
+    if not getattr(integrator, "depends_on_view", True) and integrator.mapped_medium is None:
         _prepare(scene)
     sensor, seed, spp = (arguments[name] for name in ("sensor", "seed", "spp"))
     image = np.array(mi.render(scene, sensor=sensor, seed=seed, spp=spp))
@@ -196,4 +194,6 @@ KINDS = {
     "frame": frame,
     "reference_part": reference_part,
     "measurement": measurement,
+    "cross_slabs": volume_jobs.cross_slabs,
+    "add_axes": volume_jobs.add_axes,
 }

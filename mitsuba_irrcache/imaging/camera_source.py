@@ -36,12 +36,13 @@ class CameraRaySource:
         self.builder = options.builder(options.settings)
         self._search = options.tolerance_search()
         self._step = options.rays.step  # replaced by the step that the search finds
-        self._mapped: MappedMedium | None = None
+        #: the medium whose extinction is in a file
+        self.mapped: MappedMedium | None = None
         if options.volume is not None:
             from mitsuba_irrcache.out_of_core.rendering import MappedMedium
 
             whole = not (self._search or options.rays.layered or options.emission is not None)
-            self._mapped = MappedMedium(options.settings, options.volume, whole)
+            self.mapped = MappedMedium(options.settings, options.volume, whole)
         #: estimated error of the last image with a ``tolerance``
         self.certificate: Certificate | None = None
         #: camera rays of the last scene whose caches are in memory
@@ -64,7 +65,7 @@ class CameraRaySource:
 
     def refuse_mapped(self, what: str) -> None:
         """Raise an error if the extinction of the medium is in a file."""
-        if self._mapped is not None:
+        if self.mapped is not None:
             raise IrrcacheError(
                 f"irrcache: {what} is not supported for a medium in sigma_t_file; remove "
                 "sigma_t_file, and reduce the volume to one that fits into memory."
@@ -108,7 +109,7 @@ class CameraRaySource:
                 progress = self._begin(progress)
             else:  # started by `meet_tolerance`
                 progress = self._stopping.raising(progress)
-            if self._mapped is not None:
+            if self.mapped is not None:
                 return self._mapped_camera_rays(scene, progress)
             try:
                 with dr.suspend_grad():
@@ -128,7 +129,7 @@ class CameraRaySource:
         options = self._options.rays
         try:
             with dr.suspend_grad():
-                return self._mapped.camera_rays(
+                return self.mapped.camera_rays(
                     scene, options.hide_emitters, options.quadrature, options.step, progress
                 )
         except Stopped:

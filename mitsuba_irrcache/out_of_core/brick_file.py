@@ -26,7 +26,8 @@ class BrickFile:
     def __init__(
         self, path: Path, shape: tuple[int, int, int], dtype: np.dtype, channels: int = 1
     ) -> None:
-        self.shape, self.channels, self.dtype = shape, channels, np.dtype(dtype)
+        self.path, self.shape = path, shape
+        self.channels, self.dtype = channels, np.dtype(dtype)
         self._counts = [-(-n // EDGE) for n in shape]
         self._bytes = EDGE**3 * channels * self.dtype.itemsize
         if not hasattr(os, "pread"):
@@ -36,7 +37,7 @@ class BrickFile:
             )
         self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         self.close = weakref.finalize(self, os.close, self._file)
-        size = int(np.prod(self._counts, dtype=object)) * self._bytes
+        size = self._size
         if os.fstat(self._file).st_size == size:
             return
         try:
@@ -50,6 +51,25 @@ class BrickFile:
                 f'irrcache: cannot create a working file of {size / 2**30:.1f} GiB at "{path}": '
                 f"{error.strerror}; set work_folder to a folder on another disk."
             ) from None
+
+    @classmethod
+    def existing(
+        cls, path: Path, shape: tuple[int, int, int], dtype: np.dtype, channels: int = 1
+    ) -> BrickFile:
+        """Open a file that is there; raise IrrcacheError if it is not, or is of another size."""
+        if not path.is_file():
+            raise IrrcacheError(f'the working file "{path}" is missing.')
+        bytes_there = path.stat().st_size
+        file = cls(path, shape, dtype, channels)
+        if bytes_there != file._size:
+            raise IrrcacheError(
+                f'the working file "{path}" has {bytes_there} bytes of {file._size}.'
+            )
+        return file
+
+    @property
+    def _size(self) -> int:
+        return int(np.prod(self._counts, dtype=object)) * self._bytes
 
     @classmethod
     def without_name(

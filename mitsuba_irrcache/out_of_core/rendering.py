@@ -93,7 +93,16 @@ class MappedMedium:
     @property
     def _memory(self) -> int:
         wanted = self._files.max_memory or int(SHARE * available_memory())
-        return max(wanted - BASE, 64 << 20)
+        return memory_beside_python(wanted)
+
+    @property
+    def max_memory(self) -> int:
+        """The property of the integrator [bytes]; 0 if it is not set."""
+        return self._files.max_memory
+
+    def use_file(self, path: Path) -> None:
+        """Replace ``irradiance_file``."""
+        self._files = replace(self._files, irradiance=str(path))
 
     def compute(self, scene: mi.Scene, begin: BeginSweep, progress: Progress | None) -> None:
         """Find the irradiance of a scene, by the sweeps that ``begin`` creates; an
@@ -184,6 +193,11 @@ class MappedMedium:
             return illumination.ordinates(1, pairs, rng)[0], np.ones(channels)
         sets, colour = illumination.factored_ordinates(1, pairs, channels, rng)
         return sets[0], colour
+
+
+def memory_beside_python(size: int) -> int:
+    """Bytes of a process of this size that are left for voxels."""
+    return max(size - BASE, 64 << 20)
 
 
 def _only_medium(scene: mi.Scene, description: SceneDescription) -> MediumGrid:

@@ -269,11 +269,9 @@ class AxisSweep:
         """The sums of one or two slabs as they were left, or 0, by slices; with the source, the
         four values of `Tracks.sweep`.
         """
-        shapes = [by_slices(np.empty(_shape(box), bool), self.axis).shape for box in boxes]
+        shapes = [self._shape_of_sums(box) for box in boxes]
         if self._source is None and all(part is None for part in parts):
-            voxels = sum(int(np.prod(shape)) for shape in shapes)
-            return dr.opaque(mi.Float, 0, voxels * self._channels)
-        shapes = [(*shape, self._channels) for shape in shapes]
+            return dr.opaque(mi.Float, 0, sum(int(np.prod(shape)) for shape in shapes))
         parts = [
             np.zeros(shape, np.float32) if part is None else part.reshape(shape)
             for part, shape in zip(parts, shapes, strict=True)
@@ -290,20 +288,27 @@ class AxisSweep:
     def _sums(self, values: mi.Float, boxes: list) -> list[np.ndarray]:
         """The sums of each slab, by slices."""
         place, first = slice_place(self.axis), 0
-        shape = list(by_slices(np.empty(_shape(boxes[0]), bool), self.axis).shape)
+        shape = list(self._shape_of_sums(boxes[0]))
         thickness = shape[place]
         shape[place] *= len(boxes)
         if self._source is not None:
             values = dr.gather(
                 mi.Float, values, 4 * dr.arange(mi.UInt32, dr.width(values) // 4) + 1
             )
-        sums, found = np.array(values).reshape(*shape, self._channels), []
+        sums, found = np.array(values).reshape(shape), []
         for _ in boxes:
             within: list = [slice(None)] * sums.ndim
             within[place] = slice(first, first + thickness)
             found.append(sums[tuple(within)])
             first += thickness
         return found
+
+    def shape_of_sums(self, slab: Slab) -> tuple[int, ...]:
+        """The shape of the sums of a slab, which are by slices."""
+        return self._shape_of_sums(self.box(slab))
+
+    def _shape_of_sums(self, box: tuple) -> tuple[int, ...]:
+        return (*by_slices(np.empty(_shape(box), bool), self.axis).shape, self._channels)
 
     def irradiance(self, sums: np.ndarray, box: tuple) -> np.ndarray:
         """The irradiance that the sums of a slab mean, in its ``box``: (z, y, x, channel)."""

@@ -34,7 +34,7 @@ class SlabTracks:
     """
 
     def __init__(self, grid: Grid, quantum: float) -> None:
-        self.grid = grid
+        self.grid, self.quantum = grid, quantum
         extinction = ExtinctionLayout(grid, grid, quantum, is_dense=False)
         self._layout = TrackLayout(extinction, (np.zeros(3, int), grid.resolution))
 

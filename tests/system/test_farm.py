@@ -93,3 +93,70 @@ def test_frames_equal_images_that_are_rendered_one_by_one(tmp_path, capsys):
     # Nothing is left to be done: no cluster is started.
     assert main(["farm", "frames", SCENE, "-o", str(frames), *varied, "--resume"]) == 0
     assert capsys.readouterr().out == f"3 of 3 frames are in {frames}\n"
+
+
+VOLUME = """<scene version="3.0.0">
+    <default name="light" value=""/>
+    <integrator type="irrcache">
+        <integer name="max_depth" value="-1"/>
+        <integer name="cache_spp" value="64"/>
+        <string name="sigma_t_file" value="density.npy"/>
+        <string name="max_memory" value="1GB"/>
+        <string name="irradiance_file" value="$light"/>
+    </integrator>
+    <sensor type="perspective">
+        <film type="hdrfilm">
+            <integer name="width" value="8"/> <integer name="height" value="8"/>
+        </film>
+        <transform name="to_world"> <lookat origin="0, 1, 5" target="0, 0, 0" up="0, 1, 0"/>
+        </transform>
+    </sensor>
+    <shape type="cube">
+        <bsdf type="null"/>
+        <medium name="interior" type="homogeneous">
+            <rgb name="sigma_t" value="1, 1, 1"/>
+            <rgb name="albedo" value="0.9, 0.8, 0.7"/>
+            <float name="scale" value="4"/>
+        </medium>
+    </shape>
+    <emitter type="directional">
+        <vector name="direction" x="0.4" y="-1" z="0.5"/>
+    </emitter>
+    <emitter type="constant"/>
+</scene>
+"""
+
+
+def test_a_volume_larger_than_memory_is_swept_by_workers_that_are_killed(tmp_path):
+    """The irradiance is that of one machine but for rounding, and always the same bits."""
+    rng = np.random.default_rng(1)
+    np.save(tmp_path / "density.npy", rng.random((72, 64, 80), dtype=np.float32))
+    scene, file = tmp_path / "scene.xml", tmp_path / "light.npy"
+    scene.write_text(VOLUME)
+    process = farm("cache", scene, "-o", file)
+    lines_until(process, 9)
+    kill_worker(process)
+    lines_until(process, 9)
+    process.kill()
+    process.communicate()
+    assert main(["farm", "cache", str(scene), "-o", str(file)]) == 1  # not without --resume
+    process = farm("cache", scene, "-o", file, "--resume")
+    lines_until(process, 20)
+    kill_worker(process)
+    said = process.communicate()[0]
+    assert process.returncode == 0 and f"wrote {file}" in said, said
+    assert not Path(f"{file}.parts").exists()
+    process = farm("cache", scene, "-o", tmp_path / "undisturbed.npy")
+    said = process.communicate()[0]
+    assert process.returncode == 0, said
+    assert file.read_bytes() == (tmp_path / "undisturbed.npy").read_bytes()
+    alone = load_scene(scene, {"light": str(tmp_path / "alone.npy")}, None)
+    expected = np.array(mi.render(alone, spp=1, seed=0))
+    np.testing.assert_allclose(np.load(file), np.load(tmp_path / "alone.npy"), rtol=1e-5)
+    # Frames read it, and so does an image.
+    frames = tmp_path / "frames"
+    process = farm("frames", scene, "-o", frames, "-D", f"light={file}", "--spp", "1")
+    said = process.communicate()[0]
+    assert process.returncode == 0, said
+    found = read_image(frames / "frame-0000.exr")
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)

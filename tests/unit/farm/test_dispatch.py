@@ -163,3 +163,41 @@ def test_a_lost_scheduler_is_reported():
 
     with pytest.raises(SchedulerLostError, match=r"1 of 3 jobs are finished and kept.*--resume"):
         Dispatch(Connection(cluster), jobs("first", "second", "third"), lose).run()
+
+
+def chain(*names: str) -> list[Job]:
+    """Return jobs, each of which needs the one before."""
+    before = ((), *((name,) for name in names))
+    return [
+        Job(name, "frame", {"name": name}, ENVIRONMENT, after)
+        for name, after in zip(names, before, strict=False)
+    ]
+
+
+def test_a_job_starts_when_those_that_it_needs_are_stored():
+    stored: list[str] = []
+    cluster = Cluster({"second": [Outcome("a", error="no space left")]})
+    names = ["first", "second", "third", "fourth"]
+    wanted = [*reversed(chain(*names)), *jobs("alone")]
+
+    def store(job, _):
+        assert [name for name, _ in cluster.submitted if name in names][-1] == job.name or (
+            job.name == "alone"
+        )
+        stored.append(job.name)
+
+    assert Dispatch(Connection(cluster), wanted, store).run() == {}
+    assert [name for name in stored if name != "alone"] == names and "alone" in stored
+
+
+def test_jobs_that_need_a_failed_one_are_given_up_with_it():
+    error = Outcome("a", error="no space left")
+    cluster, stored = Cluster({"second": [error] * dispatch.ATTEMPTS}), []
+    wanted = [*chain("first", "second", "third", "fourth"), *jobs("alone")]
+    failed = Dispatch(Connection(cluster), wanted, lambda job, _: stored.append(job.name)).run()
+    assert sorted(stored) == ["alone", "first"]
+    assert failed == {
+        "second": "no space left",
+        "third": "it needs second, which failed",
+        "fourth": "it needs third, which failed",
+    }

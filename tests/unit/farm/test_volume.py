@@ -1,0 +1,225 @@
+"""Sweeps of a volume by several workers find, bit by bit, what one machine finds by the same slabs,
+in whatever order, and however often, jobs are run.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.farm import volume, volume_jobs
+from mitsuba_irrcache.farm.cluster import Connection
+from mitsuba_irrcache.farm.jobs import Environment, UnfitWorkerError
+from mitsuba_irrcache.farm.results import Outcome
+from mitsuba_irrcache.farm.volume import FarmSweep
+from mitsuba_irrcache.farm.volume_jobs import SlabStep, by_length_of_way, steps_of
+from mitsuba_irrcache.farm.work import KINDS
+from mitsuba_irrcache.grids.grid import Grid
+from mitsuba_irrcache.out_of_core import slab_sweep
+from mitsuba_irrcache.out_of_core.slab_sweep import SlabSweep
+from mitsuba_irrcache.out_of_core.survey import MappedField
+from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
+from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import joint_ordinates
+
+SHAPE, MEMORY = (41, 37, 34), 1 << 30
+ENVIRONMENT = Environment("llvm_ad_rgb")
+
+
+@pytest.fixture
+def sigma_t(rgb, tmp_path):
+    """A noisy volume in a file, whose voxels are not cubes."""
+    np.save(tmp_path / "density.npy", np.random.default_rng(1).random(SHAPE, dtype=np.float32))
+    grid = Grid(SHAPE, np.diag([1.0, 1.2, 0.9, 1.0]))
+    return MappedField(VolumeFile(tmp_path / "density.npy"), grid, 6.0, "density")
+
+
+class Workers:
+    """Run jobs here, in a random order that their ``after`` allows, and sometimes twice, as where a
+    worker is lost before it answers. ``limit``: the run ends after so many jobs.
+    """
+
+    def __init__(self, monkeypatch, seed: int, limit: int = 1 << 30) -> None:
+        self.rng, self.limit, self.runs = np.random.default_rng(seed), limit, Counter()
+        monkeypatch.setattr(volume, "Dispatch", self)
+
+    def __call__(self, connection, jobs, store):
+        self.jobs, self.store = list(jobs), store
+        return self
+
+    def run(self) -> dict:
+        waiting = {job.name: job for job in self.jobs}
+        while waiting:
+            ready = [job for job in waiting.values() if not set(job.after) & waiting.keys()]
+            job = ready[self.rng.integers(len(ready))]
+            if sum(self.runs.values()) >= self.limit:
+                raise KeyboardInterrupt
+            KINDS[job.kind](job.arguments, None)
+            self.runs[job.name] += 1
+            if self.rng.random() < 0.8:
+                self.store(job, Outcome("here", 1.0))
+                del waiting[job.name]
+        return {}
+
+
+def ordinates_of(pairs: int, channels: int) -> tuple:
+    rng = np.random.default_rng(2)
+    directions, weights = joint_ordinates(1, pairs, rng)[0]
+    return directions, weights, rng.random((pairs, 2, channels)), rng.random((pairs, 2))
+
+
+def both_sweeps(sweep: SlabSweep, pairs: int, channels: int) -> list[np.ndarray]:
+    """Return the uncollided irradiance, and what a noisy source adds."""
+    directions, weights, incoming, offsets = ordinates_of(pairs, channels)
+    whole = (0, 0, 0), SHAPE
+    source = sweep.file("source-0", channels=channels)
+    values = np.random.default_rng(3).random((*SHAPE, channels), dtype=np.float32)
+    source.write(whole[0], values)
+    found = [
+        sweep.uncollided(directions, incoming, offsets),
+        sweep.scattered("scattered-0", (directions, weights, offsets), source),
+    ]
+    return [file.read(*whole) for file in found]
+
+
+def farm_sweep(sigma_t, folder, inputs: str = "a") -> FarmSweep:
+    return FarmSweep(sigma_t, folder / "parts", MEMORY, Connection(None), ENVIRONMENT, inputs)
+
+
+def by_one_machine(sigma_t, folder, pairs: int, channels: int) -> list[np.ndarray]:
+    folder = folder / "alone"
+    folder.mkdir()
+    return both_sweeps(SlabSweep(sigma_t, folder, MEMORY), pairs, channels)
+
+
+@pytest.mark.parametrize(
+    ("most", "batch", "pairs", "channels"),
+    [(5, 2, 10, 1), (6, 3, 10, 3), (9, 1, 4, 1), (14, 8, 12, 3), (20, 2, 7, 1), (64, 2, 10, 1)],
+)
+def test_workers_find_the_bits_of_one_machine(
+    sigma_t, tmp_path, monkeypatch, most, batch, pairs, channels
+):
+    monkeypatch.setattr(slab_sweep, "MOST_SLICES", most)
+    monkeypatch.setattr(volume_jobs, "FEWEST_SLABS", 1)
+    monkeypatch.setattr(volume_jobs, "PAIRS", batch)
+    monkeypatch.setattr(volume, "PAIRS", batch)
+    expected = by_one_machine(sigma_t, tmp_path, pairs, channels)
+    Workers(monkeypatch, seed=most)
+    found = both_sweeps(farm_sweep(sigma_t, tmp_path), pairs, channels)
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_run_that_is_interrupted_again_and_again_ends_with_the_same_bits(
+    sigma_t, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(slab_sweep, "MOST_SLICES", 6)
+    monkeypatch.setattr(volume, "PAIRS", 3)
+    monkeypatch.setattr(volume_jobs, "PAIRS", 3)
+    monkeypatch.setattr(volume_jobs, "FEWEST_SLABS", 1)
+    expected, interruptions = by_one_machine(sigma_t, tmp_path, 10, 1), 0
+    while True:
+        workers = Workers(monkeypatch, interruptions, limit=20)
+        try:
+            found = both_sweeps(farm_sweep(sigma_t, tmp_path), 10, 1)
+            break
+        except KeyboardInterrupt:
+            interruptions += 1
+    assert interruptions > 3 and sum(workers.runs.values()) < 20
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_finished_jobs_of_other_inputs_are_not_used(sigma_t, tmp_path, monkeypatch):
+    Workers(monkeypatch, 1)
+    both_sweeps(farm_sweep(sigma_t, tmp_path), 4, 1)
+    again = Workers(monkeypatch, 1)
+    both_sweeps(farm_sweep(sigma_t, tmp_path), 4, 1)
+    assert not again.runs
+    both_sweeps(farm_sweep(sigma_t, tmp_path, inputs="b"), 4, 1)
+    assert again.runs
+
+
+def test_a_result_that_was_lost_is_not_taken_for_zeros(sigma_t, tmp_path, monkeypatch):
+    Workers(monkeypatch, 1)
+    sweep = farm_sweep(sigma_t, tmp_path)
+    both_sweeps(sweep, 4, 1)
+    (tmp_path / "parts").joinpath(sweep.file("uncollided").path).unlink()
+    with pytest.raises(IrrcacheError, match=r"uncollided-.*found.*remove the folder"):
+        both_sweeps(farm_sweep(sigma_t, tmp_path), 4, 1)
+
+
+@pytest.mark.parametrize("damage", ["lost", "cut", "of another shape"])
+@pytest.mark.parametrize("kind", ["faces", "sums", "found"])
+def test_a_damaged_working_file_ends_the_run_with_its_name(
+    sigma_t, tmp_path, monkeypatch, damage, kind
+):
+    monkeypatch.setattr(slab_sweep, "MOST_SLICES", 9)
+    workers, folder = Workers(monkeypatch, 2), tmp_path / "parts"
+
+    class Damaging(Workers):
+        def __call__(self, connection, jobs, store):
+            def damaged(job, outcome) -> None:
+                store(job, outcome)
+                for file in folder.glob(f"*/uncollided-*.{kind}.npy"):
+                    if damage == "lost":
+                        file.unlink()
+                    elif damage == "cut":
+                        file.write_bytes(file.read_bytes()[:-1])
+                    else:
+                        np.save(file, np.zeros((3, 2), np.float32))
+
+            return super().__call__(connection, jobs, damaged)
+
+    del workers
+    Damaging(monkeypatch, 2)
+    with pytest.raises(IrrcacheError, match=rf"uncollided-.*{kind}\.npy.*remove the folder"):
+        both_sweeps(farm_sweep(sigma_t, tmp_path), 4, 1)
+
+
+def test_a_worker_without_the_folder_is_of_another_kind(tmp_path):
+    step = {"sweep": "a", "axis": 0, "step": 0, "batch": 0, "slabs": 1, "batches": 1}
+    for kind, own in (("cross_slabs", {"step": step}), ("add_axes", {"slices": [0, 1]})):
+        with pytest.raises(UnfitWorkerError, match="a folder|no folder"):
+            KINDS[kind]({"folder": str(tmp_path / "none"), "sweep": "a", **own}, tmp_path)
+
+
+@pytest.mark.parametrize("slabs", [1, 2, 3, 4, 7, 8])
+@pytest.mark.parametrize("batches", [1, 2, 5])
+def test_every_file_has_one_writer_that_its_only_reader_waits_for(slabs, batches):
+    steps = list(steps_of("a", [(slabs, batches)]))
+    writers: dict[str, list[SlabStep]] = {}
+    for step in steps:
+        names = [step.faces] if step.step < slabs - 1 else []
+        names += [(step.found if step.completes else step.sums)(number) for number in step.numbers]
+        for name in names:
+            writers.setdefault(name, []).append(step)
+    assert all(len(found) == 1 for found in writers.values())
+    reads = Counter(name for step in steps for name in step.reads)
+    assert set(reads.values()) <= {1}
+    found = {name for name in writers if name.endswith("found.npy")}
+    assert len(found) == slabs and reads.keys() == writers.keys() - found
+    for step in steps:
+        assert {writers[name][0].name for name in step.reads} == set(step.after)
+    # Each batch crosses each slab both ways.
+    assert Counter(n for step in steps for n in (step.step, slabs - 1 - step.step)) == {
+        number: 2 * batches for number in range(slabs)
+    }
+    order = [step.name for step in by_length_of_way(steps)]
+    assert all(order.index(n) < order.index(step.name) for step in steps for n in step.after)
+
+
+def test_plans_hold_no_pickles(tmp_path):
+    directions, weights, incoming, offsets = ordinates_of(3, 1)
+    ordinates = directions, weights, offsets
+    plan = volume_jobs.SweepPlan("a", SHAPE, np.eye(4), 0.5, 7, ordinates, incoming, "source-0")
+    plan.save(tmp_path)
+    known = volume_jobs.SweepPlan.load(tmp_path, "a")
+    assert (known.shape, known.quantum, known.memory, known.source) == (SHAPE, 0.5, 7, "source-0")
+    np.testing.assert_array_equal(known.incoming, incoming)
+    for mine, theirs in zip(known.ordinates, ordinates, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert replace(plan, source="").source == ""
