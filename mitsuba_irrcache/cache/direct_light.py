@@ -15,6 +15,7 @@ Camera rays exclude these values and evaluate E(p) exp(-tau(p)) instead.
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -181,19 +182,21 @@ class DirectLight:
         self, scene: mi.Scene, depth: mi.Float | mi.Color3f, classes: VoxelClasses | None
     ) -> GridField:
         """Create the field of the mean extinction, given optical depths at the voxels."""
-        length, sigma_t = self.length(self._centres), self._medium.sigma_t.at_world(self._centres)
-        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), sigma_t)
-        return self._field_of_extinction(mean, classes)
+        sigma_t = self._medium.sigma_t.at_world(self._centres)
+        return self._field_of_extinction(self._over_length(depth, sigma_t), classes)
 
     def _extinction_of_peak(self, classes: VoxelClasses | None) -> GridField:
         """Create the field of the mean extinction of the forward peak over `length`."""
         ray, near, far = DirectLight._line(self, self._centres)
-        depth, length = (
-            peak_depth(self._medium, ray, near, far, near < far),
-            self.length(self._centres),
-        )
-        mean = dr.select(length > 0, depth / dr.select(length > 0, length, 1), 0)
+        mean = self._over_length(peak_depth(self._medium, ray, near, far, near < far), 0)
         return _on_grid(self._grid, self._voxels, mean, classes)
+
+    def _over_length(
+        self, depth: mi.Float | mi.Color3f, otherwise: mi.Float | mi.Color3f | int
+    ) -> mi.Float | mi.Color3f:
+        """Return optical depths at the voxels over `length`, or ``otherwise`` where that is 0."""
+        length = self.length(self._centres)
+        return dr.select(length > 0, depth / dr.select(length > 0, length, 1), otherwise)
 
     def _field_of_extinction(
         self, mean: mi.Float | mi.Color3f, classes: VoxelClasses | None
@@ -321,6 +324,26 @@ def _past_others(
     return passed
 
 
+class RaySegment(NamedTuple):
+    """A segment of camera rays; all but the rays are pairs of values at both ends.
+
+    Attributes:
+        ray: the rays.
+        ends: distances along the rays.
+        extinctions: extinction.
+        means: mean extinction on the line to the emitter.
+        weights: weights of the source, the result of `quadrature.segment`.
+        albedos: albedo.
+    """
+
+    ray: mi.Ray3f
+    ends: tuple[mi.Float, mi.Float]
+    extinctions: tuple
+    means: tuple
+    weights: tuple
+    albedos: tuple
+
+
 class DirectLightAlongRays:
     """Direct light of an emitter, evaluated along camera rays."""
 
@@ -388,29 +411,22 @@ class DirectLightAlongRays:
 
     def scattered(
         self,
-        ray: mi.Ray3f,
-        ends: tuple[mi.Float, mi.Float],
-        sigma: tuple,
-        means: tuple,
-        weights: tuple,
-        albedo: tuple,
+        segment: RaySegment,
         with_peak: bool = True,
         peak_depth: mi.Float | mi.Color3f | None = None,
     ) -> mi.Spectrum:
         """Integrate the radiance scattered towards the camera along a segment.
 
-        ``ends`` are the distances of the segment's ends along the ray. ``sigma``, ``means`` and
-        ``albedo`` are the extinction, the mean extinction on the line to the emitter and the
-        albedo, each at both ends; ``weights`` is the result of `quadrature.segment`; ``with_peak``
-        and ``peak_depth`` are as in `AngularField.factor`.
+        ``with_peak`` and ``peak_depth`` are as in `AngularField.factor`.
 
         The segment is divided into parts. In a part with constant extinction c and optical depth C,
         along which the optical depth to the emitter changes linearly from s0 to s0 + S,
         int c e^-(c u + s) du = e^-s0 C (1 - e^-(C + S)) / (C + S), for any optical depth.
         """
         # docs/primer, eq. (2.6)
-        light, (a, b) = self._light, ends
-        near, far = (extinction * (b - a) for extinction in sigma)
+        ray, (a, b), extinctions, means, weights, albedo = segment
+        light = self._light
+        near, far = (extinction * (b - a) for extinction in extinctions)
         at = self._parts(ray, a, b, 0.5 * (near + far))
         middles = [0.5 * (u + v) for u, v in pairwise(at)]
         depths, inner = (

@@ -19,6 +19,7 @@ its key only, not on the point for which it was created.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -49,6 +50,37 @@ CLEARANCE = 1.5
 SHIFT = np.array([0.2137, 0.3719, 0.4482])
 #: Bits of a coordinate, and offsets that make coordinates and levels positive.
 BITS, OFFSET, LEVEL_OFFSET = 18, 1 << 17, 32
+
+
+class _SurfacePoint(NamedTuple):
+    """A point on a surface: its normals, and its coordinates across the normals' largest axis."""
+
+    p: mi.Point3f
+    geometric: mi.Normal3f
+    shading: mi.Normal3f
+    axis: mi.UInt32
+    side: mi.UInt32
+    place: mi.Vector3f
+    slope: mi.Vector2f
+
+
+class _SurfaceCorner(NamedTuple):
+    """A node at the corner of a square of nodes around a point.
+
+    Attributes:
+        key, number: of the node.
+        exists: whether the table has it.
+        weight: for the interpolation at the point, not normalised; 0 if the node does not apply.
+        finer: whether interpolation needs a finer level.
+        divided: whether another surface may lie between the node and the point.
+    """
+
+    key: mi.UInt64
+    number: mi.UInt32
+    exists: mi.Bool
+    weight: mi.Float
+    finer: mi.Bool
+    divided: mi.Bool
 
 
 class SurfaceNodes:
@@ -91,8 +123,7 @@ class SurfaceNodes:
         and whether any of these keys is missing in the table.
         """
         # docs/primer, eq. (5.7)
-        geometric, shading = normals
-        axis, side, place, slope = _across(geometric, mi.Vector3f(p - self._origin))
+        point = _SurfacePoint(p, *normals, *_across(normals[0], mi.Vector3f(p - self._origin)))
         level = self._coarsest_level(p)
         last = level + mi.Int32(most_levels)
         numbers = [mi.UInt32(0) for _ in range(4)]
@@ -100,47 +131,55 @@ class SurfaceNodes:
         keys = [mi.UInt64(0) for _ in range(4)]
         missing, uncertain, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
         while dr.hint(active, label="levels of surface nodes"):
-            spacing = self._spacing_at(level)
-            u, v = place.x / spacing, place.y / spacing
-            begin_u, begin_v = dr.floor(u), dr.floor(v)
             total, incomplete = mi.Float(0), mi.Bool(False)
             finer, divided = mi.Bool(False), mi.Bool(False)
-            corner_numbers, corner_weights = [], []
-            for k in range(4):
-                at_u, at_v = begin_u + (k & 1), begin_v + (k >> 1)
-                height = place.z / spacing + slope.x * (at_u - u) + slope.y * (at_v - v)
-                key = _packed(axis * 2 + side, level, at_u, at_v, dr.floor(height))
-                keys[k] = dr.select(active, key, keys[k])
-                number = self._number_of(key, active)
-                known = active & (number != NONE)
-                found = dr.gather(mi.Vector4f, self._places, number, known)
-                normal = dr.gather(mi.Vector4f, self._normals, number, known)
-                offset = dr.dot(mi.Vector3f(found.x, found.y, found.z) - p, geometric)
-                cosine = dr.dot(mi.Vector3f(normal.x, normal.y, normal.z), shading)
-                applies = known & (found.w > 0) & (dr.abs(offset) < TANGENT * spacing)
-                applies &= cosine > SAME_SIDE
-                finer |= applies & ((found.w * SPACING_PER_DISTANCE < spacing) | (cosine < FLAT))
-                divided |= known & (found.w > 0) & (normal.w < CLEARANCE * spacing)
-                weight = (1 - dr.abs(at_u - u)) * (1 - dr.abs(at_v - v))
-                weight = dr.select(applies, dr.maximum(weight, 1e-6), 0)
-                total += weight
-                incomplete |= active & ~known
-                corner_numbers.append(number)
-                corner_weights.append(weight)
+            corners = [self._corner(point, level, k, active) for k in range(4)]
+            for k, corner in enumerate(corners):
+                keys[k] = dr.select(active, corner.key, keys[k])
+                finer |= corner.finer
+                divided |= corner.divided
+                total += corner.weight
+                incomplete |= active & ~corner.exists
             # Interpolation at a coarser level than the point requires would be biased.
             finer |= divided | (total == 0)
             ends = active & ~incomplete & (~finer | (level >= last)) & (total > 0)
             uncertain |= ends & divided
             scale = dr.rcp(total)
-            for k in range(4):
-                numbers[k] = dr.select(
-                    ends & (corner_weights[k] > 0), corner_numbers[k], numbers[k]
-                )
-                weights[k] = dr.select(ends, corner_weights[k] * scale, weights[k])
+            for k, corner in enumerate(corners):
+                chosen = ends & (corner.weight > 0)
+                numbers[k] = dr.select(chosen, corner.number, numbers[k])
+                weights[k] = dr.select(ends, corner.weight * scale, weights[k])
             missing |= incomplete
             active &= ~incomplete & finer & (level < last)
             level = dr.select(active, level + 1, level)
         return numbers, weights, uncertain, keys, missing
+
+    def _corner(
+        self, point: _SurfacePoint, level: mi.Int32, k: int, active: mi.Bool
+    ) -> _SurfaceCorner:
+        """Look up the node at corner ``k`` of the square of a ``level`` that contains a point."""
+        spacing, place, slope = self._spacing_at(level), point.place, point.slope
+        u, v = place.x / spacing, place.y / spacing
+        at_u, at_v = dr.floor(u) + (k & 1), dr.floor(v) + (k >> 1)
+        height = place.z / spacing + slope.x * (at_u - u) + slope.y * (at_v - v)
+        key = _packed(point.axis * 2 + point.side, level, at_u, at_v, dr.floor(height))
+        number = self._number_of(key, active)
+        exists = active & (number != NONE)
+        found = dr.gather(mi.Vector4f, self._places, number, exists)
+        normal = dr.gather(mi.Vector4f, self._normals, number, exists)
+        offset = dr.dot(mi.Vector3f(found.x, found.y, found.z) - point.p, point.geometric)
+        cosine = dr.dot(mi.Vector3f(normal.x, normal.y, normal.z), point.shading)
+        on_surface = exists & (found.w > 0)
+        applies = on_surface & (dr.abs(offset) < TANGENT * spacing) & (cosine > SAME_SIDE)
+        weight = (1 - dr.abs(at_u - u)) * (1 - dr.abs(at_v - v))
+        return _SurfaceCorner(
+            key,
+            number,
+            exists,
+            weight=dr.select(applies, dr.maximum(weight, 1e-6), 0),
+            finer=applies & ((found.w * SPACING_PER_DISTANCE < spacing) | (cosine < FLAT)),
+            divided=on_surface & (normal.w < CLEARANCE * spacing),
+        )
 
     def _coarsest_level(self, p: mi.Point3f) -> mi.Int32:
         """Return the level at which the search begins at ``p``."""

@@ -37,7 +37,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
     SweptVolume,
     sweep_tracks,
 )
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import values_at_centres
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import SweptBox, values_at_centres
 
 #: Bytes of a voxel of both slabs while they are swept: extinction and its parts; and for each
 #: channel the sums, or these and the source, and copies of them.
@@ -322,10 +322,10 @@ class AxisSweep:
         """The values of a slab at the centres of its voxels (z, y, x, channel)."""
         grid, channels = Grid(shape, np.eye(4)), self._channels
         index = dr.arange(mi.UInt32, grid.voxel_count)
-        box = np.zeros(3, int), grid.resolution
+        box = SweptBox(grid, np.zeros(3, int), grid.resolution, self.axis)
         found = []
         for c in range(channels):
-            value = values_at_centres(means, grid, *box, self.axis, index, c, channels)
+            value = values_at_centres(means, box, index, c, channels)
             found.append(np.array(value))
         return found[0] if channels == 1 else np.stack(found, axis=1)
 

@@ -10,6 +10,8 @@ if all orders are requested, it then ends at its first collision in a medium wit
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -208,6 +210,30 @@ class ClosedFormCameraRays:
         return hit, dr.maximum(near, 0), far
 
 
+@dataclass
+class _StraightRay:
+    """A camera ray up to the first surface that is not null, and what it has gathered."""
+
+    scattered: mi.Spectrum
+    #: radiance of emitters and of volumetric emission
+    background: mi.Spectrum
+    transmittance: mi.Spectrum
+    #: transmittance for narrow sources, by the extinction before delta-M scaling
+    unscattered: mi.Spectrum
+    #: sums for `Layers`
+    gathered: list
+    #: the ray behind the last surface, and the medium there
+    segment: mi.Ray3f
+    pointer: mi.MediumPtr
+    #: distance of the last surface from the camera
+    near: mi.Float
+    #: whether the ray has hit a surface; whether it has left the scene
+    stopped: mi.Bool
+    escaped: mi.Bool
+    crossings: mi.UInt32
+    active: mi.Bool
+
+
 class TracedCameraRays:
     """Camera rays through several ``projections``, one for each visible medium."""
 
@@ -285,12 +311,13 @@ class TracedCameraRays:
         pointer = dr.zeros(mi.MediumPtr) if medium is None else mi.MediumPtr(medium)
         offset = 1 - sampler.next_1d(active)
         rng = _stream(sampler, active)
-        *marched, unscattered = self._march_to_surface(scene, ray, pointer, offset, active)
-        scattered, background, transmittance, gathered, end, pointer, stopped, escaped = marched
+        marched = self._march_to_surface(scene, ray, pointer, offset, active)
+        background, transmittance = marched.background, marched.transmittance
+        end, pointer, unscattered = marched.segment, marched.pointer, marched.unscattered
         # Path trace surfaces of low transmittance with Russian roulette.
         least = CACHED_ROULETTE_BELOW if self.caches_surfaces else ROULETTE_BELOW
         chance = dr.minimum(dr.max(transmittance) * (1 / least), 1)
-        traced = stopped & (rng.next_float32(stopped) < chance)
+        traced = marched.stopped & (rng.next_float32(marched.stopped) < chance)
         weight = dr.select(traced, transmittance / chance, 0)
         if self.caches_surfaces:
             is_stratified = isinstance(sampler, CameraSampler)
@@ -321,9 +348,9 @@ class TracedCameraRays:
             if self.narrow is not None:
                 passed, transmittance = dr.select(traced, unscattered / chance, 0), unscattered
             transparency = dr.select(traced & ~interacted, passed, 0)
-            transparency = dr.select(escaped, transmittance, transparency)
+            transparency = dr.select(marched.escaped, transmittance, transparency)
             alpha = 1 - dr.sum(transparency) / dr.size_v(mi.Spectrum)
-        return RayResult(scattered, background, transmittance, alpha, gathered)
+        return RayResult(marched.scattered, background, transmittance, alpha, marched.gathered)
 
     @symbolic
     def _march_to_surface(
@@ -334,74 +361,95 @@ class TracedCameraRays:
         offset: mi.Float,
         active: mi.Bool,
     ):
-        """March straight up to the first surface that is not null.
-
-        Returns scattered radiance, background, transmittance and gathered sums; the last segment of
-        the ray and its medium; masks of rays that hit a surface, and that left the scene; and the
-        transmittance for narrow sources.
-        """
-        scattered, background, transmittance = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(1)
-        gathered = self.projection.zero_sums()
-        unscattered = mi.Spectrum(1)
-        # Measure all distances from the camera, so that depths are correct.
-        segment, pointer, near = mi.Ray3f(ray), mi.MediumPtr(pointer), mi.Float(0)
-        stopped, escaped, active = mi.Bool(False), mi.Bool(False), mi.Bool(active)
-        max_background = mi.Spectrum(self.brightest)
-        crossings = mi.UInt32(0)
-        shows_emitters = self.max_depth > 0
-        while dr.hint(active, label="march to surface"):
-            si = scene.ray_intersect(segment, active)
-            valid = active & si.is_valid()
+        """March along ``ray`` to the first surface that is not null; return the `_StraightRay`."""
+        state = _StraightRay(
+            scattered=mi.Spectrum(0),
+            background=mi.Spectrum(0),
+            transmittance=mi.Spectrum(1),
+            unscattered=mi.Spectrum(1),
+            gathered=self.projection.zero_sums(),
+            segment=mi.Ray3f(ray),
+            pointer=mi.MediumPtr(pointer),
+            near=mi.Float(0),
+            stopped=mi.Bool(False),
+            escaped=mi.Bool(False),
+            crossings=mi.UInt32(0),
+            active=mi.Bool(active),
+        )
+        while dr.hint(state.active, label="march to surface"):
+            si = scene.ray_intersect(state.segment, state.active)
+            valid = state.active & si.is_valid()
+            # Measure all distances from the camera, so that depths are correct.
             far = dr.select(valid, dr.dot(si.p - ray.o, ray.d), dr.inf)
-            for projection in self.projections:
-                hit, entry, leave = projection.medium.intersect(ray)
-                entry, leave = dr.maximum(entry, near), dr.minimum(leave, far)
-                hit &= active & (pointer == projection.medium.pointer)
-                found, segment_transmittance, sums, emitted = projection.march(
-                    ray, entry, leave, max_background, offset, hit
+            self._march_media(state, ray, far, offset)
+            null = valid & is_null(si.bsdf().flags())
+            crosses = self._add_emitter(scene, state, ray, si, null)
+            state.stopped |= valid & ~crosses
+            state.escaped |= state.active & ~valid
+            state.pointer = dr.select(null, medium_after(si, ray.d, state.pointer), state.pointer)
+            state.segment = dr.select(crosses, si.spawn_ray(ray.d), state.segment)
+            state.near = dr.select(crosses, far, state.near)
+            state.crossings += 1
+            state.active &= crosses & (dr.max(state.transmittance) > 0)
+            state.active &= state.crossings < MOST_CROSSINGS
+        return state
+
+    def _march_media(
+        self, state: _StraightRay, ray: mi.Ray3f, far: mi.Float, offset: mi.Float
+    ) -> None:
+        """Ray march the media between the last surface and the distance ``far`` of the next one."""
+        shows_emitters, max_background = self.max_depth > 0, mi.Spectrum(self.brightest)
+        for projection in self.projections:
+            hit, entry, leave = projection.medium.intersect(ray)
+            entry, leave = dr.maximum(entry, state.near), dr.minimum(leave, far)
+            hit &= state.active & (state.pointer == projection.medium.pointer)
+            scattered, transmittance, sums, emitted = projection.march(
+                ray, entry, leave, max_background, offset, hit
+            )
+            scale = luminance(state.transmittance)
+            state.scattered += state.transmittance * scattered
+            state.background += dr.select(shows_emitters, state.transmittance * emitted, 0)
+            state.gathered = _added(state.gathered, sums, state.transmittance, scale)
+            state.transmittance *= transmittance
+            if self.narrow is not None:
+                state.unscattered *= projection.unscattered(
+                    transmittance, ray, entry, leave, hit & (entry < leave)
                 )
-                scale = luminance(transmittance)
-                scattered += transmittance * found
-                background += dr.select(shows_emitters, transmittance * emitted, 0)
-                gathered = _added(gathered, sums, transmittance, scale)
-                transmittance *= segment_transmittance
-                if dr.hint(self.narrow is not None, mode="scalar"):
-                    unscattered *= projection.unscattered(
-                        segment_transmittance, ray, entry, leave, hit & (entry < leave)
-                    )
-            # Add emitters; if they are hidden, continue behind them.
-            emitter = si.emitter(scene, active)
-            hit_emitter = active & (emitter != None)  # noqa: E711
-            hidden = mi.Bool(False)
-            null = is_null(si.bsdf().flags())
-            crosses = valid & null
-            if dr.hint(self.hide_emitters, mode="scalar"):
-                hidden = hit_emitter & (~valid | (pointer == None))  # noqa: E711
-                crosses |= hidden & valid
-                if dr.hint(self.narrow is None, mode="scalar"):
-                    hit_emitter = mi.Bool(False)
-            hit_emitter &= crosses | ~valid
-            radiance = emitter.eval(si, hit_emitter & shows_emitters)
-            attenuation = mi.Spectrum(transmittance)
-            if dr.hint(self.narrow is not None, mode="scalar"):
-                narrow = self.narrow.hits_source(
-                    ray.o, ray.d, hit_emitter & ~valid, hit_emitter & valid
-                )
-                attenuation = dr.select(narrow, unscattered, attenuation)
-                # Forward peaks scatter radiance of hidden emitters into the ray.
-                attenuation -= dr.select(hidden, unscattered, 0)
-                transmittance = dr.select(hidden, unscattered, transmittance)
-            background += dr.select(hit_emitter & shows_emitters, attenuation * radiance, 0)
-            stopped |= valid & ~crosses
-            escaped |= active & ~valid
-            pointer = dr.select(crosses & null, medium_after(si, ray.d, pointer), pointer)
-            next_ray = si.spawn_ray(ray.d)
-            segment = dr.select(crosses, next_ray, segment)
-            near = dr.select(crosses, far, near)
-            crossings += 1
-            active &= crosses & (dr.max(transmittance) > 0) & (crossings < MOST_CROSSINGS)
-        found = scattered, background, transmittance, gathered, segment, pointer, stopped, escaped
-        return *found, unscattered
+
+    def _add_emitter(
+        self,
+        scene: mi.Scene,
+        state: _StraightRay,
+        ray: mi.Ray3f,
+        si: mi.SurfaceInteraction3f,
+        null: mi.Bool,
+    ) -> mi.Bool:
+        """Add emission at the end of the segment.
+
+        Returns where the ray continues: behind ``null`` surfaces and hidden emitters.
+        """
+        valid, shows_emitters = state.active & si.is_valid(), self.max_depth > 0
+        emitter = si.emitter(scene, state.active)
+        hit_emitter = state.active & (emitter != None)  # noqa: E711
+        hidden = mi.Bool(False)
+        if self.hide_emitters:
+            hidden = hit_emitter & (~valid | (state.pointer == None))  # noqa: E711
+            if self.narrow is None:
+                hit_emitter = mi.Bool(False)
+        crosses = null | (hidden & valid)
+        hit_emitter &= crosses | ~valid
+        radiance = emitter.eval(si, hit_emitter & shows_emitters)
+        attenuation = mi.Spectrum(state.transmittance)
+        if self.narrow is not None:
+            narrow = self.narrow.hits_source(
+                ray.o, ray.d, hit_emitter & ~valid, hit_emitter & valid
+            )
+            attenuation = dr.select(narrow, state.unscattered, attenuation)
+            # Forward peaks scatter radiance of hidden emitters into the ray.
+            attenuation -= dr.select(hidden, state.unscattered, 0)
+            state.transmittance = dr.select(hidden, state.unscattered, state.transmittance)
+        state.background += dr.select(hit_emitter & shows_emitters, attenuation * radiance, 0)
+        return crosses
 
     def _is_cached(self, pointer: mi.MediumPtr) -> mi.Bool:
         """Return whether the radiance in a medium is cached."""

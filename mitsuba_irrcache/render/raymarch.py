@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularField
-from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays
+from mitsuba_irrcache.cache.direct_light import DirectLightAlongRays, RaySegment
 from mitsuba_irrcache.cache.uncertainty import UncertaintyField
 from mitsuba_irrcache.core.fast_math import minimum
 from mitsuba_irrcache.core.jit import symbolic
@@ -229,21 +229,6 @@ class Projection:
         if self._exponent is None:
             return dr.exp(-mi.Spectrum(optical_depth(self.medium.original, ray, near, far, active)))
         return dr.power(transmittance, self._exponent)
-
-    def share_unscattered(
-        self,
-        transmittance: mi.Spectrum,
-        ray: mi.Ray3f,
-        near: mi.Float,
-        far: mi.Float,
-        active: mi.Bool,
-    ) -> mi.Spectrum:
-        """Return the part of a ``transmittance`` (see `unscattered`) that belongs to radiance that
-        is not scattered into a truncated forward peak.
-        """
-        unscattered = self.unscattered(transmittance, ray, near, far, active)
-        share = unscattered / dr.maximum(transmittance, 1e-30)
-        return dr.select(active & (near < far), dr.minimum(share, 1), 1)
 
     def _exclude_occluded(
         self, p: mi.Point3f, phi: mi.Float | mi.Color3f, active: mi.Bool
@@ -516,10 +501,10 @@ class _RayMarch:
             state.peak = [state.peak[0], dr.select(skip, 0, state.peak[1])]
 
     def _with_inner_sources(self, state: _MarchState, there: _FieldSample) -> tuple:
-        """Where a segment enters or leaves matter, use the source of the end inside: the cache may
-        have no value at the other end.
+        """Use the source of the end inside the medium where a segment enters or leaves it.
 
-        Returns extinction and source before the segment.
+        At the other end the cache may have no value. Returns extinction and source before the
+        segment.
         """
         here, (extinction, previous_source) = state.here, state.previous
         enters = dr.max(mi.Spectrum(here.extinction)) == 0
@@ -568,16 +553,10 @@ class _RayMarch:
             mean = dr.select(part.skip, skipped, state.means[i])
             state.means[i] = light.mean_extinction(ray(end), state.active)
             peak_depth = 0.5 * (state.peak[0] + peak[0]) if state.peak else None
-            state.radiance += state.transmittance * light.scattered(
-                ray,
-                (state.t, end),
-                part.extinctions,
-                (mean, state.means[i]),
-                part.weights,
-                albedos,
-                bool(state.peak) or not projection.truncates_peak,
-                peak_depth,
-            )
+            ends, means = (state.t, end), (mean, state.means[i])
+            lit = RaySegment(ray, ends, part.extinctions, means, part.weights, albedos)
+            with_peak = bool(state.peak) or not projection.truncates_peak
+            state.radiance += state.transmittance * light.scattered(lit, with_peak, peak_depth)
 
     def _add_emitted(self, state: _MarchState, part: _MarchedSegment, length: mi.Float) -> None:
         emission = self._projection.medium.emission

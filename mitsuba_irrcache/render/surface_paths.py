@@ -37,6 +37,7 @@ from mitsuba_irrcache.transport.path import (
     MAX_SURVIVAL,
     MOST_CROSSINGS,
     Media,
+    PartlyOriginalMedia,
     is_null,
     medium_after,
     power_heuristic,
@@ -88,9 +89,7 @@ class SurfacePaths:
         self.narrow = next(
             (p.directional.directional for p in projections if p.truncates_peak), None
         )
-        self._original_media = media
-        if self.narrow is not None:
-            self._original_media = Media([grid.original or grid for grid in media.grids])
+        self._original_media = media.original()
         self.peak_distance = dr.opaque(mi.Float, PEAK_DISTANCE)
         #: levels of nodes for points that the camera sees, and for others
         self.levels, self.indirect_levels = (
@@ -130,14 +129,14 @@ class SurfacePaths:
 
     @symbolic
     def direct(self, scene, si, pointer, sample, rng, active, where, exact: bool):
-        """Return the radiance reflected at ``si`` that comes straight from the sampled emitters.
+        """Return the radiance of the sampled emitters that is reflected at ``si``.
 
-        ``where`` are two masks. With multiple importance sampling: where the path ends (the first
-        one), a ray is sampled from the BSDF for it here. Narrow sources are attenuated by the
-        original extinction where the second one holds, see `transmittance_to`. The transmittance
-        has no noise if it is to be ``exact``.
+        ``sample`` chooses positions on the emitters. ``where`` are two masks: where the path ends,
+        so that a ray is sampled from the BSDF here for multiple importance sampling; and where
+        narrow sources are attenuated by the original extinction, see `_media_towards`. The
+        transmittance has no noise if it is to be ``exact``.
         """
-        ends, straight = where
+        ends, is_original = where
         result, number, context = mi.Spectrum(0), mi.UInt32(0), mi.BSDFContext()
         vertex, active = vertex_at(si), mi.Bool(active) & (self.emitters.count > 0)
         while dr.hint(active, label="sampled emitters"):
@@ -147,9 +146,9 @@ class SurfacePaths:
             value *= f
             reflects = active & (record.pdf > 0) & (dr.max(value) > 0)
             behind = medium_after(si, record.d, pointer)
-            passed, rng = self.transmittance_to(
-                scene, vertex, record, behind, rng, reflects, straight, exact
-            )
+            far = are_distant(record.emitter)
+            media = self._media_towards(vertex.p, record.d, far, ~far, is_original)
+            passed, rng = visibility(scene, media, vertex, record.p, behind, rng, reflects, exact)
             weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
             result += dr.select(reflects, value * passed * weight, 0)
             number += 1
@@ -159,26 +158,25 @@ class SurfacePaths:
             result += met
         return result, rng
 
-    def transmittance_to(self, scene, vertex, record, behind, rng, active, straight, exact: bool):
-        """Return the transmittance from ``vertex`` to the position of an emitter in ``record``.
+    def _media_towards(
+        self,
+        p: mi.Point3f,
+        direction: mi.Vector3f,
+        far: mi.Bool,
+        near: mi.Bool,
+        is_original: mi.Bool,
+    ) -> Media | PartlyOriginalMedia:
+        """Return the media by which emitters in a ``direction`` from ``p`` are attenuated.
 
-        Where ``straight``, radiance of narrow sources that is scattered into a truncated forward
-        peak does not count as transmitted: it is part of what nodes gather, or of the radiance that
-        is scattered towards the vertex.
+        In the lanes ``is_original``, narrow sources are attenuated by the original extinction:
+        their radiance that is scattered into a truncated forward peak is part of the radiance that
+        nodes gather, or that is scattered towards ``p``. ``far`` and ``near`` are as in
+        `AngularBasis.hits_source`.
         """
-        narrow = mi.Bool(False)
-        if dr.hint(self.narrow is not None, mode="scalar"):
-            far = are_distant(record.emitter)
-            narrow = straight & self.narrow.hits_source(vertex.p, record.d, far, ~far)
-        passed, rng = visibility(
-            scene, self.media, vertex, record.p, behind, rng, active & ~narrow, exact
-        )
-        if dr.hint(self.narrow is not None, mode="scalar"):
-            own, rng = visibility(
-                scene, self._original_media, vertex, record.p, behind, rng, active & narrow, exact
-            )
-            passed = dr.select(narrow, own, passed)
-        return passed, rng
+        if self.narrow is None:
+            return self.media
+        narrow = is_original & self.narrow.hits_source(p, direction, far, near)
+        return PartlyOriginalMedia(self.media, self._original_media, narrow)
 
     def met_by_bsdf(self, scene, si, pointer, rng, active, exact: bool):
         """Sample a ray from the BSDF at ``si``; return the reflected radiance of a sampled emitter
@@ -190,23 +188,10 @@ class SurfacePaths:
         active = active & (sample.pdf > 0) & (dr.max(f) > 0)
         direction, vertex = si.to_world(sample.wo), vertex_at(si)
         pointer = medium_after(si, direction, pointer)
-        narrow = mi.Bool(False)
-        if self.narrow is not None:
-            narrow = self.narrow.hits_source(vertex.p, direction, mi.Bool(True), mi.Bool(True))
-        end, passed, rng = first_opaque(
-            scene, self.media, si.spawn_ray(direction), pointer, rng, active & ~narrow, exact
-        )
-        if self.narrow is not None:
-            own_end, own, rng = first_opaque(
-                scene,
-                self._original_media,
-                si.spawn_ray(direction),
-                pointer,
-                rng,
-                active & narrow,
-                exact,
-            )
-            end, passed = dr.select(narrow, own_end, end), dr.select(narrow, own, passed)
+        everywhere = mi.Bool(True)
+        media = self._media_towards(vertex.p, direction, everywhere, everywhere, everywhere)
+        ray = si.spawn_ray(direction)
+        end, passed, rng = first_opaque(scene, media, ray, pointer, rng, active, exact)
         emitter = end.emitter(scene, active)
         is_emitter = active & (emitter != None)  # noqa: E711
         value = emitter.eval(end, is_emitter)
@@ -449,9 +434,9 @@ class _PathFollower:
             sums.radiance += dr.select(hit, path.throughput * (scattered + emitted), 0)
             path.throughput = dr.select(hit, path.throughput * transmittance, path.throughput)
             if projection.truncates_peak:
-                path.share *= projection.share_unscattered(
-                    transmittance, path.ray, entry, leave, hit
-                )
+                unscattered = projection.unscattered(transmittance, path.ray, entry, leave, hit)
+                share = dr.minimum(unscattered / dr.maximum(transmittance, 1e-30), 1)
+                path.share *= dr.select(hit & (entry < leave), share, 1)
         path.clear = mi.Bool(False)
 
     def _add_hit_emitter(

@@ -9,6 +9,7 @@ from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.transport.path import (
     MOST_CROSSINGS,
     Media,
+    PartlyOriginalMedia,
     is_null,
     medium_after,
 )
@@ -20,7 +21,7 @@ LAMBERTIAN = 1e-4
 @symbolic
 def first_opaque(
     scene: mi.Scene,
-    media: Media,
+    media: Media | PartlyOriginalMedia,
     ray: mi.Ray3f,
     pointer: mi.MediumPtr,
     rng: mi.PCG32,

@@ -240,17 +240,7 @@ def _walk(
         length = dr.select(hit, si.t, dr.norm(ray.o - last))
         place = dr.select(now, ray(end * length), place)
         contradicts = dr.select(now & hit, si.shape, contradicts)
-        # Scatter before the surface, continue through it, or reflect.
-        turns = rng.next_float32(active) < TURNS
-        at = ray(rng.next_float32(active) * si.t)
-        sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
-        anywhere = mi.warp.square_to_uniform_sphere(sample)
-        flags = si.bsdf().flags()
-        null = is_null(flags)
-        through = null | transmits(flags) & (rng.next_float32(active) < 0.5)
-        side = dr.dot(si.n, ray.d)
-        back = dr.select(dr.dot(anywhere, si.n) * side > 0, -anywhere, anywhere)
-        direction = dr.select(through, ray.d, back)
+        turns, at, direction = _scattered(si, ray, rng, active)
         onwards = si.spawn_ray(direction)
         reaches = hit & ~turns
         pointer = dr.select(
@@ -260,10 +250,29 @@ def _walk(
         before = dr.select(reaches & ~now, si.shape, before)
         last = dr.select(hit, ray.o, last)
         ray.o = dr.select(turns, at, onwards.o)
-        ray.d = dr.select(turns, anywhere, direction)
+        ray.d = direction
         event += 1
         active &= hit & ~now & (event < events)
     return wrong, met, lost, place, contradicts, before
+
+
+def _scattered(
+    si: mi.SurfaceInteraction3f, ray: mi.Ray3f, rng: mi.PCG32, active: mi.Bool
+) -> tuple[mi.Bool, mi.Point3f, mi.Vector3f]:
+    """Scatter before the surface, continue through it, or reflect.
+
+    Returns whether the walk turns before the surface, a position where it may do so, and the
+    direction in which it continues.
+    """
+    turns = rng.next_float32(active) < TURNS
+    at = ray(rng.next_float32(active) * si.t)
+    sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
+    anywhere = mi.warp.square_to_uniform_sphere(sample)
+    flags = si.bsdf().flags()
+    through = is_null(flags) | transmits(flags) & (rng.next_float32(active) < 0.5)
+    side = dr.dot(si.n, ray.d)
+    back = dr.select(dr.dot(anywhere, si.n) * side > 0, -anywhere, anywhere)
+    return turns, at, dr.select(turns, anywhere, dr.select(through, ray.d, back))
 
 
 def _examine(

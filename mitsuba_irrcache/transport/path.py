@@ -57,6 +57,10 @@ class Media(Immutable):
             number = dr.select(pointer == grid.pointer, i + 1, number)
         return number
 
+    def original(self) -> Media:
+        """Return the media before delta-M scaling."""
+        return Media([grid.original or grid for grid in self.grids])
+
     def without(self, medium: MediumGrid) -> Media:
         """Return all media except one."""
         return Media([grid for grid in self.grids if grid is not medium])
@@ -118,6 +122,30 @@ class Media(Immutable):
         return attenuation
 
 
+class PartlyOriginalMedia:
+    """Media whose extinction is that before delta-M scaling in the lanes ``is_original`` only."""
+
+    def __init__(self, scaled: Media, original: Media, is_original: mi.Bool) -> None:
+        self._scaled, self._original, self._is_original = scaled, original, is_original
+
+    def transmittance(
+        self, pointer: mi.MediumPtr, ray: mi.Ray3f, far: mi.Float, rng: mi.PCG32, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.PCG32]:
+        """Estimate the transmittance as `Media.transmittance`."""
+        own, where = self._is_original, (pointer, ray, far)
+        scaled, rng = self._scaled.transmittance(*where, rng, active & ~own)
+        original, rng = self._original.transmittance(*where, rng, active & own)
+        return dr.select(own, original, scaled), rng
+
+    def exact_transmittance(
+        self, pointer: mi.MediumPtr, ray: mi.Ray3f, far: mi.Float, active: mi.Bool
+    ) -> mi.Spectrum:
+        """Compute the transmittance as `Media.exact_transmittance`."""
+        own, where = self._is_original, (pointer, ray, far)
+        scaled = self._scaled.exact_transmittance(*where, active & ~own)
+        return dr.select(own, self._original.exact_transmittance(*where, active & own), scaled)
+
+
 def is_null(flags: mi.UInt32) -> mi.Bool:
     """Return whether a BSDF with these flags is an ideal null interface."""
     return (flags & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
@@ -172,7 +200,7 @@ def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
 @symbolic
 def visibility(
     scene: mi.Scene,
-    media: Media,
+    media: Media | PartlyOriginalMedia,
     vertex: mi.Interaction3f,
     target: mi.Point3f,
     pointer: mi.MediumPtr,

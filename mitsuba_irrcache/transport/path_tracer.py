@@ -138,7 +138,7 @@ class PathTracer:
         hide_emitters: bool = False,
         is_cached: Callable[[mi.MediumPtr], mi.Bool] | None = None,
     ) -> None:
-        self._scene, self._media = scene, media
+        self.scene, self.media = scene, media
         self._max_depth, self._rr_depth = max_depth, rr_depth
         self._hide_emitters, self._is_cached = hide_emitters, is_cached
 
@@ -191,8 +191,8 @@ class PathTracer:
 
     def _next_segment(self, path: _PathState, sums: PathSums, is_direct: mi.Bool) -> _Segment:
         """Sample a free flight, add emission along it, and end paths in cached media."""
-        si = self._scene.ray_intersect(path.ray, path.active)
-        collided, t, path.throughput, path.rng, emitted = self._media.sample_distance(
+        si = self.scene.ray_intersect(path.ray, path.active)
+        collided, t, path.throughput, path.rng, emitted = self.media.sample_distance(
             path.pointer, path.ray, si.t, path.throughput, path.rng, path.active & ~path.clear
         )
         sums.add(emitted, is_direct)
@@ -221,7 +221,7 @@ class PathTracer:
         Returns the mask of lanes whose surface is a hidden emitter, which the path passes through.
         """
         si = segment.si
-        emitter = si.emitter(self._scene, segment.surface)
+        emitter = si.emitter(self.scene, segment.surface)
         hit_emitter = segment.surface & (emitter != None)  # noqa: E711
         skipped = mi.Bool(False)
         if self._hide_emitters:
@@ -229,9 +229,9 @@ class PathTracer:
             hit_emitter &= ~hidden
             # As in volpath, hidden emitters are transparent if they are outside of all media.
             skipped = hidden & si.is_valid() & (path.pointer == None)  # noqa: E711
-        record = mi.DirectionSample3f(self._scene, si, path.last)
+        record = mi.DirectionSample3f(self.scene, si, path.last)
         sampled = hit_emitter & (path.pdf > 0)
-        density = self._scene.pdf_emitter_direction(path.last, record, sampled)
+        density = self.scene.pdf_emitter_direction(path.last, record, sampled)
         mis_weight = dr.select(sampled, power_heuristic(path.pdf, density), 1)
         radiance = path.throughput * emitter.eval(si, hit_emitter) * mis_weight
         emitted = dr.select(hit_emitter, radiance, 0)
@@ -256,12 +256,12 @@ class PathTracer:
         smooth = scatters & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         active = (collided | smooth) & (path.depth + 1 < self._max_depth)
         sample = mi.Point2f(rng.next_float32(active), rng.next_float32(active))
-        record, emitted = self._scene.sample_emitter_direction(vertex, sample, False, active)
+        record, emitted = self.scene.sample_emitter_direction(vertex, sample, False, active)
         active &= (record.pdf > 0) & (dr.max(emitted) > 0)
         value, density = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(record.d), active & smooth)
         value = dr.select(collided, mi.Spectrum(dr.inv_four_pi), value)
         density = dr.select(collided, dr.inv_four_pi, density)
-        if not self._media.isotropic:
+        if not self.media.isotropic:
             collision = interaction(path.ray(segment.t), path.ray.d)
             phase = path.pointer.phase_function()
             value, density = _phase_value(
@@ -270,7 +270,7 @@ class PathTracer:
         active &= dr.max(value) > 0
         medium = dr.select(segment.surface, medium_after(si, record.d, path.pointer), path.pointer)
         attenuation, path.rng = visibility(
-            self._scene, self._media, vertex, record.p, medium, rng, active
+            self.scene, self.media, vertex, record.p, medium, rng, active
         )
         mis_weight = power_heuristic(record.pdf, dr.select(record.delta, 0, density))
         sums.scattered += dr.select(
@@ -298,7 +298,7 @@ class PathTracer:
         path.pdf = dr.select(is_vertex, density, path.pdf)
         path.pdf = dr.select(collided, dr.inv_four_pi, path.pdf)
         direction = mi.warp.square_to_uniform_sphere(sample)
-        if not self._media.isotropic:
+        if not self.media.isotropic:
             collision = interaction(path.ray(segment.t), path.ray.d)
             direction, value, density = path.pointer.phase_function().sample(
                 mi.PhaseFunctionContext(), collision, choice, sample, collided

@@ -107,7 +107,7 @@ def hg(g: float) -> dict:
     return {"type": "hg", "g": g}
 
 
-#: Scenes, and the integrator properties for them.
+#: Scenes, and the integrator properties for them; ``spp`` is that of the image.
 SCENES: dict[str, tuple[Callable[[], dict], dict]] = {
     "heterogeneous": (lambda: cloud(kinds.sky(), kinds.sun()), {}),
     "homogeneous": (lambda: homogeneous(2.0) | {"sky": kinds.sky()}, {}),
@@ -130,6 +130,10 @@ SCENES: dict[str, tuple[Callable[[], dict], dict]] = {
     "ground": (kinds.kind_ground, {}),
     "ground_hg": (kinds.kind_forward_ground, {}),
     "ground_single": (kinds.kind_ground, {"max_depth": 2}),
+    "ground_hg_hidden": (kinds.kind_forward_ground, {"hide_emitters": True}),
+    # samples enough for cached irradiance on surfaces
+    "ground_cached": (kinds.kind_ground, {"spp": 32}),
+    "ground_cached_hidden": (kinds.kind_ground, {"spp": 32, "hide_emitters": True}),
     "room": (room, {}),
     "implant": (kinds.kind_implant, {}),
     "two_media": (kinds.kind_two, {}),
@@ -198,12 +202,14 @@ def derivatives(only: str) -> Iterator[tuple[str, np.ndarray]]:
 
 def rendered(objects: dict, properties: dict) -> np.ndarray:
     """Return an image with all channels."""
+    properties = dict(properties)
+    spp = properties.pop("spp", SPP)
     scene = {"type": "scene", "sensor": kinds.sensor()} | objects
     scene["sensor"]["film"] |= {"width": SIZE, "height": SIZE}
     scene["integrator"] = {"type": "irrcache", "rr_depth": 50} | properties
     loaded = mi.load_dict(scene)
     loaded.integrator().prepare(loaded)  # raises the original error, which mi.render would wrap
-    return np.array(mi.render(loaded, spp=SPP, seed=3))
+    return np.array(mi.render(loaded, spp=spp, seed=3))
 
 
 def difference(image: np.ndarray, file: Path) -> str | None:

@@ -31,7 +31,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.ordinates import (
     OrdinateSet,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import PairGroup, TrackTable
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, values_at_centres
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import SweptBox, Tracks, values_at_centres
 
 #: Highest degree of the moments that are corrected on coarser grids.
 COARSE_ORDER = 1
@@ -85,11 +85,12 @@ class Moments:
         table.boundary_source = boundary_source(table) if boundary_source is not None else None
         channels = (table if table.boundary_source is None else table.boundary_source).channels
         sums = self.zeros(tracks.active_count * channels)
-        box = tracks.lower, tracks.lower + tracks.size
+        ends = tracks.lower, tracks.lower + tracks.size
         place, channel = voxel_and_channel(tracks.active_count, channels)
         values = dr.gather(mi.UInt32, tracks.active, place), channel, channels
         for axis, group, copies in tracks.sweep_separately(table, channels=channels):
-            sums = _add_uncollided(self, sums, copies, group, axis, tracks.grid, *box, *values)
+            box = SweptBox(tracks.grid, *ends, axis)
+            sums = _add_uncollided(self, sums, copies, group, box, values)
             dr.eval(sums)
         return concatenated(sums)
 
@@ -190,7 +191,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
         groups = self.tracks.sweep_separately(table, source, self.channels, not with_irradiance)
         for _, group, copies in groups:
             sums = received, collided, lost, depth
-            received, collided, lost, depth = _add_collided(moments, *sums, copies, group, *where)
+            received, collided, lost, depth = _add_collided(moments, sums, copies, group, *where)
             dr.eval(received, collided, lost, depth)
         # Weighting by optical depth makes scattering conserve the energy of collisions.
         weighted = 4 * dr.pi * lost / dr.select(depth > 0, depth, 1)
@@ -262,15 +263,21 @@ class AnisotropicMultigridLevel(MultigridLevel):
 
 @symbolic
 def _add_uncollided(
-    moments, sums: list, copies, group, axis: int, grid, lower, upper, voxel, channel, channels: int
+    moments: Moments,
+    sums: list,
+    copies: mi.Float,
+    group: PairGroup,
+    box: SweptBox,
+    values: tuple[mi.UInt32, mi.UInt32, int],
 ):
-    """Return ``sums`` plus the moments of the irradiance that a sweep of a group has written to
-    ``copies``, at each ``voxel`` in this ``channel``.
+    """Add the moments of the irradiance that a sweep of a group has written to ``copies``.
+
+    ``values`` are the voxel and the channel of each of the ``sums``, and the number of channels.
     """
-    voxels = dr.opaque(mi.UInt32, grid.voxel_count)
+    voxels, (voxel, channel, channels) = dr.opaque(mi.UInt32, box.grid.voxel_count), values
     k, begin = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(k < group.count, label="uncollided pairs"):
-        where = copies, grid, lower, upper, axis, voxel, channel, channels
+        where = copies, box, voxel, channel, channels
         forward = values_at_centres(*where, begin=begin)
         backward = values_at_centres(*where, begin=begin + voxels)
         basis = moments.basis(-group.direction(k))
@@ -282,15 +289,21 @@ def _add_uncollided(
 
 @symbolic
 def _add_collided(
-    moments, received: list | None, collided: list, lost, depth, copies, group, slots, values: int
+    moments: Moments,
+    sums: tuple,
+    copies: mi.Float,
+    group: PairGroup,
+    slots: mi.UInt32,
+    values: int,
 ):
-    """Return the sums of moments plus the results of a sweep of a group.
+    """Add the results of a sweep of a group to ``sums``, and return these.
 
     The results, without the voxels' own source, are in ``copies``, at these ``slots`` of the
-    ``values`` of each ordinate. The sums are the moments of the radiance in the middle of voxels,
-    ``received`` (None: not computed), and of collisions, ``collided``; the radiance ``lost``; and
-    the optical ``depth`` times solid angle.
+    ``values`` of each ordinate. The sums are the moments of the radiance in the middle of voxels
+    (None: not computed) and of collisions; the radiance that collides; and the optical depth times
+    solid angle.
     """
+    received, collided, lost, depth = sums
     step = dr.opaque(mi.UInt32, values)
     k, place = mi.UInt32(0), mi.UInt32(slots)
     while dr.hint(k < group.count, label="collided pairs"):

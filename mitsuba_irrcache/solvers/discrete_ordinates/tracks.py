@@ -26,6 +26,7 @@ in `extinction`, the record of a pair of ordinates in `track_layout`, and their 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -171,9 +172,9 @@ class Tracks:
             volume = dr.opaque(mi.Float, 0, self.grid.voxel_count * channels)
             self._sweep_axis(volume, False, table, axis, pairs)
             for c in range(channels):
-                where = axis, self.active, c, channels
+                where = SweptBox(self.grid, *box, axis), self.active, c, channels
                 cut = None if self.surfaces is None else self.surfaces.is_cut
-                values = values_at_centres(volume, self.grid, *box, *where, cut=cut)
+                values = values_at_centres(volume, *where, cut=cut)
                 index = dr.arange(mi.UInt32, active)
                 index = index + dr.opaque(mi.UInt32, active * c) if c else index
                 # In place: a sum would be a second array.
@@ -302,20 +303,27 @@ class Tracks:
         return dr.width(values) // (self.grid.voxel_count * (4 if has_source else 1))
 
 
+class SweptBox(NamedTuple):
+    """The voxels of ``grid`` between ``lower`` and ``upper`` (x, y, z), swept along an ``axis``."""
+
+    grid: Grid
+    lower: np.ndarray
+    upper: np.ndarray
+    axis: int
+
+
 def values_at_centres(
     means: mi.Float,
-    grid: Grid,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    axis: int,
+    box: SweptBox,
     index: mi.UInt32,
     channel: int = 0,
     channels: int = 1,
     begin: mi.UInt32 | int = 0,
     cut: mi.Bool | None = None,
 ) -> mi.Float:
-    """Return values at the centres of the voxels ``index`` between ``lower`` and ``upper`` (x, y,
-    z), given ``means`` over the cross sections of all voxels across ``axis``.
+    """Return values at the centres of the voxels ``index`` of a box.
+
+    ``means`` are those over the cross sections of all voxels of the grid across the box's axis.
 
     Tracks with a random shift sample a voxel's cross section uniformly; second differences along
     both transverse axes undo the smoothing. Results are never negative. ``means`` are laid out by
@@ -323,6 +331,7 @@ def values_at_centres(
     differences are omitted in voxels ``cut`` by surfaces, and next to them.
     """
     # docs/primer, eq. (4.5)
+    grid, lower, upper, axis = box
     places, strides = grid.voxel_indices(index), strides_of(grid.resolution, slicewise(axis))
     place = flat_index(places, strides) + begin
 
@@ -341,10 +350,10 @@ def values_at_centres(
         centre = place + dr.select(at == first, stride, 0) - dr.select(at == last, stride, 0)
         here, below, above = (read(i, inside) for i in (centre, centre - stride, centre + stride))
         # Voxels that no radiance has reached have no second difference.
-        known = (below > 0) & (above > 0)
+        is_lit = (below > 0) & (above > 0)
         if cut is not None:
-            known &= ~_any_cut(grid, cut, places, k, (at == first, at == last), inside)
-        change += dr.select(known, 2 * here - below - above, 0)
+            is_lit &= ~_any_cut(grid, cut, places, k, (at == first, at == last), inside)
+        change += dr.select(is_lit, 2 * here - below - above, 0)
     return dr.maximum(dr.fma(change, dr.opaque(mi.Float, SECOND_DIFFERENCE), value), 0)
 
 

@@ -13,19 +13,16 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.transport.path import Media, power_heuristic, sample_emitter
+from mitsuba_irrcache.transport.path import power_heuristic, sample_emitter
 from mitsuba_irrcache.transport.path_tracer import PathStart, PathTracer
 
 
 def contributions(
-    scene: mi.Scene,
-    media: Media,
+    tracer: PathTracer,
     position: mi.Point3f,
     pointer: mi.MediumPtr,
     spread: list[mi.Float],
     rng: mi.PCG32,
-    max_depth: mi.UInt32,
-    rr_depth: mi.UInt32,
     excluded: Sequence[mi.EmitterPtr] = (),
 ) -> list[tuple[mi.Vector3f, mi.Spectrum, mi.Spectrum]]:
     """Take one sample per lane of the incident radiance at ``position``, in the medium ``pointer``.
@@ -37,6 +34,7 @@ def contributions(
     ``spread`` are four uniform numbers for the directions. Radiance directly from the emitters
     ``excluded`` is not included.
     """
+    scene, media = tracer.scene, tracer.media
     vertex, always = dr.zeros(mi.Interaction3f), mi.Bool(True)
     vertex.p = position
     sample = mi.Point2f(spread[0], spread[1])
@@ -47,7 +45,7 @@ def contributions(
         light = dr.select(record.emitter == emitter, 0, light)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(spread[2], spread[3]))
     start = PathStart(mi.Ray3f(position, direction), pointer, 1, dr.inv_four_pi, excluded=excluded)
-    sums, _ = PathTracer(scene, media, max_depth, rr_depth).trace(start, rng, always)
+    sums, _ = tracer.trace(start, rng, always)
     sphere = 4 * dr.pi
     return [
         (record.d, light, mi.Spectrum(0)),
@@ -55,12 +53,14 @@ def contributions(
     ]
 
 
-def estimate(directional: AngularBasis | None, *args: object) -> list[mi.Spectrum]:
-    """Take one sample of the irradiance, uncollided and scattered, and of the moments of the
-    radiance if there is an angular basis ``directional``.
+def estimate(
+    directional: AngularBasis | None, tracer: PathTracer, position: mi.Point3f, *others: object
+) -> list[mi.Spectrum]:
+    """Take one sample of the irradiance, uncollided and scattered.
 
-    ``args`` are the arguments of `contributions`.
+    If there is an angular basis ``directional``, the moments of the radiance follow. The other
+    arguments are those of `contributions`.
     """
-    found = contributions(*args)
+    found = contributions(tracer, position, *others)
     layers = [sum(f[1] for f in found), sum(f[2] for f in found)]
-    return layers + (directional.moments(args[2], found) if directional is not None else [])
+    return layers + (directional.moments(position, found) if directional is not None else [])

@@ -33,6 +33,7 @@ from mitsuba_irrcache.solvers.base import Preview, Progress, Solver, SolverTask,
 from mitsuba_irrcache.solvers.grid_size import SizeAmongSurfaces, SizeRule
 from mitsuba_irrcache.solvers.path import estimator as volume_path
 from mitsuba_irrcache.transport.path import Media
+from mitsuba_irrcache.transport.path_tracer import PathTracer
 from mitsuba_irrcache.transport.tracking import free_flight, transmittance
 
 #: Number of paths in one kernel launch: enough to occupy any machine, few enough to bound memory
@@ -317,18 +318,9 @@ class _Estimator:
         number = dr.gather(mi.UInt32, self.cache.voxel_classes.medium_number, voxel)
         pointer = self.media.pointer_of(number)
         max_depth = dr.select(self.orders < 0xFFFFFFFF, self.orders + 1, self.orders)
-        return volume_path.estimate(
-            self.cache.directional,
-            self.scene,
-            self.media,
-            position,
-            pointer,
-            spread,
-            rng,
-            max_depth,
-            self.rr_depth,
-            self._excluded,
-        )
+        tracer = PathTracer(self.scene, self.media, max_depth, self.rr_depth)
+        where = tracer, position, pointer
+        return volume_path.estimate(self.cache.directional, *where, spread, rng, self._excluded)
 
     @symbolic
     def _estimate(self, position: mi.Point3f, spread: list[mi.Float], rng: mi.PCG32):

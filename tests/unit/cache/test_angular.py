@@ -12,6 +12,7 @@ from mitsuba_irrcache.errors import UnsupportedSceneError
 from mitsuba_irrcache.lights.narrow_sources import sources_of
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.path.estimator import contributions
+from mitsuba_irrcache.transport.path_tracer import PathTracer
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -100,7 +101,7 @@ def test_scattered_radiance_from_moments_and_from_directions(scenes, objects, to
     rng, p = mi.PCG32(count), mi.Point3f(0.2, 0.5, -0.3)
     spread = [rng.next_float32() for _ in range(4)]
     limits = [dr.opaque(mi.UInt32, n) for n in (3, 100)]
-    found = contributions(scene, media, p, medium.pointer, spread, rng, *limits)
+    found = contributions(PathTracer(scene, media, *limits), p, medium.pointer, spread, rng)
     dr.eval(found)
 
     def mean(value) -> float:

@@ -10,6 +10,7 @@ import pytest
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.solvers.path.estimator import contributions
 from mitsuba_irrcache.transport.path import power_heuristic, visibility
+from mitsuba_irrcache.transport.path_tracer import PathTracer
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -26,16 +27,9 @@ def irradiance(scene, position, max_depth=INFINITE, count=COUNT) -> tuple[np.nda
     medium = description.visible[0]
     rng = mi.PCG32(count)
     spread = [rng.next_float32() for _ in range(4)]
-    found = contributions(
-        scene,
-        description.media,
-        mi.Point3f(position),
-        medium.pointer,
-        spread,
-        rng,
-        dr.opaque(mi.UInt32, max_depth),
-        dr.opaque(mi.UInt32, 1000),
-    )
+    limits = [dr.opaque(mi.UInt32, depth) for depth in (max_depth, 1000)]
+    tracer = PathTracer(scene, description.media, *limits)
+    found = contributions(tracer, mi.Point3f(position), medium.pointer, spread, rng)
     layers = [np.array(sum(f[i] for f in found)) for i in (1, 2)]
     assert all(np.allclose(np.linalg.norm(np.array(f[0]), axis=0), 1, atol=1e-4) for f in found)
     error = (layers[0] + layers[1]).std(axis=1) / count**0.5

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, values_at_centres
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import SweptBox, Tracks, values_at_centres
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -44,7 +44,8 @@ def test_sharpening(out_of_bounds, grid, axis, channels, box):
 
     def action() -> None:
         for c in range(channels):
-            dr.eval(values_at_centres(values, grid, *map(np.array, box), axis, every, c, channels))
+            swept = SweptBox(grid, *map(np.array, box), axis)
+            dr.eval(values_at_centres(values, swept, every, c, channels))
 
     assert not out_of_bounds(action)
 

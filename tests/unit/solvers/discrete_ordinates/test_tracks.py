@@ -11,7 +11,7 @@ from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.solvers.discrete_ordinates import tracks
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
-from mitsuba_irrcache.solvers.discrete_ordinates.tracks import Tracks, values_at_centres
+from mitsuba_irrcache.solvers.discrete_ordinates.tracks import SweptBox, Tracks, values_at_centres
 
 SHAPES = [(8, 8, 8), (7, 12, 5), (1, 6, 9), (5, 1, 1), (9, 4, 1)]
 #: Directions along axes, edges and diagonals, almost along them, and between.
@@ -345,7 +345,7 @@ def test_sharpening_recovers_values_from_means(monkeypatch):
 
     def at(voxels, means: np.ndarray, axis: int) -> np.ndarray:
         wanted = mi.UInt32(index[voxels].ravel().tolist())
-        return np.array(values_at_centres(laid(means, axis), grid, *box, axis, wanted))
+        return np.array(values_at_centres(laid(means, axis), SweptBox(grid, *box, axis), wanted))
 
     for axis, curvature in enumerate((1 - 2, 3 - 2, 3 + 1)):
         means = np.zeros(grid.shape)
