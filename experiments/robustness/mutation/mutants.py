@@ -300,7 +300,7 @@ MUTANTS = (
         ("tests/system/test_sweep.py",),
     ),
     Mutant(
-        "light passes a sliver of its medium on its way in (arrivals)",
+        "radiance that enters is attenuated by a sliver of its medium (incoming radiance)",
         "solvers/discrete_ordinates/boundary_condition.py",
         "boundary.scene, boundary.other_media, ray, pointer",
         "boundary.scene, boundary.media, ray, pointer",

@@ -219,7 +219,7 @@ SLIPS = (
     Mutant(
         "behind a null surface a medium is seen from the camera on (camera rays)",
         "render/camera.py",
-        "            near = dr.select(crosses, far, near)\n",
+        "            state.near = dr.select(crosses, far, state.near)\n",
         "",
         ("tests/unit/render/test_camera_null_surfaces.py",),
     ),
@@ -259,7 +259,7 @@ SLIPS = (
         (BOUNDS,),
     ),
     Mutant(
-        "lines enter half a slice later (arrivals)",
+        "tracks enter half a slice later (incoming radiance)",
         "solvers/discrete_ordinates/boundary_condition.py",
         "b, c = dr.fma(a - 0.5, read.slope_b, b)",
         "b, c = dr.fma(a, read.slope_b, b)",

@@ -57,8 +57,8 @@ SURFACES = (
     Mutant(
         "nodes of surfaces that face elsewhere apply",
         "cache/surface.py",
-        "                applies &= cosine > SAME_SIDE\n",
-        "",
+        " & (cosine > SAME_SIDE)\n",
+        "\n",
         (NODES, IMAGES),
     ),
     Mutant(
