@@ -13,6 +13,8 @@ from mitsuba_irrcache.view.reference import Reference
 
 #: What a window can compare: nothing, the two images, or the difference between them.
 KINDS = ("off", "swipe", "error")
+#: Their names in the panel.
+CHOICES = {"off": "off", "swipe with volpath": "swipe", "error against volpath": "error"}
 #: Pixels of the window per pixel of the reference and side: the first one is used until the time of
 #: a pass is known, then the finest with which a pass takes at most `PASS_SECONDS`.
 COARSENESS = (4, 2, 1)

@@ -45,7 +45,7 @@ class LightPanel:
     def _add_details(self, gui: viser.GuiApi, lighting: Lighting) -> None:
         document = self._session.document
         density = gui.add_number(
-            "density", document.density, min=0.001, max=1000.0, step=0.01,
+            "density, ×", document.density, min=0.001, max=1000.0, step=0.01,
             hint="factor of the extinction",
         )  # fmt: skip
         depth = gui.add_number(
@@ -73,7 +73,7 @@ class LightPanel:
         self._status.content = f"{state}: {error}{status.samples} samples"
         target = self._session.target_error
         above = status.improving and status.error > target
-        shown = f"error of the illumination {100 * status.error:.2g} %, target {100 * target:.2g} %"
+        shown = f"illumination: error {100 * status.error:.2g} %, target {100 * target:.2g} %"
         coarse = "coarse illumination, being refined" if status.improving else ""
         self._channel.send("hint", shown if above else "" if status.samples else coarse)
         if status.message:

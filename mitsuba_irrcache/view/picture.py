@@ -22,6 +22,15 @@ from mitsuba_irrcache.view.light import Seen
 MARKED, MARK, FLOOR = "image, errors marked", (1.0, 0.0, 0.8), 0.02
 #: Quantities that a window can display.
 KINDS = ("image", MARKED, "colour", "illumination", "error bar", "transmittance", "depth")
+#: What the kinds that are no images show.
+CAPTIONS = {
+    MARKED: "magenta: pixels whose error bar exceeds the target",
+    "colour": "albedo, as seen",
+    "illumination": "illumination, without the colour of the medium",
+    "error bar": "standard error and bias of each pixel, × 10",
+    "transmittance": "share of the background that is seen",
+    "depth": "mean depth: bright is near",
+}
 #: Scale factor with which the standard error is displayed.
 ERROR_SCALE = 10.0
 #: Exposures in stops that can be chosen.

@@ -48,6 +48,8 @@ class TransferPanel:
                 "preset", (_OWN, *preset_names()), initial_value=self._history.now[1]
             )
             gui.add_html("<irrcache-transfer></irrcache-transfer>")
+            if appearance.has_own_colours:
+                gui.add_markdown("The colours are those of the file, not those of the band.")
         editing.bind(self._preset, self._take_preset)
         channel.receive("transfer", self._edited)
         channel.receive("load", self._load)

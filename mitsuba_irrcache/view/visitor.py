@@ -18,11 +18,10 @@ from PIL import Image
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.camera import NARROWEST, WIDEST, Camera
 from mitsuba_irrcache.view.channel import Channel
-from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
-from mitsuba_irrcache.view.comparison import Compared, described
+from mitsuba_irrcache.view.comparison import CHOICES, Compared, described
 from mitsuba_irrcache.view.editing import Editing, plain
 from mitsuba_irrcache.view.export_panel import ExportPanel
-from mitsuba_irrcache.view.picture import EXPOSURES, KINDS, MARKED, TONES, Look
+from mitsuba_irrcache.view.picture import CAPTIONS, EXPOSURES, KINDS, MARKED, TONES, Look
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 
@@ -53,6 +52,8 @@ class Visitor:
         self._gone = False
         self._noted = 0.0
         self._view: View | None = None
+        # How the camera was placed, and how much further away for a window that is high.
+        self._placed, self._away = np.zeros(3), 1.0
         self._look = Look(exposure=session.exposure)
         self.window = session.open(self._show)
         self._add_controls(client.gui)
@@ -82,14 +83,14 @@ class Visitor:
             self._kind = gui.add_dropdown("show", KINDS)
             self._exposure = gui.add_slider("exposure, EV", *EXPOSURES, 0.1, self.session.exposure)
             self._compare = gui.add_dropdown(
-                "volpath", COMPARISONS,
-                hint="compare with volpath, which is refined while no camera moves: swipe with the "
-                "divider, or the error in false colours",
+                "compare", tuple(CHOICES),
+                hint="with Mitsuba's path tracer, which is refined while no camera moves: swipe "
+                "with the divider, or the error in false colours",
             )  # fmt: skip
             self._reset = gui.add_button("reset camera", color="gray")
             gui.add_html(f'<irrcache-window key="{self._key}"></irrcache-window>')
-        with gui.add_folder("Camera and tone", order=5, expand_by_default=False):
-            fov = self.session.cameras[cameras[0]].fov
+        with gui.add_folder("Camera, tone, background", order=5, expand_by_default=False):
+            fov = round(self.session.cameras[cameras[0]].fov, 1)
             self._fov = gui.add_slider("field of view, °", NARROWEST, WIDEST, 0.5, fov)
             self._tone = gui.add_dropdown("tone mapping", tuple(TONES))
             self._filter = gui.add_checkbox(
@@ -111,10 +112,12 @@ class Visitor:
         kind, tone, exposure = self._kind.value, self._tone.value, self._exposure.value
         if kind not in KINDS or tone not in TONES or not -64 <= exposure <= 64:
             raise IrrcacheError(f"{kind!r}, {tone!r}, exposure {exposure!r}: nothing to be shown.")
-        if self._compare.value not in COMPARISONS:
+        if self._compare.value not in CHOICES:
             raise IrrcacheError(f"{self._compare.value!r} is no comparison.")
         if self._compare.value != "off" and self.session.light.is_emissive:
             raise IrrcacheError("volpath does not render the emission of media.")
+        if self._compare.value == "off":  # what is shown until the next image is ours alone
+            self._channel.send("comparison", {"mode": "off"}, self._key)
         colour = tuple(_linear(c) for c in self._background.value)
         self._look = Look(kind, float(exposure), tone, bool(self._filter.value), colour)
         self._look_again()
@@ -128,10 +131,10 @@ class Visitor:
         self._look_again()
 
     @property
-    def _aspect(self) -> float:
-        """Return width over height of the image."""
+    def _distance_factor(self) -> float:
+        """Return how much further away than in wide windows a camera has to be."""
         camera = self.client.camera
-        return max(camera.image_width, 1) / max(camera.image_height, 1)
+        return max(1.0, max(camera.image_height, 1) / max(camera.image_width, 1))
 
     def _go_to(self, name: str) -> None:
         if name not in self.session.cameras:
@@ -139,12 +142,12 @@ class Visitor:
         camera, place = self.session.cameras[name], self.session.placement.to_browser
         with self.client.atomic():
             self.client.camera.up_direction = np.array(camera.up)
-            target, away = np.array(camera.target), max(1.0, 1 / self._aspect)  # fits high windows
-            position = target + away * (np.array(camera.position) - target)
-            self.client.camera.position = place(position)
+            self._away, target = self._distance_factor, np.array(camera.target)
+            self._placed = place(target + self._away * (np.array(camera.position) - target))
+            self.client.camera.position = self._placed
             self.client.camera.look_at = place(camera.target)
             self.client.camera.fov = math.radians(camera.fov)
-        self._fov.value = camera.fov
+        self._fov.value = round(camera.fov, 1)
         self._look_again()
 
     def _seen(self) -> View | None:
@@ -175,11 +178,14 @@ class Visitor:
         if not np.isfinite(numbers).all() or seen.distance == 0 or not any(seen.up):
             return  # the browser sent values that are no camera
         size = camera.image_width, camera.image_height
+        if self._away != self._distance_factor and np.allclose(camera.position, self._placed):
+            self._go_to(self._sensor.value)  # the window was resized before the camera was moved
+            return
         self._channel.send("camera", seen.axes.round(4).tolist(), self._key)
         look = self._look
         if look.kind == MARKED:
             look = replace(look, target=self.session.target_error)
-        view = View(seen, size, look, self._compare.value)
+        view = View(seen, size, look, CHOICES[self._compare.value])
         if self._view is not None and view != self._view and view.shows_place_of(self._view):
             self._channel.send("note", "rendering ...", self._key)  # may take seconds
         self._view = view
@@ -217,7 +223,7 @@ class Visitor:
         send("note", f"{state}: {width} x {height}, {samples} per pixel", key)
         found = picture.compared
         if found is None and picture.view.compared == "off":
-            send("comparison", {"mode": "off"}, key)
+            send("comparison", {"mode": "off", "left": CAPTIONS.get(picture.view.look.kind)}, key)
             return
         if found is None:
             found = Compared(picture.view.compared, "volpath waits until the camera stops")

@@ -62,6 +62,8 @@ def test_edit_save_reload_and_second_window(browser, started):
     assert first.std() > 20
     assert window.page.title() == "phantom:thorax:32,22,29 - irrcache"
     assert window.field("preset").input_value() == "ct-chest"
+    # The window was open before the camera was known.
+    assert window.field("field of view, °").input_value() == "30"
 
     # Dragging rotates the camera, the wheel moves it closer; meanwhile images have low resolution.
     drag_until_coarse(window, first.shape[1])

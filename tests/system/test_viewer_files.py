@@ -183,7 +183,7 @@ def test_cameras_and_environment_of_a_scene_with_surfaces(browser, tmp_path, sce
         assert difference(turned, front) > 3
 
         # The comparison: a caption from the beginning, then volpath on the right of the divider.
-        window.choose("volpath", "swipe")
+        window.choose("compare", "swipe")
         window.page.locator("#irrcache-overlay .right", has_text="volpath").wait_for()
         window.wait_for(r"volpath, \d{2,} samples per pixel.*; RMSE")
         divider = window.page.locator("#irrcache-overlay .divider").bounding_box()
@@ -203,7 +203,7 @@ def test_cameras_and_environment_of_a_scene_with_surfaces(browser, tmp_path, sce
         assert ours.std() > 10 and abs(ours.mean() - theirs.mean()) < 3
         squares = [block_means(image, 10).ravel() for image in (ours, theirs)]  # without noise
         assert np.corrcoef(*squares)[0, 1] > 0.9
-        window.choose("volpath", "error")
+        window.choose("compare", "error")
         window.page.locator("#irrcache-overlay .scale", has_text="% of the mean").wait_for()
         assert window.errors == []
     log = (tmp_path / "log.txt").read_text()

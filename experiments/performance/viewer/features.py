@@ -77,12 +77,12 @@ def light(window: Window) -> str:
 
 def reference(window: Window) -> str:
     """Choose both comparisons."""
-    window.choose("volpath", "swipe")
+    window.choose("compare", "swipe")
     window.page.locator("#irrcache-overlay .divider").wait_for()
     window.wait_for("volpath, [0-9]+ sample", 120)
-    window.choose("volpath", "error")
+    window.choose("compare", "error")
     window.page.locator("#irrcache-overlay .scale").wait_for()
-    window.choose("volpath", "off")
+    window.choose("compare", "off")
     return "path traced, swipe and false colours"
 
 

@@ -133,7 +133,7 @@ def editing(window: Window, repeats: int) -> dict[str, float]:
             began = time.time()
         else:
             began = time.time()
-            window.enter("density", height)
+            window.enter("density, ×", height)
         window.wait_for_picture(shown)
         found.append(_seen(window, shown, began) - began)
     label = "a point dragged" if has_curve else "density"

@@ -33,19 +33,19 @@ def turn_light(window: Window) -> None:
 
 def swipe(window: Window) -> None:
     """Compare with volpath, after its first sample."""
-    window.choose("volpath", "swipe")
+    window.choose("compare", "swipe")
     window.wait_for("volpath, [0-9]+ sample", 240)
 
 
 def error(window: Window) -> None:
     """Show the error in false colours."""
-    window.choose("volpath", "error")
+    window.choose("compare", "error")
     window.page.locator("#irrcache-overlay .scale").wait_for(timeout=240_000)
 
 
 def marks(window: Window) -> None:
     """Mark the pixels whose error bar exceeds the target."""
-    window.choose("volpath", "off")
+    window.choose("compare", "off")
     window.choose("show", "image, errors")
     window.page.wait_for_timeout(4000)
 

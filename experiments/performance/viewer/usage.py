@@ -106,8 +106,8 @@ class User:
 
     def density(self, window: Window) -> None:
         """Change the density, sometimes to an invalid value."""
-        unfolded(window, "Scattering and error", "density").enter(
-            "density", self._rng.choice(["0.5", "1", "2", "-3"])
+        unfolded(window, "Scattering and error", "density, ×").enter(
+            "density, ×", self._rng.choice(["0.5", "1", "2", "-3"])
         )
 
     def sun(self, window: Window) -> None:
@@ -120,7 +120,7 @@ class User:
 
     def compare(self, window: Window) -> None:
         """Switch the comparison with volpath."""
-        window.choose("volpath", str(self._rng.choice(COMPARISONS)))
+        window.choose("compare", str(self._rng.choice(COMPARISONS)))
 
     def preset(self, window: Window) -> None:
         """Select a preset of the transfer function."""

@@ -22,6 +22,7 @@
     root.innerHTML = `
       <img class="preview" data-id="preview" alt="" hidden>
       <img data-id="reference" alt="image by volpath" hidden>
+      <div class="pending" data-id="pending" hidden></div>
       <div class="divider" data-id="divider" role="slider" tabindex="0" hidden
         aria-label="divider between irrcache and volpath" aria-valuemin="0" aria-valuemax="100"
         ><span>↔</span></div>
@@ -73,13 +74,16 @@
     split = Math.min(Math.max(share, 0), 1);
     find("divider").style.left = `${100 * split}%`;
     find("divider").setAttribute("aria-valuenow", String(Math.round(100 * split)));
-    find("reference").style.clipPath = `inset(0 0 0 ${100 * split}%)`;
+    for (const name of ["reference", "pending"]) {
+      find(name).style.clipPath = `inset(0 0 0 ${100 * split}%)`;
+    }
   }
 
   function compare(value) {
     comparison = value;
     const swipe = value.mode === "swipe";
     find("divider").hidden = !swipe;
+    find("pending").hidden = !swipe || value.has_image; // what is below is no image by volpath
     set("left", value.left || "");
     set("right", value.right || "");
     if (!swipe || !value.has_image) hideReference();

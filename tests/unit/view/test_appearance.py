@@ -9,8 +9,10 @@ pytest.importorskip("viser")
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.appearance import WHOLE, Appearance, cropped
-from mitsuba_irrcache.view.comparison import _finest, false_colours, rounded
+from mitsuba_irrcache.view.comparison import CHOICES, _finest, false_colours, rounded
+from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.crop_panel import checked_box
+from mitsuba_irrcache.view.picture import CAPTIONS, KINDS
 from mitsuba_irrcache.volumes.colours import Colours
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.options import MissingItemError, picked
@@ -86,6 +88,12 @@ def test_missing_time_steps_tell_how_many_there_are():
     with pytest.raises(MissingItemError, match="give 0 to 4") as caught:
         picked("a.tif", "frame", 5, 1 << 30)
     assert caught.value.count == 5
+
+
+def test_every_kind_is_named_and_explained():
+    """In the panel, and over images of what is no radiance."""
+    assert tuple(CHOICES.values()) == COMPARISONS
+    assert set(CAPTIONS) == set(KINDS) - {"image"}
 
 
 def test_errors_have_colours_and_round_limits():
