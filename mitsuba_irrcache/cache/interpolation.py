@@ -20,7 +20,7 @@ class Interpolation(Immutable):
         falloff: inverse-square factor of nearby emitters, by which Phi is divided before
             interpolation; None without such emitters.
         direct_lights: emitters whose irradiance camera rays evaluate in closed form. It is excluded
-            from lookups, although the layers of the cache include it (`DirectLight.irradiance`: its
+            from lookups, although the arrays of the cache include it (`DirectLight.irradiance`: its
             values at the voxel centres, for spot lights with the mean of E over the voxel).
         peak_depths: optical depths of scattering into a truncated forward peak between the voxels
             and narrow sources; None if no peak is truncated, or there are no such sources.

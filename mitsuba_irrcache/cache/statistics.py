@@ -14,8 +14,8 @@ from mitsuba_irrcache.core.immutable import Immutable
 
 #: Samples per batch, unless voxels share their samples.
 BATCH = 8
-#: Layers of a cache: irradiance directly from emitters, and scattered radiance.
-LAYERS = ("uncollided", "scattered")
+#: Groups of scattering orders whose irradiance is cached separately: order 0, and all others.
+ORDER_GROUPS = ("uncollided", "scattered")
 
 
 class BatchSums(Immutable):
@@ -34,9 +34,9 @@ class BatchSums(Immutable):
         real: type of the sums: float32 if they are correlated, since there are few batches then,
             otherwise float64.
         streams: samples taken per voxel from each random stream.
-        totals: sums of batch means for each layer and channel.
-        spreads: for each channel, the sum of squared deviations of the batches' irradiance (both
-            layers) from its mean.
+        totals: sums of batch means for each order group and channel.
+        spreads: for each channel, the sum of squared deviations of the batches' irradiance (of
+            all orders) from its mean.
         moments: sums of batch means for each angular moment and channel, float32.
 
     An array that is None stands for 0.
@@ -50,7 +50,7 @@ class BatchSums(Immutable):
         self.moment_count, self.is_correlated = moments, is_correlated
         self.real = mi.Float if is_correlated else dr.float64_array_t(mi.Float)
         self.streams: dict[int, int] = {}
-        self.totals: list = [None] * (len(LAYERS) * channels)
+        self.totals: list = [None] * (len(ORDER_GROUPS) * channels)
         self.spreads: list = [None] * channels
         self.moments: list = [None] * (moments * channels)
 
@@ -67,14 +67,14 @@ class BatchSums(Immutable):
         """Samples per active voxel."""
         return sum(self.streams.values())
 
-    def means(self, layer: int) -> list[mi.Float]:
-        """Return the irradiance of one of the `LAYERS` at the active voxels, per channel."""
-        n, first = self._batch_count, layer * self.channels
+    def means(self, group: int) -> list[mi.Float]:
+        """Return the irradiance of one of the `ORDER_GROUPS` at the active voxels, per channel."""
+        n, first = self._batch_count, group * self.channels
         totals = self.totals[first : first + self.channels]
         return [mi.Float(self.zeros if t is None else t / n) for t in totals]
 
     def irradiance(self) -> list[mi.Float]:
-        """Return the irradiance of both layers at the active voxels, per channel."""
+        """Return the irradiance of all orders at the active voxels, per channel."""
         return [a + b for a, b in zip(self.means(0), self.means(1), strict=True)]
 
     def moment_means(self) -> list[mi.Float]:

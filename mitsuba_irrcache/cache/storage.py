@@ -11,7 +11,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.statistics import BATCH, LAYERS, BatchSums
+from mitsuba_irrcache.cache.statistics import BATCH, ORDER_GROUPS, BatchSums
 from mitsuba_irrcache.errors import CacheFileError
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.io.files import atomic_write
@@ -153,7 +153,7 @@ def _check_sums(
     totals: np.ndarray, spreads: np.ndarray, shape: tuple[int, int], real: type
 ) -> None:
     channels, width = shape
-    expected = (len(LAYERS) * channels, width), shape
+    expected = (len(ORDER_GROUPS) * channels, width), shape
     if channels not in (1, 3) or (totals.shape, spreads.shape) != expected:
         raise ValueError(f"sums of shape {totals.shape} where {expected[0]} is expected")
     if totals.dtype != real or spreads.dtype != real:

@@ -47,8 +47,8 @@ def _consistent(method: Callable) -> Callable:
 class IrradianceCache:
     """Irradiance (fluence rate) Phi = int_S2 L dw on a grid.
 
-    The unit is W m^-2, or the scene's unit of radiance times sr. There are two layers:
-    ``uncollided`` (directly from emitters) and ``scattered`` (orders 1 to max_depth - 2). Only the
+    The unit is W m^-2, or the scene's unit of radiance times sr. It is the sum of ``uncollided``
+    (order 0, directly from emitters) and ``scattered`` (orders 1 to max_depth - 2). Only the
     ``active`` voxels, those that a lookup inside the medium can read, have values; the others are
     zero. ``fingerprint`` maps each input (medium, boundary, emitters, settings) to a digest.
     """
@@ -151,7 +151,7 @@ class IrradianceCache:
     @property
     @_consistent
     def irradiance(self) -> mi.TensorXf:
-        """Phi, both layers, (z, y, x, channel)."""
+        """Phi, all orders, (z, y, x, channel)."""
         return self._tensor(self._sums.irradiance())
 
     @property
@@ -250,9 +250,9 @@ class IrradianceCache:
         """Add ``samples`` per voxel of the stream ``seed``.
 
         ``blocks`` cover the active voxels in turn. Each is a tuple of lists of arrays: the sums of
-        batch means for each layer and channel; for each channel, the sum of squared deviations of
-        the batches' irradiance from its mean; and, for anisotropic scattering, the sums of batch
-        means for each moment and channel. None, in all blocks, stands for 0.
+        batch means for each order group and channel; for each channel, the sum of squared
+        deviations of the batches' irradiance from its mean; and, for anisotropic scattering, the
+        sums of batch means for each moment and channel. None, in all blocks, represents 0.
         """
         # One assignment: an interrupt cannot leave inconsistent sums.
         self._sums = self._sums.with_blocks(seed, samples, blocks)

@@ -23,7 +23,7 @@ MINIMUM_DISTANCE = 0.25
 #: Maximum distance of an emitter from the voxels, and maximum radius, in voxel edges. The
 #: irradiance of emitters that are larger or farther away is smooth enough for interpolation:
 #: accurate to 0.3 % between the voxels.
-REACH, LARGEST = 16.0, 8.0
+MOST_DISTANCE, LARGEST = 16.0, 8.0
 #: Maximum number of points that represent an area emitter, and that represent all emitters.
 MOST_POINTS = 8
 #: Number of positions at which the strength of a point-like emitter is evaluated.
@@ -71,11 +71,11 @@ class VoxelSamplePoints:
 class InverseSquareFactor:
     """Inverse-square factor W of nearby small emitters, which tends to 1 far away from them.
 
-        W = 1 + sum_k w_k REACH^2 h^2 / r_k^2,    sum_k w_k = 1,
+        W = 1 + sum_k w_k D^2 h^2 / r_k^2,    sum_k w_k = 1,
 
-    where h is the longest edge of a voxel. Lookups interpolate Phi / W and multiply by W. Phi / W
-    is smooth where Phi falls off like 1/r^2: next to an emitter it is proportional to the
-    transmittance.
+    where h is the longest edge of a voxel, and D is `MOST_DISTANCE`. Lookups interpolate Phi / W
+    and multiply by W. Phi / W is smooth where Phi falls off like 1/r^2: next to an emitter it is
+    proportional to the transmittance.
     """
 
     # docs/primer, eq. (2.4)
@@ -91,7 +91,7 @@ class InverseSquareFactor:
         self._points = [
             (
                 mi.Point3f([dr.opaque(mi.Float, float(v)) for v in position]),
-                dr.opaque(mi.Float, strength / total * (REACH * edge) ** 2),
+                dr.opaque(mi.Float, strength / total * (MOST_DISTANCE * edge) ** 2),
                 dr.opaque(mi.Float, max(squared, (NEAREST * edge) ** 2)),
             )
             for position, strength, squared in points
@@ -198,7 +198,7 @@ def _of_point(emitter: mi.Emitter, grid: Grid) -> list[tuple[np.ndarray, float, 
     not near.
     """
     position = position_of(emitter)
-    if edges_away(position[:, None], grid) > REACH:
+    if edges_away(position[:, None], grid) > MOST_DISTANCE:
         return []
     rng = np.random.default_rng(1)
     p = grid.world.point(mi.Point3f(rng.random((3, POSITIONS)) * grid.resolution[:, None]))
@@ -217,7 +217,7 @@ def _of_area(shape: mi.Shape, grid: Grid) -> list[tuple[np.ndarray, float, float
     found = shape.sample_position(0.0, sample)
     area, edge = float(dr.max(shape.surface_area())[0]), float(grid.voxel_size.max())
     positions = np.array(found.p, dtype=np.float64)
-    if np.sqrt(area / np.pi) > LARGEST * edge or edges_away(positions, grid) > REACH:
+    if np.sqrt(area / np.pi) > LARGEST * edge or edges_away(positions, grid) > MOST_DISTANCE:
         return []
     si = dr.zeros(mi.SurfaceInteraction3f, MOST_POINTS)
     si.p, si.n, si.uv, si.wi = found.p, found.n, found.uv, mi.Vector3f(0, 0, 1)

@@ -20,7 +20,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.compile import compile_scene
-from mitsuba_irrcache.scene.fingerprint import Snapshot
+from mitsuba_irrcache.scene.fingerprint import SceneVersion
 from mitsuba_irrcache.solvers.base import Progress as SolverProgress
 
 __all__ = ["CacheBuilder", "CacheSettings", "Progress"]
@@ -63,7 +63,7 @@ class CacheBuilder:
         self.revision = 0
         #: the visible media of the scene, each with its cache
         self.parts: list[CachedMedium] = []
-        self._snapshot: Snapshot | None = None
+        self._version: SceneVersion | None = None
         self._stages: list[Stage] = []
         self._checkpointed = 0  # number of active `checkpoints` contexts, which save the caches
         #: whether the first two batches may be rendered while incomplete; see `Solver.preview`
@@ -105,7 +105,7 @@ class CacheBuilder:
             if self.parts is other.parts:
                 return
             self.settings, self.samples = other.settings, other.samples
-            self.parts, self._snapshot = other.parts, other._snapshot
+            self.parts, self._version = other.parts, other._version
             self.revision += 1
 
     def fit(self, scene: mi.Scene) -> None:
@@ -115,16 +115,16 @@ class CacheBuilder:
 
     def _fit(self, scene: mi.Scene) -> None:
         volume = self._emission if isinstance(self._emission, mi.Volume) else None
-        snapshot = Snapshot(scene, volume, self._snapshot)
-        changes = snapshot.changes(self._snapshot) if self._snapshot is not None else []
-        if self._snapshot is None or changes:
-            edited = bool(changes) and snapshot.shares_objects_with(self._snapshot)
+        version = SceneVersion(scene, volume, self._version)
+        changes = version.changes(self._version) if self._version is not None else []
+        if self._version is None or changes:
+            edited = bool(changes) and version.shares_objects_with(self._version)
             if edited:
                 names = ", ".join(changes[:4])
                 mi.Log(mi.LogLevel.Info, f"irrcache: the scene changed ({names}): new cache")
             # Keep grids while parameters carry gradients: another grid makes the objective jump.
-            grids = _grids(self.parts) if edited and snapshot.carries_gradients else {}
-            self.parts, self._snapshot = [], None
+            grids = _grids(self.parts) if edited and version.carries_gradients else {}
+            self.parts, self._version = [], None
             self.revision += 1
             description = compile_scene(scene, self._baked_emission(), self.settings.max_depth)
             media = description.visible
@@ -144,7 +144,7 @@ class CacheBuilder:
                 )
                 for medium in media
             ]
-        self._snapshot = snapshot
+        self._version = version
 
     def _baked_emission(self) -> Emission | None:
         if self._emission is None:

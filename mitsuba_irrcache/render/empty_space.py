@@ -12,13 +12,13 @@ from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.media.emission import Emission
 
 #: Maximum distance in macrocells that rays skip at once.
-REACH = 8
+MOST_CELLS = 8
 
 
 class Clearance:
     """Chebyshev distance of each macrocell to the nearest one with extinction or emission.
 
-    Distances are in macrocells, 0 for occupied cells and at most `REACH`.
+    Distances are in macrocells, 0 for occupied cells and at most `MOST_CELLS`.
     """
 
     def __init__(self, cells: Macrocells, emission: Emission | None = None) -> None:
@@ -26,7 +26,7 @@ class Clearance:
         occupied = cells.majorant > 0
         if emission is not None:
             occupied |= emission.reaches(cells)
-        self.distance = chebyshev(occupied, cells.shape, REACH)
+        self.distance = chebyshev(occupied, cells.shape, MOST_CELLS)
 
     def along(self, ray: mi.Ray3f) -> ClearanceAlongRay:
         """Prepare lookups along a ray."""

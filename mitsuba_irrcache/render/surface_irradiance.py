@@ -25,7 +25,7 @@ from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_null
 
 #: Rays by which a node finds the distances of its surroundings, and by which it gathers radiance;
 #: by which those gather it that only other nodes see.
-PROBES, GATHERED, GATHERED_INDIRECT = 32, 128, 32
+DISTANCE_RAYS, GATHERED, GATHERED_INDIRECT = 32, 128, 32
 #: Rays by which a node gathers what forward peaks scatter, around each narrow source, and the mean
 #: cosine of the angle between them for a source without extent.
 AROUND_SOURCES, MEAN_COSINE = 64, 0.85
@@ -122,16 +122,16 @@ class SurfaceIrradiance:
         p, normals, valid = _first_surface(scene, ray, length)
         dr.eval(p, normals, valid)
         count = dr.width(numbers)
-        lane, k = Divisor(PROBES).split(dr.arange(mi.UInt32, count * PROBES))
-        start, rng = self._ray_from(scene, p, normals, numbers, (lane, k), PROBES)
+        lane, k = Divisor(DISTANCE_RAYS).split(dr.arange(mi.UInt32, count * DISTANCE_RAYS))
+        start, rng = self._ray_from(scene, p, normals, numbers, (lane, k), DISTANCE_RAYS)
         pointer = self.paths.media.pointer_of(dr.gather(mi.UInt32, medium, lane))
         active = dr.gather(mi.Bool, valid, lane)
         other, found, (nearest, surface) = self.paths.walk(scene, start, pointer, rng, active)
         closeness = dr.select(active & (nearest > 0), dr.rcp(nearest), 0)
         dr.eval(other, found, closeness, surface)
-        mean = dr.block_sum(closeness, PROBES) / PROBES
+        mean = dr.block_sum(closeness, DISTANCE_RAYS) / DISTANCE_RAYS
         distance = dr.select(valid, dr.rcp(dr.maximum(mean, 1e-18)), 0)
-        clearance = dr.block_reduce(dr.ReduceOp.Min, surface, PROBES)
+        clearance = dr.block_reduce(dr.ReduceOp.Min, surface, DISTANCE_RAYS)
         self.nodes.place(p, normals, distance, clearance, medium)
         return other, found
 

@@ -1,4 +1,4 @@
-"""Inputs of a cache: compared within a process by identity (`Snapshot`), in files by `digests`."""
+"""Inputs of a cache, compared by identity in a process (`SceneVersion`), in files by `digests`."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ SMALL, SMALL_IN_ALL, SAMPLED = 1 << 17, 1 << 19, 1 << 12
 
 #: Name of the input in `digests` that is compared with a tolerance, the number of its rays per
 #: shape, and the tolerance of their means.
-RESPONSES, PROBES, TOLERANCE = "responses of surfaces", 512, 1e-4
+RESPONSES, RESPONSE_RAYS, TOLERANCE = "responses of surfaces", 512, 1e-4
 #: Parts of ``str(object)`` that are not properties of the object: mesh name, scene bounds, address.
 _ELSEWHERE = re.compile(
     r"\A\w+\[\s*name = [^\n]*|\bbsphere = \w+\[.*?\n *\],?|0x[0-9a-f]+", re.DOTALL
 )
 
 
-class Snapshot:
+class SceneVersion:
     """Objects and parameters of a scene on which its caches depend, at one time.
 
-    Comparing two snapshots launches no kernel unless a parameter was edited in between. A snapshot
+    Comparing two versions launches no kernel unless a parameter was edited in between. A version
     references Dr.Jit variables directly, not the members of Mitsuba's objects, which change with
     the scene. While it holds a variable, no other variable can get the same index, and all
     operations that write to such an array (``dr.scatter``, ``params[key][i] = x``) write to a copy
@@ -42,7 +42,7 @@ class Snapshot:
     arrays are compared too, and a few thousand values of larger ones. Code that edits a large array
     through a view has to call ``params.set_dirty``, which Mitsuba requires as well.
 
-    A snapshot keeps the old arrays of an edited scene alive until the next rendering, which
+    A version keeps the old arrays of an edited scene alive until the next rendering, which
     releases them before it creates the new cache.
     """
 
@@ -50,11 +50,13 @@ class Snapshot:
         self,
         scene: mi.Scene,
         emission: mi.Volume | None = None,
-        previous: Snapshot | None = None,
+        previous: SceneVersion | None = None,
     ) -> None:
-        """``emission`` is a volume of the integrator, which need not be part of the scene. Values
-        that have not changed since the ``previous`` snapshot are shared with it, so that comparing
-        the two is fast.
+        """Record the present version of ``scene``.
+
+        ``emission`` is a volume of the integrator, which need not be part of the scene. Values that
+        have not changed since the ``previous`` version are shared with it, so that comparing the
+        two is fast.
         """
         params = mi.traverse(scene)
         camera_side = (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.ReconstructionFilter)
@@ -75,13 +77,13 @@ class Snapshot:
         budget = _Budget(SMALL_IN_ALL)
         self._values = {k: _kept(v, shared.get(k), budget) for k, v in values.items()}
 
-    def changes(self, other: Snapshot) -> list[str]:
+    def changes(self, other: SceneVersion) -> list[str]:
         """Return names of differing parameters, and classes of objects that only one has."""
         mine, theirs = self._values, other._values
         names = [k for k in mine.keys() | theirs.keys() if mine.get(k) != theirs.get(k)]
         return sorted({*names, *(node.class_name() for node in self._objects ^ other._objects)})
 
-    def shares_objects_with(self, other: Snapshot) -> bool:
+    def shares_objects_with(self, other: SceneVersion) -> bool:
         """Return whether both belong to the same scene, or to scenes that share objects."""
         return not self._objects.isdisjoint(other._objects)
 
@@ -224,14 +226,14 @@ def responses(scene: mi.Scene) -> str:
         np.array([getattr(shape.bbox(), end) for shape in shapes], dtype=np.float32).T
         for end in ("min", "max")
     )
-    count = len(shapes) * PROBES
-    shape = dr.arange(mi.UInt32, count) // PROBES
+    count = len(shapes) * RESPONSE_RAYS
+    shape = dr.arange(mi.UInt32, count) // RESPONSE_RAYS
     lower, upper = (
         mi.Point3f([dr.gather(mi.Float, mi.Float(row), shape) for row in rows])
         for rows in (lower, upper)
     )
     # The same random numbers for each shape: their order does not matter.
-    lane = dr.arange(mi.UInt32, count) % PROBES
+    lane = dr.arange(mi.UInt32, count) % RESPONSE_RAYS
     draws = [mi.sample_tea_float32(lane, mi.UInt32(k), 6) for k in range(16)]
     target = lower + mi.Point3f(draws[:3]) * (upper - lower)
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(draws[3:5]))
@@ -251,8 +253,8 @@ def responses(scene: mi.Scene) -> str:
         *(_squashed(value) for value in (reflected, weight, emitted)),
     ]
     # Random weights distinguish responses that have the same mean.
-    sums = [dr.block_sum(dr.select(valid, value, 0) * draws[12], PROBES) for value in found]
-    numbers = np.nan_to_num(np.array(sums, dtype=np.float64) / PROBES, nan=1.0)
+    sums = [dr.block_sum(dr.select(valid, value, 0) * draws[12], RESPONSE_RAYS) for value in found]
+    numbers = np.nan_to_num(np.array(sums, dtype=np.float64) / RESPONSE_RAYS, nan=1.0)
     return " ".join(f"{number:.6f}" for number in numbers.T.ravel())
 
 

@@ -140,8 +140,7 @@ class Solver(ABC):
     def knows_direct_lights(
         cls, scene: mi.Scene, medium: MediumGrid, grid: Grid, active: mi.UInt32
     ) -> bool:
-        """Return whether the uncollided layer includes exactly ``light.irradiance`` for each direct
-        light.
+        """Return whether the uncollided irradiance includes exactly that of each direct light.
 
         Lookups subtract it, and camera rays evaluate it in closed form. Otherwise the cache gets no
         direct lights.

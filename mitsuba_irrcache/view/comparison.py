@@ -9,7 +9,7 @@ import numpy as np
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.light import Light
 from mitsuba_irrcache.view.picture import Look, displayed
-from mitsuba_irrcache.view.reference import Reference
+from mitsuba_irrcache.view.reference import ViewReference
 
 #: What a window can compare: nothing, the two images, or the difference between them.
 KINDS = ("off", "swipe", "error")
@@ -54,7 +54,7 @@ class Comparison:
 
     def __init__(self, light: Light, camera: Camera, size: tuple[int, int]) -> None:
         self.light, self.camera, self.size = light, camera, size
-        self._reference = Reference(light, camera, size, COARSENESS[0])
+        self._reference = ViewReference(light, camera, size, COARSENESS[0])
         self._is_probing = True
         self._first_seconds = 0.0
 
@@ -81,7 +81,7 @@ class Comparison:
             seconds = (known.seconds - self._first_seconds) / (PROBE - 1)
             finest = _finest(seconds, known.coarseness)
             if finest != known.coarseness:
-                self._reference = Reference(self.light, self.camera, self.size, finest)
+                self._reference = ViewReference(self.light, self.camera, self.size, finest)
         return complete or not known.samples
 
     def state(self, kind: str, image: np.ndarray, look: Look, backdrop: np.ndarray) -> Compared:

@@ -13,7 +13,7 @@ from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import SAMPLES, View
 
 #: Layers in the EXR besides the image.
-LAYERS = ("colour", "illumination", "background", "transmittance", "depth", "noise", "bias")
+SAVED_AOVS = ("colour", "illumination", "background", "transmittance", "depth", "noise", "bias")
 #: Pattern of accepted file names: no folders, no hidden files.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 
@@ -47,7 +47,7 @@ def keep(
 
     def write() -> list[Path]:
         light = session.light
-        image, names = samples.channels(LAYERS, view.look.filtered)
+        image, names = samples.channels(SAVED_AOVS, view.look.filtered)
         about = {
             "version": __version__,
             "samples per voxel": light.samples,

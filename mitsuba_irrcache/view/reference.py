@@ -23,7 +23,7 @@ from mitsuba_irrcache.view.light import Light
 MOST_SAMPLES = 4096
 
 
-class Reference:
+class ViewReference:
     """Samples by ``volpath`` of the scene of a ``light``, at its maximum depth, from ``camera``.
 
     ``window_size`` is (width, height); each pixel of the reference covers ``coarseness`` x

@@ -21,7 +21,7 @@ from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
 from mitsuba_irrcache.media.medium import MediumGrid
 from mitsuba_irrcache.scene.occluders import first_surface
-from mitsuba_irrcache.solvers.discrete_ordinates.layout import layer_and_index
+from mitsuba_irrcache.solvers.discrete_ordinates.layout import block_and_index
 from mitsuba_irrcache.solvers.discrete_ordinates.track_record import FIXED_POINT_ONE
 from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TrackCrossings, TrackGeometry
 from mitsuba_irrcache.transport.path import MOST_CROSSINGS, is_solid
@@ -145,7 +145,7 @@ class SurfaceCrossings:
         #: index of the first crossing of each ordinate, and the number of all crossings
         self.starts = np.zeros(ordinates + 1, np.int64)
         for begin in range(0, ordinates, most):
-            number, place = layer_and_index(count, min(most, ordinates - begin))
+            number, place = block_and_index(count, min(most, ordinates - begin))
             number += dr.opaque(mi.UInt32, begin)
             first, last, before, behind, *voxels = _intersect(self, number, place)
             wanted = (first <= last) | (before < 1)
@@ -315,7 +315,7 @@ def _lattice(
     """
     across = [k for k in range(3) if k != axis]
     count = [int(upper[k] - lower[k]) * RAYS_PER_EDGE for k in across]
-    row, column = layer_and_index(count[0], count[1])
+    row, column = block_and_index(count[0], count[1])
     place = [dr.opaque(mi.Float, float(n)) for n in lower]
     for k, i in zip(across, (column, row), strict=True):
         place[k] = place[k] + (mi.Float(i) + 0.5) * (1 / RAYS_PER_EDGE)

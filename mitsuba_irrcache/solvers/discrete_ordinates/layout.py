@@ -76,8 +76,8 @@ def voxel_and_channel(count: int, channels: int) -> tuple[mi.UInt32, mi.UInt32]:
     return voxel, index - voxel * channels
 
 
-def layer_and_index(width: int, count: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Return layer, and index in the layer, of each value of an array of ``count`` consecutive
-    layers of ``width`` values (voxels or tracks).
+def block_and_index(width: int, count: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """Return block, and index in the block, of each value of an array of ``count`` consecutive
+    blocks of ``width`` values (voxels or tracks).
     """
     return Divisor(width).split(dr.arange(mi.UInt32, width * count))

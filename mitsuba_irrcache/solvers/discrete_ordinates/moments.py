@@ -22,7 +22,7 @@ from mitsuba_irrcache.core.jit import concatenated, symbolic
 from mitsuba_irrcache.solvers.discrete_ordinates.kernel import collisions
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     interleaved_channels,
-    layer_and_index,
+    block_and_index,
     voxel_and_channel,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel
@@ -229,7 +229,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
 
     def _scattered(self, phi: mi.Float) -> mi.Float:
         """Return the moments of the scattered radiance, per optical depth."""
-        moment, place = layer_and_index(self._width, self.moments.count)
+        moment, place = block_and_index(self._width, self.moments.count)
         factor = dr.gather(mi.Float, self.moments.factors, moment)
         scattered = phi * factor * dr.gather(mi.Float, self.albedo, place)
         dr.eval(scattered)
@@ -254,7 +254,7 @@ class AnisotropicMultigridLevel(MultigridLevel):
 
     def _indices(self, moments: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """Return moment, active voxel and channel of each value of an array of ``moments``."""
-        moment, place = layer_and_index(self._width, moments)
+        moment, place = block_and_index(self._width, moments)
         if self.channels == 1:
             return moment, place, mi.UInt32(0)
         voxel = place // self.channels

@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.cache.statistics import LAYERS
+from mitsuba_irrcache.cache.statistics import ORDER_GROUPS
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.grids.boundary import Boundary
 from mitsuba_irrcache.grids.occupancy import occupied_box
@@ -228,8 +228,10 @@ class Sweep:
     # A batch
 
     def _batch(self, number: int) -> tuple:
-        """Compute a batch: the irradiance of both layers in all channels at the active voxels, and
-        the moments if any, in the form that `IrradianceCache.add` takes.
+        """Compute a batch in the form that `IrradianceCache.add` takes.
+
+        It has the irradiance of both order groups in all channels at the active voxels, and the
+        moments if any.
         """
         cache, seed = self.cache, (self.seed, number)
         if self._medium.emission is not None:
@@ -239,15 +241,15 @@ class Sweep:
         found = []
         for channels in self._channel_groups(grey):
             found += self._solve(sets(channels), channels)
-        layers: list[list] = [[] for _ in range(len(LAYERS) + cache.moments)]
+        values: list[list] = [[] for _ in range(len(ORDER_GROUPS) + cache.moments)]
         # Channels with the same factor share one array.
         factors = {factor: dr.opaque(mi.Float, factor) for factor in map(float, colour)}
         for c in range(cache.channels):
             factor = factors[float(colour[c])]
-            for layer, values in zip(layers, found[min(c, len(found) - 1)], strict=True):
-                layer.append(values if values is None else values * factor)
-        dr.eval(layers)
-        irradiance, moments = layers[: len(LAYERS)], layers[len(LAYERS) :]
+            for own, part in zip(values, found[min(c, len(found) - 1)], strict=True):
+                own.append(part if part is None else part * factor)
+        dr.eval(values)
+        irradiance, moments = values[: len(ORDER_GROUPS)], values[len(ORDER_GROUPS) :]
         parts = [tuple(chain(*irradiance)), (None,) * cache.channels]
         return (*parts, tuple(chain(*moments))) if moments else tuple(parts)
 
@@ -318,8 +320,9 @@ class Sweep:
         level = self._level(channels)
         swept, uncollided = self._uncollided(level.tracks, sets[1:], channels)
         total = self._swept(level, sets, channels)
-        # Both layers use the same ordinates: in their sum the uncollided part along tracks cancels
-        # (but for suns evaluated in closed form), so it has no noise in a constant environment.
+        # Both order groups use the same ordinates: in their sum the uncollided part along tracks
+        # cancels (but for suns evaluated in closed form), so it has no noise in a constant
+        # environment.
         scattered = [
             dr.maximum(dr.gather(mi.Float, total, place) - along_tracks, 0)
             for place, along_tracks in zip(self._interleaved_places(channels), swept, strict=True)

@@ -45,7 +45,7 @@ from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
     flat_index,
-    layer_and_index,
+    block_and_index,
     slicewise,
     strides_of,
 )
@@ -220,7 +220,7 @@ class Tracks:
             medium = self._medium(axis, source is not None)
             for start in range(0, len(pairs), most):
                 group = PairGroup(table, pairs[start : start + most])
-                number, track = layer_and_index(self._count, len(group))
+                number, track = block_and_index(self._count, len(group))
                 size = 2 * len(group) * values * width
                 # Zeros where empty slices are skipped.
                 defined = collisions and medium.empty is None
@@ -284,7 +284,7 @@ class Tracks:
         most, medium = max(1, MAX_COPIED_VOXELS // voxels), self._medium(0, has_source)
         for start in range(0, len(pairs), most):
             group = PairGroup(table, pairs[start : start + most])
-            number, track = layer_and_index(self._count, len(group))
+            number, track = block_and_index(self._count, len(group))
             copies = dr.opaque(mi.Float, 0, dr.width(values) * len(group))
             volume = SweptVolume(
                 copies,

@@ -62,5 +62,5 @@ def estimate(
     arguments are those of `contributions`.
     """
     found = contributions(tracer, position, *others)
-    layers = [sum(f[1] for f in found), sum(f[2] for f in found)]
-    return layers + (directional.moments(position, found) if directional is not None else [])
+    irradiances = [sum(f[1] for f in found), sum(f[2] for f in found)]
+    return irradiances + (directional.moments(position, found) if directional is not None else [])

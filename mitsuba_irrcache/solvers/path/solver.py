@@ -5,7 +5,7 @@ With isotropic scattering the irradiance at x is a sum over scattering orders (p
     Phi(x) = sum_k E[beta_k D(x_k)],   x_0 = x,  beta_0 = 1,  beta_k = beta_(k-1) albedo(x_k)
 
 where x_k follows from x_(k-1) by a uniform direction and a free flight, and D(x) = int_S2 L_e T dw
-is the irradiance at x directly from the emitters. Order 0 is the *uncollided* layer of the
+is the irradiance at x directly from the emitters. Order 0 is the *uncollided* part of the
 cache, the others the *scattered* one.
 """
 
@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_irrcache.cache.angular import AngularBasis
-from mitsuba_irrcache.cache.statistics import BATCH, LAYERS
+from mitsuba_irrcache.cache.statistics import BATCH, ORDER_GROUPS
 from mitsuba_irrcache.cache.volume import IrradianceCache
 from mitsuba_irrcache.core.jit import symbolic
 from mitsuba_irrcache.core.sequences import kronecker, random_stream
@@ -143,13 +143,13 @@ class PathSolver(Solver):
         while remaining:
             count = min(batches_at_once, remaining)
             first = cache.streams.get(seed, 0) // BATCH
-            layers = []
+            blocks = []
             for voxels in _blocks(cache.active_count, block):
-                if layers and progress is not None:
+                if blocks and progress is not None:
                     progress(done, total)
-                layers.append(estimator.batches(voxels, first, count))
+                blocks.append(estimator.batches(voxels, first, count))
                 done += dr.width(voxels) * BATCH * count
-            cache.add(seed, BATCH * count, layers)
+            cache.add(seed, BATCH * count, blocks)
             if progress is not None:
                 progress(done, total)
             remaining -= count
@@ -182,8 +182,8 @@ def _block(cache: IrradianceCache) -> int:
 def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
     """Compute the statistics of each voxel from sums over batches of ``size`` samples.
 
-    Each voxel has ``count`` consecutive batches. Returns sums of batch means for each layer and
-    channel; squared deviations of the irradiance (both layers) from its mean for each channel; and
+    Each voxel has ``count`` consecutive batches. Returns sums of batch means for each order group
+    and channel; squared deviations of the irradiance from its mean for each channel; and
     sums of batch means of the moments, if any.
     """
     means = [total / size for total in totals]
@@ -196,8 +196,8 @@ def _statistics(totals: list, size: int, count: int, channels: int) -> tuple:
         for s, b in zip(squares, both, strict=True)
     ]
     sums = [dr.block_sum(mean, count) for mean in means]
-    layers, moments = tuple(sums[: 2 * channels]), tuple(sums[2 * channels :])
-    return (layers, tuple(spreads), *([moments] if moments else []))
+    totals, moments = tuple(sums[: 2 * channels]), tuple(sums[2 * channels :])
+    return (totals, tuple(spreads), *([moments] if moments else []))
 
 
 class Opening(Preview):
@@ -210,7 +210,7 @@ class Opening(Preview):
         self.cache, self.seed = task.cache, task.seed
         self.size = 0  #: samples of each batch so far
         self._estimator = _Estimator(task)
-        # In blocks of voxels, for each layer and channel: the sums of both batches.
+        # In blocks of voxels, for each order group and channel: the sums of both batches.
         self._totals: list[list] = []
 
     def grow(self, size: int, progress: Progress | None = None) -> None:
@@ -268,8 +268,8 @@ class _Estimator:
         """Estimate ``count`` batches, starting with batch ``first``.
 
         ``voxels`` are indices into the list of active voxels. Returns for each voxel the sums of
-        the batch means of every layer and channel and their spread for every channel (float64),
-        and the sums for every moment and channel (float32).
+        the batch means of every order group and channel and their spread for every channel
+        (float64), and the sums for every moment and channel (float32).
         """
         result = _statistics(
             self.sums(voxels, first, count, 0, BATCH), BATCH, count, self.cache.channels
@@ -280,7 +280,7 @@ class _Estimator:
 
     def sums(self, voxels: mi.UInt32, first: int, count: int, start: int, size: int) -> list:
         """Sum samples ``start`` to ``start + size`` of batches ``first`` to ``first + count`` for
-        every layer and channel; the batches of a voxel are consecutive.
+        every order group and channel; the batches of a voxel are consecutive.
 
         Float64 sums of float32 values are exact (unless these span a factor of 2^25), so they do
         not depend on how samples are divided into passes.
@@ -293,25 +293,25 @@ class _Estimator:
         within = lane - row * per_batch + dr.opaque(mi.UInt32, start)
         number = dr.gather(mi.UInt32, voxels, lane // per_voxel)
         voxel = dr.gather(mi.UInt32, cache.active, number)
-        layers = list(self._layers(self.sample_points.of(voxel), batch, within, voxel))
+        values = list(self._sample(self.sample_points.of(voxel), batch, within, voxel))
         for light in cache.direct_lights:
-            layers[0] += dr.gather(mi.Spectrum, light.irradiance, number)
+            values[0] += dr.gather(mi.Spectrum, light.irradiance, number)
         double = dr.float64_array_t(mi.Float)
-        # A layer that is zero throughout comes as a literal without a width.
+        # Values that are zero throughout come as a literal without a width.
         none = dr.zeros(mi.Float, dr.width(lane))
-        kinds = [double] * len(LAYERS) + [mi.Float] * cache.moments
+        kinds = [double] * len(ORDER_GROUPS) + [mi.Float] * cache.moments
         values = [
             kind(v[c] + none)
-            for kind, v in zip(kinds, layers, strict=True)
+            for kind, v in zip(kinds, values, strict=True)
             for c in range(cache.channels)
         ]
         dr.eval(values)
         return [dr.block_sum(value, size) for value in values]
 
-    def _layers(
+    def _sample(
         self, position: mi.Point3f, batch: mi.UInt32, within: mi.UInt32, voxel: mi.UInt32
     ) -> Sequence[mi.Spectrum]:
-        """Compute one sample per lane of both layers and of the moments."""
+        """Compute one sample per lane of both order groups and of the moments."""
         rng, spread = _random_numbers(batch, within, voxel, self.seed)
         if not self.medium.is_traced:
             return self._estimate(position, spread, rng)
@@ -324,7 +324,7 @@ class _Estimator:
 
     @symbolic
     def _estimate(self, position: mi.Point3f, spread: list[mi.Float], rng: mi.PCG32):
-        """Compute one sample of both layers per lane in an isolated medium.
+        """Compute one sample of both order groups per lane in an isolated medium.
 
         ``spread`` are four uniform numbers for the directions.
         """

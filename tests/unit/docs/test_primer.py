@@ -106,7 +106,7 @@ def test_no_line_is_taken_for_a_comment(page):
 
 
 CONSTANTS = [
-    ("2-representation", r"\\frac\{\((\d+) h\)\^2\}", (falloff.REACH,)),
+    ("2-representation", r"\\frac\{\((\d+) h\)\^2\}", (falloff.MOST_DISTANCE,)),
     ("4-sweep", r"4\\pi \\cdot ([\d.]+)\) < 1", (multigrid.THIN,)),
     ("4-sweep", r"of at most (\d+) voxels along a side", (multigrid.COARSEST,)),
     ("4-sweep", r"\$\[-0.5, (\d+)\]\$", (anderson.MAX_EXTRAPOLATION,)),

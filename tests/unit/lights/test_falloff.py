@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 from mitsuba_irrcache.grids.grid import Grid
-from mitsuba_irrcache.lights.falloff import LARGEST, REACH, InverseSquareFactor
+from mitsuba_irrcache.lights.falloff import LARGEST, MOST_DISTANCE, InverseSquareFactor
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -33,7 +33,9 @@ def test_factor_depends_on_the_distance():
     """The factor is 1 + (16 h / r)^2, whatever the intensity."""
     p = np.random.default_rng(1).random((3, 50))
     squares = np.sum((p - LAMP[:, None]) ** 2, axis=0)
-    np.testing.assert_allclose(value(falloff(), p), 1 + (REACH / 8) ** 2 / squares, rtol=1e-3)
+    np.testing.assert_allclose(
+        value(falloff(), p), 1 + (MOST_DISTANCE / 8) ** 2 / squares, rtol=1e-3
+    )
 
 
 @pytest.mark.parametrize("aside", [0.0, 1e-3, 0.04, 0.3])
@@ -47,7 +49,7 @@ def test_means_along_a_ray(aside, a, b):
 
     def w(t: float) -> float:
         squared = (t - 0.53) ** 2 + aside**2 + (1e-3 / 8) ** 2
-        return 1 + (REACH / 8) ** 2 / squared
+        return 1 + (MOST_DISTANCE / 8) ** 2 / squared
 
     for k, mean in enumerate(measured):
         weighted = quad(
@@ -70,14 +72,14 @@ def test_means_over_voxels():
         index = mi.UInt32(voxel[0] + 8 * (voxel[1] + 8 * voxel[2]))
         mean = found.spread(index)[0] * found.of_voxels(index)[0]
         squares = np.sum(((np.array(voxel) + offsets) / 8 - position) ** 2, axis=1)
-        expected = 1 + np.mean((REACH / 8) ** 2 / squares)
+        expected = 1 + np.mean((MOST_DISTANCE / 8) ** 2 / squares)
         assert mean == pytest.approx(expected, rel=tolerance)
 
 
 def test_only_near_and_small_emitters_have_a_factor():
     """Only near and small emitters get a factor; others vary smoothly between voxels."""
-    assert falloff([0.5, 0.5, 1 + 0.9 * REACH / 8]) is not None
-    assert falloff([0.5, 0.5, 1 + 1.1 * REACH / 8]) is None
+    assert falloff([0.5, 0.5, 1 + 0.9 * MOST_DISTANCE / 8]) is not None
+    assert falloff([0.5, 0.5, 1 + 1.1 * MOST_DISTANCE / 8]) is None
     for size, near in ((0.5, True), (2.0, False)):
         place = mi.ScalarTransform4f().translate([0.5, 0.5, 1.2]).scale(size * LARGEST / 8)
         lamp = {"type": "disk", "to_world": place, "emitter": {"type": "area"}}

@@ -14,7 +14,7 @@ from mitsuba_irrcache.grids.fields import ConstantField, GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.majorants import Macrocells
 from mitsuba_irrcache.media.medium import MediumGrid
-from mitsuba_irrcache.render.empty_space import REACH, Clearance
+from mitsuba_irrcache.render.empty_space import MOST_CELLS, Clearance
 from mitsuba_irrcache.render.quadrature import QUADRATURES, segment
 from mitsuba_irrcache.render.raymarch import EARLY_STOP, Projection
 
@@ -212,7 +212,7 @@ def test_skipping_empty_macrocells_changes_nothing():
 
 
 def test_clearance_is_the_distance_to_matter():
-    """The clearance of macrocells is their distance to occupied ones, up to REACH.
+    """The clearance of macrocells is their distance to occupied ones, up to MOST_CELLS.
 
     The distance in the maximum norm is compared with a search over all pairs of cells.
     """
@@ -222,7 +222,7 @@ def test_clearance_is_the_distance_to_matter():
     matter = place[np.array(cells.majorant) > 0]
     expected = np.abs(place[:, None] - matter[None]).max(axis=2).min(axis=1)
     found = np.array(Clearance(cells).distance)
-    np.testing.assert_array_equal(found, np.minimum(expected, REACH))
+    np.testing.assert_array_equal(found, np.minimum(expected, MOST_CELLS))
 
 
 def test_early_stop_with_a_bright_light_behind():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.scene.compile import compile_scene
-from mitsuba_irrcache.scene.fingerprint import Snapshot, digests
+from mitsuba_irrcache.scene.fingerprint import SceneVersion, digests
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -48,12 +48,12 @@ def test_edits_of_emitters_are_detected(scenes, ending):
     Parameters that Mitsuba derives from it are excepted.
     """
     scene = cloud_scene(scenes)
-    before = Snapshot(scene)
-    assert Snapshot(scene).changes(before) == []
+    before = SceneVersion(scene)
+    assert SceneVersion(scene).changes(before) == []
     params, key = named(scene, ending)
     params[key] = EDITS[ending](params[key])
     params.update()
-    assert key in Snapshot(scene).changes(before)
+    assert key in SceneVersion(scene).changes(before)
 
 
 @pytest.mark.parametrize(
@@ -61,17 +61,17 @@ def test_edits_of_emitters_are_detected(scenes, ending):
 )
 def test_edits_of_the_camera_are_ignored(scenes, ending, value):
     scene = cloud_scene(scenes)
-    before = Snapshot(scene)
+    before = SceneVersion(scene)
     params, key = named(scene, ending)
     params[key] = value
     params.update()
-    assert Snapshot(scene).changes(before) == []
+    assert SceneVersion(scene).changes(before) == []
 
 
 def test_comparing_snapshots_runs_no_kernel(scenes, kernels):
     scene = cloud_scene(scenes)
-    before = Snapshot(scene)
-    assert kernels(lambda: Snapshot(scene).changes(before)) == []
+    before = SceneVersion(scene)
+    assert kernels(lambda: SceneVersion(scene).changes(before)) == []
 
 
 def digest(scene) -> dict[str, str]:

@@ -17,7 +17,7 @@ from mitsuba_irrcache.view import comparison
 from mitsuba_irrcache.view.camera import Camera
 from mitsuba_irrcache.view.document import Document
 from mitsuba_irrcache.view.light import Light
-from mitsuba_irrcache.view.reference import Reference
+from mitsuba_irrcache.view.reference import ViewReference
 from mitsuba_irrcache.view.session import Session
 from mitsuba_irrcache.view.window import Picture, View
 from tests.support.viewer_session import SCENE, SIZE, Screen, drag, front
@@ -43,9 +43,9 @@ def document(request, tmp_path, scenes) -> Document:
     return Document.load(tmp_path / "scene.xml")
 
 
-def reference_of(document: Document, camera: Camera, samples: int) -> Reference:
+def reference_of(document: Document, camera: Camera, samples: int) -> ViewReference:
     light = Light(document.scene(), document.settings, document.seeing)
-    found = Reference(light, camera, SIZE)
+    found = ViewReference(light, camera, SIZE)
     while found.samples < samples:
         found.refine()
     return found
@@ -91,7 +91,7 @@ def test_reported_error_excludes_the_reference_noise(document):
     """
     camera = Camera((0.5, -5.0, 1.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
     exact = reference_of(document, camera, 96).radiance()
-    few = Reference(Light(document.scene(), document.settings, document.seeing), camera, SIZE)
+    few = ViewReference(Light(document.scene(), document.settings, document.seeing), camera, SIZE)
     assert few.error_of(exact) is None
     while few.samples < 2:
         few.refine()
@@ -146,7 +146,7 @@ def test_coarse_references_are_means_over_pixels(document):
     """A coarse reference is the finer one, averaged over the pixels that it covers."""
     camera = Camera((0.5, -5.0, 1.5), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0)
     light = Light(document.scene(), document.settings, document.seeing)
-    fine, coarse = Reference(light, camera, SIZE), Reference(light, camera, SIZE, 3)
+    fine, coarse = ViewReference(light, camera, SIZE), ViewReference(light, camera, SIZE, 3)
     for reference, samples in ((fine, 24), (coarse, 96)):
         while reference.samples < samples:
             reference.refine()

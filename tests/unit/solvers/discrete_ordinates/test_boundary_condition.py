@@ -24,15 +24,15 @@ DIRECTIONS = np.array([[0.2, 0.5, 1.0], [1.0, -0.7, 0.4], [-0.3, -1.0, 0.6], [0.
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 
 
-def swept(lattice: Tracks, found: IncomingRadiance, values: mi.Float, i: int, offset) -> np.ndarray:
+def swept(tracks: Tracks, found: IncomingRadiance, values: mi.Float, i: int, offset) -> np.ndarray:
     """Return the radiance at voxels of tracks in direction ``i`` without extinction."""
     dark, rows = np.zeros((1, 2)), np.array([i])
 
     def entering(table):
-        return BoundarySource(*found._cells_of(lattice, table, rows), values)
+        return BoundarySource(*found._cells_of(tracks, table, rows), values)
 
-    volume = lattice.uncollided(DIRECTIONS[rows], dark, offset[rows], entering)
-    return np.array(volume, dtype=np.float64).reshape(lattice.grid.shape)
+    volume = tracks.uncollided(DIRECTIONS[rows], dark, offset[rows], entering)
+    return np.array(volume, dtype=np.float64).reshape(tracks.grid.shape)
 
 
 @pytest.fixture
@@ -58,16 +58,16 @@ def test_tracks_carry_the_radiance_of_their_entry(scenes, monkeypatch, alone, wa
     fine = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
     offsets = np.random.default_rng(3).random((len(DIRECTIONS), 2))
     found, (_, _, hit, ray, _) = sampled_rays(fine, DIRECTIONS, offsets)
-    lattice, low, high = fine, lower, upper
+    tracks, low, high = fine, lower, upper
     if coarse:
         half = Grid((6, 5, 4), place)
         low, high = lower // 2, upper // 2
-        lattice = Tracks(half, dr.zeros(mi.Float, half.voxel_count), low, high)
+        tracks = Tracks(half, dr.zeros(mi.Float, half.voxel_count), low, high)
     inside = np.s_[low[2] : high[2], low[1] : high[1], low[0] : high[0]]
-    at = np.moveaxis(np.indices(lattice.grid.shape)[::-1], 0, -1) + 0.5
-    world = lattice.grid.world.matrix
+    at = np.moveaxis(np.indices(tracks.grid.shape)[::-1], 0, -1) + 0.5
+    world = tracks.grid.world.matrix
     centres = (at @ world[:3, :3].T + world[:3, 3])[inside]
-    edge = np.linalg.norm(lattice.grid.voxel_size)
+    edge = np.linalg.norm(tracks.grid.voxel_size)
     for i, direction in enumerate(DIRECTIONS):
         across = np.cross(direction, [0.3, 0.8, -0.5])
         across /= np.linalg.norm(across)
@@ -75,7 +75,7 @@ def test_tracks_carry_the_radiance_of_their_entry(scenes, monkeypatch, alone, wa
         is_way = (dr.arange(mi.UInt32, dr.width(along)) & 1) == way
         values = dr.select(hit & is_way, along, 0)
         dr.eval(values)
-        brought = swept(lattice, found, values, i, offsets)[inside]
+        brought = swept(tracks, found, values, i, offsets)[inside]
         share = 1 if cells > 30 else found._edge.max()
         error = np.abs(brought - (centres @ across + 10))
         assert error.max() < 0.9 * edge * share
@@ -96,11 +96,11 @@ def test_reflected_radiance_is_linear_in_phi(scenes):
     scene = scenes.load({"type": "irrcache", "solver": "path"}, shape, 4, emitter=None, wall=wall)
     (medium,) = compile_scene(scene).visible
     grid = Grid((8, 8, 8), medium.frame)
-    lattice = Tracks(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)
+    tracks = Tracks(grid, dr.full(mi.Float, 40.0, 512), np.zeros(3, int), grid.resolution)
     offsets = np.random.default_rng(1).random((len(DIRECTIONS), 2))
     rows = DIRECTIONS, np.zeros((len(DIRECTIONS), 2, 3)), np.ones(len(DIRECTIONS)), offsets
     found = IncomingRadiance(
-        SurfaceBoundary(scene, medium, [], 1000), lattice, rows, True, (1, 2, 0)
+        SurfaceBoundary(scene, medium, [], 1000), tracks, rows, True, (1, 2, 0)
     )
     returned, voxel = np.array(found.reflected[0]) * 4 * np.pi, np.array(found.voxel)
     assert np.array(found.emitted).max() == 0

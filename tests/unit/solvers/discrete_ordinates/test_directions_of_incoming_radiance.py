@@ -111,16 +111,16 @@ def test_scattering_voxel_radiates_forward():
 
 
 def test_paths_continue_their_tracks(scenes, monkeypatch):
-    """A path that continues a track passes the centres of all slices at points of the lattice.
+    """A path that continues a track passes the centres of all slices at points of the tracks.
 
     These are a whole number of voxels from the first track.
     """
     without_paths(monkeypatch)
     grid = Grid((12, 10, 8), scenes.placement((1.0, 3.0, 2.0), turn=35))
     lower, upper = np.array([2, 2, 0]), np.array([8, 8, 10])
-    lattice = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
+    tracks = Tracks(grid, dr.zeros(mi.Float, grid.voxel_count), lower, upper)
     offsets = np.random.default_rng(3).random((len(WAYS), 2))
-    _, (number, _, hit, ray, _) = sampled_rays(lattice, WAYS, offsets)
+    _, (number, _, hit, ray, _) = sampled_rays(tracks, WAYS, offsets)
     row, hit = np.array(number) // 2, np.array(hit)
     start = np.array(grid.coordinates.point(ray.o), np.float64)[:, hit].T
     velocities = WAYS @ grid.coordinates.matrix[:3, :3].T

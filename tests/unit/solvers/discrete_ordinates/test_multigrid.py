@@ -39,10 +39,10 @@ def level(random, evenly: bool):
     sigma_t = mi.Float(random.uniform(0, 20, VOXELS).tolist())
     albedos = random.uniform(0.5, 1, (3, VOXELS))
     grid = Grid(SHAPE, np.eye(4))
-    lines = Tracks(grid, sigma_t, np.zeros(3, int), grid.resolution)
+    tracks = Tracks(grid, sigma_t, np.zeros(3, int), grid.resolution)
 
     def of(*channels: int) -> MultigridLevel:
-        return MultigridLevel(sigma_t, flat(albedos[list(channels)]), lines, evenly)
+        return MultigridLevel(sigma_t, flat(albedos[list(channels)]), tracks, evenly)
 
     return of
 
@@ -148,14 +148,14 @@ def test_solution_needs_occupied_voxels_only(random, evenly):
     found = []
     for wanted in (np.arange(VOXELS), index):
         all_matter = mi.Float(sigma_t.tolist())
-        lines = Tracks(
+        tracks = Tracks(
             grid, all_matter, np.zeros(3, int), grid.resolution,
             active=mi.UInt32(wanted.tolist()), sparse=len(wanted) < VOXELS,
         )  # fmt: skip
         fields = (mi.Float(f[wanted].ravel().tolist()) for f in (sigma_t, albedo))
-        some = MultigridLevel(*fields, lines, evenly)
+        some = MultigridLevel(*fields, tracks, evenly)
         phi = some.solve(mi.Float(b[wanted].ravel().tolist()), of_rows)
-        received = some.sweep(phi, lines.table(*of_rows))[0]
+        received = some.sweep(phi, tracks.table(*of_rows))[0]
         found.append([np.array(v).reshape(-1, 2) for v in (phi, received)])
     for whole, part in zip(*found, strict=True):
         whole = whole[index]

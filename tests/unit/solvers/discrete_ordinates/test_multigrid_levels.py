@@ -25,9 +25,9 @@ def level_of(scenes, shape, edges, sigma_t: np.ndarray, evenly: bool) -> Multigr
     sides = np.array(shape)[::-1] * edges
     grid = Grid(shape, scenes.placement(tuple(sides), turn=20))
     values = mi.Float(np.float32(sigma_t).ravel())
-    lattice = Tracks(grid, values, np.zeros(3, int), grid.resolution)
+    tracks = Tracks(grid, values, np.zeros(3, int), grid.resolution)
     return MultigridLevel(
-        values, mi.Float(np.full(values.shape[0], 0.8, np.float32)), lattice, evenly
+        values, mi.Float(np.full(values.shape[0], 0.8, np.float32)), tracks, evenly
     )
 
 

@@ -56,8 +56,8 @@ def test_incoming_radiance_stays_in_bounds(out_of_bounds, grid, box):
     directions = np.array([[0.2, 0.5, 1.0], [1.0, -0.7, 0.4], [-0.3, -1.0, 0.6]])
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     sigma_t = dr.opaque(mi.Float, 0.5, grid.voxel_count)
-    lattice = Tracks(grid, sigma_t, *map(np.array, box))
+    tracks = Tracks(grid, sigma_t, *map(np.array, box))
     offsets = np.random.default_rng(1).random((3, 2))
     assert not out_of_bounds(
-        lambda: dr.eval(lattice.uncollided(directions, np.ones((3, 2)), offsets))
+        lambda: dr.eval(tracks.uncollided(directions, np.ones((3, 2)), offsets))
     )

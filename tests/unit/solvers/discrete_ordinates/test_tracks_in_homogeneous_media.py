@@ -52,11 +52,11 @@ def test_incoming_radiance_is_attenuated(way, back):
     """
     grid, sigma_t = Grid(SHAPE, np.diag([1.4, 1.8, 1.2, 1])), 4.0
     count = grid.voxel_count
-    lines = Tracks(grid, dr.full(mi.Float, sigma_t, count), np.zeros(3, int), grid.resolution)
+    tracks = Tracks(grid, dr.full(mi.Float, sigma_t, count), np.zeros(3, int), grid.resolution)
     light, offset = np.zeros((1, 2)), np.array([[0.35, 0.8]])
     light[0, back] = 3.0
     volume = dr.opaque(mi.Float, 0, count * 4)
-    lines.sweep(volume, lines.table(way[None], light, np.ones(1), offset))
+    tracks.sweep(volume, tracks.table(way[None], light, np.ones(1), offset))
     received = np.array(volume, np.float64).reshape(*SHAPE, 4)[..., 1]
     length = behind_the_entry(grid, -way if back else way, offset[0])
     np.testing.assert_allclose(received, 3 * np.exp(-sigma_t * length), rtol=2e-3)
