@@ -20,16 +20,13 @@ Rows are saved in output/defaults/results.json; no case is started after ``--bud
 from __future__ import annotations
 
 import time
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
-from experiments.support.documents import replace_tables
-from experiments.support.options import add_document, begin, parser_of
-from experiments.support.store import Store
+from experiments.support.case_rows import CaseRows, with_budget
 from experiments.validation.defaults.cases import SMOOTH, Case, cases
 from mitsuba_irrcache.compare.metrics import block_means
 from mitsuba_irrcache.compare.tables import Table
@@ -97,25 +94,16 @@ def cells(case: Case, row: dict) -> list[str]:
 
 def run() -> None:
     """Compute missing rows, and print the table."""
-    parser = parser_of(__doc__)
-    add_document(parser)
-    parser.add_argument("--only", default="", help="cases whose name contains this")
-    parser.add_argument("--budget", type=float, default=480, help="no case is begun later")
-    args = parser.parse_args()
-    begin()
-    mi.set_variant("llvm_ad_mono")
-    mi.set_log_level(mi.LogLevel.Error)
-    folder = args.output / "defaults"
-    folder.mkdir(parents=True, exist_ok=True)
-    store, started = Store(folder / "results.json", args.force), time.perf_counter()
-    table = []
-    for case in (c for c in cases() if args.only in c.name):
-        if case.name not in store.rows and time.perf_counter() - started > args.budget:
-            continue
-        table.append(cells(case, store.row(case.name, partial(measure, case))))
-        print(" | ".join(table[-1]), flush=True)
-    if args.document:
-        replace_tables(args.document, {"defaults": Table("", HEAD, table)})
+    rows = CaseRows(__doc__, "defaults", with_budget(480), "llvm_ad_mono")
+    table = [
+        cells(case, row)
+        for case, row in rows.rows(
+            ((case.name, case) for case in cases()),
+            measure,
+            lambda title, case, row: " | ".join(cells(case, row)),
+        )
+    ]
+    rows.write({"defaults": Table("", HEAD, table)})
 
 
 if __name__ == "__main__":

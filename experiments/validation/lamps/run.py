@@ -14,18 +14,14 @@ Rows and references are saved in output/lamps; ``--force`` discards the rows. No
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from time import process_time
 
 import mitsuba as mi
 import numpy as np
 
-from experiments.support.documents import replace_tables
-from experiments.support.options import Options, add_document, begin, parser_of
-from experiments.support.store import Store
+from experiments.support.case_rows import CaseRows, with_reference
 from experiments.validation.lamps.cases import CASES, build
 from experiments.validation.thick.cases import scene
 from experiments.validation.thick.run import BLOCK, PIXELS, SPP, image, reference
@@ -107,28 +103,25 @@ def tabulate(
     settings: dict[str, dict],
 ) -> None:
     """Compute missing rows of an experiment of this ``name`` and print the table."""
-    parser = parser_of(description)
-    add_document(parser)
-    parser.add_argument("--only", default="", help="cases whose name contains this")
-    parser.add_argument("--seconds", type=float, default=40.0, help="of volpath for each case")
-    args = parser.parse_args()
-    begin()
-    options = Options(output=args.output, force=args.force)
-    folder = options.folder(name)
-    store, rows = Store(folder / "results.json", options.force), []
-    for case in cases:
-        if args.only not in case:
-            continue
-        objects, depth = build(case)
-        file = folder / f"{re.sub('[^0-9a-z]+', '-', case)}.npy"
-        for title, chosen in settings.items():
-            arguments = objects, depth, chosen, args.seconds, file
-            row = store.row(f"{case}: {title}", partial(measure, *arguments))
-            rows.append(cells(case, title, row))
-            print(" | ".join(rows[-1]), flush=True)
-    if args.document:
-        short = [[r[0], *r[2:]] for r in rows if r[1] == "defaults"]
-        replace_tables(args.document, {name: Table("", [HEAD[0], *HEAD[2:]], short)})
+    rows = CaseRows(description, name, with_reference(40.0))
+
+    def titled() -> Iterator[tuple[str, tuple]]:
+        for case in cases:
+            if rows.args.only in case:
+                objects, depth = build(case)
+                where = rows.args.seconds, rows.file(case)
+                for title, chosen in settings.items():
+                    yield f"{case}: {title}", (case, title, (objects, depth, chosen, *where))
+
+    def shown(_: str, case: tuple, row: dict) -> str:
+        return " | ".join(cells(case[0], case[1], row))
+
+    found = [
+        cells(case, title, row)
+        for (case, title, _), row in rows.rows(titled(), lambda case: measure(*case[2]), shown)
+    ]
+    short = [[r[0], *r[2:]] for r in found if r[1] == "defaults"]
+    rows.write({name: Table("", [HEAD[0], *HEAD[2:]], short)})
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ smaller one of the error at the finest resolution and the limit, with its standa
 
 from __future__ import annotations
 
+import argparse
 import time
 from functools import partial
 
@@ -25,14 +26,14 @@ import mitsuba as mi
 import numpy as np
 
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
-from experiments.support.documents import replace_tables
-from experiments.support.options import add_document, begin, parser_of
+from experiments.support.case_rows import CaseRows, with_budget
 from experiments.support.store import Store
 from experiments.validation.limits.cases import EMITTERS, Case, cases
 from experiments.validation.limits.reference import orders, single
 from mitsuba_irrcache.compare.tables import Table
 from mitsuba_irrcache.errors import IrrcacheError, origin
 
+SOLVERS = ("sweep", "path")
 #: Resolutions with samples per voxel; the last two with several seeds. With few samples images of
 #: ``path`` are too dark (16 at a resolution of 64: 0.5 to 1 %, some 4 % in a narrow cone), which
 #: decreases with the noise of the samples; probably because roots of irradiance are interpolated.
@@ -160,29 +161,21 @@ def cell(row: dict | None) -> str:
 
 def run() -> None:
     """Compute missing rows, and print the table."""
-    parser = parser_of(__doc__)
-    add_document(parser)
-    parser.add_argument("--only", default="", help="cases whose name contains this")
-    parser.add_argument("--solver", choices=("sweep", "path"), help="one of the two")
-    parser.add_argument("--budget", type=float, default=280, help="no case is begun later")
-    args = parser.parse_args()
-    begin()
-    mi.set_variant("llvm_ad_mono")
-    mi.set_log_level(mi.LogLevel.Error)
-    folder = args.output / "limits"
-    folder.mkdir(parents=True, exist_ok=True)
-    store, started = Store(folder / "results.json", args.force), time.perf_counter()
-    for solver in (args.solver,) if args.solver else ("sweep", "path"):
-        for case in cases():
-            name = f"{solver}: {case.name}"
-            if args.only not in name:
-                continue
-            if name not in store.rows and time.perf_counter() - started > args.budget:
-                print(f"{name:55} not computed yet; run again", flush=True)
-                continue
-            print(line(name, store.row(name, partial(attempt, case, solver, store))), flush=True)
-    if args.document:
-        replace_tables(args.document, {"limits": matrix(store.rows)})
+
+    def declare(parser: argparse.ArgumentParser) -> None:
+        with_budget(280)(parser)
+        parser.add_argument("--solver", choices=SOLVERS, help="one of the two")
+
+    rows = CaseRows(__doc__, "limits", declare, "llvm_ad_mono")
+    solvers = (rows.args.solver,) if rows.args.solver else SOLVERS
+    titled = ((f"{solver}: {case.name}", (case, solver)) for solver in solvers for case in cases())
+    for _ in rows.rows(
+        titled,
+        lambda case: attempt(*case, rows.store),
+        lambda title, _, row: line(title, row),
+    ):
+        pass
+    rows.write({"limits": matrix(rows.store.rows)})
 
 
 if __name__ == "__main__":

@@ -18,17 +18,13 @@ marked table, without the marked rows. No data are needed.
 
 from __future__ import annotations
 
-import re
-from functools import partial
 from pathlib import Path
 from time import process_time
 
 import mitsuba as mi
 import numpy as np
 
-from experiments.support.documents import replace_tables
-from experiments.support.options import Options, add_document, begin, parser_of
-from experiments.support.store import Store
+from experiments.support.case_rows import CaseRows, with_reference
 from experiments.validation.thick.cases import CLASSES, scene
 from mitsuba_irrcache.compare.tables import Table
 
@@ -121,23 +117,15 @@ def classes(rows: dict[str, dict]) -> Table:
 
 def run() -> None:
     """Compute missing rows and print the table."""
-    parser = parser_of(__doc__)
-    add_document(parser)
-    parser.add_argument("--only", default="", help="cases whose name contains this")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of volpath for each case")
-    args = parser.parse_args()
-    begin()
-    options = Options(output=args.output, force=args.force)
-    store = Store(options.folder("thick") / "results.json", options.force)
-    for kind, cases in CLASSES.items():
-        for name, (objects, depth) in cases().items():
-            key = f"{kind}: {name}"
-            if args.only in key:
-                file = options.folder("thick") / f"{re.sub('[^0-9a-z]+', '-', key)}.npy"
-                row = store.row(key, partial(measure, objects, depth, args.seconds, file))
-                print(line(key, row), flush=True)
-    if args.document:
-        replace_tables(args.document, {"thick": classes(store.rows)})
+    rows = CaseRows(__doc__, "thick", with_reference(20.0))
+    titled = (
+        (title := f"{kind}: {name}", (*case, rows.args.seconds, rows.file(title)))
+        for kind, cases in CLASSES.items()
+        for name, case in cases().items()
+    )
+    for _ in rows.rows(titled, lambda case: measure(*case), lambda title, _, row: line(title, row)):
+        pass
+    rows.write({"thick": classes(rows.store.rows)})
 
 
 if __name__ == "__main__":

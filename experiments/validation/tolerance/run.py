@@ -14,6 +14,7 @@ Rows are saved in output/tolerance/results.json; no case is started after ``--bu
 
 from __future__ import annotations
 
+import argparse
 import time
 from functools import partial
 
@@ -22,8 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 import mitsuba_irrcache  # noqa: F401 (registers the plugin)
-from experiments.support.documents import replace_tables
-from experiments.support.options import add_document, begin, parser_of
+from experiments.support.case_rows import CaseRows, with_budget
 from experiments.support.store import Store
 from experiments.validation.limits.cases import Case, cases
 from experiments.validation.limits.reference import single
@@ -107,33 +107,28 @@ def summary(rows: list[dict], tolerances: list[float]) -> str:
 
 def run() -> None:
     """Compute missing rows, and print the table."""
-    parser = parser_of(__doc__)
-    add_document(parser)
-    parser.add_argument("--only", default="", help="cases whose name contains this")
-    parser.add_argument("--tolerances", type=float, nargs="+", default=TOLERANCES)
-    parser.add_argument("--budget", type=float, default=280, help="no case is begun later")
-    args = parser.parse_args()
-    begin()
-    mi.set_variant("llvm_ad_mono")
-    mi.set_log_level(mi.LogLevel.Error)
-    folder = args.output / "tolerance"
-    folder.mkdir(parents=True, exist_ok=True)
-    store, started = Store(folder / "results.json", args.force), time.perf_counter()
-    table, rows, used = [], [], []
-    for case in (c for c in cases() if c.max_depth == 2 and args.only in c.name):
-        for tolerance in args.tolerances:
-            key = f"{case.name}, {tolerance:g}"
-            if key not in store.rows and time.perf_counter() - started > args.budget:
-                continue
-            row = store.row(key, partial(measure, case, tolerance, store))
-            if "refused" not in row:
-                rows.append(row)
-                used.append(tolerance)
-            table.append(cells(case, tolerance, row))
-            print(" | ".join(table[-1]), flush=True)
-    print(summary(rows, used))
-    if args.document:
-        replace_tables(args.document, {"tolerance": Table("", HEAD, table)})
+
+    def declare(parser: argparse.ArgumentParser) -> None:
+        with_budget(280)(parser)
+        parser.add_argument("--tolerances", type=float, nargs="+", default=TOLERANCES)
+
+    rows = CaseRows(__doc__, "tolerance", declare, "llvm_ad_mono")
+    titled = (
+        (f"{case.name}, {tolerance:g}", (case, tolerance))
+        for case in cases()
+        if case.max_depth == 2
+        for tolerance in rows.args.tolerances
+    )
+    found = list(
+        rows.rows(
+            titled,
+            lambda case: measure(*case, rows.store),
+            lambda title, case, row: " | ".join(cells(*case, row)),
+        )
+    )
+    rendered = [(row, tolerance) for (_, tolerance), row in found if "refused" not in row]
+    print(summary([row for row, _ in rendered], [tolerance for _, tolerance in rendered]))
+    rows.write({"tolerance": Table("", HEAD, [cells(*case, row) for case, row in found])})
 
 
 if __name__ == "__main__":
