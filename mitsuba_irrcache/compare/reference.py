@@ -13,8 +13,9 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
+from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.files import atomic_write
-from mitsuba_irrcache.io.scene_files import load_scene
+from mitsuba_irrcache.io.scene_files import load_scene, loses_emission
 
 from .scene_files import scene_digest
 
@@ -93,6 +94,11 @@ def reference(
     found = Reference.load(path) if path.exists() else None
     if found is not None and found.spp >= spp and found.seconds >= seconds:
         return found
+    if loses_emission(scene_file, parameters, integrator):
+        raise IrrcacheError(
+            f'the media of "{scene_file}" emit, but the reference "{integrator}" would be without '
+            "emission: a comparison needs another --reference, or emission_scale 0 in the scene."
+        )
     scene = load_scene(scene_file, parameters, integrator)
     saved = time.perf_counter()
     with tqdm(

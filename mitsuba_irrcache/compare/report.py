@@ -19,6 +19,9 @@ from .results import Measurement
 from .summary import Curve, Reached, equal_time, time_to, uncertainty
 from .tables import Table, percent, seconds, with_uncertainty
 
+#: Ratio of times from which a lower bound of it is stated.
+LEAST_RATIO = 1.5
+
 
 @dataclass
 class Figure:
@@ -105,6 +108,12 @@ def _ratio(best: Curve, other: Curve, error: float) -> str:
         return f"{other.integrator} is as good as {best.integrator} within the uncertainty."
     ours = time_to(best, error)
     ratio = float(other.seconds[-1]) / ours.seconds
+    if ours.how == "at most" and ratio < LEAST_RATIO:
+        return (
+            f"The first image of {best.integrator}, after {seconds(ours.seconds)} s, is better "
+            f"than {other.integrator}'s after {seconds(float(other.seconds[-1]))} s; a smaller "
+            "first budget tells how much faster it is."
+        )
     at_least = "at least " if ours.how == "at most" else ""
     return (
         f"The error that {other.integrator} has after {seconds(float(other.seconds[-1]))} s, "

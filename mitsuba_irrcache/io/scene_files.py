@@ -162,6 +162,16 @@ def integrator_of(path: str | Path, parameters: dict[str, str] | None = None) ->
     return "path" if node is None else node.props.plugin_name()
 
 
+def loses_emission(path: str | Path, parameters: dict[str, str] | None, integrator: str) -> bool:
+    """Return whether media of a scene emit, but would not with another integrator."""
+    _, state = _parse(Path(path), parameters)
+    node = _integrator_node(state)
+    if node is None or "emission" not in node.props or node.props.get("emission_scale", 1.0) == 0:
+        return False
+    _replace_integrator(state, integrator, Path(path))
+    return "emission" not in node.props
+
+
 def parse_integrator(specification: str) -> tuple[str, dict[str, object]]:
     """Split ``name`` or ``name{key=value,...}`` into the plugin's name and its properties.
 

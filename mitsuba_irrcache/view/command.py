@@ -23,7 +23,7 @@ from mitsuba_irrcache.machine.extras import require
 from mitsuba_irrcache.machine.llvm import require_llvm
 from mitsuba_irrcache.machine.memory import free_at_once
 from mitsuba_irrcache.volumes import importer
-from mitsuba_irrcache.volumes.options import MissingItemError
+from mitsuba_irrcache.volumes.options import MissingItemError, UnchosenItemError
 
 if TYPE_CHECKING:
     from mitsuba_irrcache.view.appearance import Appearance
@@ -125,7 +125,7 @@ def _fill(server: Server, args: argparse.Namespace, name: str) -> Session:
 
 
 def _time_steps(args: argparse.Namespace) -> TimeSteps | None:
-    """Return the time steps of the file if ``--frame`` names one of several."""
+    """Return the time steps of the file if there are several."""
     from mitsuba_irrcache.view.time_panel import TimeSteps
 
     if args.frame is None:
@@ -170,11 +170,22 @@ def _document(args: argparse.Namespace, server: Server) -> tuple[Document, Appea
     small = importer.read_small(args)
     if small is not None:
         _preview(server, document, Appearance(*small))
-    volume, mapping, colours = importer.read(args)
+    volume, mapping, colours = _read(args)
     appearance = Appearance(volume, mapping, args.preset or "", colours)
     if small is None and appearance.volume.values.size > MANY_VOXELS:
         _preview(server, document, appearance.coarse())
     return document(appearance), appearance
+
+
+def _read(args: argparse.Namespace) -> tuple:
+    """Read the input; of several time steps the first one is meant, unless another is chosen."""
+    try:
+        return importer.read(args)
+    except UnchosenItemError as error:
+        if error.what != "frame":
+            raise
+    args.frame = 0
+    return importer.read(args)
 
 
 def _preview(

@@ -7,12 +7,14 @@ import io
 import numpy as np
 import viser
 from PIL import Image
+from viser.transforms import SO3
 
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view.appearance import Appearance, Box
 from mitsuba_irrcache.view.channel import Channel
 from mitsuba_irrcache.view.editing import Editing
 from mitsuba_irrcache.view.session import Session
+from mitsuba_irrcache.volumes.data import VolumeData
 
 AXES = ("x", "y", "z")
 #: Edges of a cube as pairs of corners, whose coordinates are the bits of their numbers.
@@ -42,12 +44,15 @@ class CropPanel:
             whole = server.gui.add_button("whole volume", color="gray")
             self._axis = server.gui.add_dropdown("slice across", AXES, initial_value="z")
             self._position = server.gui.add_slider("position, %", 0, 100, 1, 50)
+            self._in_image = server.gui.add_checkbox(
+                "in the image", False, hint="draw the slice at its place, over the volume"
+            )
             # Viser's own image logs errors in the browser's console where it is folded away.
             server.gui.add_html("<irrcache-slice></irrcache-slice>")
         for slider in self._ranges:
             editing.bind(slider, lambda _: self._crop(tuple(s.value for s in self._ranges)))
         whole.on_click(lambda _: editing.submit("whole", self._reset))
-        for control in (self._axis, self._position):
+        for control in (self._axis, self._position, self._in_image):
             editing.bind(control, lambda _: self._show_slice())
         self._show_slice()
 
@@ -74,9 +79,28 @@ class CropPanel:
         )  # fmt: skip
 
     def _show_slice(self) -> None:
-        encoded = io.BytesIO()
-        Image.fromarray(self._slice()).save(encoded, "PNG")
+        encoded, pixels = io.BytesIO(), self._slice()
+        Image.fromarray(pixels).save(encoded, "PNG")
         self._channel.send("slice", encoded.getvalue())
+        if not self._in_image.value:
+            self._server.scene.remove_by_name("/slice")
+            return
+        centre, right, down = slice_place(
+            self._appearance.volume, AXES.index(self._axis.value), self._position.value / 100
+        )
+        width, height = np.linalg.norm(right), np.linalg.norm(down)
+        right, down = right / width, down / height
+        place, turned = self._session.placement, np.stack([right, down, np.cross(right, down)], 1)
+        self._server.scene.add_image(
+            "/slice",
+            np.repeat(pixels[..., None], 3, axis=-1),
+            width / place.radius,
+            height / place.radius,
+            wxyz=SO3.from_matrix(turned).wxyz,
+            position=place.to_browser(centre),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
 
     def _slice(self) -> np.ndarray:
         """Return the chosen slice in grey levels, uint8 (rows, columns), head or front on top."""
@@ -84,12 +108,31 @@ class CropPanel:
         if axis not in AXES or not 0 <= position <= 100:
             raise IrrcacheError(f"there is no slice across {axis!r} at {position!r} %.")
         values, number = self._appearance.volume.values, 2 - AXES.index(axis)
-        index = round(position / 100 * (values.shape[number] - 1))
+        index = _index(position / 100, values.shape[number])
         found = np.asarray(values.take(index, axis=number), dtype=np.float32)
         low, high = self._appearance.edges[0], self._appearance.edges[-1]
         grey = 255 * np.clip((found - low) / max(high - low, 1e-30), 0, 1)
         rows = grey if axis == "z" else grey[::-1]  # seen from below the feet, as in radiology
         return rows.astype(np.uint8)
+
+
+def slice_place(
+    volume: VolumeData, axis: int, share: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the centre of a slice in the world, and its extent to the right and downwards.
+
+    ``axis`` is 0, 1 or 2 for x, y or z; ``share`` says where along it, from 0 to 1.
+    """
+    to_world, count = volume.to_world, volume.size[axis]
+    centre = np.array([0.5, 0.5, 0.5, 1.0])
+    centre[axis] = (_index(share, count) + 0.5) / count
+    right, down = (1, 2) if axis == 0 else (0, 2) if axis == 1 else (0, 1)
+    sign = 1 if axis == 2 else -1  # the head, or the front, is on top
+    return (to_world @ centre)[:3], to_world[:3, right], sign * to_world[:3, down]
+
+
+def _index(share: float, count: int) -> int:
+    return round(share * (count - 1))
 
 
 def checked_box(percent: object) -> Box:

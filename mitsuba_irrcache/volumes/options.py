@@ -87,6 +87,14 @@ class MissingItemError(IrrcacheError):
         self.count = count
 
 
+class UnchosenItemError(IrrcacheError):
+    """Of several channels or frames, as ``what`` says, none is chosen."""
+
+    def __init__(self, message: str, what: str) -> None:
+        super().__init__(message)
+        self.what = what
+
+
 def picked(source: str, what: str, count: int, wanted: int | None) -> int:
     """Return the index to read of ``count`` items: the one ``wanted``, or 0 if there is one.
 
@@ -100,9 +108,10 @@ def picked(source: str, what: str, count: int, wanted: int | None) -> int:
     if wanted is None:
         uses = "albedo or emission" if count == 4 else "albedo, emission or extinction"
         colours = f"; or read them as colours: --colour {uses}"
-        raise IrrcacheError(
+        raise UnchosenItemError(
             f"{source} has {count} {what}s; choose one with --{what} N, from 0 to {count - 1}"
-            f"{colours if what == 'channel' and count in (3, 4) else ''}"
+            f"{colours if what == 'channel' and count in (3, 4) else ''}",
+            what,
         )
     if not 0 <= wanted < count:
         remedy = f"give 0 to {count - 1}" if count > 1 else f"leave --{what} out"

@@ -8,6 +8,7 @@ import pytest
 
 from mitsuba_irrcache.compare.reference import CHUNK, Reference, reference
 from mitsuba_irrcache.compare.scene_files import scene_files
+from mitsuba_irrcache.errors import IrrcacheError
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -153,3 +154,19 @@ def test_round_trip(tmp_path):
     np.testing.assert_array_equal(read.a, a)
     np.testing.assert_array_equal(read.b, b)
     assert (read.spp, read.seconds) == (7, 1.5)
+
+
+def test_references_without_the_emission_of_media_are_refused(scene, tmp_path):
+    """All errors would be those of the reference."""
+    text = scene.read_text()
+    (scene.parent / "camera.xml").write_text(
+        CAMERA.replace(
+            '<integrator type="volpath"> <integer name="max_depth" value="2"/>',
+            '<integrator type="irrcache"> <rgb name="emission" value="1, 0.5, 0"/>'
+            '<float name="emission_scale" value="$emission"/>',
+        )
+    )
+    scene.write_text(text.replace("<path", '<default name="emission" value="1"/> <path', 1))
+    with pytest.raises(IrrcacheError, match="would be without emission"):
+        reference(scene, {}, "volpath", tmp_path / "references", spp=1)
+    assert reference(scene, {"emission": "0"}, "volpath", tmp_path / "references", spp=1).spp >= 1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.compare.metrics import net_mse
+from mitsuba_irrcache.compare.report import _ratio
 from mitsuba_irrcache.compare.summary import (
     Curve,
     curves,
@@ -108,3 +109,12 @@ def test_uncertainty_of_the_last_error():
         last = curve([np.sqrt(square)], resolved=np.sqrt(2 * of_square), times=[1])
         stated.append(uncertainty(last))
     assert np.std(errors) == pytest.approx(np.mean(stated), rel=0.3)
+
+
+def test_a_first_image_that_is_better_states_no_ratio_of_one():
+    """A lower bound of the ratio that is about 1 says nothing."""
+    best = Curve("a", np.array([2.0]), np.array([0.005]), np.zeros(1))
+    other = Curve("b", np.array([0.5, 2.0]), np.array([0.17, 0.08]), np.zeros(2))
+    assert "The first image of a, after 2 s, is better" in _ratio(best, other, 0.08)
+    early = Curve("a", np.array([0.2]), np.array([0.005]), np.zeros(1))
+    assert _ratio(early, other, 0.08).endswith("at least 10 times faster.")

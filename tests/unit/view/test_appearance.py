@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
+
 import numpy as np
 import pytest
 
 pytest.importorskip("viser")
 
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.view import command
 from mitsuba_irrcache.view.appearance import WHOLE, Appearance, cropped
 from mitsuba_irrcache.view.comparison import CHOICES, _finest, false_colours, rounded
 from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
-from mitsuba_irrcache.view.crop_panel import checked_box
+from mitsuba_irrcache.view.crop_panel import checked_box, slice_place
 from mitsuba_irrcache.view.picture import CAPTIONS, KINDS
 from mitsuba_irrcache.volumes.colours import Colours
 from mitsuba_irrcache.volumes.data import VolumeData
@@ -30,6 +33,22 @@ def test_crop_boxes_keep_whole_voxels():
     for wrong in (((0, 100),) * 2, ((50, 20),) * 3, ((0, 101),) * 3, ((0, 50, 100),) * 3):
         with pytest.raises(IrrcacheError):
             checked_box(wrong)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_slices_lie_where_their_voxels_are(axis):
+    """The pixels of a slice are at the places of its voxels: head, or front, on top."""
+    volume = VolumeData(
+        np.zeros((5, 4, 3)), (1, 2, 3), origin=(7, 8, 9), direction=np.eye(3)[[1, 0, 2]]
+    )
+    centre, right, down = slice_place(volume, axis, 0.5)
+    columns, rows = (1, 2) if axis == 0 else (0, 2) if axis == 1 else (0, 1)
+    upper_left = np.zeros(3)
+    upper_left[axis] = round(0.5 * (volume.size[axis] - 1))
+    upper_left[rows] = 0 if axis == 2 else volume.size[2] - 1
+    found = centre - right / 2 - down / 2
+    found += right / 2 / volume.size[columns] + down / 2 / volume.size[rows]
+    np.testing.assert_allclose(found, (volume.index_to_world @ [*upper_left, 1])[:3])
 
 
 def test_empty_boxes_are_refused():
@@ -94,6 +113,23 @@ def test_every_kind_is_named_and_explained():
     """In the panel, and over images of what is no radiance."""
     assert tuple(CHOICES.values()) == COMPARISONS
     assert set(CAPTIONS) == set(KINDS) - {"image"}
+
+
+def test_the_viewer_begins_with_the_first_of_several_time_steps(tmp_path):
+    """All of them are offered by a slider; channels have to be chosen."""
+    tifffile = pytest.importorskip("tifffile")
+    values = np.random.default_rng(0).random((3, 4, 5, 6)).astype(np.float32)
+    tifffile.imwrite(tmp_path / "a.tif", values, imagej=True, metadata={"axes": "TZYX"})
+    np.save(tmp_path / "a.npy", values.transpose(1, 2, 3, 0))
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    args = parser.parse_args([str(tmp_path / "a.tif"), "--density"])
+    np.testing.assert_array_equal(command._read(args)[0].values, values[0])
+    steps = command._time_steps(args)
+    assert (steps.count, steps.first) == (3, 0)
+    np.testing.assert_array_equal(steps.read(2)[0].values, values[2])
+    with pytest.raises(IrrcacheError, match="3 channels"):
+        command._read(parser.parse_args([str(tmp_path / "a.npy"), "--density"]))
 
 
 def test_errors_have_colours_and_round_limits():
