@@ -31,7 +31,7 @@ from mitsuba_irrcache.pipeline.cached_medium import CacheSettings
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import compile_scene
 from mitsuba_irrcache.scene.description import SceneDescription
-from mitsuba_irrcache.scene.fingerprint import Snapshot, digests
+from mitsuba_irrcache.scene.fingerprint import SceneVersion, digests
 from mitsuba_irrcache.solvers.discrete_ordinates.angular_quadrature import Ordinates
 from mitsuba_irrcache.solvers.discrete_ordinates.extinction import DENSE
 from mitsuba_irrcache.solvers.discrete_ordinates.incident import DistantIllumination
@@ -57,7 +57,7 @@ class MappedMedium:
     def __init__(self, settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
         """``whole``: nothing but the radiance is wanted, of a medium that emits nothing."""
         self._settings, self._files, self._whole = settings, files, whole
-        self._snapshot: Snapshot | None = None
+        self._version: SceneVersion | None = None
         #: of the files that the irradiance was computed from
         self._states: list | None = None
         self._folder: tempfile.TemporaryDirectory | None = None
@@ -76,10 +76,10 @@ class MappedMedium:
         """Create the camera rays for ``scene``; the irradiance is computed if it is not known yet,
         or if the scene or a file has changed.
         """
-        snapshot = Snapshot(scene, None, self._snapshot)
+        version = SceneVersion(scene, None, self._version)
         paths = [path for path in (self._files.sigma_t, self._files.albedo) if path]
         states = [VolumeFile(path).state for path in paths]
-        changed = states != self._states or snapshot.changes(self._snapshot)
+        changed = states != self._states or version.changes(self._version)
         if self._rays is None or changed:
             self._rays = None
             self.compute(scene, self._on_this_machine, progress)
@@ -87,7 +87,7 @@ class MappedMedium:
             arguments = self._medium, field, quadrature, step, self._memory
             projection = SlabProjection(*arguments)
             self._rays = ClosedFormCameraRays(projection, self._settings.max_depth, hide_emitters)
-            self._snapshot, self._states = snapshot, states
+            self._version, self._states = version, states
         return self._rays
 
     @property
