@@ -300,11 +300,14 @@ def _write(path: Path, values: np.ndarray) -> None:
     partial = path.with_name(f"{path.name}.{uuid4().hex}.tmp")
     try:
         with open(partial, "wb") as file:
-            np.lib.format.write_array(file, np.ascontiguousarray(values), allow_pickle=False)
+            values = np.ascontiguousarray(values)
+            header = np.lib.format.header_data_from_array_1_0(values)
+            np.lib.format.write_array_header_1_0(file, header)
+            file.write(values.data)  # NumPy's own does not say why it fails
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)
-        raise IrrcacheError(f'cannot write "{path}": {error.strerror or error}.') from error
+        raise IrrcacheError(f'cannot write "{path}": {error.strerror or error}') from None
 
 
 def _replace(path: Path, data: bytes) -> None:

@@ -49,7 +49,7 @@ class BrickFile:
             self.close()
             raise IrrcacheError(
                 f'irrcache: cannot create a working file of {size / 2**30:.1f} GiB at "{path}": '
-                f"{error.strerror}; set work_folder to a folder on another disk."
+                f"{error.strerror}; use another disk (work_folder, or -o of irrcache farm)."
             ) from None
 
     @classmethod

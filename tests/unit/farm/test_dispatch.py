@@ -201,3 +201,11 @@ def test_jobs_that_need_a_failed_one_are_given_up_with_it():
         "third": "it needs second, which failed",
         "fourth": "it needs third, which failed",
     }
+
+
+def test_a_slow_job_that_others_wait_for_is_started_once_more():
+    cluster, stored = Cluster({"slow": ["never"]}, ("busy", "idle")), []
+    wanted = [*jobs("quick"), *chain("slow", "after")]
+    assert Dispatch(Connection(cluster), wanted, lambda job, _: stored.append(job.name)).run() == {}
+    assert sorted(stored) == ["after", "quick", "slow"]
+    assert [name for name, _ in cluster.submitted].count("slow") == 2
