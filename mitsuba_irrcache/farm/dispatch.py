@@ -202,7 +202,7 @@ class Dispatch:
             room -= 1
 
     def _next_ready(self) -> Job | None:
-        """The first job that waits for no other."""
+        """Return the first job that waits for no other."""
         ready = (job for job in self._waiting if not any(n in self._open for n in job.after))
         return next(ready, None)
 

@@ -76,7 +76,7 @@ class Results:
         return self._records.is_dir() and any(self._records.iterdir())
 
     def has(self, job: Job) -> bool:
-        """Whether the job is finished, with the same inputs, and its files are as they were."""
+        """Return whether the job has finished with the same inputs, and its files are unchanged."""
         try:
             record = json.loads(self._record(job).read_text())
             files = record["files"]

@@ -108,7 +108,7 @@ class FarmSweep(SlabSweep):
         return self.file(name, channels=channels)
 
     def _jobs(self, plan: SweepPlan) -> tuple[list[Job], dict[str, list[str]]]:
-        """The jobs of a sweep, and the files by job that nothing else reads."""
+        """Return the jobs of a sweep, and the files by job that nothing else reads."""
         sweeps = plan.sweeps(self._folder)
         numbers = [
             (len(plan.slabs(sweep)), len(list(even_slabs(sweep.pair_count, PAIRS))))

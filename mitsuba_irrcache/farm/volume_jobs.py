@@ -96,7 +96,7 @@ class SweepPlan:
             )
 
     def sweeps(self, folder: Path) -> list[AxisSweep]:
-        """The sweeps of all dominant axes, with the files that they read."""
+        """Return the sweeps of all dominant axes, with the files that they read."""
         grid = Grid(self.shape, self.to_world)
         levels = BrickFile.existing(folder / LEVELS, self.shape, np.uint16)
         source = None
@@ -106,7 +106,7 @@ class SweepPlan:
         return AxisSweep.of_all(tracks, levels, self.ordinates, self.incoming, source)
 
     def slabs(self, sweep: AxisSweep) -> list[Slab]:
-        """The slabs of one dominant axis."""
+        """Return the slabs of one dominant axis."""
         return sweep.slabs(self.memory, PAIRS, FEWEST_SLABS)
 
 
@@ -153,17 +153,17 @@ class SlabStep:
         return self._is_second_visit and self.batch == self.batches - 1
 
     def sums(self, number: int) -> str:
-        """The file of the sums of a slab after the step; `found` if it `completes` them."""
+        """Return the file of the sums of a slab after the step; `found` if it `completes` them."""
         return f"{self.sweep}-{self.axis}-slab-{number}-{self._visits}.sums.npy"
 
     def sums_before(self, number: int) -> str | None:
-        """The file of the sums before the step; None where they are 0."""
+        """Return the file of the sums before the step; None where they are 0."""
         if not self._visits:
             return None
         return f"{self.sweep}-{self.axis}-slab-{number}-{self._visits - 1}.sums.npy"
 
     def found(self, number: int) -> str:
-        """The file of the irradiance in a slab."""
+        """Return the file of the irradiance in a slab."""
         return f"{self.sweep}-{self.axis}-slab-{number}.found.npy"
 
     @property
@@ -267,7 +267,7 @@ def add_axes(arguments: dict, _: Path) -> None:
 
 
 def slices_of(shape: tuple[int, int, int]) -> list[Slab]:
-    """The slices of each job of `add_axes`: whole bricks, which no other job writes."""
+    """Return the slices of each job of `add_axes`: whole bricks, which no other job writes."""
     return list(even_slabs(shape[0], EDGE))
 
 

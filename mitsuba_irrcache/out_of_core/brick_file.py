@@ -1,4 +1,4 @@
-"""A working file of a volume in bricks, boxes of which are read and written."""
+"""Working files of volumes, stored in bricks, of which boxes are read and written."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EDGE = 32
 
 
 class BrickFile:
-    """Values (z, y, x, channel) of one type in a file, 0 at first; a file that is there is opened.
+    """Values (z, y, x, channel) of one type in a file, created with zeros if it is missing.
 
     Slabs across any axis are read and written in whole bricks, each of which is contiguous; slabs
     across x of an array with x fastest would touch every page of the file.
@@ -43,7 +43,7 @@ class BrickFile:
         try:
             os.ftruncate(self._file, size)
             if hasattr(os, "posix_fallocate"):
-                # Reserved at once, so that a full disk shows now and not after hours.
+                # Reserve the space at once, so that a full disk is noticed now and not after hours.
                 os.posix_fallocate(self._file, 0, size)
         except OSError as error:
             self.close()
@@ -56,7 +56,7 @@ class BrickFile:
     def existing(
         cls, path: Path, shape: tuple[int, int, int], dtype: np.dtype, channels: int = 1
     ) -> BrickFile:
-        """Open a file that is there; raise IrrcacheError if it is not, or is of another size."""
+        """Open an existing file; raise IrrcacheError if it is missing or has another size."""
         if not path.is_file():
             raise IrrcacheError(f'the working file "{path}" is missing.')
         bytes_there = path.stat().st_size
@@ -75,14 +75,14 @@ class BrickFile:
     def without_name(
         cls, path: Path, shape: tuple[int, int, int], dtype: np.dtype, channels: int = 1
     ) -> BrickFile:
-        """Create a file that vanishes when it is closed, or with the returned object."""
+        """Create a file that is deleted when it is closed, or with the returned object."""
         try:
             return cls(path, shape, dtype, channels)
         finally:
             path.unlink(missing_ok=True)
 
     def read(self, lower: Sequence[int], upper: Sequence[int]) -> np.ndarray:
-        """Return the box between these voxels (z, y, x): (z, y, x), with channels if several."""
+        """Return the values (z, y, x[, channel]) of a box between two corners (z, y, x)."""
         shape = [b - a for a, b in zip(lower, upper, strict=True)]
         box = np.empty((*shape, self.channels), self.dtype)
         for number, inside, outside in self._bricks(lower, upper):
@@ -90,7 +90,7 @@ class BrickFile:
         return box[..., 0] if self.channels == 1 else box
 
     def write(self, lower: Sequence[int], values: np.ndarray) -> None:
-        """Replaces a box from the voxel ``lower`` (z, y, x) on."""
+        """Replace the values of a box that begins at the voxel ``lower`` (z, y, x)."""
         values = values.reshape(*values.shape[:3], self.channels)
         upper = [a + n for a, n in zip(lower, values.shape, strict=False)]
         for number, inside, outside in self._bricks(lower, upper):
@@ -106,8 +106,10 @@ class BrickFile:
         return np.frombuffer(data, self.dtype).reshape(EDGE, EDGE, EDGE, self.channels)
 
     def _bricks(self, lower: Sequence[int], upper: Sequence[int]) -> Iterator[tuple]:
-        """Yield the number of each brick that a box meets, and the slices of their common part in
-        the brick and in the box.
+        """Yield each brick that overlaps a box.
+
+        The results are the index of the brick, and the slices of the overlap within the brick and
+        within the box.
         """
         _, ny, nx = self._counts
         ranges = [range(a // EDGE, -(-b // EDGE)) for a, b in zip(lower, upper, strict=True)]
@@ -121,18 +123,18 @@ class BrickFile:
 
 
 class RecordFile:
-    """Arrays of numbers, each of which is stored whole and read whole, by number."""
+    """Arrays that are stored and read as a whole, by index."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._sizes = path, {}
 
     def write(self, number: int, values: np.ndarray) -> None:
-        """Stores an array."""
+        """Store an array."""
         self._sizes[number] = values.shape
         values.tofile(self._name(number))
 
     def read(self, number: int) -> np.ndarray | None:
-        """Return an array, and delete it from the disk; None where there is none."""
+        """Return an array and delete it from the disk; None if it was not stored."""
         if number not in self._sizes:
             return None
         name, shape = self._name(number), self._sizes.pop(number)

@@ -1,4 +1,4 @@
-"""The irradiance of a volume in a ``.npy`` of the user's, and a record of what it follows from."""
+"""The property ``irradiance_file``: irradiance in a ``.npy``, with a record of its inputs."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ class IrradianceFile:
         self.channels = 1 if is_grey else channels
 
     def read(self, lower: Sequence[int], upper: Sequence[int]) -> np.ndarray:
-        """Return the box between these voxels (z, y, x): (z, y, x), with channels if several."""
+        """Return the values (z, y, x[, channel]) of a box between two corners (z, y, x)."""
         # Opened anew each time, as pages of a mapped file count as memory of the process.
         mapped = np.load(self._path, mmap_mode="r", allow_pickle=False)
         box = mapped[tuple(slice(a, b) for a, b in zip(lower, upper, strict=True))]
         return np.array(box[..., 0] if self.channels == 1 else box)
 
     def close(self) -> None:
-        """Do nothing: the file is the user's."""
+        """Do nothing, since the file belongs to the user."""
 
 
 def write(path: Path, irradiance: BrickFile, colour: np.ndarray, inputs: str) -> None:
-    """Write the irradiance slab by slab, the product of values and ``colour`` (channels); then its
-    record, with the digest of its ``inputs``.
+    """Write the irradiance slab by slab, and then its record with the digest of its ``inputs``.
+
+    The irradiance is the product of the values and of ``colour`` (channels).
     """
     _record(path).unlink(missing_ok=True)
     partial = path.with_name(f".{path.name}.tmp")
@@ -64,7 +65,7 @@ def write(path: Path, irradiance: BrickFile, colour: np.ndarray, inputs: str) ->
 
 
 def recorded(path: Path, inputs: str) -> IrradianceFile | None:
-    """Open a file that was computed from these ``inputs`` and not written to since, if it is."""
+    """Open the file if it was computed from these ``inputs`` and has not been changed since."""
     try:
         record = json.loads(_record(path).read_text())
         if record["inputs"] == inputs and record["file"] == _state(path):
@@ -79,6 +80,6 @@ def _record(path: Path) -> Path:
 
 
 def _state(path: Path) -> list[int]:
-    """Size and time of a file."""
+    """Return the size and time of a file."""
     state = path.stat()
     return [state.st_size, state.st_mtime_ns]

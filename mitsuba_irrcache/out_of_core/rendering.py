@@ -40,8 +40,8 @@ from mitsuba_irrcache.solvers.sweep import DEFAULT_DIRECTIONS
 
 #: Emitters whose radiance enters along tracks.
 EMITTERS = (EmitterKind.CONSTANT_ENVIRONMENT, EmitterKind.ENVIRONMENT_MAP, EmitterKind.SUN)
-#: Share of the free memory that is used if nothing else is said, and what Python, Mitsuba and its
-#: kernels take of it [bytes].
+#: Share of the free memory that is used by default; memory of it that Python, Mitsuba and kernels
+#: need [bytes].
 SHARE, BASE = 0.5, 700 << 20
 #: Ordinates come in pairs, and batches in memory are multiples of this number.
 MULTIPLE = 32
@@ -52,13 +52,16 @@ BeginSweep = Callable[[MappedField, str], SlabSweep]
 
 
 class MappedMedium:
-    """The medium of a scene, its extinction in a file, and the irradiance in it."""
+    """The medium of a scene whose extinction stays in a file, and its irradiance."""
 
     def __init__(self, settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
-        """``whole``: nothing but the radiance is wanted, of a medium that emits nothing."""
+        """Store the settings.
+
+        ``whole`` states that only the radiance is requested, and that the medium is not emissive.
+        """
         self._settings, self._files, self._whole = settings, files, whole
         self._version: SceneVersion | None = None
-        #: of the files that the irradiance was computed from
+        #: states of the files from which the irradiance was computed
         self._states: list | None = None
         self._folder: tempfile.TemporaryDirectory | None = None
         self._medium: MediumGrid | None = None
@@ -73,8 +76,9 @@ class MappedMedium:
         step: float,
         progress: Progress | None = None,
     ) -> ClosedFormCameraRays:
-        """Create the camera rays for ``scene``; the irradiance is computed if it is not known yet,
-        or if the scene or a file has changed.
+        """Create the camera rays for ``scene``.
+
+        The irradiance is computed first if it was not yet, or if the scene or a file has changed.
         """
         version = SceneVersion(scene, None, self._version)
         paths = [path for path in (self._files.sigma_t, self._files.albedo) if path]
@@ -97,7 +101,7 @@ class MappedMedium:
 
     @property
     def max_memory(self) -> int:
-        """The property of the integrator [bytes]; 0 if it is not set."""
+        """The property ``max_memory`` of the integrator [bytes]; 0 if it is not set."""
         return self._files.max_memory
 
     def use_file(self, path: Path) -> None:
@@ -105,8 +109,9 @@ class MappedMedium:
         self._files = replace(self._files, irradiance=str(path))
 
     def compute(self, scene: mi.Scene, begin: BeginSweep, progress: Progress | None) -> None:
-        """Find the irradiance of a scene, by the sweeps that ``begin`` creates; an
-        ``irradiance_file`` that was computed from the same inputs is read instead.
+        """Compute the irradiance of a scene by the sweeps that ``begin`` creates.
+
+        An ``irradiance_file`` that was computed from the same inputs is read instead.
         """
         check_settings(self._settings, self._files, self._whole)
         description = compile_scene(scene, max_depth=self._settings.max_depth)
@@ -165,8 +170,9 @@ class MappedMedium:
     def _inputs(
         self, scene: mi.Scene, description: SceneDescription, medium: MediumGrid, grid: Grid
     ) -> str:
-        """The SHA-256 of all that the irradiance depends on; volume files count as unchanged while
-        their sizes and times are.
+        """Return the SHA-256 of everything that the irradiance depends on.
+
+        Volume files are represented by their sizes and times of modification.
         """
         settings = self._settings
         paths = [path for path in (self._files.sigma_t, self._files.albedo) if path]
@@ -180,8 +186,9 @@ class MappedMedium:
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def _ordinates(self, scene: mi.Scene) -> tuple[Ordinates, np.ndarray]:
-        """The ordinates, for single scattering those of the first batch of a cache in memory, and
-        the factors of channels.
+        """Return the ordinates and the factors of channels.
+
+        For single scattering, the ordinates are those of the first batch of a cache in memory.
         """
         all_orders = self._settings.max_depth < 0
         samples = self._settings.samples or (1 if all_orders else 2) * DEFAULT_DIRECTIONS
@@ -196,7 +203,7 @@ class MappedMedium:
 
 
 def memory_beside_python(size: int) -> int:
-    """Bytes of a process of this size that are left for voxels."""
+    """Return the bytes that a process of this size can use for voxels."""
     return max(size - BASE, 64 << 20)
 
 
@@ -233,7 +240,7 @@ def _refuse(reason: str) -> None:
 
 
 def _placement(medium: MediumGrid) -> np.ndarray:
-    """``to_world`` of the voxels: that of the scene's grid, else along the axes of the world."""
+    """Return ``to_world`` of the voxels: that of the scene's grid, or the axis-aligned box."""
     linear = medium.boundary.to_world[:3, :3]
     ends = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1)
     corners = medium.boundary.frame[:3, :3] @ ends + medium.boundary.frame[:3, 3:]
@@ -251,9 +258,7 @@ def _placement(medium: MediumGrid) -> np.ndarray:
 
 
 def _scale(medium: MediumGrid) -> float:
-    """The factor of the file's values: the scene's ``scale``, or the product of it and a constant
-    extinction.
-    """
+    """Return the factor of the file's values: the scene's ``scale`` and constant extinction."""
     sigma_t = medium.sigma_t
     if isinstance(sigma_t, ConstantField):
         return sigma_t.maximum

@@ -1,10 +1,10 @@
 """All orders of scattering in volumes in files.
 
-A coarse copy of the medium, which fits into memory, is solved for all orders by multigrid. What has
-been scattered there, interpolated, and the uncollided irradiance of the whole volume are the source
-of a sweep of the whole volume, which finds one more order in all its detail: an iteration of
-phi <- A phi + b (docs/primer, eq. 4.9) whose initial error is that of the coarse grid. It is
-repeated while it changes much.
+A coarse copy of the medium, which fits into memory, is solved for all orders by multigrid. The
+scattered irradiance of the copy, interpolated, and the uncollided irradiance of the whole volume
+are the source of a sweep of the whole volume. This is a source iteration phi <- A phi + b
+(docs/primer, eq. 4.9) whose initial error is that of the coarse grid. Further iterations follow
+while the irradiance changes by more than `NEGLIGIBLE`.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ from mitsuba_irrcache.pipeline.cached_medium import CachedMedium, CacheSettings
 from mitsuba_irrcache.pipeline.defaults import choose_solver
 from mitsuba_irrcache.scene.description import SceneDescription
 
-#: Voxels along the longest side of the coarse copy, at most.
+#: Largest number of voxels along a side of the coarse copy.
 COARSE = 128
-#: Passes over the whole volume, at most, and the relative change of the irradiance of collisions,
-#: in root mean square, up to which no other pass follows.
+#: Largest number of passes over the whole volume; root mean square of the relative change of the
+#: irradiance, weighted by collisions, below which no other pass follows.
 MOST_PASSES, NEGLIGIBLE = 3, 0.01
 
 Progress = Callable[[int, int], None]
 
 
 def coarse_medium(medium: MediumGrid) -> MediumGrid:
-    """Make the coarse copy of a medium whose extinction is in a file: means over blocks of voxels,
-    of the albedo by extinction.
+    """Create the coarse copy of a medium whose extinction is in a file.
+
+    Its values are means over blocks of voxels; those of the albedo are weighted by extinction.
     """
     sigma_t, albedo = medium.sigma_t, medium.albedo
     shape = sigma_t.grid.shape
@@ -68,8 +69,10 @@ def _block_sums(values: np.ndarray, starts: list[np.ndarray]) -> np.ndarray:
 
 
 class ScatteredIrradiance:
-    """Scattered irradiance in ``medium``, the only one of a scene, given the ``uncollided`` one in
-    a file, both in units of ``colour`` (channels of the image).
+    """Scattered irradiance in ``medium``, the only one of a scene.
+
+    It is computed from the ``uncollided`` irradiance in a file; both are in units of ``colour``
+    (channels of the image).
 
     ``ordinates`` are directions, weights and offsets of the passes over the whole volume.
     """
@@ -91,7 +94,7 @@ class ScatteredIrradiance:
     def solve(
         self, scene: mi.Scene, description: SceneDescription, settings: CacheSettings
     ) -> None:
-        """Solve for all orders on a coarse grid, with these settings of a cache."""
+        """Solve for all orders on the coarse grid, with these settings of a cache."""
         coarse = coarse_medium(self._medium)
         settings = replace(settings, resolution=max(coarse.sigma_t.grid.shape))
         solver = choose_solver(scene, coarse, "sweep", -1, settings.resolution)
@@ -132,7 +135,7 @@ class ScatteredIrradiance:
         return before
 
     def _source(self, name: str, before: BrickFile | None) -> BrickFile:
-        """The scattered radiance per optical depth, in a working file."""
+        """Return the scattered radiance per optical depth, in a working file."""
         file = self._sweep.file(name, channels=self._channels)
         for lower, upper in self._boxes():
             scattered = self._scattered(lower, upper, before)
@@ -142,13 +145,13 @@ class ScatteredIrradiance:
         return file
 
     def _boxes(self) -> Iterator[tuple[list[int], list[int]]]:
-        """Yield runs of slices in whole bricks: lower and upper end (z, y, x)."""
+        """Yield the lower and upper corner (z, y, x) of boxes of slices that fill whole bricks."""
         slices, ny, nx = self._grid.shape
         for first, last in even_slabs(slices, EDGE):
             yield [first, 0, 0], [last, ny, nx]
 
     def _albedo(self, lower: list[int], upper: list[int]) -> np.ndarray:
-        """The albedo in some whole slices, or the same for all voxels."""
+        """Return the albedo in a box of whole slices; one value if it is constant."""
         albedo = self._medium.albedo
         if isinstance(albedo, MappedField):
             values = albedo.file.read(lower[0], upper[0]) * np.float32(albedo.factor)
@@ -163,7 +166,7 @@ class ScatteredIrradiance:
         return known.read(lower, upper).reshape(*_shape(lower, upper), self._channels)
 
     def _evaluated(self, field: GridField, lower: list[int], upper: list[int]) -> np.ndarray:
-        """A field at the centres of the voxels of a box: (z, y, x, channel)."""
+        """Return a field at the centres of the voxels of a box: (z, y, x, channel)."""
         shape = _shape(lower, upper)
         box = Grid(tuple(shape), np.eye(4))
         at = box.voxel_indices(dr.arange(mi.UInt32, box.voxel_count))
@@ -174,8 +177,9 @@ class ScatteredIrradiance:
         return np.stack([np.array(c) for c in channels], axis=-1).reshape(*shape, -1)
 
     def _change(self, before: BrickFile | None, after: BrickFile) -> float:
-        """Root mean square of the change, relative to that of the whole irradiance, weighted by
-        extinction.
+        """Return the root mean square of the change over that of the irradiance.
+
+        Both are weighted by extinction.
         """
         change = total = 0.0
         for box in self._boxes():
@@ -189,7 +193,7 @@ class ScatteredIrradiance:
 
 
 def add(total: BrickFile, part: BrickFile) -> None:
-    """Add the values of a file to those of another one."""
+    """Add the values of the file ``part`` to those of ``total``."""
     slices, ny, nx = total.shape
     for first, last in even_slabs(slices, EDGE):
         box = (first, 0, 0), (last, ny, nx)

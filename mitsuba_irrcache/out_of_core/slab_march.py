@@ -1,8 +1,8 @@
-"""Ray marching of volumes in files: slabs across z, front to back, with radiance and transmittance
-passed on.
+"""Ray marching of volumes in files, through slabs across z from front to back.
 
-Every step of a ray is made in the slab in which it ends. Rays upwards cross the slabs in ascending
-order, then those downwards in descending order. Slabs that no ray has left to cross are not read.
+Radiance and transmittance are passed on from slab to slab. Every step of a ray is made in the slab
+in which it ends. First the rays that run upwards cross the slabs in ascending order, then the
+others in descending order. Slabs that no ray crosses are not read.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from mitsuba_irrcache.out_of_core.slabs import Slab, even_slabs
 from mitsuba_irrcache.out_of_core.survey import MappedField
 from mitsuba_irrcache.render.raymarch import MarchedPart, Projection
 
-#: Slices beside a slab that its values depend on: of the lookups, of `conserving` and of the
-#: extrapolation beyond the border.
+#: Number of slices on either side of a slab on which lookups in it depend: by interpolation, by
+#: `conserving`, and by the extrapolation beyond the border.
 HALO = 4
-#: Bytes of a voxel of a slab while it is packed, for each of its values.
+#: Memory per voxel of a slab while it is packed, for each value of the voxel [bytes].
 BYTES = 40
-#: Most slices of a slab, and fewest, of which the halo would be the most.
+#: Largest and smallest number of slices of a slab; thinner slabs would consist mostly of halo.
 MOST_SLICES, FEWEST_SLICES = 128, 8
 
 
 class MappedIrradiance:
-    """The irradiance in a file, as `Projection` needs it: the product of its ``values`` and, where
-    these are of one channel, of a ``colour`` (channels).
+    """The irradiance in a file, with the interface that `Projection` needs.
+
+    It is the product of the ``values`` and, if these have one channel, of ``colour`` (channels).
     """
 
     def __init__(self, values: BrickFile, colour: np.ndarray, grid: Grid) -> None:
@@ -46,11 +47,11 @@ class MappedIrradiance:
         if values.channels == 1 and np.ptp(colour) == 0:
             self._factors = self._factors[:1]
         self.channels = len(self._factors)
-        #: an upper bound, once `measure` has found it
+        #: an upper bound, set by `measure`
         self.maximum = 0.0
 
     def measure(self, slabs: Sequence[Slab]) -> None:
-        """Find the ``maximum``, reading slab by slab."""
+        """Compute the ``maximum``, slab by slab."""
         largest = 0.0
         for slab in slabs:
             window = _Window(self.inner, slab)
@@ -61,7 +62,7 @@ class MappedIrradiance:
         self.maximum = largest**2
 
     def roots(self, window: _Window) -> mi.Float:
-        """Square roots in the extended grid of a window, see `IrradianceCache.field`."""
+        """Return the square roots in the extended grid of a window, see `IrradianceCache.field`."""
         (_, ny, nx), sub = self.inner.shape, window.grid
         values = mi.Float(self._values.read((window.lower, 0, 0), (window.upper, ny, nx)).ravel())
         place = dr.arange(mi.UInt32, sub.voxel_count * self.channels)
@@ -80,8 +81,9 @@ class MappedIrradiance:
 
 
 class _Window:
-    """The slices of the extended grid that lookups in a slab of it read, and the slices of the grid
-    itself from ``lower`` up to ``upper``, from which they follow.
+    """The slices of the extended grid that lookups in a slab read.
+
+    Their values follow from the slices of the grid itself from ``lower`` up to ``upper``.
     """
 
     def __init__(self, grid: Grid, slab: Slab) -> None:
@@ -92,7 +94,7 @@ class _Window:
         self.grid = Grid((self.upper - self.lower, *grid.shape[1:]), np.eye(4))
         self.extension = Extension(self.grid)
         layer = self.extension.grid.shape[1] * self.extension.grid.shape[2]
-        #: number of the first voxel of the window in the extension, and its voxels
+        #: index of the first voxel of the window in the extended grid, and its number of voxels
         self.first_voxel = (self.first - self.lower) * layer
         self.voxels = (self.end - self.first) * layer
 
@@ -133,7 +135,7 @@ class _WindowGroup(PackedGroup):
 
 
 class _SlabLookups(Lookups):
-    """Lookups in the window that was entered last."""
+    """Lookups in the current window, see `enter`."""
 
     def __init__(self, grid: Grid, fields: list, limits: Sequence[float]) -> None:
         self._grid = grid
@@ -145,7 +147,7 @@ class _SlabLookups(Lookups):
         self.groups: list[PackedGroup] = []
 
     def enter(self, slab: Slab) -> None:
-        """Read the window of a slab."""
+        """Read the window of a slab, and make it the current one."""
         self.groups = []  # frees the memory of the one before
         window = _Window(self._grid, slab)
         self.groups = [_WindowGroup(self._grid, window, self._mapped), *self._in_memory]
@@ -156,7 +158,10 @@ def _is_mapped(field: Field | MappedField | MappedIrradiance) -> bool:
 
 
 class _Slab(MarchedPart):
-    """The part of rays in a slab up to ``bound``, along z or against it."""
+    """The part of rays in a slab, which ends at ``bound`` on the z axis.
+
+    Rays run along z if ``ascending``, otherwise against it.
+    """
 
     def __init__(self, state: tuple | None, bound: float, ascending: bool) -> None:
         super().__init__(state)
@@ -169,8 +174,9 @@ class _Slab(MarchedPart):
 
 
 class SlabProjection(Projection):
-    """Ray marching of a medium whose extinction, irradiance and perhaps albedo stay in files, in
-    about ``memory`` bytes.
+    """Ray marching of a medium whose fields stay in files, within about ``memory`` bytes.
+
+    These are the extinction, the irradiance, and the albedo unless it is constant.
     """
 
     def __init__(
@@ -204,7 +210,7 @@ class SlabProjection(Projection):
         offset: mi.Float,
         active: mi.Bool,
     ) -> tuple:
-        """March as `Projection.march` does, through slab after slab."""
+        """March as `Projection.march`, slab by slab."""
         active = mi.Bool(active) & (near < far)
         dr.eval(ray, near, far, background, offset, active)
         upwards = self._grid.coordinates.vector(ray.d).z >= 0
@@ -223,7 +229,7 @@ class SlabProjection(Projection):
         return radiance, transmittance, [], mi.Spectrum(0)
 
     def _march_one_way(self, rays: tuple, ascending: bool) -> tuple:
-        """Radiance and transmittance of rays that all run upwards, or downwards."""
+        """Return radiance and transmittance of rays that all run upwards, or all downwards."""
         ray, near, *_, active = rays
         entry = (self._grid.coordinates.point(ray(near)).z + 1) * mi.Float(1 if ascending else -1)
         entry = abs(float(dr.min(dr.select(active, entry, dr.inf))[0]))
@@ -231,7 +237,7 @@ class SlabProjection(Projection):
         state, found = None, None
         for number, slab in enumerate(slabs):
             is_last = number == len(slabs) - 1
-            # Rays that enter in a slab are at least a rounding error beyond its begin.
+            # Rays that enter in a slab are at least a rounding error beyond its first face.
             is_before = slab[1] < entry - 1 if ascending else slab[0] > entry + 1
             if is_before and not is_last:
                 continue

@@ -1,10 +1,10 @@
-"""Sweeps of volumes in files, slab by slab, with the radiance of all tracks passed on.
+"""Sweeps of volumes in files, slab by slab.
 
-Across the dominant axis of an ordinate every track of a slice stays in the slab until its end, also
-where it leaves through a side and enters again at the other. So one number per track and channel is
-passed on from slab to slab. All ordinates of one dominant axis are swept together: along the axis
-through the first slab while those against it pass through the last one, and so on, until both have
-passed through all. Each slab is visited twice, and its sums are kept in a file between.
+Slabs lie across the dominant axis of an ordinate, so that each of its tracks crosses a whole slab,
+also if it leaves through a side and enters again at the opposite one. So one number per track and
+channel, its radiance, is passed on from slab to slab. All ordinates of one dominant axis are swept
+together: those along the axis cross the first slab while those against it cross the last one, and
+so on. Each slab is visited twice; its sums are stored in a file in the meantime.
 """
 
 from __future__ import annotations
@@ -39,14 +39,15 @@ from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.tracks import SweptBox, values_at_centres
 
-#: Bytes of a voxel of both slabs while they are swept: extinction and its parts; and for each
-#: channel the sums, or these and the source, and copies of them.
+#: Memory per voxel of both slabs during a sweep [bytes]: of the extinction; and for each channel of
+#: the sums, or of the sums and the source, with copies.
 BYTES, BYTES_OF_CHANNEL, BYTES_OF_SOURCE = 16, 16, 56
-#: Most values of all channels of both slabs: kernels count them in 32 bits, four for each.
+#: Largest number of values of all channels of both slabs, since kernels use 32-bit indices of four
+#: numbers per value.
 MOST_VALUES = 1 << 30
-#: Most slices of a slab: more would not be faster.
+#: Largest number of slices of a slab; thicker slabs are not faster.
 MOST_SLICES = 128
-#: Share of the memory for what tracks carry.
+#: Share of the memory for the radiance of the tracks.
 SHARE_CARRIED = 0.4
 
 Progress = Callable[[int, int], None]
@@ -56,8 +57,9 @@ PairsOfOrdinates = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class SlabSweep:
-    """Sweeps of the extinction ``sigma_t``, with working files in ``folder``, in about ``memory``
-    bytes.
+    """Sweeps of the extinction ``sigma_t``, within about ``memory`` bytes.
+
+    Working files are in ``folder``.
     """
 
     def __init__(self, sigma_t: MappedField, folder: Path, memory: int) -> None:
@@ -79,8 +81,9 @@ class SlabSweep:
         offsets: np.ndarray,
         progress: Progress = lambda done, total: None,
     ) -> BrickFile:
-        """Uncollided irradiance at the centres of all voxels, as `Tracks.uncollided` computes it:
-        a file of float32 with the channels of ``incoming`` (n, 2, channels).
+        """Compute the uncollided irradiance at the centres of all voxels, as `Tracks.uncollided`.
+
+        Returns a file of float32 with the channels of ``incoming`` (n, 2, channels).
         """
         ordinates = directions, np.zeros(len(directions)), offsets
         return self._irradiance("uncollided", ordinates, incoming, None, progress)
@@ -92,8 +95,9 @@ class SlabSweep:
         source: BrickFile,
         progress: Progress = lambda done, total: None,
     ) -> BrickFile:
-        """Irradiance of what voxels emit or scatter, in a file called ``name``; ``source`` is this
-        radiance per optical depth.
+        """Compute the irradiance of the radiance that voxels emit or scatter.
+
+        ``source`` is this radiance per optical depth. Returns a file called ``name``.
         """
         incoming = np.zeros((len(ordinates[0]), 2, source.channels))
         return self._irradiance(name, ordinates, incoming, source, progress)
@@ -132,11 +136,11 @@ class SlabSweep:
         return total
 
     def extinction(self, lower: list[int], upper: list[int]) -> np.ndarray:
-        """The extinction in a box (z, y, x), in units of its quantum."""
+        """Return the quantised extinction in a box (z, y, x)."""
         return self._levels.read(lower, upper)
 
     def close(self) -> None:
-        """Closes the working file of the extinction."""
+        """Close the working file of the extinction."""
         self._levels.close()
 
 
@@ -200,7 +204,7 @@ class AxisSweep:
         return len(self._incoming)
 
     def groups(self, memory: int) -> list[list[int]]:
-        """The pairs, in as many groups as needed for what the tracks of one to fit into memory."""
+        """Divide the pairs into groups; the radiance of the tracks of one group fits in memory."""
         each = 2 * self._track_count * (self._channels + 1) * 4
         most = max(1, int(SHARE_CARRIED * memory / each))
         return [list(range(first, last)) for first, last in even_slabs(self.pair_count, most)]
@@ -219,15 +223,15 @@ class AxisSweep:
 
     @staticmethod
     def numbers(slabs: list[Slab], step: int) -> list[int]:
-        """The slabs that are crossed in a ``step``: along the axis, and, if it is another one,
-        against it.
+        """Return the slabs that are crossed in a ``step``: along the axis, and, if it is another
+        one, against it.
         """
         last = len(slabs) - 1 - step
         return [step] if step == last else [step, last]
 
     @staticmethod
     def is_second_visit(slabs: list[Slab], step: int) -> bool:
-        """Whether the slabs of a ``step`` have been crossed both ways after it."""
+        """Return whether the slabs of a ``step`` have been crossed both ways after it."""
         return step >= len(slabs) // 2
 
     def cross(
@@ -260,14 +264,15 @@ class AxisSweep:
         return self._sums(values, boxes)
 
     def box(self, slab: Slab) -> tuple[list[int], list[int]]:
-        """Lower and upper end (z, y, x) of a slab."""
+        """Return the lower and upper end (z, y, x) of a slab."""
         lower, upper = [0, 0, 0], list(self._tracks.grid.shape)
         lower[2 - self.axis], upper[2 - self.axis] = slab
         return lower, upper
 
     def _values(self, parts: list[np.ndarray | None], boxes: list) -> mi.Float:
-        """The sums of one or two slabs as they were left, or 0, by slices; with the source, the
-        four values of `Tracks.sweep`.
+        """Return the stored sums of one or two slabs, or 0, by slices.
+
+        With a source, each voxel has the four values of `Tracks.sweep`.
         """
         shapes = [self._shape_of_sums(box) for box in boxes]
         if self._source is None and all(part is None for part in parts):
@@ -286,7 +291,7 @@ class AxisSweep:
         return mi.Float(joined.ravel())
 
     def _sums(self, values: mi.Float, boxes: list) -> list[np.ndarray]:
-        """The sums of each slab, by slices."""
+        """Return the sums of each slab, by slices."""
         place, first = slice_place(self.axis), 0
         shape = list(self._shape_of_sums(boxes[0]))
         thickness = shape[place]
@@ -304,14 +309,14 @@ class AxisSweep:
         return found
 
     def shape_of_sums(self, slab: Slab) -> tuple[int, ...]:
-        """The shape of the sums of a slab, which are by slices."""
+        """Return the shape of the sums of a slab, which are by slices."""
         return self._shape_of_sums(self.box(slab))
 
     def _shape_of_sums(self, box: tuple) -> tuple[int, ...]:
         return (*by_slices(np.empty(_shape(box), bool), self.axis).shape, self._channels)
 
     def irradiance(self, sums: np.ndarray, box: tuple) -> np.ndarray:
-        """The irradiance that the sums of a slab mean, in its ``box``: (z, y, x, channel)."""
+        """Convert the sums of a slab to the irradiance (z, y, x, channel) in its ``box``."""
         if self._source is None:
             found = self._at_centres(mi.Float(sums.ravel()), _shape(box))
         else:
@@ -319,7 +324,7 @@ class AxisSweep:
         return found.reshape(*_shape(box), self._channels)
 
     def _at_centres(self, means: mi.Float, shape: tuple[int, int, int]) -> np.ndarray:
-        """The values of a slab at the centres of its voxels (z, y, x, channel)."""
+        """Return the values of a slab at the centres of its voxels (z, y, x, channel)."""
         grid, channels = Grid(shape, np.eye(4)), self._channels
         index = dr.arange(mi.UInt32, grid.voxel_count)
         box = SweptBox(grid, np.zeros(3, int), grid.resolution, self.axis)
@@ -335,5 +340,5 @@ def _shape(box: tuple) -> tuple[int, int, int]:
 
 
 def _thickness(memory: int, slice_bytes: int) -> int:
-    """How many slices of so many bytes each fit, one at least."""
+    """Return how many slices of ``slice_bytes`` bytes each fit in ``memory``, at least one."""
     return int(np.clip(memory // slice_bytes, 1, MOST_SLICES))

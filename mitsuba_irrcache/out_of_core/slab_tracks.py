@@ -1,4 +1,4 @@
-"""Tracks through two slabs of a volume at a time, one for either way of each pair of ordinates."""
+"""Tracks through two slabs of a volume at a time, one for each direction of a pair of ordinates."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ from mitsuba_irrcache.solvers.discrete_ordinates.track_table import TRANSVERSE, 
 
 
 class SlabTracks:
-    """Tracks through all voxels of ``grid``, whose extinction is read slab by slab, one value for
-    each voxel in units of ``quantum`` [1/scene unit].
+    """Tracks through all voxels of ``grid``, whose extinction is read slab by slab.
+
+    It has one value per voxel, in units of ``quantum`` [1/scene unit].
     """
 
     def __init__(self, grid: Grid, quantum: float) -> None:
@@ -39,7 +40,7 @@ class SlabTracks:
         self._layout = TrackLayout(extinction, (np.zeros(3, int), grid.resolution))
 
     def dominant_axes(self, ordinates: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-        """The dominant axis of each of these ordinates, which are as in `slab_table`."""
+        """Return the dominant axis of each ordinate; ``ordinates`` are as in `slab_table`."""
         _, axes, _ = self._layout.record(*ordinates, by_slice=True)
         return axes
 
@@ -50,7 +51,7 @@ class SlabTracks:
         axis: int,
         slabs: tuple[Slab, Slab],
     ) -> TrackTable:
-        """The table of ordinates, all with the dominant ``axis``, for a pair of slabs.
+        """Return the table of ordinates, all with the dominant ``axis``, for a pair of slabs.
 
         Args:
             ordinates: directions (n, 3), weights (n) and offsets (n, 2), as in `Tracks.table`.
@@ -87,8 +88,9 @@ def _table(record: TrackRecord, incoming: np.ndarray, axis: int, forward: np.nda
 
 
 def _moved(fields: TransverseFields, stride: int, first: int, last: int) -> TransverseFields:
-    """The fields of tracks that begin in slice ``first`` along the axis, and in ``last`` against
-    it.
+    """Return the fields of tracks that begin in other slices.
+
+    Those along the axis begin in slice ``first``, those against it in slice ``last``.
     """
     ahead, behind = (fields.start + n * fields.slope for n in (first, last))
     return replace(
@@ -108,7 +110,7 @@ def by_slices(box: np.ndarray, axis: int) -> np.ndarray:
 
 
 def from_slices(values: np.ndarray, axis: int) -> np.ndarray:
-    """Transpose what `by_slices` returns back to (z, y, x, ...)."""
+    """Transpose a result of `by_slices` back to (z, y, x, ...)."""
     return values.transpose(*np.argsort(_order(axis)), *range(3, values.ndim))
 
 
@@ -117,13 +119,15 @@ def _order(axis: int) -> list[int]:
 
 
 def slice_place(axis: int) -> int:
-    """Where ``axis`` is among those of `by_slices`."""
+    """Return the position of ``axis`` among the axes of `by_slices`."""
     return 2 - slicewise(axis).index(axis)
 
 
 def swept_medium(parts: list[np.ndarray], axis: int) -> SweptMedium:
-    """The extinction of one or two slabs as tracks along ``axis`` read it: for each voxel its
-    quantised value and that of its neighbour (see `Extinction.corners`, by rows).
+    """Return the extinction of one or two slabs in the form that tracks along ``axis`` read.
+
+    For each voxel this is its quantised value and that of its neighbour (see `Extinction.corners`,
+    by rows).
 
     ``parts`` are boxes (z, y, x) of quantised values, uint16.
     """

@@ -1,4 +1,4 @@
-"""What is found out about a volume in a first pass over its file: bounds, and invalid values."""
+"""A first pass over the file of a volume: bounds of its values, and invalid values."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class MappedField:
         return Macrocells(largest, least, self._ends[0].shape, coordinates)
 
     def values(self, first: int, last: int) -> mi.Float:
-        """Values of some slices, scaled, x fastest."""
+        """Return the scaled values of slices ``first`` to ``last - 1``, x fastest."""
         return mi.Float(self.file.read(first, last).ravel()) * self.scale
 
     def _bounds(self, what: str) -> tuple[np.ndarray, np.ndarray]:
-        """Minimum and maximum of each macrocell, grown by one voxel."""
+        """Return the minimum and maximum over each macrocell, extended by one voxel."""
         size, slices = self._cell, self.grid.shape[0]
         found = []
         for first in range(0, slices, size):

@@ -12,7 +12,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.zarr_chunks import check_chunks
 from mitsuba_irrcache.machine.extras import require
 
-#: How names of raw files state voxels along x, y, z and the type, as in the Open SciVis data sets.
+#: Names of raw files, with sizes along x, y, z and type, as in the Open SciVis data sets.
 RAW_NAME = re.compile(r"_(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32)|float(?:16|32|64))\.raw$")
 #: Names of the file in the folder of a Zarr array, of version 3 and 2 of the format.
 ZARR_MARKS = ("zarr.json", ".zarray")
@@ -49,7 +49,7 @@ class VolumeFile:
         self.shape = tuple(int(n) for n in array.shape)
 
     def read(self, first: int, last: int) -> np.ndarray:
-        """Return the slices from ``first`` up to before ``last``: float32 (z, y, x)."""
+        """Return the slices ``first`` to ``last - 1``, float32 (z, y, x)."""
         # Opened anew each time: pages of a mapped file count as memory of the process while it is
         # mapped.
         array = self._open()
@@ -63,8 +63,9 @@ class VolumeFile:
 
     @property
     def state(self) -> list[tuple[str, int, int, int]]:
-        """Name, size, time and number of the file, or of each file in the folder: they change when
-        it is written.
+        """Return name, size, time and inode of the file, or of each file in the folder.
+
+        They change when a file is written.
         """
         parts = sorted(self.path.rglob("*")) if self.path.is_dir() else [self.path]
         known = ((str(part), part.stat()) for part in parts)

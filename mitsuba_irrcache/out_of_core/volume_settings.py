@@ -1,4 +1,4 @@
-"""Properties of the integrator for volumes larger than memory, and what they are combined with."""
+"""Properties of the integrator for volumes larger than memory, and their valid combinations."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class VolumeSettings:
 
 
 def check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool) -> None:
-    """Raise IrrcacheError for settings that are not supported."""
+    """Raise IrrcacheError for combinations of settings that are not supported."""
     if not files.sigma_t:
         raise IrrcacheError(
             "irrcache: albedo_file, max_memory, work_folder or irradiance_file is set, but not "
@@ -73,7 +73,7 @@ def check_settings(settings: CacheSettings, files: VolumeSettings, whole: bool) 
 
 
 def work_folder(files: VolumeSettings) -> tempfile.TemporaryDirectory:
-    """Make a folder for working files, which is deleted with the integrator."""
+    """Create a folder for working files, which is deleted with the integrator."""
     parent = files.work_folder or Path(files.sigma_t).resolve().parent
     try:
         return tempfile.TemporaryDirectory(prefix=".irrcache-", dir=parent)
