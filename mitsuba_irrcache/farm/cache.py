@@ -1,4 +1,4 @@
-"""One cache, filled by many workers: the bits are those of one machine that fills it alone."""
+"""Caches filled by many workers, with the same bits as by a single machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mitsuba_irrcache.pipeline.stream_parts import missing_parts
 
 
 class CacheRun:
-    """The caches of a scene, and what is missing in them.
+    """The caches of a scene, and the batches that they lack.
 
     The file of a cache holds a number of first batches. Later ones wait as files in a folder beside
     it until those before them are there: parts are appended in the order of their numbers, whatever
@@ -39,7 +39,7 @@ class CacheRun:
         if not hasattr(integrator, "cached_media"):
             raise IrrcacheError(f'"{scene["scene"]}" is rendered without a cache; add -i irrcache.')
         media = enumerate(integrator.cached_media(self._scene))
-        #: media with a cache, by their numbers in the scene
+        #: media with a cache, by their indices in the scene
         self._media = {number: medium for number, medium in media if medium.cache is not None}
         if not self._media:
             raise IrrcacheError(f'no medium of "{scene["scene"]}" needs a cache.')
@@ -60,7 +60,7 @@ class CacheRun:
         return [medium.file for medium in self._media.values()]
 
     def begin(self) -> list[Job]:
-        """Append the parts that an earlier run left, and return the jobs that are missing."""
+        """Append the stored parts of an earlier run, and return the jobs that remain."""
         self._results.begin(resume=True)
         for number, medium in self._media.items():
             if medium.is_dark:
@@ -89,7 +89,7 @@ class CacheRun:
         cache.append(IrradianceCache.load(file), job.arguments["first"])
 
     def store(self, job: Job, outcome: Outcome) -> None:
-        """Keep a part, and append all that follow on their caches now."""
+        """Store a part, and append all parts that are next in order to their caches."""
         self._parts[job.arguments["medium"]].store(job, outcome)
         if self._checkpoints.is_due:
             self.save()

@@ -1,4 +1,4 @@
-"""The cluster: a scheduler that runs already, or one of this command's own on this machine."""
+"""The cluster: a running scheduler, or one that this command starts on this machine."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from mitsuba_irrcache.machine.versions import installed_version
 if TYPE_CHECKING:  # importing it takes a second
     from distributed import Client, LocalCluster, Security
 
-#: Workers on this machine by default, at most.
+#: Largest default number of workers on this machine.
 MOST_WORKERS = 4
-#: Seconds to wait for a scheduler, and for its first worker.
+#: Time to wait for a scheduler, and for its first worker [s].
 PATIENCE = 30
-#: Settings of workers on this machine: results are not written to disk, where memory would be
-#: pickled, and a process that dies is no fault of the job at once.
+#: Settings of workers on this machine: results are not spilled to disk, and a job is not abandoned
+#: as soon as its process dies.
 _SETTINGS = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.deploy.lost-worker-timeout": "5s",
 }
-#: The answer of workers without a package.
+#: Raised on workers without a package.
 MISSING = metadata.PackageNotFoundError
-#: Seconds without a worker on this machine after which none is expected any more.
+#: Time without a worker on this machine after which the run is given up [s].
 LONGEST_START = 300.0
 
 
@@ -205,7 +205,7 @@ def _announce(client: Client) -> None:
 
 
 def unfit_workers(client: Client) -> dict[str, str]:
-    """Return, by address, why workers that are there cannot run jobs: other software.
+    """Return, by address, why connected workers cannot run jobs: other versions of software.
 
     Only Python's own library is used on them, so that any worker can answer.
     """

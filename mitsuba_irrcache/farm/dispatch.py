@@ -1,4 +1,4 @@
-"""Runs jobs on the workers of a cluster, each until its result is stored once.
+"""Run jobs on the workers of a cluster, and store the result of each once.
 
 Workers may die, be slow, leave, join, or be of another kind. Jobs are pure functions, so that
 another worker can repeat any of them, and the first result of a job counts.
@@ -25,18 +25,18 @@ from mitsuba_irrcache.farm.work import run_job
 if TYPE_CHECKING:
     from distributed import Future
 
-#: Jobs that are submitted at a time, per worker: one that runs and one that waits.
+#: Number of submitted jobs per worker: one that runs and one that waits.
 JOBS_PER_WORKER = 2
-#: Attempts of a job that raises an error, and rounds of one whose workers die: Dask ends a round
-#: after `distributed.scheduler.allowed-failures` workers.
+#: Number of attempts of a job that raises an error; number of submissions of a job whose workers
+#: die, each of which Dask ends after `distributed.scheduler.allowed-failures` workers.
 ATTEMPTS, ROUNDS = 2, 5
-#: Jobs that may fail before any has succeeded.
+#: Number of failed jobs after which a run ends if no job has succeeded.
 FAILURES = 3
-#: Seconds between looks at the cluster, between attempts to start workers again that died while
-#: they started, and between messages that no worker is there.
+#: Time between checks of the cluster, between attempts to restart workers that died during their
+#: start, and between messages that there is no worker [s].
 INTERVAL, REFILL, REMINDER = 1.0, 5.0, 30.0
-#: A job that takes so many times the median, and so many seconds, is given to a second worker if
-#: there is one that has nothing else to do.
+#: A job that takes longer than this multiple of the median, and than this time [s], is also given
+#: to a second worker if one is idle.
 SLOW, SLOW_SECONDS = 4.0, 5.0
 
 
@@ -116,7 +116,7 @@ class Dispatch:
     # The cluster
 
     def _look(self) -> None:
-        """Look at the cluster every now and then."""
+        """Check the state of the cluster every `INTERVAL` seconds."""
         now = time.monotonic()
         if now - self._looked < INTERVAL:
             return
@@ -170,14 +170,14 @@ class Dispatch:
             )
 
     def _release_stranded(self) -> None:
-        """Take back jobs whose possible workers have all left."""
+        """Withdraw jobs whose admissible workers have all left."""
         for key, attempt in list(self._attempts.items()):
             if attempt.workers is not None and not set(attempt.workers) & set(self._workers):
                 self._cancel([key])
                 self._again(attempt.job)
 
     def _repeat_slow(self) -> None:
-        """Give jobs that take unusually long to workers that have nothing else to do."""
+        """Submit jobs that take unusually long to idle workers as well."""
         if self._next_ready() is not None or not self._durations:
             return
         jobs_by_worker = self._client.processing()
@@ -207,7 +207,7 @@ class Dispatch:
         return next(ready, None)
 
     def _submit(self, job: Job, workers: list[str] | None = None) -> None:
-        """Submit a job, for some ``workers`` only if they are given, or if others are unfit."""
+        """Submit a job, only for ``workers`` if these are given or if others are unfit."""
         workers = workers or (self._fit if self.unfit else None)
         key = f"irrcache-{self._run}-{job.name}-{uuid4().hex[:8]}"
         future = self._client.submit(

@@ -15,7 +15,7 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.farm.jobs import Environment, Job, scene_arguments
 from mitsuba_irrcache.io.scene_files import load_scene
 
-#: Frames of one run, at most: a slip such as 0:1:1e9 is refused.
+#: Largest number of frames of one run; more are most likely a mistake, such as 0:1:1e9.
 MOST_FRAMES = 1_000_000
 
 

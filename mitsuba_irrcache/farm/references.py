@@ -12,7 +12,7 @@ from mitsuba_irrcache.farm.results import Checkpoints, OrderedParts, Outcome, Re
 
 
 class ReferenceRun:
-    """The file of a reference, and the launches that are missing in it.
+    """The file of a reference, and the launches that it lacks.
 
     Launches have the seeds that one machine would use, and are added in its order.
     """
@@ -35,7 +35,7 @@ class ReferenceRun:
 
     @property
     def missing(self) -> list[Job]:
-        """The jobs that no earlier run has finished."""
+        """Return the jobs that no earlier run has finished."""
         return self._parts.missing
 
     def _jobs(self, scene: dict, sensor: int, spp: int, environment: Environment) -> Iterator[Job]:
@@ -50,7 +50,7 @@ class ReferenceRun:
         self.found = joined(self.found, Reference.load(file))
 
     def store(self, job: Job, outcome: Outcome) -> None:
-        """Keep the samples of one launch, and add all that are next now."""
+        """Store the samples of one launch, and add all that are next in order."""
         self._parts.store(job, outcome)
         if self._checkpoints.is_due:
             self.save()

@@ -1,4 +1,4 @@
-"""Results of jobs as files, which appear whole or not at all, each with a record of its inputs."""
+"""Results of jobs as files, written atomically, each with a record of its inputs."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Results:
 
 
 class OrderedParts:
-    """Results that arrive in any order and are added to a whole in the order of their jobs.
+    """Results that finish in any order and are added to a whole in the order of their jobs.
 
     Each waits as a file; `missing` are the jobs without one. ``add`` is called with each job and
     its file; the file is removed by `forget`, once the whole is written.
@@ -137,14 +137,15 @@ class OrderedParts:
         return not self._queue
 
     def store(self, job: Job, outcome: Outcome) -> None:
-        """Keep the result of a job, and add all that are next now."""
+        """Store the result of a job, and add all results that are next in order."""
         self._results.store(job, outcome)
         self._present.add(job.name)
         self.advance()
 
     def advance(self) -> None:
-        """Add all results that are next; one that does not fit is removed, so that another run
-        computes it again.
+        """Add all results that are next in order.
+
+        A result that cannot be added is removed, so that another run computes it again.
         """
         while self._queue and self._queue[0].name in self._present:
             job = self._queue[0]
@@ -163,20 +164,20 @@ class OrderedParts:
 
 
 class Checkpoints:
-    """Decides when a whole is written again: not too often, for the share of time that it takes."""
+    """Decide when a whole is written again, such that writing takes a small share of the time."""
 
     def __init__(self) -> None:
         self._ended, self._took = perf_counter(), 0.0
 
     @property
     def is_due(self) -> bool:
-        """Whether the last time is long ago."""
+        """Whether the whole should be written now."""
         limit = max(CHECKPOINT_SECONDS, self._took / CHECKPOINT_SHARE)
         return perf_counter() - self._ended >= limit
 
     @contextmanager
     def measured(self) -> Iterator[None]:
-        """Measure the time of writing."""
+        """Measure the time of writing within this context."""
         started = perf_counter()
         yield
         self._ended = perf_counter()

@@ -1,6 +1,4 @@
-"""Studies: several integrators on several scenes, measured by many workers as `irrcache compare`
-measures them.
-"""
+"""Studies: measurements of `irrcache compare` for several scenes, by many workers."""
 
 from __future__ import annotations
 
@@ -37,7 +35,7 @@ class SceneStudy:
         self._checked: dict = {}
 
     def begin(self, resume: bool) -> list[Job]:
-        """Check scene and integrators; return the measurements that are missing."""
+        """Check scene and integrators; return the jobs of measurements that remain."""
         self._results.begin(resume)
         for name in FOLDERS:
             (self._folder / name).mkdir(exist_ok=True)
@@ -63,18 +61,18 @@ class SceneStudy:
         return jobs
 
     def store(self, job: Job, outcome: Outcome) -> None:
-        """Keep the measurements of one integrator."""
+        """Store the measurements of one integrator."""
         self._results.store(job, outcome)
 
     @property
     def measurements(self) -> list[Measurement]:
-        """The measurements that are there; some may hold an error."""
+        """Return the finished measurements, some of which may hold an error."""
         names = [file_name(n, i) for n, i in enumerate(self._args.integrator)]
         files = [self._folder / "measurements" / f"{name}.json" for name in names]
         return [Measurement.load(file) for file in files if file.exists()]
 
     def report(self, reference: Reference) -> Path:
-        """Write the report of all measurements that are there; return its file."""
+        """Write the report of all finished measurements; return its file."""
         measurements = self.measurements
         if not measurements:
             raise IrrcacheError(f'there are no measurements in "{self._folder}" to report.')

@@ -1,4 +1,4 @@
-"""What runs on a worker: functions of JSON arguments that write files."""
+"""The jobs on a worker: functions of JSON arguments that write files."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _WORKING = threading.Lock()
 
 
 class _Kept:
-    """What one job leaves for the next one, as long as it is of the same scene."""
+    """A value that one job leaves for the next one, if that has the same scene."""
 
     def __init__(self) -> None:
         self.key, self.value = "", None
 
     def get(self, key: str, make: Callable[[], object]) -> object:
-        """Return the value of the last job if that had the same ``key``, else a new one."""
+        """Return the value of the last job if it had the same ``key``, otherwise a new one."""
         if key != self.key:
             self.key, self.value = "", None  # released first
             self.value, self.key = make(), key
