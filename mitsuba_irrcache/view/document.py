@@ -142,6 +142,10 @@ class Document:
             raise IrrcacheError(f"max_depth is {depth}; it must be -1 (all orders) or at least 1.")
         _set(self._integrator, "integer", "max_depth", str(depth))
 
+    def set_hide_emitters(self, hidden: bool) -> None:
+        """Set whether cameras see emitters directly."""
+        _set(self._integrator, "boolean", "hide_emitters", str(bool(hidden)).lower())
+
     def set_density(self, factor: float) -> None:
         """Multiply the extinction that the scene gives its media by a factor."""
         if not 0 < factor < 1e6:

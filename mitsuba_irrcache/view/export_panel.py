@@ -43,7 +43,7 @@ class ExportPanel:
                 "save view" if self._folder is not None else "download view",
                 hint="PNG, EXR with layers, and a scene for irrcache render",
             )
-            self._saved = gui.add_markdown("")
+            self._saved = gui.add_markdown("PNG, EXR with layers, Mitsuba scene")
         with gui.add_folder("Animation", order=7, expand_by_default=False):
             self._path: list[Camera] = []
             self._frames = gui.add_number("frames", 72, min=1, max=MOST_FRAMES, step=1)

@@ -37,6 +37,13 @@ class LightPanel:
                 self._light("environment", lighting.environment, 0.0, 10.0, gui)
             self._sun = self._light("sun", lighting.sun, 0.0, 1000.0, gui)
             gui.add_html("<irrcache-light></irrcache-light>")
+            hidden = gui.add_checkbox(
+                "hide emitters", session.document.seeing.hide_emitters,
+                hint='they light the medium, but are not seen: "background" is',
+            )  # fmt: skip
+            self.editing.bind(
+                hidden, lambda value: session.edit(lambda d: d.set_hide_emitters(value))
+            )
         with gui.add_folder("Scattering and error", order=4, expand_by_default=False):
             self._add_details(gui, lighting)
         channel.receive("sun", self._turn_sun)

@@ -97,7 +97,7 @@ class Visitor:
                 "filter", False, hint="of the illumination; weaker as the caches converge"
             )
             self._background = gui.add_rgb(
-                "background", (0, 0, 0), hint="where emitters are hidden (-D hide_emitters=true)"
+                "background", (0, 0, 0), hint="where emitters are hidden, see the group Light"
             )
         for handle in (
             self._kind, self._exposure, self._tone, self._filter, self._background, self._compare
