@@ -56,9 +56,23 @@ def crop(window: Window) -> str:
 
 
 def slices(window: Window) -> str:
-    """Wait for a slice."""
+    """Wait for a slice, and draw it in the image."""
     window.page.locator("irrcache-slice img").wait_for()
-    return "one, in the panel"
+    place, before = window.canvas(), window.page.screenshot(clip=window.canvas())
+    window.tick("in the image")
+    window.page.wait_for_timeout(2000)
+    assert window.page.screenshot(clip=place) != before
+    window.tick("in the image")
+    return "one, in the panel and in the image"
+
+
+def background(window: Window) -> str:
+    """Show the emitters instead of the background."""
+    shown = len(window.shown())
+    window.tick("hide emitters")
+    window.wait_for_picture(shown)
+    window.tick("hide emitters")
+    return "any colour, or the emitters"
 
 
 def marker(window: Window) -> str:
@@ -111,6 +125,7 @@ ROWS: dict[str, Callable[[Window], str]] = {
     "crop box": crop,
     "slice planes": slices,
     "orientation marker": marker,
+    "background": background,
     "direction of the sun": light,
     "comparison with `volpath`": reference,
     "error bars": errors,
