@@ -134,14 +134,15 @@ def test_a_corrupted_kernel_cache(tmp_path):
     same.
     """
     rng, pictures = np.random.default_rng(1), []
+    folder = {"HOME": str(tmp_path), "DRJIT_CACHE_DIR": str(tmp_path)}
     for _ in range(2):
         done = subprocess.run(
-            [sys.executable, "-c", RENDERED], env=os.environ | {"HOME": str(tmp_path)},
+            [sys.executable, "-c", RENDERED], env=os.environ | folder,
             cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=300,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         pictures.append(done.stdout.split()[-1])
-        files = sorted((tmp_path / ".drjit").glob("*.bin"))
+        files = sorted(tmp_path.rglob("*.bin"))
         assert len(files) > 10
         for number, file in enumerate(files):
             content = np.fromfile(file, np.uint8)
