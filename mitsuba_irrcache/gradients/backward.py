@@ -25,6 +25,7 @@ from mitsuba_irrcache.lights.falloff import edges_away
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
+from mitsuba_irrcache.solvers.base import registered
 
 
 def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
@@ -48,8 +49,9 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
     name = f'medium "{medium.name}"'
     if part.half_space is not None:
         refuse_all(keys, f"{name} is opaque and homogeneous, and has no cache", "Set resolution")
-    if part.solver.name != "sweep":
-        refuse_all(keys, f'the solver is "{part.solver.name}"', 'Set solver to "sweep"')
+    if not part.solver.has_gradients:
+        others = " or ".join(f'"{s.name}"' for s in registered() if s.has_gradients)
+        refuse_all(keys, f'the solver is "{part.solver.name}"', f"Set solver to {others}")
     depth = part.settings.max_depth
     if depth > 2:
         refuse_all(keys, f"max_depth is {depth}", "Set max_depth to 1, 2 or -1")

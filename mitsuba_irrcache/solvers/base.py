@@ -89,6 +89,8 @@ class Solver(ABC):
     has_preview: ClassVar[bool] = False
     #: whether it supports media with delta-M scaling (see `delta_m`)
     supports_delta_m: ClassVar[bool] = False
+    #: whether gradients of its irradiance are computed, see `gradients`
+    has_gradients: ClassVar[bool] = False
     #: whether it finds emitters behind glass by chance only, as ``volpath`` does
     finds_refracted_by_chance: ClassVar[bool] = False
 

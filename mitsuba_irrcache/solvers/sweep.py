@@ -52,6 +52,7 @@ class SweepSolver(Solver):
 
     name = "sweep"
     precedence = 10
+    has_gradients = True
     size_rule = SizeRule(
         TARGET_ERROR,
         fewest=32,

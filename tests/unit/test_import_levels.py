@@ -93,6 +93,19 @@ def test_modules_do_not_import_each_other_in_a_circle():
     assert edges == {}
 
 
+def test_no_test_imports_another():
+    tests = Path(__file__).parents[1]
+    wrong = [
+        f"{path.relative_to(tests)} imports {name}"
+        for path in tests.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in [getattr(node, "module", None), *(alias.name for alias in node.names)]
+        if name and name.rpartition(".")[2].startswith("test_")
+    ]
+    assert wrong == []
+
+
 def targets(module: str, path: Path) -> set[str]:
     """Return the imported modules; an imported name may be a module or be defined in one."""
     names = imported(module, path)

@@ -13,7 +13,7 @@ from mitsuba_irrcache.io.mitsuba_vol import read_vol
 from mitsuba_irrcache.volumes.lengths import mass_density, metres, mixing_ratio
 from mitsuba_irrcache.volumes.options import CloudVariables
 from mitsuba_irrcache.volumes.readers import read_volume
-from tests.unit.volumes.test_readers import data_folder
+from tests.support.slices import data_folder
 
 xarray = pytest.importorskip("xarray", reason="xarray is not installed")
 pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")

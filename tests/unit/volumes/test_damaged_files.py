@@ -16,8 +16,8 @@ from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.images import write_pixels
 from mitsuba_irrcache.volumes.options import ReadOptions
 from mitsuba_irrcache.volumes.readers import read_volume
+from tests.support.slices import write_dicom
 from tests.support.volume_files import WRITTEN, Written, ramp
-from tests.unit.volumes.test_readers import write_dicom
 
 PAGE = b"<html>404 not found</html>"
 CUTS = {"quarter": 0.25, "half": 0.5, "three quarters": 0.75}

@@ -508,7 +508,7 @@ def test_sparse_grid_larger_than_the_memory_is_refused(tmp_path):
 
 @pytest.mark.data
 def test_openvdb_smoke_is_that_of_its_conversion():
-    from tests.unit.volumes.test_readers import data_folder
+    from tests.support.slices import data_folder
 
     library_is_there = openvdb()
     assert library_is_there

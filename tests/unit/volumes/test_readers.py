@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import locale
 import os
 import re
 import struct
@@ -20,20 +19,13 @@ from mitsuba_irrcache.io.mitsuba_vol import read_vol, write_vol
 from mitsuba_irrcache.volumes.data import VolumeData
 from mitsuba_irrcache.volumes.raw import RawLayout
 from mitsuba_irrcache.volumes.readers import read_volume
+from tests.support.slices import data_folder, write_dicom
 
 SPACING, ORIGIN = (0.7, 0.9, 2.5), (-30.0, 12.0, 101.5)
 ANGLE = 0.3
 DIRECTION = np.array(
     [[np.cos(ANGLE), -np.sin(ANGLE), 0], [np.sin(ANGLE), np.cos(ANGLE), 0], [0, 0, 1.0]]
 )
-
-
-def data_folder() -> Path:
-    default = Path(__file__).resolve().parents[3] / ".." / "shared" / "data"
-    folder = Path(os.environ.get("IRRCACHE_DATA", default))
-    if not folder.is_dir():
-        pytest.skip(f"no data folder {folder}; set IRRCACHE_DATA to run this test")
-    return folder
 
 
 def ramp(dtype="int16") -> np.ndarray:
@@ -47,36 +39,6 @@ def write_image(path: Path, values: np.ndarray, compress: bool = False) -> Path:
     image.SetDirection(DIRECTION.ravel())
     SimpleITK.WriteImage(image, str(path), useCompression=compress)
     return path
-
-
-def write_dicom(folder: Path, positions, uid="1.2.826.0.1.9", tag="a", shear=0.0) -> None:
-    """Write DICOM slices of the value 20 times their position, stored as (value + 1000) / 2.
-
-    File names do not follow the positions.
-    """
-    folder.mkdir(exist_ok=True)
-    before = locale.setlocale(locale.LC_ALL)  # the writer sets it to C, in which text is ASCII
-    writer = SimpleITK.ImageFileWriter()
-    writer.KeepOriginalImageUIDOn()
-    for index, position in enumerate(positions):
-        image = SimpleITK.GetImageFromArray(np.full((6, 5), 20 * position, dtype=np.int16))
-        image.SetSpacing(SPACING[:2])
-        tags = {
-            "0008|0060": "CT",
-            "0008|0016": "1.2.840.10008.5.1.4.1.1.2",
-            "0008|0018": f"{uid}.{index + 1}",
-            "0020|000e": uid,
-            "0020|0013": str(index),
-            "0020|0032": f"{ORIGIN[0]}\\{ORIGIN[1] + shear * position}\\{position}",
-            "0020|0037": "1\\0\\0\\0\\1\\0",
-            "0028|1052": "-1000",
-            "0028|1053": "2",
-        }
-        for key, value in tags.items():
-            image.SetMetaData(key, value)
-        writer.SetFileName(str(folder / f"{tag}{(7 * index) % 97:02d}.dcm"))
-        writer.Execute(image)
-    locale.setlocale(locale.LC_ALL, before)
 
 
 # Placement
