@@ -22,6 +22,9 @@ PASS_SECONDS = 3.0
 #: Passes after which the resolution is chosen. The time of the first one does not count, since
 #: kernels may be compiled in it.
 PROBE = 2
+#: Sides of the blocks of pixels over which errors are averaged, and the noise that their means may
+#: have, relative to the mean of the image: noise of few samples would hide all else.
+BLOCKS, BLOCK_NOISE = (1, 2, 4, 8, 16), 0.05
 #: Largest relative error that has a colour of its own; noise of few samples is larger.
 LARGEST = 1.0
 #: Colours of errors from -1 to 1, blue for too dark and red for too bright.
@@ -94,7 +97,10 @@ class Comparison:
         if not known.samples:
             return Compared(kind, text)
         if kind == "error":
-            error = known.signed_error(image)
+            side = block_side(known.noise)
+            error = block_means(known.signed_error(image), side)
+            if side > 1:
+                text += f"; means of {side * known.coarseness} x {side * known.coarseness} pixels"
             limit = min(rounded(float(np.quantile(np.abs(error), 0.98))), LARGEST)
             colours = np.kron(false_colours(error / limit), np.ones((known.coarseness,) * 2 + (1,)))
             return Compared(kind, text, None, colours.astype(np.uint8), limit)
@@ -121,6 +127,27 @@ def false_colours(values: np.ndarray) -> np.ndarray:
     """Return colours (..., 3) in [0, 255] of values in [-1, 1], clamped."""
     at = np.linspace(-1, 1, len(_STOPS))
     return np.stack([np.interp(values, at, channel) for channel in _STOPS.T], axis=-1)
+
+
+def block_side(noise: float | None) -> int:
+    """Return the side of the smallest blocks of pixels whose means are free enough of noise.
+
+    ``noise`` is the standard deviation of a pixel, None if it is not known.
+    """
+    if noise is None:
+        return BLOCKS[-1]
+    return next((side for side in BLOCKS if noise / side <= BLOCK_NOISE), BLOCKS[-1])
+
+
+def block_means(values: np.ndarray, side: int) -> np.ndarray:
+    """Return an array like ``values`` (height, width) of means over blocks of pixels."""
+    for axis, length in enumerate(values.shape):
+        starts = np.arange(0, length, side)
+        counts = np.diff(np.append(starts, length))
+        sums = np.add.reduceat(values, starts, axis=axis)
+        means = sums / counts.reshape(-1, *(1,) * (values.ndim - 1 - axis))
+        values = np.repeat(means, counts, axis=axis)
+    return values
 
 
 def rounded(limit: float) -> float:

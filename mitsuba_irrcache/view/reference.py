@@ -137,6 +137,16 @@ class ViewReference:
         truth = self.radiance()
         return (self.reduced(image) - truth).mean(axis=-1) / (float(truth.mean()) or 1.0)
 
+    @property
+    def noise(self) -> float | None:
+        """Return the standard deviation of the noise in `signed_error`, None before the second
+        sample.
+        """
+        if self._passes < 2:
+            return None
+        a, b = (self._sums / self._counts[..., None]).mean(axis=-1)
+        return 0.5 * float(np.sqrt(((a - b) ** 2).mean())) / (0.5 * float((a + b).mean()) or 1.0)
+
     def _trace(self, band: range) -> np.ndarray:
         """Render the colours of a band, (pixels, 3)."""
         count = len(band)

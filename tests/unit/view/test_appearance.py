@@ -12,7 +12,14 @@ pytest.importorskip("viser")
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.view import command
 from mitsuba_irrcache.view.appearance import WHOLE, Appearance, cropped
-from mitsuba_irrcache.view.comparison import CHOICES, _finest, false_colours, rounded
+from mitsuba_irrcache.view.comparison import (
+    CHOICES,
+    _finest,
+    block_means,
+    block_side,
+    false_colours,
+    rounded,
+)
 from mitsuba_irrcache.view.comparison import KINDS as COMPARISONS
 from mitsuba_irrcache.view.crop_panel import checked_box, slice_place
 from mitsuba_irrcache.view.picture import CAPTIONS, KINDS
@@ -139,6 +146,17 @@ def test_errors_have_colours_and_round_limits():
     assert [rounded(v) for v in (0, 0.011, 0.02, 0.3, 0.7, 12)] == pytest.approx(
         [0.001, 0.02, 0.02, 0.5, 1, 20]
     )
+
+
+def test_noisy_errors_are_means_over_blocks():
+    """The side of blocks follows from the noise; blocks at the edges are smaller."""
+    sides = [block_side(noise) for noise in (0.01, 0.05, 0.09, 0.3, 100.0, None)]
+    assert sides == [1, 1, 2, 8, 16, 16]
+    values = np.random.default_rng(0).normal(size=(7, 10))
+    np.testing.assert_array_equal(block_means(values, 1), values)
+    found = block_means(values, 4)
+    np.testing.assert_allclose(found[:4, 4:8], values[:4, 4:8].mean())
+    np.testing.assert_allclose(found[4:, 8:], values[4:, 8:].mean())
 
 
 def test_references_are_as_fine_as_time_allows():

@@ -154,6 +154,9 @@ def test_coarse_references_are_means_over_pixels(document):
     error, resolved = coarse.error_of(fine.radiance())
     assert error < max(0.03, 2 * resolved)
     assert abs(coarse.signed_error(1.1 * fine.radiance()).mean() - 0.1) < 0.02
+    # What is left between two means of the same is their noise.
+    spread = coarse.signed_error(fine.radiance()).std()
+    assert spread == pytest.approx(np.hypot(coarse.noise, fine.noise / 3), rel=0.2)
 
 
 @pytest.mark.parametrize("document", list(SCENES), indirect=True)
