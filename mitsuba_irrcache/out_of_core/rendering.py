@@ -155,9 +155,7 @@ class MappedMedium:
             known = self._medium, found, colour, (directions, weights, offsets)
             scattering = ScatteredIrradiance(sweep, *known)
             scattering.solve(scene, description, replace(self._settings, samples=0))
-            scattered = scattering.find(report)
-            add(found, scattered)
-            scattered.close()
+            found = add(found, scattering.find(report), sweep.file("both", channels=found.channels))
         sweep.close()
         self._irradiance = found, colour
         if files.irradiance:

@@ -192,12 +192,18 @@ class ScatteredIrradiance:
         return (change / max(total, 1e-300)) ** 0.5
 
 
-def add(total: BrickFile, part: BrickFile) -> None:
-    """Add the values of the file ``part`` to those of ``total``."""
+def add(first: BrickFile, second: BrickFile, total: BrickFile) -> BrickFile:
+    """Write the sums of two files to a third one, return it, and close the two.
+
+    They do not change, so that this may be done again after an interruption.
+    """
     slices, ny, nx = total.shape
-    for first, last in even_slabs(slices, EDGE):
-        box = (first, 0, 0), (last, ny, nx)
-        total.write(box[0], total.read(*box) + part.read(*box))
+    for begin, end in even_slabs(slices, EDGE):
+        box = (begin, 0, 0), (end, ny, nx)
+        total.write(box[0], first.read(*box) + second.read(*box))
+    first.close()
+    second.close()
+    return total
 
 
 def _shape(lower: list[int], upper: list[int]) -> list[int]:
