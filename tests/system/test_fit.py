@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.gradients.cases import SUN, Case
+from experiments.validation.gradients.cases import SUN, Case
 from mitsuba_irrcache.cli.main import main
 from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.gradients.fit import Result, Settings, View, _roughness, fit

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.gradients.cases import CASES, LAMP, POINT, SKY, SUN, Case, sky_with_sun
-from experiments.gradients.differences import compare, gradients, key_of, pixel_weights
+from experiments.validation.gradients.cases import CASES, LAMP, POINT, SKY, SUN, Case, sky_with_sun
+from experiments.validation.gradients.differences import compare, gradients, key_of, pixel_weights
 from mitsuba_irrcache.errors import IrrcacheError
 
 #: Largest relative error of directional derivatives along smooth perturbations, and the least

@@ -3,7 +3,7 @@
     python -m experiments.robustness.identity.run FOLDER [--against OTHER_FOLDER] [--only PART]
 
 Writes FOLDER/<scene>-<solver>.npy, one image for each solver that supports the scene, and
-FOLDER/gradient-<case>-<parameter>.npy, derivatives of images of `experiments.gradients.cases`. With
+FOLDER/gradient-<case>-<parameter>.npy, gradients in `experiments.validation.gradients.cases`. With
 ``--against``, every image is compared with the one of the same name in OTHER_FOLDER; the script
 prints the differences, and exits with 1 if there are any. To be run before and after a change that
 must not affect results, for instance a refactoring, on the same machine with the same versions of
@@ -23,10 +23,10 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from experiments.gradients.cases import CASES
-from experiments.gradients.differences import gradients, pixel_weights
 from experiments.performance.kinds import scenes as kinds
 from experiments.support.options import begin
+from experiments.validation.gradients.cases import CASES
+from experiments.validation.gradients.differences import gradients, pixel_weights
 from mitsuba_irrcache.errors import IrrcacheError
 
 SIZE, SPP = 32, 4

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.gradients.cases import Case
+from experiments.validation.gradients.cases import Case
 from mitsuba_irrcache.gradients.forward_peak import with_forward_peak
 from mitsuba_irrcache.gradients.resampling import VoxelQuadrature
 from mitsuba_irrcache.gradients.splatting import GridSplat

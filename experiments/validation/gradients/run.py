@@ -1,6 +1,6 @@
 """Gradients against finite differences of the image, and beside those of ``prbvolpath``.
 
-    python -m experiments.gradients.run [--case NAME] [--document docs/validation.md]
+    python -m experiments.validation.gradients.run [--case NAME] [--document docs/validation.md]
 
 The first table has for each case and parameter the relative error and the cosine of directional
 derivatives along smooth perturbations (`differences`), the second one errors by voxel at equal
@@ -14,11 +14,11 @@ from time import process_time
 
 import mitsuba as mi
 
-from experiments.gradients import beside_prb
-from experiments.gradients.cases import CASES, Case
-from experiments.gradients.differences import compare, gradients, pixel_weights
 from experiments.support.documents import replace_tables
 from experiments.support.options import add_document, begin
+from experiments.validation.gradients import beside_prb
+from experiments.validation.gradients.cases import CASES, Case
+from experiments.validation.gradients.differences import compare, gradients, pixel_weights
 from mitsuba_irrcache.compare.tables import Table
 
 

@@ -1,6 +1,6 @@
 """A density from eight views, with this integrator and with ``prbvolpath``.
 
-    python -m experiments.gradients.optimise [--seconds 24] [--voxels 24]
+    python -m experiments.validation.gradients.optimise [--seconds 24] [--voxels 24]
 
 Adam fits the extinction of a cube under a sky and a sun, from a start without structure. Prints the
 error of two views that the optimisation does not see, relative to their mean, against CPU time;
@@ -18,9 +18,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from experiments.gradients.cases import SKY, SUN, Case
-from experiments.gradients.differences import key_of
 from experiments.support.options import begin
+from experiments.validation.gradients.cases import SKY, SUN, Case
+from experiments.validation.gradients.differences import key_of
 from mitsuba_irrcache.gradients.fit import Result, Settings, View
 from mitsuba_irrcache.gradients.fit import fit as run_fit
 

@@ -14,8 +14,8 @@ from time import process_time
 import mitsuba as mi
 import numpy as np
 
-from experiments.gradients.cases import Case
-from experiments.gradients.differences import gradients, pixel_weights
+from experiments.validation.gradients.cases import Case
+from experiments.validation.gradients.differences import gradients, pixel_weights
 from mitsuba_irrcache.compare.tables import Table
 
 #: Extinction, relative to the largest, from which on voxels are counted apart from the others.

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from experiments.gradients.cases import EDGE, Case, blob
+from experiments.validation.gradients.cases import EDGE, Case, blob
 
 #: Camera samples of each pixel, for images and for gradients.
 SPP, SPP_GRAD = 64, 64
