@@ -34,7 +34,6 @@ IMAGES = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of ``irrcache fit``."""
-    own = Settings()
     parser.add_argument("scene", help="scene XML with the start volume and a sensor for each image")
     parser.add_argument(
         "--images", nargs="+", required=True, metavar="FILE",
@@ -54,6 +53,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--held-out", type=whole(0), default=0, metavar="N",
         help="number of images at the end that are held out to measure the error (default: 0)",
     )  # fmt: skip
+    _add_settings(parser)
+    parser.add_argument(
+        "--resume", action="store_true", help=f"continue from {CHECKPOINT} in the output folder"
+    )
+    parser.add_argument(
+        "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
+        help=f"integrator and its properties (default: {INTEGRATOR} in place of a path tracer)",
+    )  # fmt: skip
+    add_scene_options(parser)
+    parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that are fields of `Settings`."""
+    own = Settings()
     parser.add_argument(
         "--method", choices=METHODS, default=own.method, help="optimiser (default: %(default)s)"
     )
@@ -71,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--scale", type=float, default=own.scale,
-        help="extinction or emission to expect (default: the start's)",
+        help="expected extinction or emission (default: that of the start)",
     )  # fmt: skip
     parser.add_argument(
         "--smoothness", type=float, default=own.smoothness,
@@ -87,15 +101,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed", type=whole(0), default=own.seed, help="seed of the samples (default: 0)"
     )
-    parser.add_argument(
-        "--resume", action="store_true", help=f"continue from {CHECKPOINT} in the output folder"
-    )
-    parser.add_argument(
-        "-i", "--integrator", metavar="NAME{KEY=VALUE,...}",
-        help=f"integrator and its properties (default: {INTEGRATOR} in place of a path tracer)",
-    )  # fmt: skip
-    add_scene_options(parser)
-    parser.add_argument("-v", "--verbose", action="store_true", help="show Mitsuba's log")
 
 
 def run(args: argparse.Namespace) -> int:

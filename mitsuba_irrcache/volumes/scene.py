@@ -142,9 +142,6 @@ def scene_xml(
     emits: bool = False,
 ) -> str:
     """Return the scene; ``to_world`` is of the grids' unit cube, ``view`` as from ``camera``."""
-    grid, boundary = _text(to_world), _text(_boundary_to_world(to_world))
-    origin, target, up = (_text(vector) for vector in view)
-    far = 10 * float(np.linalg.norm(np.subtract(view[0], view[1])))
     defaults = {
         "integrator": settings.integrator,
         "max_depth": settings.max_depth,
@@ -159,15 +156,10 @@ def scene_xml(
     if emits:
         defaults["emission"] = "1"
         emission = f"""
-        <volume name="emission" type="gridvolume">
-            <string name="filename" value={quoteattr(EMISSION_FILE)}/>
-            <transform name="to_world"><matrix value="{grid}"/></transform>
-        </volume>
+{_volume_xml("emission", EMISSION_FILE, to_world)}
         <float name="emission_scale" value="$emission"/>"""
-    phase = '<phase type="isotropic"/>'
     if settings.asymmetry:
         defaults["g"] = f"{settings.asymmetry:.9g}"
-        phase = '<phase type="hg"><float name="g" value="$g"/></phase>'
     sun = ""
     if settings.sun:
         defaults["sun"] = f"{settings.sun:.9g}"
@@ -185,7 +177,23 @@ def scene_xml(
         <boolean name="hide_emitters" value="$hide_emitters"/>{emission}
     </integrator>
 
-    <sensor type="perspective">
+{_sensor_xml(view)}
+
+    <emitter type="constant">
+        <rgb name="radiance" value="$radiance, $radiance, $radiance"/>
+    </emitter>
+{sun}
+    <!-- Lengths are in the units of the data (mm for medical volumes), extinction in 1/length. -->
+{_medium_xml(to_world, is_isotropic=not settings.asymmetry)}
+</scene>
+"""
+
+
+def _sensor_xml(view: tuple[np.ndarray, ...]) -> str:
+    """Return the sensor with its film; ``view`` is as from ``camera``."""
+    origin, target, up = (_text(vector) for vector in view)
+    far = 10 * float(np.linalg.norm(np.subtract(view[0], view[1])))
+    return f"""    <sensor type="perspective">
         <float name="fov" value="{_FIELD_OF_VIEW:g}"/>
         <string name="fov_axis" value="smaller"/>
         <float name="near_clip" value="{far * 1e-5:.9g}"/>
@@ -203,22 +211,18 @@ def scene_xml(
             <string name="component_format" value="float32"/>
             <rfilter type="gaussian"/>
         </film>
-    </sensor>
+    </sensor>"""
 
-    <emitter type="constant">
-        <rgb name="radiance" value="$radiance, $radiance, $radiance"/>
-    </emitter>
-{sun}
-    <!-- Lengths are in the units of the data (mm for medical volumes), extinction in 1/length. -->
-    <medium type="heterogeneous" id="volume">
-        <volume name="sigma_t" type="gridvolume">
-            <string name="filename" value={quoteattr(SIGMA_T_FILE)}/>
-            <transform name="to_world"><matrix value="{grid}"/></transform>
-        </volume>
-        <volume name="albedo" type="gridvolume">
-            <string name="filename" value={quoteattr(ALBEDO_FILE)}/>
-            <transform name="to_world"><matrix value="{grid}"/></transform>
-        </volume>
+
+def _medium_xml(to_world: np.ndarray, is_isotropic: bool) -> str:
+    """Return the medium and the shape that bounds it."""
+    phase = '<phase type="hg"><float name="g" value="$g"/></phase>'
+    if is_isotropic:
+        phase = '<phase type="isotropic"/>'
+    boundary = _text(_boundary_to_world(to_world))
+    return f"""    <medium type="heterogeneous" id="volume">
+{_volume_xml("sigma_t", SIGMA_T_FILE, to_world)}
+{_volume_xml("albedo", ALBEDO_FILE, to_world)}
         <float name="scale" value="$scale"/>
         {phase}
     </medium>
@@ -227,9 +231,15 @@ def scene_xml(
         <transform name="to_world"><matrix value="{boundary}"/></transform>
         <bsdf type="null"/>
         <ref name="interior" id="volume"/>
-    </shape>
-</scene>
-"""
+    </shape>"""
+
+
+def _volume_xml(name: str, file: str, to_world: np.ndarray) -> str:
+    """Return a property that is a grid volume in a file."""
+    return f"""        <volume name="{name}" type="gridvolume">
+            <string name="filename" value={quoteattr(file)}/>
+            <transform name="to_world"><matrix value="{_text(to_world)}"/></transform>
+        </volume>"""
 
 
 def _boundary_to_world(to_world: np.ndarray) -> np.ndarray:
