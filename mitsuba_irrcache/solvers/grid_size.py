@@ -30,14 +30,21 @@ MOST_VOXELS, MOST_DIRECTIONAL = 1 << 25, 1 << 21
 TARGET_ERROR = 0.5
 #: RESOLVED is the optical depth of a data voxel up to which voxels of that size have the target
 #: error. Above, the number of voxels is proportional to the optical depth, and above OPAQUE to its
-#: power OPAQUE_POWER; at most MOST_PER_DATA_VOXEL voxels along each axis of a data voxel.
-RESOLVED, OPAQUE, OPAQUE_POWER, MOST_PER_DATA_VOXEL = 0.7, 1.2, 0.45, 6.0
+#: power OPAQUE_POWER; at most MOST_PER_DATA_VOXEL voxels along each axis of a data voxel. From
+#: EVEN voxels on that number is even, so that the kinks of trilinear data lie on faces of voxels:
+#: 7 voxels per data voxel of depth 100 have a larger error than 6, and 9 than 8.
+RESOLVED, OPAQUE, OPAQUE_POWER, EVEN, MOST_PER_DATA_VOXEL = 0.7, 1.2, 0.45, 4.0, 8.0
 #: The error [%] of a medium that is dense at its boundary is about BORDER_ERROR d^BORDER_ORDER,
 #: where d is the optical depth of a cache voxel at the boundary.
 BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
-#: Mean optical depth of a cache voxel above which a warning is logged, and the error that was
-#: measured there: opaque bone of 100 mean free paths per data voxel, 16 per cache voxel.
-OPAQUE_VOXEL, OPAQUE_ERROR = 10.0, "1 % of the mean, and up to 6 % of it in small regions,"
+#: RMSE [% of the mean] of an image with all orders of scattering through data with opaque detail as
+#: fine as their voxels: d^OPAQUE_DEPTH_ORDER r^OPAQUE_SIZE_ORDER, with the optical depth d of a
+#: data voxel and the ratio r of the edges of cache and data voxels. A fit to 1.5 <= d <= 100 and
+#: 1/12 <= r <= 1; errors of 4 x 4 pixels are up to OPAQUE_PEAK times as large. They are smaller in
+#: smooth data. A warning is logged above LARGE_OPAQUE_ERROR; the fit saturates at
+#: MOST_OPAQUE_ERROR.
+OPAQUE_DEPTH_ORDER, OPAQUE_SIZE_ORDER, OPAQUE_PEAK = 0.7, 1.5, 2.7
+LARGE_OPAQUE_ERROR, MOST_OPAQUE_ERROR = 3.0, 9.0
 #: Maximum number of voxels along the longest side that a boundary of glass can require. Glass
 #: reflects most of the radiance inside, which then varies less towards the boundary, and voxels are
 #: more expensive. At an optical depth of 40 this number has an error of 0.5 % (ball) and 0.7 %
@@ -45,7 +52,7 @@ OPAQUE_VOXEL, OPAQUE_ERROR = 10.0, "1 % of the mean, and up to 6 % of it in smal
 MOST_IN_GLASS = 64
 #: Maximum number of voxels of a cache that is finer than its data: all orders of scattering then
 #: take half a minute on two cores.
-MOST_REFINED = 8_000_000
+MOST_REFINED = 1 << 24
 
 #: Error [%] that voxels larger than those of the data may cause under smooth illumination, and
 #: coefficients of its estimate, fits to images of 32 scenes (experiments/validation/defaults): with
@@ -143,6 +150,7 @@ def _estimated_grid(medium: MediumGrid, rule: SizeRule, voxels: int) -> tuple[Gr
             ratio = np.minimum(depth, OPAQUE) / RESOLVED
             ratio *= np.maximum(depth / OPAQUE, 1) ** OPAQUE_POWER
         ratio = np.clip(ratio, 1, MOST_PER_DATA_VOXEL)
+        ratio = np.where(ratio >= EVEN, 2 * np.floor(ratio / 2), ratio)
         dense = "finer than those of the medium, which is dense"
         wanted[dense if ratio.max() > 1 else "of the medium"] = data.resolution * ratio
     edge = _edge_of_error(rule.target_error)
@@ -275,12 +283,20 @@ def warn_of_dense_border(medium: MediumGrid, grid: Grid) -> None:
 
 def warn_of_opaque_voxels(medium: MediumGrid, grid: Grid, max_depth: int) -> None:
     """Log a warning if voxels are too opaque for several orders of scattering."""
-    depth = _colliding_extinction(medium) * grid.voxel_size.max()
-    if max_depth != 2 and not medium.homogeneous and depth > OPAQUE_VOXEL:
+    data = (medium.original or medium).sigma_t.grid
+    if max_depth == 2 or data is None or medium.homogeneous:
+        return
+    sigma_t = _colliding_extinction(medium)
+    edge, size = data.voxel_size.max(), grid.voxel_size.max()
+    error = (sigma_t * edge) ** OPAQUE_DEPTH_ORDER * (size / edge) ** OPAQUE_SIZE_ORDER
+    error = min(error, MOST_OPAQUE_ERROR)
+    if error > LARGE_OPAQUE_ERROR and sigma_t * size > RESOLVED:
         mi.Log(
             mi.LogLevel.Warn,
-            f"irrcache: voxels of the cache have a mean optical depth of {depth:.2g}: errors of "
-            f"about {OPAQUE_ERROR} are expected between dense structures. Raise resolution.",
+            f"irrcache: voxels of the cache have a mean optical depth of {sigma_t * size:.2g}: "
+            f"errors of up to about {error:.0f} % of the mean, and {OPAQUE_PEAK * error:.0f} % in "
+            "small regions, are expected where the extinction varies within a few voxels. Raise "
+            "resolution.",
         )
 
 

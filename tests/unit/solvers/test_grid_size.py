@@ -56,7 +56,8 @@ def test_small_grids_get_more_voxels(shape):
 
 
 def test_dense_grids_are_refined_by_optical_depth():
-    """Dense grids are refined per axis by the optical depth, by a factor of six at most.
+    """Dense grids are refined per axis by the optical depth, by a factor of eight at most,
+    which is even from four on.
 
     For ``path`` they are not, since its noise exceeds the discretisation error.
     """
@@ -65,8 +66,8 @@ def test_dense_grids_are_refined_by_optical_depth():
     assert dense == (64, 64, 64)  # 1 / 0.7 for each data voxel would be 57
     assert chosen(in_air(40, 48.0)) == (68, 68, 68)
     assert chosen(in_air(40, 40.0 * 1.2 * 4)) == (127, 127, 127)  # 4^0.45 times as many
-    assert opaque == (200, 200, 200)
-    assert chosen(in_air(20, 20000.0)) == (120, 120, 120)
+    assert opaque == (256, 256, 256)
+    assert chosen(in_air(20, 20000.0)) == (160, 160, 160)
     assert chosen(in_air(40, 40000.0), solver="path") == (40, 40, 40)
     assert chosen(np.full((4, 4, 4), 500.0), solver="path") == (32, 32, 32)
     assert chosen(np.full((1, 1, 1), 1.0), solver="path") == (16, 16, 16)
@@ -173,3 +174,24 @@ def test_directions_by_default(scenes):
         scene.integrator().prepare(scene)
         cache = scene.integrator().cache
         assert (cache.samples, cache.batch) == expected
+
+
+@pytest.mark.parametrize(
+    ("count", "depth", "max_depth", "warns"),
+    [
+        (64, 20.0, -1, True),  # 5 voxels for each 4 of the data
+        (64, 20.0, 2, False),
+        (16, 100.0, -1, False),  # 8 voxels along each data voxel
+        (64, 2.0, -1, False),
+    ],
+)
+def test_opaque_voxels_are_announced(count, depth, max_depth, warns, monkeypatch):
+    """A cache that is too coarse for opaque data, because of its number of voxels, says so."""
+    monkeypatch.setattr(grid_size, "MOST_REFINED", 80**3 if count == 64 else 1 << 24)
+    messages = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: messages.append((level, text)))
+    dense = medium(in_air(count, count * depth))
+    grid, _ = choose_grid(dense, 0, solver_named("sweep").size_rule)
+    grid_size.warn_of_opaque_voxels(dense, grid, max_depth)
+    assert bool(messages) is warns
+    assert all(level == mi.LogLevel.Warn and "Raise resolution" in t for level, t in messages)
