@@ -28,7 +28,7 @@ def replace_tables(
     """Replaces the blocks of ``document`` that have the names of ``tables``; returns these names.
 
     Below each table stands its ``origin``; None: when and where it was measured. Raises ValueError
-    where the document has none of the tables.
+    where the document has none of the tables, or several of one name.
     """
     text, found = document.read_text(), []
     origin = provenance() if origin is None else origin
@@ -37,6 +37,8 @@ def replace_tables(
         block = re.compile(
             rf"(?<=<!-- table: {re.escape(name)} -->\n).*?(?=<!-- end -->)", re.DOTALL
         )
+        if text.count(f"<!-- table: {name} -->") > 1:
+            raise ValueError(f"{document} has several tables of the name {name}; rename one.")
         if block.search(text):
             new = as_markdown(table) + below
             text = block.sub(lambda _, new=new: new, text, count=1)

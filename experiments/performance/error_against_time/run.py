@@ -165,7 +165,7 @@ def main() -> None:
     whole = table(cases)
     print(f"\n{whole.as_text()}\n  {whole.note}\n\n{defaults(cases).as_text()}")
     if args.document:
-        tables = {"error-against-time": whole, "defaults": defaults(cases)}
+        tables = {"error-against-time": whole, "default-settings": defaults(cases)}
         replace_tables(args.document, tables)
 
 

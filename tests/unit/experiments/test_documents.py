@@ -34,6 +34,19 @@ def test_a_block_is_replaced_and_nothing_else(tmp_path):
     assert len(BLOCK.findall(page.read_text())) == 2
 
 
+def test_two_tables_of_one_name_are_refused(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(2 * "<!-- table: mine -->\n<!-- end -->\n")
+    with pytest.raises(ValueError, match="several tables of the name mine"):
+        documents.replace_tables(page, {"mine": TABLE})
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").rglob("*.md")), ids=lambda page: page.stem)
+def test_tables_of_a_page_have_names_of_their_own(page):
+    names = [name for name, _ in BLOCK.findall(page.read_text())]
+    assert len(names) == len(set(names))
+
+
 def test_a_document_without_the_mark_is_refused_and_stays(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("<!-- table: other -->\n<!-- end -->\n")
