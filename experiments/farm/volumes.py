@@ -5,10 +5,10 @@ and a model of them.
         [--document docs/developing/bricks.md]
 
 All are commands of users: ``irrcache render`` of a volume in a file, with all orders of scattering,
-within 8 GB; ``irrcache farm cache`` by one and two workers against one process. The time of the
-sweeps is compared with a model, which starts jobs in the order of the farm as soon as those that
-they need have ended and a worker is free. The same model tells what larger volumes would cost on
-clusters. Needs 31 bytes of free disk space per voxel. Writes output/farm/volumes.json.
+within 8 GB; ``irrcache farm cache`` by one, two and four workers against one process. The time of
+the sweeps is compared with a model, which starts jobs in the order of the farm as soon as those
+that they need have ended and a worker is free. The same model tells what larger volumes would cost
+on clusters. Needs 31 bytes of free disk space per voxel. Writes output/farm/volumes.json.
 """
 
 from __future__ import annotations
@@ -304,7 +304,7 @@ def model_table(cases: list[Cluster]) -> Table:
                 f"{found['idle']:.0%}",
                 f"{found['moved'] / 1e9:.1f} GB",
                 f"{seconds / (seconds + found['arithmetic']):.0%}",
-                f"{found['efficiency']:.0%}",
+                f"{found['efficiency']:.1%}",
             ]
         )
     return Table("Sweeps by slabs: model", head, rows)
@@ -316,7 +316,7 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=1024)
     parser.add_argument("--directions", type=int, default=32)
     args, store = begun(parser, "volumes")
-    rows = {n: store.row(f"workers {n}", lambda n=n: by_workers(n)) for n in (0, 1, 2)}
+    rows = {n: store.row(f"workers {n}", lambda n=n: by_workers(n)) for n in (0, 1, 2, 4)}
     tables = {"volumes-workers": workers_table(rows), "volumes-model": model_table(CLUSTERS)}
     for table in tables.values():
         print(table.as_text(), flush=True)

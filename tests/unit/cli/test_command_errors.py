@@ -64,7 +64,6 @@ def test_missing_packages_are_named_with_the_command(tmp_path):
     (tmp_path / "slices").mkdir()
     (tmp_path / "slices" / "1.dcm").write_text("none")
     commands = {
-        "import phantom:thorax:16,16,16 --preset ct-chest -o out": ("scipy", "volumes"),
         "import ct.nrrd --density -o out": ("SimpleITK", "volumes"),
         "import slices --density -o out": ("SimpleITK", "volumes"),
         "view scene.xml": ("viser", "view"),
