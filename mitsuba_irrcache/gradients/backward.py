@@ -20,12 +20,22 @@ from mitsuba_irrcache.gradients.parameters import (
     shaped_like,
 )
 from mitsuba_irrcache.grids.fields import Field
-from mitsuba_irrcache.lights.emitters import POINT_LIKE, position_of
+from mitsuba_irrcache.lights.emitters import POINT_LIKE, EmitterKind, position_of
 from mitsuba_irrcache.lights.falloff import edges_away
 from mitsuba_irrcache.pipeline.cached_medium import CachedMedium
 from mitsuba_irrcache.render.camera import ClosedFormCameraRays
 from mitsuba_irrcache.scene.compile import media_of
 from mitsuba_irrcache.solvers.base import registered
+
+#: Kinds of emitters whose radiance the adjoint equation and the derivatives of images include.
+EMITTERS = frozenset(
+    (
+        EmitterKind.CONSTANT_ENVIRONMENT,
+        EmitterKind.ENVIRONMENT_MAP,
+        EmitterKind.SUN,
+        *POINT_LIKE,
+    )
+)
 
 
 def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
@@ -52,6 +62,14 @@ def check(parts: list[CachedMedium], keys: list[str], layered: bool) -> None:
     if not part.solver.has_gradients:
         others = " or ".join(f'"{s.name}"' for s in registered() if s.has_gradients)
         refuse_all(keys, f'the solver is "{part.solver.name}"', f"Set solver to {others}")
+    for emitter, kind in part.description.emitters:
+        if kind not in EMITTERS:
+            refuse_all(
+                keys,
+                f'emitter "{emitter.id()}" ({emitter.class_name()}) is neither an environment nor '
+                "a sun nor a point or spot light",
+                "Remove it",
+            )
     depth = part.settings.max_depth
     if depth > 2:
         refuse_all(keys, f"max_depth is {depth}", "Set max_depth to 1, 2 or -1")

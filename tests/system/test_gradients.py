@@ -12,6 +12,8 @@ import pytest
 from experiments.validation.gradients.cases import CASES, LAMP, POINT, SKY, SUN, Case, sky_with_sun
 from experiments.validation.gradients.differences import compare, gradients, key_of, pixel_weights
 from mitsuba_irrcache.errors import IrrcacheError
+from mitsuba_irrcache.gradients import backward
+from mitsuba_irrcache.lights.emitters import EmitterKind
 
 #: Largest relative error of directional derivatives along smooth perturbations, and the least
 #: cosine; the first also where voxels are empty.
@@ -418,6 +420,13 @@ def test_scenes_without_gradients_are_refused(rgb, scenes):
 def test_points_in_sharply_scattering_matter_are_refused(rgb):
     scene = Case(data=8, cache=8, g=0.6, emitters=lambda: {"lamp": LAMP}).load()
     assert 'emitter "lamp" is in medium' in refused(scene, "sigma_t.data")
+
+
+def test_emitters_without_derivatives_are_refused_by_name(rgb, monkeypatch):
+    """A kind that is added to the solvers has no gradients until they include it."""
+    monkeypatch.setattr(backward, "EMITTERS", backward.EMITTERS - {EmitterKind.POINT})
+    scene = Case(data=8, cache=8, emitters=lambda: {"lamp": LAMP}).load()
+    assert 'emitter "lamp" (PointLight)' in refused(scene, "sigma_t.data")
 
 
 def test_emission_of_zero_is_refused(rgb):
