@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from mitsuba_irrcache.errors import IrrcacheError
 from mitsuba_irrcache.io.files import atomic_write
 from mitsuba_irrcache.out_of_core.brick_file import EDGE, BrickFile
 from mitsuba_irrcache.out_of_core.slabs import even_slabs
@@ -42,24 +42,19 @@ def write(path: Path, irradiance: BrickFile, colour: np.ndarray, inputs: str) ->
     The irradiance is the product of the values and of ``colour`` (channels).
     """
     _record(path).unlink(missing_ok=True)
-    partial = path.with_name(f".{path.name}.tmp")
     shape, (slices, ny, nx) = (*irradiance.shape, len(colour)), irradiance.shape
-    try:
+    with atomic_write(path) as file:
+        header = {"descr": "<f4", "fortran_order": False, "shape": tuple(shape)}
+        np.lib.format.write_array_header_1_0(file, header)
         for first, last in even_slabs(slices, EDGE):
-            mode = "r+" if first else "w+"
-            mapped = np.lib.format.open_memmap(partial, mode, np.float32, shape)
             values = irradiance.read((first, 0, 0), (last, ny, nx))
-            values = values.reshape(last - first, ny, nx, -1)
-            mapped[first:last] = values * colour.astype(np.float32)
-            del mapped
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise IrrcacheError(
-            f'irrcache: irradiance_file "{path}" cannot be written: {error.strerror}.'
-        ) from None
+            values = values.reshape(last - first, ny, nx, -1) * colour.astype(np.float32)
+            file.write(np.ascontiguousarray(values, "<f4").data)
+        file.flush()
+        # Noted before the file gets its name, under which another process may write its own.
+        state = _state(file.fileno())
     is_grey = irradiance.channels == 1 and bool(np.ptp(colour) == 0)
-    record = {"inputs": inputs, "is_grey": is_grey, "file": _state(path)}
+    record = {"inputs": inputs, "is_grey": is_grey, "file": state}
     with atomic_write(_record(path)) as file:
         file.write(json.dumps(record).encode())
 
@@ -79,7 +74,7 @@ def _record(path: Path) -> Path:
     return path.with_name(f"{path.name}.json")
 
 
-def _state(path: Path) -> list[int]:
-    """Return the size and time of a file."""
-    state = path.stat()
+def _state(file: Path | int) -> list[int]:
+    """Return the size and time of a file, given its path or descriptor."""
+    state = os.stat(file)
     return [state.st_size, state.st_mtime_ns]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+from contextlib import contextmanager
 from pathlib import Path
 
 import mitsuba as mi
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 
 from mitsuba_irrcache.errors import IrrcacheError
-from mitsuba_irrcache.out_of_core import scattering, slab_march, slab_sweep
+from mitsuba_irrcache.out_of_core import irradiance_file, scattering, slab_march, slab_sweep
+from mitsuba_irrcache.out_of_core.brick_file import BrickFile
 from mitsuba_irrcache.out_of_core.volume_files import VolumeFile
 from mitsuba_irrcache.out_of_core.volume_settings import parse_memory
 from tests.support.scenes import SUN, boundary, image, load, medium, placement, texture
@@ -93,6 +95,34 @@ def test_an_irradiance_file_of_the_same_inputs_is_read(density, tmp_path, monkey
     np.testing.assert_array_equal(rendered(), computed)
     np.save(tmp_path / "density.npy", density[::-1])
     assert np.abs(rendered() - computed).max() > 0.01
+
+
+def test_a_record_is_that_of_the_file_that_was_written_with_it(tmp_path, monkeypatch):
+    """Another process, of other inputs, writes the same file in between."""
+
+    def brick_file(value: float) -> BrickFile:
+        file = BrickFile.without_name(tmp_path / "working", (40, 3, 2), np.float32)
+        file.write((0, 0, 0), np.full((40, 3, 2), value, np.float32))
+        return file
+
+    path, colour, atomic_write = tmp_path / "light.npy", np.ones(3), irradiance_file.atomic_write
+
+    @contextmanager
+    def disturbed(file):
+        with atomic_write(file) as opened:
+            yield opened
+        monkeypatch.setattr(irradiance_file, "atomic_write", atomic_write)
+        irradiance_file.write(path, brick_file(2.0), colour, "theirs")
+        Path(f"{path}.json").unlink()
+
+    monkeypatch.setattr(irradiance_file, "atomic_write", disturbed)
+    irradiance_file.write(path, brick_file(1.0), colour, "mine")
+    assert np.load(path).shape == (40, 3, 2, 3) and (np.load(path) == 2).all()
+    assert irradiance_file.recorded(path, "mine") is None
+    irradiance_file.write(path, brick_file(1.0), colour, "mine")
+    found = irradiance_file.recorded(path, "mine")
+    assert (found.read((30, 1, 0), (40, 2, 2)) == 1).all() and found.channels == 1
+    assert irradiance_file.recorded(path, "theirs") is None
 
 
 def test_all_orders_of_a_white_furnace_are_white(density, tmp_path, monkeypatch):
