@@ -27,6 +27,8 @@ from mitsuba_irrcache.view.window import Picture, View
 
 #: JPEG quality for moving cameras and for images that better ones will replace.
 MOVING_QUALITY, RESTING_QUALITY = 80, 95
+#: How often the first camera is placed again in a page that is still loading.
+ATTEMPTS = 5
 #: Seconds between two updates of the text below the image.
 NOTE_SECONDS = 0.25
 
@@ -52,8 +54,10 @@ class Visitor:
         self._gone = False
         self._noted = 0.0
         self._view: View | None = None
-        # How the camera was placed, and how much further away for a window that is high.
-        self._placed, self._away = np.zeros(3), 1.0
+        # Where the camera was placed, where it looks, how much further away it is for a window that
+        # is high, and how often it may still be placed again.
+        self._placed, self._aimed, self._away = np.zeros(3), np.zeros(3), 1.0
+        self._attempts = ATTEMPTS
         self._look = Look(exposure=session.exposure)
         self.window = session.open(self._show)
         self._add_controls(client.gui)
@@ -145,7 +149,8 @@ class Visitor:
             self._away, target = self._distance_factor, np.array(camera.target)
             self._placed = place(target + self._away * (np.array(camera.position) - target))
             self.client.camera.position = self._placed
-            self.client.camera.look_at = place(camera.target)
+            self._aimed = place(camera.target)
+            self.client.camera.look_at = self._aimed
             self.client.camera.fov = math.radians(camera.fov)
         self._fov.value = round(camera.fov, 1)
         self._look_again()
@@ -160,7 +165,14 @@ class Visitor:
 
     # ------------------------------------------------------------------ to and from the session
 
-    async def _camera_moved(self, _: viser.CameraHandle) -> None:
+    async def _camera_moved(self, camera: viser.CameraHandle) -> None:
+        if self._attempts:  # the page has not told yet that its camera is where it was placed
+            places = (camera.position, self._placed), (camera.look_at, self._aimed)
+            if not all(np.allclose(*pair, atol=1e-3) for pair in places):
+                self._attempts -= 1
+                self._go_to(self._sensor.value)
+                return
+            self._attempts = 0
         self._look_again()
 
     def _look_again(self) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from experiments.performance.viewer.browser import Browser, Window, viewer
 
 SIZES = ((1400, 900), (800, 600), (1920, 1080))
-PICTURE = (1100, 620)
+PICTURE = (1200, 800)
 VIEW = ("phantom:thorax:190,120,165", "--preset", "ct-chest", "-D", "radiance=2")
 #: Relative error of the caches in percent.
 TARGET = 4
@@ -75,8 +75,9 @@ def main() -> None:
         window.unfold("Scattering and error")
         window.enter("target error %", TARGET)
         window.unfold("Scattering and error")
-        window.orbit(10, 6, 0.03, first=150)
+        window.orbit(10, 4, 0.03, first=150)
         window.wait_for("^final", 600)
+        window.page.get_by_text("View", exact=True).scroll_into_view_if_needed()
         take(window, args.output / "viewer.jpg")
         window.page.close()
         for size in SIZES:
