@@ -11,6 +11,7 @@ import io
 import json
 from pathlib import Path
 from unittest import mock
+from unittest.mock import Mock
 
 import numpy as np
 
@@ -135,7 +136,7 @@ def _without_long_work():
     from mitsuba_irrcache.view import command as view
 
     def show(args) -> None:
-        view._document(args)
+        view._document(args, Mock())  # no page is shown
         raise WorkBegins
 
     def end(*_, **__) -> None:
