@@ -21,8 +21,8 @@ from mitsuba_irrcache.cache.angular import AngularBasis
 from mitsuba_irrcache.core.jit import concatenated, symbolic
 from mitsuba_irrcache.solvers.discrete_ordinates.kernel import collisions
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
-    interleaved_channels,
     block_and_index,
+    interleaved_channels,
     voxel_and_channel,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.multigrid import MultigridLevel

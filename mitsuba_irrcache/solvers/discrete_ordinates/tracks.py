@@ -44,8 +44,8 @@ from mitsuba_irrcache.solvers.discrete_ordinates.kernel import (
     sweep_tracks,
 )
 from mitsuba_irrcache.solvers.discrete_ordinates.layout import (
-    flat_index,
     block_and_index,
+    flat_index,
     slicewise,
     strides_of,
 )
