@@ -29,7 +29,7 @@ from mitsuba_irrcache.core.spectrum import channel_mean
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 from mitsuba_irrcache.grids.occupancy import marked
-from mitsuba_irrcache.grids.root_field import ExtendedField, Extension
+from mitsuba_irrcache.grids.root_field import ExtendedField
 from mitsuba_irrcache.lights.emitters import EmitterKind, EmittersByKind
 from mitsuba_irrcache.lights.solid_angle import SolidAngle
 from mitsuba_irrcache.media.medium import MediumGrid
@@ -176,32 +176,20 @@ class AreaLight(DirectLight):
     def _attenuation(
         self, scene: mi.Scene, p: mi.Point3f
     ) -> tuple[mi.Float | mi.Color3f, mi.Spectrum]:
-        self.points_per_voxel = self._sample_count(scene)
-        sums = self._sums_of(scene, p, self._voxels, self.order)
+        voxels = self._voxels
+        count = self.points_per_voxel = self._sample_count(scene)
+        rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
+        sums = self._sums(scene, p, dr.opaque(mi.UInt32, count), rng, self.order)
         transmitted, visible, _, _, _, angular = sums
         passed = dr.select(transmitted > 0, visible / transmitted, 0)
-        depth = self._mean_depth(sums)
+        mean, bias = _mean_and_bias(*sums)
+        depth = -dr.log(dr.maximum(mean, 1e-30)) - bias
+        depth = depth[0] if self._medium.sigma_t.channels == 1 else mi.Color3f(depth)
         seen = dr.mean(visible)
         share = dr.select(seen > 0, 1 / dr.select(seen > 0, seen, 1), 0)
         self._angular_means = [share * total for total in angular]
-        # Points next to the faces use the random numbers of the nearest voxel, so that differences
-        # between the two have little noise.
-        _, nearest, self._border = Extension(self._grid).border()
-        self._border_depth = self._mean_depth(self._sums_of(scene, self._border, nearest))
-        dr.eval(depth, passed, self._angular_means, self._border, self._border_depth)
+        dr.eval(depth, passed, self._angular_means)
         return depth, passed
-
-    def _sums_of(self, scene: mi.Scene, p: mi.Point3f, voxels: mi.UInt32, order: int = 0):
-        """Return `_sums` over `points_per_voxel` points, with the random numbers of ``voxels``."""
-        count = self.points_per_voxel
-        rng = random_stream(mi.sample_tea_32(voxels, hashed_seed((count, 0))[0]))
-        return self._sums(scene, p, dr.opaque(mi.UInt32, count), rng, order)
-
-    def _mean_depth(self, sums: tuple) -> mi.Float | mi.Color3f:
-        """Return the optical depth of the mean transmittance from the result of `_sums`."""
-        mean, bias = _mean_and_bias(*sums)
-        depth = -dr.log(dr.maximum(mean, 1e-30)) - bias
-        return depth[0] if self._medium.sigma_t.channels == 1 else mi.Color3f(depth)
 
     def _sample_count(self, scene: mi.Scene) -> int:
         """Return the number of points on the emitter per voxel.
@@ -343,16 +331,12 @@ class AreaLight(DirectLight):
     ) -> ExtendedField:
         """Create the field of the optical depth divided by `length`.
 
-        Next to the faces of the grid it is exact: close to a face that the emitter irradiates at
-        grazing angles the optical depth varies like x log(x) with the distance x. Extrapolated from
-        the centres of voxels of a fifth of a mean free path, it is too small by 0.3.
+        It is extrapolated beyond the outermost voxel centres, because it varies within a voxel next
+        to faces that the emitter irradiates at grazing angles.
         """
         field = super()._field_of_extinction(mean, classes)
-        sigma_t = self._medium.sigma_t.at_world(self._border)
-        border = self._over_length(self._border, self._border_depth, sigma_t)
-        border = [border] if field.channels == 1 else list(border)
         known = marked(self._grid, self._voxels)
-        return ExtendedField(self._grid, field.data, field.channels, border, known)
+        return ExtendedField(self._grid, field.data, field.channels, known)
 
     def _field_of_others(self, passed: mi.Spectrum, classes: VoxelClasses | None) -> ExtendedField:
         """Create the field of visibility, interpolated linearly: shadow edges have no bias."""

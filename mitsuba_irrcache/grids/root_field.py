@@ -6,15 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_irrcache.core.spectrum import scatter_channels
 from mitsuba_irrcache.grids.fields import GridField
 from mitsuba_irrcache.grids.grid import Grid
 
 #: Maximum ratio of neighbouring square roots of irradiance used for extrapolation.
 STEEPEST = 4.0
-#: Distance in voxels from the faces of a grid at which values that are extended beyond it are
-#: computed. On the faces themselves, the mean extinction between them and an emitter is 0 / 0.
-INSET = 0.03
 
 
 class RootField(GridField):
@@ -56,34 +52,24 @@ class ExtendedField(GridField):
     """Values interpolated trilinearly on a grid with an `Extension`.
 
     Unlike `RootField` it interpolates the values themselves. Beyond the outermost voxel centres
-    they are constant, or, with ``border``, the values at the positions of `Extension.border`, such
-    that lookups at these positions return them. ``known`` masks the voxels that have values;
-    others are not extended.
+    they are extrapolated linearly from ``known`` voxels, and clamped to 0; without ``known`` the
+    extrapolation is constant.
     """
 
     def __init__(
-        self,
-        grid: Grid,
-        values: mi.Float,
-        channels: int,
-        border: list[mi.Float] | None = None,
-        known: mi.Bool | None = None,
+        self, grid: Grid, values: mi.Float, channels: int, known: mi.Bool | None = None
     ) -> None:
         self.inner, extension = grid, Extension(grid)
-        inside = extension.inside(dr.arange(mi.UInt32, extension.grid.voxel_count))
+        voxel = dr.arange(mi.UInt32, extension.grid.voxel_count)
+        inside, inwards = extension.inside(voxel), extension.inwards(voxel)
         extended = dr.zeros(mi.Float, extension.grid.voxel_count * channels)
-        scatter_channels(
-            extended,
-            [dr.gather(mi.Float, values, inside * channels + c) for c in range(channels)],
-            dr.arange(mi.UInt32, extension.grid.voxel_count),
-        )
-        if border is not None:
-            added, nearest, _ = extension.border()
-            valid = dr.gather(mi.Bool, known, nearest)
-            for c, face in enumerate(border):
-                value = dr.gather(mi.Float, values, nearest * channels + c)
-                value = dr.lerp(value, face, 1 / (0.5 - INSET))
-                dr.scatter(extended, dr.maximum(value, 0), added * channels + c, valid)
+        for c in range(channels):
+            value = nearest = dr.gather(mi.Float, values, inside * channels + c)
+            for inner in inwards if known is not None else ():
+                valid = dr.gather(mi.Bool, known, inner)
+                change = nearest - dr.gather(mi.Float, values, inner * channels + c)
+                value += dr.select(valid, change, 0)
+            dr.scatter(extended, dr.maximum(value, 0), voxel * channels + c)
         dr.eval(extended)
         super().__init__(extension.grid, extended, channels)
 
@@ -111,20 +97,6 @@ class Extension:
     def inside(self, voxel: mi.UInt32) -> mi.UInt32:
         """Return the nearest voxels of the original grid."""
         return self.inner.index(*(nearest for nearest, _ in self._nearest(voxel)))
-
-    def border(self) -> tuple[mi.UInt32, mi.UInt32, mi.Point3f]:
-        """Return the added voxels, the nearest original voxel of each, and world positions on the
-        line between their centres, at `INSET` inside of the faces of the original grid.
-        """
-        voxel = dr.arange(mi.UInt32, self.grid.voxel_count)
-        indices = self.grid.voxel_indices(voxel)
-        outside = mi.Bool(False)
-        for place, side in zip(indices, self.inner.sides, strict=True):
-            outside |= (place == 0) | (place > side)
-        added = dr.compress(outside)
-        nearest = self.inside(added)
-        p = dr.lerp(self.inner.centers(nearest), self.grid.centers(added), 0.5 - INSET)
-        return added, nearest, p
 
     def inwards(self, voxel: mi.UInt32) -> list[mi.UInt32]:
         """Return for each axis the neighbour of the nearest original voxel in inward direction.

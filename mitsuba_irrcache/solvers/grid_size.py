@@ -17,7 +17,7 @@ from mitsuba_irrcache.media.medium import MediumGrid
 REQUESTED = "as requested"
 
 #: Estimated error of the pixels at the boundary of a medium [%] above which a warning is logged.
-LARGE_BORDER_ERROR = 3.0
+LARGE_BORDER_ERROR = 2.0
 
 #: Estimated error [%] above which the irradiance of suns and points is not interpolated.
 SMALL_BORDER_ERROR = 0.2
@@ -38,13 +38,15 @@ RESOLVED, OPAQUE, OPAQUE_POWER, EVEN, MOST_PER_DATA_VOXEL = 0.7, 1.2, 0.45, 4.0,
 #: where d is the optical depth of a cache voxel at the boundary.
 BORDER_ERROR, BORDER_ORDER = 3.5, 1.2
 #: RMSE [% of the mean] of an image with all orders of scattering through data with opaque detail as
-#: fine as their voxels: d^OPAQUE_DEPTH_ORDER r^OPAQUE_SIZE_ORDER, with the optical depth d of a
-#: data voxel and the ratio r of the edges of cache and data voxels. A fit to 1.5 <= d <= 100 and
+#: fine as their voxels: OPAQUE_ERROR d^OPAQUE_DEPTH_ORDER r^OPAQUE_SIZE_ORDER at most, with the
+#: optical depth d of a data voxel and the ratio r of the edges of cache and data voxels. Found with
+#: noise and a steep transfer function on 16^3 and 32^3 voxels for 1.5 <= d <= 100 and
 #: 1/12 <= r <= 1; errors of 4 x 4 pixels are up to OPAQUE_PEAK times as large. They are smaller in
-#: smooth data. A warning is logged above LARGE_OPAQUE_ERROR; the fit saturates at
-#: MOST_OPAQUE_ERROR.
+#: smooth data, and saturate at MOST_OPAQUE_ERROR. A warning is logged above LARGE_OPAQUE_ERROR, and
+#: above an optical depth of OPAQUE_VOXEL per cache voxel.
+OPAQUE_ERROR, OPAQUE_VOXEL = 1.5, 10.0
 OPAQUE_DEPTH_ORDER, OPAQUE_SIZE_ORDER, OPAQUE_PEAK = 0.7, 1.5, 2.7
-LARGE_OPAQUE_ERROR, MOST_OPAQUE_ERROR = 3.0, 9.0
+LARGE_OPAQUE_ERROR, MOST_OPAQUE_ERROR = 4.5, 9.0
 #: Maximum number of voxels along the longest side that a boundary of glass can require. Glass
 #: reflects most of the radiance inside, which then varies less towards the boundary, and voxels are
 #: more expensive. At an optical depth of 40 this number has an error of 0.5 % (ball) and 0.7 %
@@ -288,9 +290,9 @@ def warn_of_opaque_voxels(medium: MediumGrid, grid: Grid, max_depth: int) -> Non
         return
     sigma_t = _colliding_extinction(medium)
     edge, size = data.voxel_size.max(), grid.voxel_size.max()
-    error = (sigma_t * edge) ** OPAQUE_DEPTH_ORDER * (size / edge) ** OPAQUE_SIZE_ORDER
-    error = min(error, MOST_OPAQUE_ERROR)
-    if error > LARGE_OPAQUE_ERROR and sigma_t * size > RESOLVED:
+    error = OPAQUE_ERROR * (sigma_t * edge) ** OPAQUE_DEPTH_ORDER
+    error = min(error * (size / edge) ** OPAQUE_SIZE_ORDER, MOST_OPAQUE_ERROR)
+    if error > LARGE_OPAQUE_ERROR or sigma_t * size > OPAQUE_VOXEL:
         mi.Log(
             mi.LogLevel.Warn,
             f"irrcache: voxels of the cache have a mean optical depth of {sigma_t * size:.2g}: "

@@ -181,7 +181,8 @@ def test_directions_by_default(scenes):
     [
         (64, 20.0, -1, True),  # 5 voxels for each 4 of the data
         (64, 20.0, 2, False),
-        (16, 100.0, -1, False),  # 8 voxels along each data voxel
+        (16, 100.0, -1, True),  # 8 voxels along each data voxel, of depth 12
+        (16, 30.0, -1, False),  # 6 voxels, of depth 5
         (64, 2.0, -1, False),
     ],
 )
