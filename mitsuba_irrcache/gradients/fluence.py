@@ -47,7 +47,7 @@ class FluenceFields:
             DirectLight(scene, light.emitter, medium, grid, voxels) for light in cache.direct_lights
         ]
         channels, colour = transport.channels, transport.colour
-        # Of channels that differ by a constant factor, the brightest one represents all.
+        # The brightest of several channels that differ by a constant factor represents all.
         own = range(channels) if channels == cache.channels else [int(colour.argmax())]
         cached = [self._cached(c) for c in own]
         swept, self.collided = transport.irradiance(

@@ -88,7 +88,7 @@ class MissingItemError(IrrcacheError):
 
 
 class UnchosenItemError(IrrcacheError):
-    """Of several channels or frames, as ``what`` says, none is chosen."""
+    """Several channels or frames, named by ``what``, are available and none is chosen."""
 
     def __init__(self, message: str, what: str) -> None:
         super().__init__(message)
